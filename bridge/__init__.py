@@ -1,5 +1,5 @@
 """rosbridge without ROS: protocol core, asyncio client, field lookup in messages, embedded server.
 
-Start at `bridge.client` (`connect`: topics, services and actions), `posteriors.listening` (`listen`: results in one call) or
-`bridge.hub.server` (`serve_hub`: a server for programs and tests). `bridge.errors` contains all errors.
+Start at `bridge.client` (`connect`: topics, services and actions) or `bridge.hub.server` (`serve_hub`: a server for
+programs and tests). `bridge.errors` contains all errors.
 """

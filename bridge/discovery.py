@@ -38,7 +38,7 @@ _PATH: Final = re.compile(r"/[A-Za-z0-9._~/-]{0,200}")
 _HOST: Final = re.compile(r"[A-Za-z0-9.-]{1,253}")
 _LAST_PORT: Final = 65535
 _PORT: Final = re.compile(r"[0-9]+(/.*)?")
-"""What follows `robot:` in a URI without ws://, and therefore is not a name."""
+"""The port of `robot:9090`, a URI that lacks its ws://, and not a name."""
 _TAKEN_TIME: Final = 3.0
 """Seconds to wait for another owner of a name."""
 

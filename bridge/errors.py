@@ -52,7 +52,7 @@ class EncodeError(UsageError):
 
 
 class MessageTooLargeError(EncodeError):
-    """Raised when a message has more bytes than this client, or the server as far as known, accepts."""
+    """Raised when a message exceeds the limit of this client, or the known limit of the server."""
 
 
 class MessageTypeError(EncodeError):

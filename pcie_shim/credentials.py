@@ -1,8 +1,8 @@
 """Credentials of links over TCP: a key that host and board share, and TLS.
 
-Before its greeting, a board with a key sends a challenge. The host answers with a proof that it has the key, and gets the
-board's. Neither proof reveals the key, nor fits another link. The proofs protect the beginning of a link; what is sent
-afterwards is protected only by TLS.
+Before its greeting, a board with a key sends a challenge. The host answers with a proof that it has the key, and gets
+the proof of the board. Neither proof reveals the key or is valid for another link. The proofs protect only the
+beginning of a link; TLS protects the data that follows.
 """
 
 import hashlib
@@ -29,7 +29,7 @@ class Credentials:
 
     Attributes:
         key: The shared key; empty for none.
-        tls: The board's certificate, or the authorities that the host trusts; None: no TLS, or the system's authorities.
+        tls: The board's certificate, or the authorities that the host trusts; None for no TLS or the system's.
     """
 
     key: bytes = field(default=b"", repr=False)

@@ -68,7 +68,7 @@ class Endpoint:
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """Parse `unix:/path`, `tcp://host:port` or `tls://host:port`; an EndpointError for anything else, or too long a path."""
+    """Parse `unix:/path`, `tcp://host:port` or `tls://host:port`, or raise an EndpointError."""
     if text.startswith("unix:"):
         endpoint = Endpoint(path=text.removeprefix("unix:"))
         if not endpoint.path.startswith("/"):

@@ -30,7 +30,7 @@ ERROR: Final = 5
 PROGRAM: Final = 6
 """Loader to the programming port: a part of a programming file; `address` is its offset in bytes."""
 AUTHENTICATE: Final = 7
-"""Board to host, before GREET: a challenge; the host's request has its nonce and its proof, the reply the board's proof."""
+"""Board to host, before GREET: a challenge. The host requests with nonce and proof; the reply is the board's proof."""
 
 REPLY: Final = 1
 """Flag: the answer to the request of the same sequence number."""

@@ -114,7 +114,7 @@ def resources() -> dict[str, float]:
 
 
 def _listen(path: str) -> socket.socket:
-    """Listen at a path, in place of a killed process; an OSError if another one listens there, or the system refuses."""
+    """Listen at a path, in place of a killed process, or raise an OSError, for example if another process listens."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)  # a full backlog means that a process is listening
         if probe.connect_ex(path) == errno.ECONNREFUSED:

@@ -47,7 +47,7 @@ WAIT_TIMEOUT: Final = 60.0
 CLOSE_TIMEOUT: Final = 5.0
 """Maximum time in seconds that closing takes."""
 _LOOK: Final = 1.0
-"""Interval in seconds at which a waiting thread looks whether the client's thread is alive."""
+"""Interval in seconds at which a waiting thread checks that the client's thread is alive."""
 
 _log = logging.getLogger("bridge")
 
@@ -274,7 +274,7 @@ class BlockingGoalRequest(_Blocking[GoalRequest]):
         return self._async.canceling
 
     def wait_canceling(self, timeout: float) -> bool:
-        """Wait until the goal is to be cancelled, at most `timeout` seconds; return whether it is."""
+        """Wait at most `timeout` seconds for the cancellation of the goal; return whether it was cancelled."""
 
         async def wait() -> None:
             with suppress(TimeoutError):
@@ -297,7 +297,7 @@ class BlockingGoalRequest(_Blocking[GoalRequest]):
         self._do(self._async.abort, values)
 
     def cancel(self, values: Mapping[str, Any] | None = None) -> None:
-        """End the goal as cancelled, with what it has reached."""
+        """End the goal as cancelled, with the values reached so far."""
         self._do(self._async.cancel, values)
 
 
@@ -389,7 +389,7 @@ class BlockingRos(_Blocking[Ros]):
     def close(self) -> None:
         """Close the connection after all published messages, and end everything that waits.
 
-        Further calls have no effect. The interpreter's exit closes too.
+        Further calls have no effect. The exit of the interpreter closes the client too.
         """
         if not self._closing.acquire(blocking=False):
             return
@@ -580,7 +580,7 @@ def _in_threads(handler: Callable[[A], R], most: int, busy: BridgeError) -> Call
 
 
 def _on_own_thread(callback: StateCallback) -> StateCallback:
-    """Return a function that has another called in order, on a daemon thread."""
+    """Return a function that queues the calls of another one, which a daemon thread makes in order."""
     waiting: SimpleQueue[tuple[State, str]] = SimpleQueue()
 
     def work() -> None:

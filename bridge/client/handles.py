@@ -329,8 +329,8 @@ class Publication(Handle):
         Raises:
             DisconnectedError: There is no connection now, or the publication or the client is closed.
             SlowPeerError: The server did not accept it in time, or `queue_size` messages are already waiting.
-            MessageTooLargeError: It is larger than `max_size`, or than the server accepts, as far as known: the
-                hub announces its limit, and others close the connection once, which reconnects.
+            MessageTooLargeError: It is larger than `max_size`, or than the known limit of the server: the hub
+                announces its limit, and other servers reveal theirs by closing the connection once.
             MessageTypeError: It has a field that its type does not have, or an array of another shape.
             EncodeError: It cannot be sent as JSON; for a NaN or infinity, the sentence gives its path.
         """

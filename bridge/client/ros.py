@@ -369,7 +369,7 @@ class Ros:
             type: Its type: `example_interfaces/action/Fibonacci`, or without the middle; in ROS 1
                 `actionlib_tutorials/FibonacciAction`, or without the ending.
             handler: Coroutine function that is called with each goal, and executes it: it may send feedback,
-                and should watch whether the goal is to be cancelled. The goal succeeds with the fields that it
+                and should check whether the goal has been cancelled. The goal succeeds with the fields that it
                 returns, or is cancelled with them if the sender asked for that, unless the handler has ended
                 the goal differently. If it raises an error, the goal is aborted, and the error is logged. Up to
                 64 goals are executed concurrently. It is cancelled when the connection is lost (ROS 2).
@@ -520,8 +520,8 @@ def connect(
             limit.
         ping_interval: Seconds of silence after which the server is pinged.
         ping_timeout: Seconds to wait for data after a ping before the connection counts as lost.
-        check_types: Whether messages, requests and goals with a misspelt field or an array of another shape are refused before they
-            are sent, if their type is known.
+        check_types: Refuse messages, requests and goals with a misspelt field or an array of another shape
+            before they are sent, if their type is known.
         on_state: Callback for each new state and its reason.
 
     Raises:

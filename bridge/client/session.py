@@ -469,7 +469,7 @@ class Session:
             self._waiting -= 1
 
     def flush(self) -> None:
-        """Send the output of the core, which is too small and rare to wait, unless a server causes it and never reads."""
+        """Send the output of the core without waiting: it is small and rare, unless a server floods the client."""
         for message in self.core.data_to_send():
             websocket = self._websocket
             if websocket is not None and websocket.is_open:

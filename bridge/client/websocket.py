@@ -105,7 +105,7 @@ class WebSocket(WebSocketTransport):
     """A WebSocket client connection with callbacks for messages and for its end.
 
     Attributes:
-        largest_accepted: maximum size of a message in bytes, as the server announced in its handshake; None if it did not.
+        largest_accepted: maximum size of a message in bytes that the server announced in its handshake, or None.
         opened: whether `begin` was called after the handshake; only then are callbacks called.
     """
 

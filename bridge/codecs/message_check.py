@@ -17,13 +17,13 @@ from bridge.errors import MessageTypeError, NameFormError
 from bridge.names import ros1_type, ros2_type
 
 _SCALARS: Final = frozenset({bool, int, float, str, NoneType})
-"""Types of scalars that are recognised at once; another value, for example NumPy's, is looked at."""
+"""Types of scalars that are recognised at once; other values, such as NumPy's, are inspected."""
 SCALAR: Final = -1
 """Length of a field that is not an array; 0 is an array of any length."""
 CLOSELY: Final = 64
 """Number of messages of the same structure after which only the outermost keys are compared."""
 SAMPLE: Final = 16
-"""Then the whole structure of one in so many is compared."""
+"""After `CLOSELY` messages, the whole structure of one message in this many is compared."""
 _MAX_TYPES: Final = 1000
 _MAX_FIELDS: Final = 1000
 _BYTES: Final = frozenset({"uint8", "int8", "octet", "byte", "char"})
@@ -77,7 +77,7 @@ def definitions_from_rosapi(answer: Any) -> Definitions:
 
 
 def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
-    """Return the definitions of a standard type and of its parts from rosbags; empty for another type, or without rosbags."""
+    """Return the definitions of a standard type and its parts from rosbags; empty for others or without rosbags."""
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:

@@ -44,7 +44,7 @@ def in_region(true_lines: ArrayLike, posteriors: ArrayLike, mass: float = REGION
 
 
 def means(posteriors: ArrayLike, width: int) -> NDArray[np.float64]:
-    """Return the mean (column, row) of each posterior, float64[frames, 2] in cells; a cell's centre is its whole number.
+    """Return the mean (column, row) of each posterior in cells, float64[frames, 2]; cell 3 has its centre at 3.0.
 
     Posteriors are float64[frames, lines], row-major.
     """

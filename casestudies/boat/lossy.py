@@ -15,7 +15,7 @@ SETTLED_S: Final = 3.0
 
 
 async def report_refused(ros: Ros, topic: str, type_: str) -> None:
-    """Warn if the server passes nothing on that is published on an advertised topic, as far as rosapi tells."""
+    """Warn if, according to rosapi, the server does not forward an advertised topic."""
     await asyncio.sleep(SETTLED_S)
     known = await ros.topic_type(topic)
     if known is None or (known and same_type(known, type_)):

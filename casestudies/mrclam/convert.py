@@ -209,7 +209,7 @@ def windows(
 
 
 def _medians(track: Track, sightings: Sequence[Measured]) -> dict[int, tuple[float, float]]:
-    """Return each landmark's median range and median absolute bearing: measured bearing plus the heading at that moment."""
+    """Return the median range and absolute bearing (measured bearing plus heading) of each landmark."""
     seen = {}
     for landmark in sorted({each.landmark for each in sightings}):
         own = [each for each in sightings if each.landmark == landmark]

@@ -225,7 +225,7 @@ def player(
 ) -> None:
     """Play a recorded robot's sightings of landmarks, and compare each posterior's mean with the reference.
 
-    Each frame is published after the result of the one before.
+    Each frame is published after the result of the previous one.
     """
     if print_msg:
         print(SIGHTINGS_MSG, end="")

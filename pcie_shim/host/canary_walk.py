@@ -155,7 +155,7 @@ def _longest_canary(parameters: BM1Parameters) -> int:
 
 
 def _enough_cycles(parameters: BM1Parameters) -> int:
-    """Return the cycles after which every value of the random numbers has occurred, but for a small chance."""
+    """Return the cycles after which every value of the random numbers has occurred, except with a small probability."""
     values = 1 << parameters.prob_bits
     return ceil(values * (log(values) + _SURE))
 

@@ -1,7 +1,9 @@
 """Comparison of rosbridge clients on one hub, and of the hub with a server of the reference server's design.
 
 The peer of each measured client or server is a bare socket, which does not encode or decode:
-published: client -> hub -> bare socket.   received: bare socket -> hub -> client.   round trip: client -> hub -> client.
+published:  client -> hub -> bare socket
+received:   bare socket -> hub -> client
+round trip: client -> hub -> client
 Everything is measured in turns within one run, so that noise on the machine affects all alike.
 """
 

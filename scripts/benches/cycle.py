@@ -83,7 +83,7 @@ def message(reading: dict[str, int]) -> dict[str, object]:
 async def one_by_one(
     publication: Publication, answers: Subscription, some: list[dict[str, int]], times: list[float]
 ) -> None:
-    """Publish readings, each after the answer to the one before, and record the times."""
+    """Publish readings, each after the answer to the previous one, and record the times."""
     for reading in some:
         started = time.perf_counter_ns()
         await publication.publish(message(reading))

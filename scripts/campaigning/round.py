@@ -100,7 +100,7 @@ class Round:
         return dict(zip(("near", "far"), near_far, strict=True))
 
     async def _drive(self) -> None:
-        """Publish readings, each after the result of the one before has arrived or is late."""
+        """Publish readings, each after the result of the previous one has arrived or is late."""
         while self._driving:
             if self._paused or not self._client.connected.is_set():
                 await asyncio.sleep(0.01)

@@ -16,7 +16,7 @@ async def shrink(
 
     Args:
         parts: A list that failed.
-        fails: Function that tells whether a list fails.
+        fails: Function that returns whether a list fails.
         seconds: Time after which no further list is tried.
     """
     deadline = time.monotonic() + seconds

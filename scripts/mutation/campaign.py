@@ -40,16 +40,16 @@ NEEDED = 0.9
 FACTOR, LEAST_LIMIT = 5.0, 8.0
 """A test is stopped after `FACTOR` times its duration without a mutant, and `LEAST_LIMIT` seconds."""
 QUICK: Final = 30
-"""Number of tests, the quickest, that are tried before the others, because hundreds take long to select."""
+"""Number of the quickest tests that run before the others, because selecting hundreds takes long."""
 ATTEMPTS = 3
-"""A test that fails with a mutant must fail twice, because load or a signal can fail it too; tried so often."""
+"""Maximum number of attempts to see a test fail twice, because load or a signal can also fail it once."""
 BASELINE_LIMIT = 900.0
 GRACE = 15.0
 MARK = "ROSBAYES_MUTANT"
 FROM_OUTSIDE = (-signal.SIGTERM, -signal.SIGKILL, -signal.SIGINT)
-"""Exit codes of tests that were killed, which says nothing about a mutant."""
+"""Exit codes of tests that were killed, and so have no result."""
 Outcome = Literal["found", "timed out", "killed", "survived"]
-"""Of a mutant; a timeout counts as found. `killed` is not a result."""
+"""Outcome of a mutant: a timeout counts as found, and `killed` is not a result."""
 FOUND: Final = "found"
 TIMED_OUT: Final = "timed out"
 KILLED: Final = "killed"
@@ -75,7 +75,7 @@ MODULES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "services/master/reload.py": (_MASTER, _STACK),
     "bridge/client/session.py": (_CLIENT, ()),
 }
-"""Tests of each module, of which those that execute the mutated line run, and tests of processes for the rest."""
+"""Tests of each module: first those of which the ones that execute the mutated line run, then tests of processes."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class Tree:
     def _run(
         self, command: list[str], limit: float, variables: Mapping[str, str] = MappingProxyType({})
     ) -> int | None:
-        """Return the exit code of a Python process, None if it did not end in time. Nothing that it started is left."""
+        """Return the exit code of a Python process, None if it did not end in time, and end all that it started."""
         mark = new_mark()
         process = subprocess.Popen(
             [sys.executable, *command],
@@ -217,7 +217,7 @@ class Tree:
             return any(self._run(command, BASELINE_LIMIT) in (0, *FROM_OUTSIDE) for _ in range(2))
 
     def type_checks_with(self, module: str, source: str) -> bool:
-        """Return whether mypy accepts a mutated module, because a mistake that it refuses cannot land either."""
+        """Return whether mypy accepts a mutated module; a mistake that mypy finds cannot be merged either."""
         with self._mutated(module, source):
             return self._run(["-m", "mypy", module], BASELINE_LIMIT) != 1  # 2: mypy itself failed
 
@@ -339,7 +339,7 @@ class Campaign:
         self._failure: Exception | None = None
 
     def run(self) -> None:
-        """Try what is not known, until the time is over.
+        """Try the mutants without a result, until the time is over.
 
         Raises:
             MutationError: The tests fail without a mutant.

@@ -27,14 +27,14 @@ END_TIME: Final = 15.0
 
 
 class Watch:
-    """Pytest plugin that tells which test begins."""
+    """Pytest plugin that reports which test begins."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_logstart(self, nodeid: str) -> None:
-        """Tell the name of a test."""
+        """Report the name of a test."""
         os.write(self._descriptor, f"{nodeid}\n".encode())
 
 

@@ -1,4 +1,4 @@
-"""A server of the action that roslibpy's tests of ROS 2 send goals to: one number of Fibonacci's sequence per step."""
+"""The Fibonacci action server for roslibpy's tests of ROS 2: one number of the sequence per step."""
 
 from __future__ import annotations
 

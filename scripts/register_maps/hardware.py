@@ -4,11 +4,12 @@
 
 The register block is generated here and not by peakrdl-regblock-vhdl, which was tried, because:
 
-- A board accepts single words, like the emulated board. The exporter requires write buffers for 64-bit
-registers, in which the low word has no effect until the high one is written. - A board refuses accesses
-depending on their address, its state and the value written. This would need a separate decoder in front of
-the exporter's block. - The exported text needs a VHDL package from the exporter's wheel, which everyone who
-builds the hardware would also need.
+- A board accepts single words, like the emulated board. The exporter requires write buffers for 64-bit registers, in
+  which the low word has no effect until the high one is written.
+- A board refuses accesses depending on their address, its state and the value written. This would need a separate
+  decoder in front of the exporter's block.
+- The exported text needs a VHDL package from the exporter's wheel, which everyone who builds the hardware would also
+  need.
 """
 
 from __future__ import annotations

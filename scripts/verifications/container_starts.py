@@ -104,7 +104,7 @@ def check_robot(stack: Stack) -> None:
 
 
 def check_absent_robot(stack: Stack) -> None:
-    """Check that a stack waits for a robot, says so, and computes results soon after the robot appears."""
+    """Check that a stack reports that it waits for a robot, and computes results soon after the robot appears."""
     uri = f"ws://host.docker.internal:{ROBOT_PORT}"
     stack.variables["ROSBRIDGE_URI"] = uri
     try:

@@ -51,7 +51,7 @@ class Canaries:
         return self._walk.canary(self._next)
 
     def judge(self, output: FrameOutput) -> None:
-        """Go on to the next canary, or raise a DamagedBoardError and stay at this one."""
+        """Advance to the next canary, or raise a DamagedBoardError and stay at this one."""
         board = self._walk.differing_board(self._next, output.boards)
         if board is not None:
             raise DamagedBoardError(

@@ -1,4 +1,4 @@
-"""The setting `integrity`: whether and how silently wrong counts of boards are detected."""
+"""The setting `integrity`: detection of silently wrong counts of boards."""
 
 from dataclasses import dataclass
 from typing import Final

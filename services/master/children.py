@@ -1,4 +1,4 @@
-"""Regular questions to the master's children: whether each still answers."""
+"""Liveness checks of the master's children."""
 
 import asyncio
 import time

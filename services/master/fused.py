@@ -169,7 +169,7 @@ class FusedBoards:
         self._looking = self._loop.create_task(self._find_lost_boards(None, error))
 
     def _take_next(self) -> None:
-        """Go on with a canary that is owed, or else with the frame that waits."""
+        """Continue with a canary that is owed, or else with the frame that waits."""
         if self._boards.is_canary_owed:
             self._post_canary()
         else:

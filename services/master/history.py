@@ -19,7 +19,7 @@ ON_THE_BOARDS = "on the boards"
 AT_THE_PUBLISHER = "at the publisher"
 
 FRAME = "frame"
-"""The stage that stands for all others: from the receipt of the reading until the result has been sent."""
+"""The whole frame as a stage: from the receipt of the reading until the result has been sent."""
 _WHERE = {
     "rosbridge_in": "subscriber",
     "waited": "master",
@@ -67,7 +67,7 @@ class FrameTrace:
         return spans
 
     def timeline(self) -> FrameTimeline:
-        """Return the frame for the user."""
+        """Return the frame as it is reported to the user."""
         spans, published = self.spans(), self.published
         total_ns = published.total_ns if published is not None else 0
         hops_ns = total_ns - sum(duration for _, duration in spans.values())

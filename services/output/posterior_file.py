@@ -36,7 +36,7 @@ class ResultFile(Protocol):
 
 
 def open_result_file(path: Path) -> ResultFile:
-    """Open a file: `.jsonl` and `.csv` are appended to, `.npz` is overwritten; a SettingsError if it cannot be written."""
+    """Open a file, or raise a SettingsError: `.jsonl` and `.csv` are appended to, `.npz` is overwritten."""
     kinds: dict[str, type[_JsonLines | _CsvLines | _Archive]] = {
         ".jsonl": _JsonLines,
         ".csv": _CsvLines,

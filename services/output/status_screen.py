@@ -94,7 +94,7 @@ def _processes(stack: StackStatus) -> Table:
 
 
 def _stages(process: ProcessStatus) -> Table:
-    """Return the latencies of the published frames, the whole first."""
+    """Return the latencies of the published frames, that of the whole frame first."""
     table = _table("latency of")
     for heading in ("p50 ms", "p99 ms", "frames"):
         table.add_column(heading, justify="right")

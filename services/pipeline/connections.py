@@ -46,7 +46,7 @@ async def connect_all(
                 retry=True,
                 ca_file=settings.ca,
                 ros_version=settings.ros_version,
-                check_types=False,  # its own messages are right
+                check_types=False,  # our own messages need no check
                 on_state=None if on_state is None else partial(on_state, used),
                 **options,
             )

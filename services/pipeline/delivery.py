@@ -30,7 +30,7 @@ class AdvertisedTopic:
 
 
 async def refusals(topics: Iterable[AdvertisedTopic], *, settled: bool) -> dict[str, str]:
-    """Return, by topic, why topics cannot be received, as far as rosapi tells.
+    """Return, by topic, why topics cannot be received, according to rosapi.
 
     Args:
         topics: The topics.

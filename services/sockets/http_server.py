@@ -15,7 +15,7 @@ from pcie_shim.endpoint import Endpoint
 REQUEST_LIMIT: Final = 1 << 13
 """Maximum size of a request in bytes."""
 REQUEST_TIME: Final = 5.0
-"""Seconds in which a client must send its request, and again to take the answer."""
+"""Seconds in which a client must send its request, and then as many to receive the answer."""
 CLIENTS: Final = 8
 """Maximum number of concurrent connections; a new one replaces the oldest."""
 PACE: Final = 0.02

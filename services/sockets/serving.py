@@ -34,7 +34,7 @@ class Link(Protocol):
         return 0
 
     def send(self, record: Record) -> bool:
-        """Send a record; return whether a master is there."""
+        """Send a record; return whether a master is connected."""
 
     def keep(self, record: Record) -> None:
         """Send a record now and to every later master: a state that lasts, such as readiness."""
@@ -164,7 +164,7 @@ class MasterLink(Link):
         return 0 if self._master is None else self._master.backlog
 
     def send(self, record: Record) -> bool:
-        """Send a record; return whether a master is there."""
+        """Send a record; return whether a master is connected."""
         return self._master is not None and self._greeted and self._master.send(record)
 
     def keep(self, record: Record) -> None:

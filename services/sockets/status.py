@@ -89,7 +89,7 @@ BUCKETS_S = tuple(digit * 10.0**exponent for exponent in range(-5, 1) for digit 
 
 
 class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
-    """The latencies of a stage of frames; `frame` is the stage that stands for all others.
+    """The latencies of a stage of frames; `frame` is the whole frame.
 
     `p50_ms` and `p99_ms` are quantiles over the last 1000 published frames. `frames`, `sum_s` and `buckets`
     cover all of them: a bucket has the number of frames up to its bound in `BUCKETS_S`, without those below.

@@ -41,8 +41,8 @@ def board_layout(
     Without an `interface`, it has as many inputs and results as needed, but at least the default numbers.
 
     Raises:
-        BuildError: More boards than lines, a machine that is larger than the interface, an interface that is larger than
-            the register map, or too many seeds.
+        BuildError: There are more boards than lines, the machine is larger than the interface, the interface is
+            larger than the register map, or there are too many seeds.
     """
     blocks = partition_lines(parameters.lines, partitions)
     board = replace(parameters, lines=blocks[0].lines)

@@ -39,8 +39,8 @@ class Relations:
 def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> Relations:
     """Search for relations of 2, 3 or 4 bits between columns, in as many groups as a few seconds permit.
 
-    `seeds` are uint64[groups, columns]; the columns of a group are those whose bits are ANDed. Of a state `prob_bits` low
-    bits are compared with a code.
+    `seeds` are uint64[groups, columns]; the columns of a group are those whose bits are ANDed. The low
+    `prob_bits` bits of a state are compared with a code.
     """
     groups, columns = seeds.shape
     bits = columns * prob_bits

@@ -11,7 +11,7 @@ from toolchain.deployment.deployment import Deployment, DeploymentFile
 
 
 def deployment_hash(deployment: DeploymentFile) -> str:
-    """Return the SHA-256 (hexadecimal) of a deployment without its URIs, endpoints, compression, `topic_bytes` and integrity."""
+    """Return the SHA-256 (hexadecimal) of the part of a deployment that follows from the model."""
     content = deployment.model_dump(
         mode="json",
         exclude={

@@ -18,7 +18,7 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
         edited: True to accept an edited `deployment.toml`, whose hash does not match its content.
 
     Raises:
-        DeploymentError: The deployment is absent, not TOML, or has a wrong key or value (file, line, nearest right name).
+        DeploymentError: The deployment is absent, not TOML, or has a wrong key or value.
         DeploymentVersionError: Another format.
         DamagedDeploymentError: `deployment.toml` or an image has changed since the build; the sentence
             contains the file and both hashes.

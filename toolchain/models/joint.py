@@ -199,8 +199,8 @@ class Question:
         cut = {symbol.name for symbol in self.searched} | set(self.given)
         factors, terms = self._factors(active, observed)
         among_all = Links(terms, factors, cut)
-        # Two symbols need a part of the factors that all need, so their path is not shorter than the one among all: pairs
-        # are tried from the shortest such path on, since there may be thousands.
+        # The factors of two symbols are among those of all, so their path is not shorter than their path among all.
+        # Because there may be thousands of pairs, those with the shortest paths among all are tried first.
         least = sorted(
             (
                 (length, one, other)

@@ -47,5 +47,5 @@ def base_type(type_name: str) -> str:
 
 
 def with_header(message: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a message with the time of now in its header."""
+    """Return a message with the current time in its header."""
     return {"header": stamps.header(time.time_ns(), "", 1), **message}

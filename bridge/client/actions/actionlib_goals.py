@@ -130,7 +130,7 @@ class ActionlibSender:
         return self
 
     async def send(self, values: Mapping[str, Any], limit: float, *, feedback: bool) -> Goal:
-        """Send a goal; one for which there is no server ends at once, as in ROS 2."""
+        """Send a goal; without a server, it ends at once, as in ROS 2."""
         if len(self._session.goals) >= MAX_GOALS:
             raise SlowPeerError(f"{MAX_GOALS} goals are active, so none was sent to {self.action}")
         deadline = time.monotonic() + limit

@@ -23,7 +23,7 @@ End = Callable[[GoalStatus, Mapping[str, Any] | str], None]
 class GoalRequest:
     """A goal that this client executes, for its handler.
 
-    The first of `succeed`, `abort` and `cancel` ends it; the handler may go on to clean up.
+    The first of `succeed`, `abort` and `cancel` ends it; the handler may continue, to clean up.
 
     Attributes:
         values: Fields of the goal.
@@ -46,7 +46,7 @@ class GoalRequest:
         await self._canceling.wait()
 
     def ask_to_cancel(self) -> None:
-        """Tell the handler that the sender wants the goal cancelled."""
+        """Tell the handler that the sender has cancelled the goal."""
         self._canceling.set()
 
     def feed_back(self, values: Mapping[str, Any]) -> None:
@@ -63,7 +63,7 @@ class GoalRequest:
         self._finish(GoalStatus.ABORTED, values or {})
 
     def cancel(self, values: Mapping[str, Any] | None = None) -> None:
-        """End the goal as cancelled, with what it has reached."""
+        """End the goal as cancelled, with the values reached so far."""
         self._finish(GoalStatus.CANCELED, values or {})
 
     def _finish(self, status: GoalStatus, values: Mapping[str, Any] | str) -> None:

@@ -99,7 +99,7 @@ class GoalRequested:
 
 @dataclass(frozen=True, slots=True)
 class CancelRequested:
-    """The sender of a goal wants it cancelled."""
+    """The sender of a goal has cancelled it."""
 
     action: str
     goal: str

@@ -44,7 +44,7 @@ class Probation:
         return topic in self._left_out
 
     def hear(self, topic: str) -> None:
-        """Take note of a topic's message that was not too large."""
+        """Record a message of a topic that was not too large."""
         self._heard.add(topic)
 
     def blame(self, subscribed: Sequence[str], named: str | None, *, only_topics: bool) -> str | None:
@@ -76,7 +76,7 @@ class Probation:
         return None
 
     def release(self) -> str | None:
-        """Return the next suspect, which is to be subscribed now; None after the last one."""
+        """Return the next suspect to subscribe to; None after the last one."""
         self._current = self._held.pop(0) if self._held else None
         return self._current
 

@@ -257,8 +257,9 @@ class Subscriptions:
     def renew(self, topic: str) -> bool:
         """Renew the subscription of a topic that is silent although published; return whether it gives up CBOR.
 
-        rosbridge for ROS 2 fixes the quality of service when it subscribes, so that a best-effort publisher which starts
-        later is not heard. Servers fail to write some types as CBOR: from the second renewal on, JSON is asked for.
+        rosbridge for ROS 2 fixes the quality of service when it subscribes, so it does not hear a best-effort
+        publisher that starts later. Servers fail to write some types as CBOR, so the second and later renewals
+        request JSON.
         """
         subscribed = self._subscribed.get(absolute(topic))
         if subscribed is None or subscribed.has_messages:

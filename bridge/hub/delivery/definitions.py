@@ -122,7 +122,7 @@ class Definitions:
         return ros2_type(type_name) if self.ros_version == 2 else ros1_type(type_name)
 
     def filler(self, type_name: str) -> Filler | None:
-        """Return what fills the absent fields of a message type, or None if the type is unknown.
+        """Return the filler of the absent fields of a message type, or None if the type is unknown.
 
         Raises:
             DefinitionsPendingError: The definitions are being loaded.
@@ -137,7 +137,7 @@ class Definitions:
         return self._fillers[type_name]
 
     def fillers(self, type_name: str, kind: Literal["srv", "action"]) -> dict[str, Filler]:
-        """Return what fills the parts of a service or an action, such as `Request`; unknown parts are left out.
+        """Return the fillers of the parts of a service or an action, such as `Request`, without unknown parts.
 
         Raises:
             DefinitionsPendingError: The definitions are being loaded.

@@ -3,7 +3,7 @@
 The reference server builds a ROS message from the JSON and forwards that (`_to_object_inst` in
 rosbridge_library/internal/message_conversion.py): an absent field has the message's default, and the stamp of a
 `std_msgs/Header` without one is the time of receipt. So is that of an absent header, as the specification says
-(ROSBRIDGE_PROTOCOL.md, 3.3.3). Unlike there, values that are present are not checked.
+(ROSBRIDGE_PROTOCOL.md, 3.3.3). Unlike the reference server, the hub does not check present values.
 """
 
 import itertools
@@ -55,7 +55,7 @@ class Filler:
         self._defaults = {} if is_special else types.defaults(name)
         self._headers: frozenset[str] = frozenset() if is_special else types.headers(name)
         self._usual: dict[str, Any] = {}
-        """The defaults that were last appended, because a publisher mostly leaves out the same fields."""
+        """The defaults that were last appended, because a publisher usually leaves out the same fields."""
         self._usual_fields: frozenset[str] = frozenset()
         self._usual_tail = b""
 
@@ -133,7 +133,7 @@ class Types:
         ros_version: RosVersion,
         wall_clock: Callable[[], int],
     ) -> None:
-        """Prepare nothing yet.
+        """Start without prepared types.
 
         Args:
             field_types: Returns the fields of a message; of a basic type, raises a KeyError.
@@ -151,11 +151,11 @@ class Types:
         self._fills: dict[str, _Fill] = {}
 
     def new_header(self) -> dict[str, Any]:
-        """Return a `std_msgs/Header` of this moment."""
+        """Return a `std_msgs/Header` with the current time."""
         return self.defaults(HEADER) | {"stamp": self.new_stamp()}
 
     def new_stamp(self) -> dict[str, int]:
-        """Return the time of this moment in the form of the ROS version."""
+        """Return the current time in the form of the ROS version."""
         return stamp(self._wall_clock(), self._ros_version)
 
     def headers(self, name: str) -> frozenset[str]:

@@ -95,7 +95,7 @@ _ROSAPI: Final = {
     "TopicsAndRawTypes": "---\nstring[] topics\nstring[] types\nstring[] typedefs_full_text",
     "TopicsForType": "string type\n---\nstring[] topics",
 }
-"""Services of rosapi as in ROS 1; ROS 2 adds what `_ROSAPI_2` says."""
+"""Services of rosapi as in ROS 1; `_ROSAPI_2` contains the additions of ROS 2."""
 _ROSAPI_2: Final = {
     "DeleteParam": "string name\n---\nbool successful\nstring reason",
     "GetParam": "string name\nstring default_value\n---\nstring value\nbool successful\nstring reason",
@@ -174,7 +174,7 @@ def part_name(type_name: str, part: str, ros_version: Literal[1, 2]) -> str:
 
 @cache
 def message_texts(ros_version: Literal[1, 2]) -> dict[str, str]:
-    """Return the definitions of messages by name in ROS 2's form, with a message for each part of a service or action."""
+    """Return message definitions by name in ROS 2's form, including the parts of services and actions."""
     rosapi = "rosapi_msgs" if ros_version == 2 else "rosapi"
     own = _ROSAPI | (_ROSAPI_2 if ros_version == 2 else {})
     services = _SERVICES | {f"{rosapi}/{name}": text for name, text in own.items()}

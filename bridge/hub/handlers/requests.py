@@ -72,7 +72,7 @@ class Offers:
     def __init__(
         self, offers: dict[str, Offer], names_of: Callable[[Client], set[str]], limit: int, kind: str
     ) -> None:
-        """Manage services or actions of a graph, at most `limit` of a client; `kind` is also the field of operations."""
+        """Manage services or actions of a graph, at most `limit` per client; `kind` is also a field of operations."""
         self._offers = offers
         self._names_of = names_of
         self._limit = limit

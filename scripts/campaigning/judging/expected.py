@@ -19,7 +19,7 @@ BOARDS = 2
 BANKS = 4
 TARGET, MAX_CYCLES = 127, 1 << 17
 FIRST_SLICE = 256
-"""End of the first slice of a frame; each further slice ends at twice the cycle of the one before."""
+"""End of the first slice of a frame; each further slice ends at twice the cycle of the previous one."""
 BUILD_OPTIONS = ("--partitions", "2", "--counter-bits", "7", "--rng-banks", "4")
 WORDS = {StopReason.OVERFLOW: "overflow", StopReason.SLICE: "slice", StopReason.MAX_CYCLES: "max cycles"}
 

@@ -138,7 +138,7 @@ class Observer:
         self._fault_since = now
 
     def flip(self, frames: int) -> None:
-        """Record that a bit of a board's table flips now; results of so many frames may be wrong until `calm`."""
+        """Record that a bit of a board's table flips; results of up to `frames` frames may be wrong until `calm`."""
         self._flip_frames, self._first_wrong = frames, 0
 
     def calm(self, now: float) -> None:
@@ -207,7 +207,7 @@ class Observer:
         self.findings.append(Finding(flaw, sentence, now))
 
     def _wrong(self, number: int, sentence: str, now: float) -> None:
-        """Report a wrong result, unless a table is damaged and the frames are not over in which that is found."""
+        """Report a wrong result, unless a table is damaged and its detection is not yet due."""
         if not self._flip_frames:
             self._find(Flaw.WRONG, sentence, now)
             return

@@ -25,7 +25,7 @@ class Interval:
 
 
 def bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]]) -> Interval:
-    """Return a statistic over frames (the first axis) with its percentile bootstrap interval; whole frames are drawn."""
+    """Return a statistic over frames (the first axis) with its percentile bootstrap interval over whole frames."""
     chosen = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
     drawn = np.asarray(values)[chosen].reshape(RESAMPLES, -1)
     low, high = np.quantile(statistic(drawn, axis=1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2]).tolist()

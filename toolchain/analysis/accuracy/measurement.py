@@ -82,7 +82,7 @@ class Accuracy:
         frames: Number of frames.
         posteriors: Number of posteriors: one per frame, or one per replica of a frame.
         banks: Number of seed sets with which each was run.
-        impossible: Share of posteriors for which no line can count, although the model has one (or always, without a model).
+        impossible: Share of posteriors for which no line can count although, if there is a model, it has one.
         without: Share of runs without a posterior, including those whose counts remained 0.
         overflow: Share of runs that ended with an overflow.
         machine: The machine against the model; None without a model.

@@ -257,7 +257,7 @@ class Faults:
         return self._counted(frame, _flipped(frame.codes, CODE_BITS, rate, self._random))
 
     def fixed_point(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
-        """Multiply the codes in 8 bits, with an exponent common to all lines; flip a bit of a factor or of a product."""
+        """Multiply the codes in 8 bits with an exponent common to all lines; flip a bit of a factor or product."""
         product = np.full(frame.codes.shape[1], 2**CODE_BITS - 1, dtype=np.uint16)
         for row in frame.codes:
             factor = decode_code(_flipped(row, CODE_BITS, rate, self._random), CODE_BITS)
