@@ -2,18 +2,18 @@
 
 import asyncio
 import contextlib
-import difflib
 import time
+from functools import partial
 
 import msgspec
 
 from bridge.client import Message, Ros, State, Subscription
 from bridge.errors import BridgeError, NoMessageError, TopicLeftOutError
-from bridge.names import absolute
 from services.errors import RosbridgeLostError, VariableError
 from services.pipeline.connections import connect_all, reconnect_now, report_failure
 from services.pipeline.generations import Generations
 from services.pipeline.timed_frames import TimedFrames
+from services.pipeline.unpublished import report_unpublished
 from services.settings import Settings
 from services.sockets.local_socket import MAX_RECORD
 from services.sockets.records import (
@@ -42,7 +42,6 @@ from services.sockets.status import (
     why_not_connected,
 )
 from terminal.logs import get_logger
-from terminal.one_line import shown
 from toolchain.deployment import Deployment, Source
 
 ROLE = "subscriber"
@@ -51,8 +50,6 @@ RECEIVED_QUEUE = 64
 _BURST_PAUSE = 0.02
 """Seconds of silence that end the backlog sent to a new subscriber."""
 _BURST_LIMIT = 0.1
-_HINT_AFTER = 2.0
-"""Seconds without a first message after which a mistyped topic is suspected."""
 _BACKLOG_LIMIT = min(1 << 18, MAX_RECORD)
 """Maximum of bytes waiting for the master; then readings are passed over (queue = latest).
 """
@@ -204,11 +201,21 @@ class Subscriber:
                     max_size=settings.message_bytes,
                 )
                 self._link.keep(Ready(f"connected to {', '.join(by_uri)}"))
+                rosbridges = [by_uri[settings.uri or source.uri] for source in sources]
+                # not only when the boards are programmed, which may take much longer
+                hints = [
+                    asyncio.ensure_future(
+                        report_unpublished(ros, source.topic, partial(self._link.notice, "warning"))
+                    )
+                    for ros, source in zip(rosbridges, sources, strict=True)
+                ]
+                for hint in hints:
+                    stack.callback(hint.cancel)
                 await self._begun.wait()
                 async with asyncio.TaskGroup() as group:
                     lost = group.create_task(self._watch_loss())
                     tasks = [
-                        group.create_task(self._follow(by_uri[settings.uri or source.uri], at, source))
+                        group.create_task(self._follow(rosbridges[at], at, source, hints[at]))
                         for at, source in enumerate(sources)
                     ]
                     await asyncio.wait(tasks)
@@ -228,7 +235,7 @@ class Subscriber:
         if self._lost is not None:
             await self._lost
 
-    async def _follow(self, ros: Ros, at: int, source: Source) -> None:
+    async def _follow(self, ros: Ros, at: int, source: Source, hint: asyncio.Future[None]) -> None:
         subscription = ros.subscribe(
             source.topic,
             source.type,
@@ -239,7 +246,6 @@ class Subscriber:
         )
         self._subscriptions.append(subscription)
         timeout = self._settings.first_data_timeout
-        hint = asyncio.ensure_future(self._hint(ros, source))
         first, silent = True, False
         connection: int | None = None
         lost_before = 0
@@ -270,16 +276,6 @@ class Subscriber:
             self._passed_over += subscription.lost - lost_before
             lost_before = subscription.lost
             self._read(at, message)
-
-    async def _hint(self, ros: Ros, source: Source) -> None:
-        """Report a topic without a publisher, and topics with similar names, since it may be mistyped."""
-        await asyncio.sleep(_HINT_AFTER)
-        if await ros.publishers(source.topic) != []:
-            return  # or the server has no rosapi
-        others = {name for name in await ros.topics() or [] if name != absolute(source.topic)}
-        near = difflib.get_close_matches(absolute(source.topic), others, 3, 0.6)
-        perhaps = f"; did you mean {' or '.join(shown(name) for name in near)}?" if near else ""
-        self._link.notice("warning", f"{source.topic} has no publisher at {ros.uri} yet{perhaps}")
 
     def _read(self, at: int, message: Message) -> None:
         try:

@@ -2,17 +2,35 @@
 
 import asyncio
 import contextlib
+from collections.abc import Callable
 from typing import Any
 
-from bridge.client import connect
+from bridge.client import State, connect
 from bridge.fields import Field
-from services.pipeline.connections import connect_all
+from services.pipeline.connections import OnState, connect_all
 from services.pipeline.subscriber import RECEIVED_QUEUE
 from services.pipeline.timed_frames import TimedFrames
+from services.pipeline.unpublished import report_unpublished
 from services.settings import Settings
 from services.sockets.records import Reading
+from terminal.connection import report_connection
 from terminal.output import print_json_line, say
 from toolchain.deployment import Deployment, Source
+
+
+def _warn(sentence: str) -> None:
+    say(f"warning: {sentence}")
+
+
+def _report_state() -> OnState:
+    reports: dict[str, Callable[[str, str], None]] = {}
+
+    def on_state(uri: str, state: State, reason: str) -> None:
+        if uri not in reports:
+            reports[uri] = report_connection(uri)
+        reports[uri](state, reason)
+
+    return on_state
 
 
 async def print_variables(settings: Settings, source: Source, names: list[str], count: int | None) -> int:
@@ -30,14 +48,17 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
         ca_file=settings.ca,
         max_size=settings.message_bytes,
         ros_version=settings.ros_version,
+        on_state=report_connection(source.uri),
     ) as ros:
         subscription = ros.subscribe(
             source.topic, source.type, queue_size=RECEIVED_QUEUE, max_bytes=settings.topic_bytes
         )
         say(f"listening on {source.topic} at {source.uri}")
+        hint = asyncio.ensure_future(report_unpublished(ros, source.topic, _warn))
         printed = 0
         while count is None or printed < count:
             message = await subscription.next(timeout=settings.first_data_timeout)
+            hint.cancel()
             values: dict[str, Any] = {}
             for field in fields:
                 present, value = field.value(message.msg)
@@ -78,11 +99,15 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
             stack,
             settings,
             [source.uri for source in deployment.sources],
+            on_state=_report_state(),
             max_size=settings.message_bytes,
         )
 
         async def follow(at: int, source: Source) -> None:
-            subscription = by_uri[settings.uri or source.uri].subscribe(
+            ros = by_uri[settings.uri or source.uri]
+            hint = asyncio.ensure_future(report_unpublished(ros, source.topic, _warn))
+            stack.callback(hint.cancel)
+            subscription = ros.subscribe(
                 source.topic,
                 source.type,
                 queue_size=RECEIVED_QUEUE,
@@ -91,6 +116,7 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
             )
             while True:
                 frames.add(at, await subscription.next(timeout=settings.first_data_timeout))
+                hint.cancel()
 
         for source in deployment.sources:
             say(f"listening on {source.topic} at {settings.uri or source.uri}")

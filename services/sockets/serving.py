@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol, Self
@@ -19,6 +20,8 @@ from toolchain.errors import ToolchainError
 
 GREETING_TIME = 5.0
 """Seconds in which a client must send its hello before another may connect."""
+MAX_UNSAID = 4
+"""Maximum number of the latest messages for the user that are stored for the next master."""
 
 
 class Link(Protocol):
@@ -81,6 +84,7 @@ class MasterLink(Link):
         self._server: asyncio.Server | None = None
         self._listener: socket.socket | None = None
         self._last: dict[type[Record], Record] = {}
+        self._unsaid: deque[Notice] = deque(maxlen=MAX_UNSAID)
 
     async def __aenter__(self) -> Self:
         """Start listening."""
@@ -143,8 +147,9 @@ class MasterLink(Link):
                 raise
             self._greeted = True
             self._on_record(record)
-            for each in self._last.values():
+            for each in (*self._unsaid, *self._last.values()):
                 protocol.send(each)
+            self._unsaid.clear()
             return
         if not isinstance(record, Hello):
             self._on_record(record)
@@ -171,6 +176,11 @@ class MasterLink(Link):
         """Send a record now and to every later master: a state that lasts, such as readiness."""
         self._last[type(record)] = record
         self.send(record)
+
+    def notice(self, level: str, sentence: str) -> None:
+        """Send a message for the user now, or to the next master: a service may wait before its master has connected."""
+        if not self.send(record := Notice(level, sentence)):
+            self._unsaid.append(record)
 
     def serve(self, deployment: Deployment) -> None:
         """Greet later masters with another deployment from now on."""

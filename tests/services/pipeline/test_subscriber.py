@@ -66,15 +66,14 @@ def test_the_number_of_a_reading_is_logged_for_debugging(boat, link, level, logg
 async def test_a_topic_that_nobody_publishes_is_reported_with_similar_names(
     boat, link, monkeypatch, existing, hinted
 ):
-    monkeypatch.setattr("services.pipeline.subscriber._HINT_AFTER", 0.05)
+    monkeypatch.setattr("services.pipeline.unpublished.AFTER", 0.05)
     async with FakeRosbridge(rosapi=True) as fake:
         fake.know(existing, "boat_msgs/Sensors")
         subscriber = Subscriber(Settings(uri=fake.uri), boat, link.make)
         running = asyncio.create_task(subscriber.run())
         while not any(isinstance(each, Ready) for each in link.sent):
             await asyncio.sleep(0.01)
-        link.take(Begin(once=False))
-        while not any(isinstance(each, Notice) for each in link.sent):
+        while not any(isinstance(each, Notice) for each in link.sent):  # before the run begins
             await asyncio.sleep(0.01)
         (notice,) = (each for each in link.sent if isinstance(each, Notice))
         assert notice.level == "warning"

@@ -125,6 +125,20 @@ async def test_one_master_is_served_at_a_time(changed, serve):
     assert [type(each) for each in service.records] == [Hello, Hello]
 
 
+async def test_what_a_service_says_before_its_master_comes_is_not_lost(changed, serve):
+    service = serve(changed[1])
+    for number in range(serving.MAX_UNSAID + 1):
+        service.link.notice("info", str(number))
+    for expected in (["1", "2", "3", "4", "now"], ["now"]):
+        protocol, records, _ = await service.connect(changed[1].hash)
+        await until(lambda: service.link.has_master)
+        service.link.notice("info", "now")
+        await until(lambda records=records, expected=expected: len(records) == len(expected) + 1)
+        assert [each.sentence for each in records[1:]] == expected
+        protocol.close()
+        await until(lambda: not service.link.has_master)
+
+
 async def test_a_client_that_does_not_greet_is_cut_off(changed, serve, monkeypatch):
     monkeypatch.setattr(serving, "GREETING_TIME", 0.1)
     service = serve(changed[1])
