@@ -1,7 +1,7 @@
 """A fake rosbridge server for tests: scripted, and able to be silent, late and wrong, to refuse and to vanish.
 
-Its HTTP answers identify it as a fake: `Server: FakeRosbridge, a test double`. It shares no code with `bridge`, and uses only
-`websockets` and the standard library's json. It has no message types, so it does not check them.
+Its HTTP answers identify it as a fake: `Server: FakeRosbridge, a test double`. It shares no code with `bridge`, and
+uses only `websockets` and the standard library's json. It has no message types, so it does not check them.
 
     async with FakeRosbridge() as fake:
         ...                                  # clients at fake.uri, in this process or in others
@@ -21,13 +21,13 @@ It behaves as real servers do (A: rosbridge_suite on ROS 1, B: on ROS 2, R: rosb
 * null where a published message may hold a number is refused (A, B, R), with `refuses_null`;
 * after a message that is JSON but not an object the connection is open and dead (A, B), with `zombies`;
 * every `/` leaves as `\\/` (A, B), with `escapes`;
-* type names of the ROS 2 form are refused (A), with `ros=1`; rosapi, if there, answers as that ROS does;
-* a subscription made before a best-effort publisher began never hears it (B: `MultiSubscriber.__init__` in
+* type names of the ROS 2 form are refused (A), with `ros=1`; rosapi, if present, answers as in that ROS version;
+* a subscription made before a best-effort publisher started never hears it (B: `MultiSubscriber.__init__` in
   rosbridge_library/internal/subscribers.py chooses the reliability once), for topics of `start_best_effort`;
 * a type with an array of fixed length is never sent as CBOR (A, B: `extract_cbor_values` in
   rosbridge_library/internal/cbor_conversion.py fails on it), for topics in `fails_as_cbor`;
-* a topic that `topics_glob` does not allow is neither advertised nor subscribed, and only the server's log says so (A, B:
-  rosbridge_library/capabilities/advertise.py), for topics in `refused_topics`.
+* a topic that `topics_glob` does not allow is neither advertised nor subscribed, which only the server's log reports
+  (A, B: rosbridge_library/capabilities/advertise.py), for topics in `refused_topics`.
 """
 
 import asyncio

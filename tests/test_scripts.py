@@ -1,4 +1,4 @@
-"""Every script says how it is used, and none is silent for long while it works."""
+"""Every script prints its usage, and none is silent for long."""
 
 import asyncio
 import os

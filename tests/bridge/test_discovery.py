@@ -1,4 +1,4 @@
-"""Robots by name, on loopback only: whoever else is on the network neither hears nor disturbs these tests."""
+"""Robots by name, on loopback only, so that others on the network neither see nor disturb these tests."""
 
 import os
 import sys
@@ -57,7 +57,7 @@ async def test_what_cannot_be_a_name_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("uri", ["robot:9090", "robot:9090/bridge"])
-async def test_a_port_is_no_name_of_a_robot_and_the_sentence_names_the_uri(uri: str) -> None:
+async def test_a_port_instead_of_a_robots_name_is_refused_with_the_uri_that_was_meant(uri: str) -> None:
     with pytest.raises(DiscoveryError, match=f"ws://{uri}") as caught:
         await discovery.announced_uri(uri)
     assert caught.value.exit_code == 2

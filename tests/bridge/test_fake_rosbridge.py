@@ -1,4 +1,4 @@
-"""The fake is a double of real servers only if a client that this project did not write gets along with it."""
+"""The fake works with an independent client, as a double of real servers must."""
 
 import asyncio
 import json

@@ -78,7 +78,7 @@ def test_the_first_message_with_it_decides_the_place():
         ({}, "no fields at all"),
     ],
 )
-def test_a_missing_name_is_told_with_what_was_there(message, listed):
+def test_the_error_for_a_missing_field_lists_the_fields_of_the_message(message, listed):
     with pytest.raises(FieldMissingError) as caught:
         find(message, "D2")
     assert str(caught.value) == f"the message has no field 'D2'; it has {listed}"
@@ -195,7 +195,7 @@ def test_a_byte_of_an_image_in_any_form(length):
 
 
 @pytest.mark.parametrize("text", ["\u00e4\u00e4\u00e4\u00e4", "a b!", "====", "a===", "ab=c"])
-def test_a_text_that_is_no_base64_has_no_bytes(text):
+def test_a_text_that_is_not_base64_has_no_bytes(text):
     for index in range(3):
         present, value = Field(f"a[{index}]").value({"a": text})
         assert not present or value is None or type(value) is int

@@ -6,7 +6,7 @@ from bridge.errors import OptionError
 from bridge.qos import Qos
 
 
-def test_only_what_is_said_is_asked():
+def test_only_given_options_are_requested():
     assert Qos().as_operation() == {}
     assert Qos(
         history="keep_last",

@@ -190,7 +190,7 @@ def test_the_transforms_of_all_frames_are_bounded_and_each_frame_keeps_its_newes
     assert known <= 40
 
 
-def test_a_clock_that_was_set_back_begins_anew():
+def test_a_clock_that_is_set_back_clears_the_history():
     tree = TransformTree()
     for stamp in (10**15, 5 * SECOND, 6 * SECOND):
         tree.take(message("map", "base", turned(stamp / SECOND, 0, stamp)), static=False)

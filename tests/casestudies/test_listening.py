@@ -1,4 +1,4 @@
-"""Hearing three topics of a fake server: what is waited for, and for how long."""
+"""Listening to three topics of a fake server: conditions and limits of the wait."""
 
 import asyncio
 

@@ -1,4 +1,4 @@
-"""The image's entry point: which machine code it hands to numba."""
+"""The image's entry point: the machine code that it selects for numba."""
 
 import os
 import subprocess

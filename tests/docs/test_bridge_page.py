@@ -1,4 +1,4 @@
-"""The examples of the client's pages are programs: each is run as it stands against a hub, but for addresses and files."""
+"""The examples of the client's pages: each runs against a hub, with only addresses and files replaced."""
 
 import asyncio
 import contextlib

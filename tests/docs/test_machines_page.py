@@ -1,4 +1,4 @@
-"""The page about machines: its examples do what they show, and its table names every parameter."""
+"""The page about machines: its examples give the shown results, and its table names every parameter."""
 
 import dataclasses
 import doctest

@@ -1,4 +1,4 @@
-"""The pages about operation: alarms are those of the sources, and units are ones that systemd takes."""
+"""The pages about operation: alarms are those of the sources, and systemd accepts the units."""
 
 import ast
 import re

@@ -129,7 +129,7 @@ def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
     assert fitted.known[0].normal.sigma.max() < 0.2
 
 
-def test_the_boiler_is_a_question_and_the_printed_refusal_is_said(tmp_path):
+def test_the_boiler_is_a_question_with_the_printed_refusal(tmp_path):
     example, _ = blocks("python")
     (tmp_path / "model.py").write_text(example)
     model = load_model(tmp_path, {"gauge_sigma": "0.3"})

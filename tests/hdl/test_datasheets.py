@@ -1,4 +1,4 @@
-"""The datasheets say what the VHDL says, and the VHDL keeps to its style."""
+"""The datasheets match the VHDL, and the VHDL follows its style."""
 
 import re
 import subprocess

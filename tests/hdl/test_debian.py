@@ -15,7 +15,7 @@ def test_nothing_is_installed_where_nothing_is_missing(monkeypatch):
     debian.install({"ghdl": "ghdl"})
 
 
-def test_another_system_is_told_what_to_install(monkeypatch):
+def test_the_error_on_another_system_names_what_to_install(monkeypatch):
     monkeypatch.setattr(debian.shutil, "which", only(set()))
     with pytest.raises(
         debian.MissingToolError, match=r"^srec_cat and tclsh not found; install srecord tcl \(Debian"

@@ -1,4 +1,4 @@
-"""A listener of roslibpy, a client that this project did not write.
+"""A listener with roslibpy, an independent client.
 
     python roslibpy_listener.py URI FILE COUNT
 

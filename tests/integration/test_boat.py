@@ -1,4 +1,4 @@
-"""The boat case as a whole: what comes out on the wire is right, and read there by a client of others.
+"""The whole boat case: an independent client reads the right results on the wire.
 
 boat-simulator -> hub -> boat-normaliser -> hub -> master and its processes -> hub -> roslibpy
 """

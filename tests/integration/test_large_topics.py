@@ -1,4 +1,4 @@
-"""A camera whose pictures are too large, beside a topic that frames need: results go on.
+"""A camera whose pictures are too large does not stop the results from another topic.
 
 /range (Range, needed), /camera (Image, 640 x 480, may be missing)  ->  hub  ->  subscriber, master  ->  hub
 """

@@ -1,4 +1,4 @@
-"""Starts and ends: whatever happens to a run, its processes end, and its exit code says why.
+"""Starts and ends: whatever happens to a run, its processes end, and its exit code gives the reason.
 
 robot ──▶ hub ──▶ master, its services (with --fused: tasks of the master), boards
 """

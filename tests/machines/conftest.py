@@ -1,4 +1,4 @@
-"""Both kernels, for whatever must hold for both."""
+"""Both kernels, for tests that both must pass."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""A machine's tables, a frame's start and a slice's resume: what is taken and what is refused."""
+"""A machine's tables, the start of a frame and the resumption of a slice: accepted and refused arguments."""
 
 import numpy as np
 import pytest

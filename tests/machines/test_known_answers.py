@@ -1,4 +1,4 @@
-"""A machine small enough to run by hand: what each cycle of it must do.
+"""A machine that is small enough to compute each cycle by hand.
 
 4 lines, the prior and one sensor, 2-bit codes, LFSR8, one step a clock. Its generators show (low 2 bits):
 

@@ -1,4 +1,4 @@
-"""The reference over generators of every kind: slices and frames make no difference to what is counted."""
+"""The reference kernel with generators of every kind: slices and frames do not change the counts."""
 
 import numpy as np
 from hypothesis import HealthCheck, given, settings

@@ -1,4 +1,4 @@
-"""Several replicas around one set of generators: each is a machine of its own.
+"""Replicas that share generators: each equals a machine that runs alone.
 
 session ──┬── R replicas together ── reasons, cycles, counts, states ──┐
           └── R machines alone ───── reasons, cycles, counts ──────────┴── equal

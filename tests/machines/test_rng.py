@@ -1,4 +1,4 @@
-"""Generators: each against its definition, written here again in plain Python."""
+"""Generators, each compared with its definition in plain Python."""
 
 import functools
 import itertools

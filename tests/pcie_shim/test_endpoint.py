@@ -64,7 +64,7 @@ def test_a_socket_whose_queue_is_full_is_served_and_not_waited_for(folder: Path)
             listen(endpoint)
 
 
-def test_a_taken_port_and_a_missing_folder_are_said(folder: Path) -> None:
+def test_a_port_in_use_and_a_missing_folder_are_reported(folder: Path) -> None:
     server = socket.create_server(("127.0.0.1", 0))
     port = server.getsockname()[1]
     with server, pytest.raises(EndpointError):
@@ -74,7 +74,7 @@ def test_a_taken_port_and_a_missing_folder_are_said(folder: Path) -> None:
     assert f"{folder / 'no'} " in str(caught.value)
 
 
-def test_nothing_listening_is_said_in_time(folder: Path) -> None:
+def test_an_unused_endpoint_is_reported_in_time(folder: Path) -> None:
     with pytest.raises(UnreachableError):
         connect(Endpoint(path=str(folder / "a.sock")), timeout=0.05)
     (folder / "b.sock").touch()

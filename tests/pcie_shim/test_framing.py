@@ -91,7 +91,7 @@ def test_a_flipped_bit_is_never_taken_for_a_frame(
     assert 12 * 8 <= position < 16 * 8
 
 
-def test_a_wrong_crc_and_a_boundless_length_are_told_apart() -> None:
+def test_a_wrong_crc_and_an_excessive_length_have_different_errors() -> None:
     stream = bytearray(encode(framing.WRITE, 0, 1, 0, 1, b"1234"))
     stream[-1] ^= 1
     with pytest.raises(CrcError):
@@ -108,7 +108,7 @@ def test_the_wire_format_is_the_documented_one() -> None:
 
 
 @pytest.mark.parametrize("payload", [b"", b"x" * 96])
-def test_other_frames_are_no_greeting(payload: bytes) -> None:
+def test_other_frames_are_not_a_greeting(payload: bytes) -> None:
     (frame,) = _frames(encode(framing.GREET, 0, 0, 0, len(payload) // 4, payload))
     with pytest.raises(FramingError):
         framing.decode_greeting(frame)

@@ -1,4 +1,4 @@
-"""Any JSON value, for messages that nobody would write."""
+"""Arbitrary JSON values, for hostile messages."""
 
 from hypothesis import strategies as st
 

@@ -1,4 +1,4 @@
-"""`/bm/frame`: what is written is read back, and anything else is read or refused."""
+"""`/bm/frame`: written reports are read back, and other messages are read or refused."""
 
 import json
 

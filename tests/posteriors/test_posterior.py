@@ -1,4 +1,4 @@
-"""`/BMresults`: messages that are read, and the posteriors that come of them."""
+"""`/BMresults`: messages, and the posteriors that are read from them."""
 
 import numpy as np
 import pytest

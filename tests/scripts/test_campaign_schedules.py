@@ -1,4 +1,4 @@
-"""Schedules of the campaign: seeded, within what a master forgives, and shortened when they fail."""
+"""Schedules of the campaign: seeded, within the limits of a master, and shortened when they fail."""
 
 import random
 from collections import Counter

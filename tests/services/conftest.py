@@ -1,4 +1,4 @@
-"""The deployment that the services' tests share; nobody changes its folder."""
+"""The deployment that the services' tests share, which no test changes."""
 
 from pathlib import Path
 

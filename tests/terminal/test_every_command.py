@@ -1,4 +1,4 @@
-"""Every command reads its flags as `terminal.command_line` does; test_usage.py shows how that is."""
+"""Every command reads its flags with `terminal.command_line`, which test_usage.py tests."""
 
 import importlib
 import re

@@ -1,4 +1,4 @@
-"""The status socket: one JSON object per connection, for its user alone, whatever asks and whatever answers.
+"""The status socket: one JSON object per connection, only for its user, with hostile clients and servers.
 
 is_ready, read_status ──▶ NAME.status.sock ◀── serve_health (in a loop, or in_thread of a blocking process)
 """

@@ -1,4 +1,4 @@
-"""Lines on standard error in each format: text as ever, dated text, and one JSON object per line."""
+"""Lines on standard error in each format: text, dated text, and one JSON object per line."""
 
 import json
 import os
@@ -108,7 +108,7 @@ def test_progress_is_one_line_that_the_next_line_replaces(capsys, monkeypatch):
 
 
 @pytest.mark.parametrize(("after_s", "said"), [(0.0, "waiting\n"), (60.0, "")])
-def test_a_wait_is_said_only_if_it_is_long(capsys, monkeypatch, after_s, said):
+def test_only_a_long_wait_is_reported(capsys, monkeypatch, after_s, said):
     monkeypatch.delenv("BM_LOG_FORMAT", raising=False)
     with say_if_slow("waiting", after_s=after_s):
         time.sleep(0.5)

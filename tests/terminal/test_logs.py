@@ -38,7 +38,7 @@ def test_a_value_is_seen(value, seen):
     assert shown(value) == seen
 
 
-def test_what_is_said_is_a_line(capsys):
+def test_a_message_is_one_line(capsys):
     say(HOSTILE)
     assert capsys.readouterr().err == HARMLESS + "\n"
     say_lines("one\n\x1btwo")

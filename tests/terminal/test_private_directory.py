@@ -1,4 +1,4 @@
-"""Private directories: whose they are, and that those of killed masters are removed and no others."""
+"""Private directories: their owner, and the removal of those of killed masters only."""
 
 import socket
 import sys

@@ -1,4 +1,4 @@
-"""A small model and its machine, for tests that look at machines from outside."""
+"""A small model and its machine, for tests of machines from outside."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The `toolchain` command within a test's process, and what several rooms' tests share."""
+"""The `toolchain` command within a test's process, and code shared by the tests of several rooms."""
 
 import tracemalloc
 from contextlib import contextmanager

@@ -1,6 +1,7 @@
-"""Doubles of the three real servers, with what they do otherwise than the specification says; measured, not guessed.
+"""Doubles of the three real servers, with their measured differences from the specification.
 
-A: rosbridge_suite on ROS 1; B: rosbridge_suite on ROS 2; R: rosbridge-server-rs on ROS 2 (``docs/reference/rosbridge-differences.md``).
+A: rosbridge_suite on ROS 1; B: rosbridge_suite on ROS 2; R: rosbridge-server-rs on ROS 2
+(``docs/reference/rosbridge-differences.md``).
 They are fakes over `tests.fake_rosbridge`, and add the forms of delivery: what each makes of ``compression`` and
 ``fragment_size``, and what it loses.
 """

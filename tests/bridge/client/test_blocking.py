@@ -1,4 +1,4 @@
-"""The blocking client: the asyncio client on a thread of its own, from whose waits errors, Ctrl-C and the exit come back."""
+"""The blocking client: errors, Ctrl-C and the exit end waits for the asyncio client on its thread."""
 
 import asyncio
 import logging

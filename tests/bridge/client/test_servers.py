@@ -1,4 +1,4 @@
-"""The client on doubles of the real servers, A, B and R: what each does otherwise is either taken or told.
+"""The client on doubles of the real servers A, B and R: it accepts or reports each difference.
 
 Ros ◀──WebSocket──▶ Double (A, B or R)
 """
@@ -71,7 +71,7 @@ async def test_serialised_bytes_of_either_ros(double, ros):
 
 
 @pytest.mark.parametrize("double", ["R"], indirect=True)
-async def test_what_the_server_refuses_is_told(double, ros):
+async def test_refusals_of_the_server_are_reported(double, ros):
     double.known.remove("png")
     subscription = ros.subscribe("/a", TYPE, compression="png")
     with pytest.raises(NoMessageError, match="unsupported compression png$"):

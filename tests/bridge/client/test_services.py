@@ -33,7 +33,7 @@ async def test_calls_and_refusals(fake, ros):
     assert [call["service"] for call in calls].count("/rosapi/service_type") == 1
 
 
-async def test_a_request_for_a_service_of_nobody_is_refused_at_once(fake, ros):
+async def test_a_request_for_an_unserved_service_is_refused_at_once(fake, ros):
     ros._session._take([b'{"op": "call_service", "service": "/nope", "id": "1", "args": {}}'])
     refusal = await fake.wait_for_op("service_response", service="/nope")
     assert refusal["result"] is False

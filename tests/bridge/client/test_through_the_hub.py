@@ -60,7 +60,7 @@ async def settled(ros: Ros) -> None:
 @pytest.mark.parametrize("compression", ["none", "png", "cbor"])
 @pytest.mark.parametrize("fragment_size", [None, 50])
 @pytest.mark.parametrize("arrays", ["list", "numpy"])
-async def test_a_scan_comes_as_it_was_sent(one, other, compression, fragment_size, arrays):
+async def test_a_scan_arrives_unchanged(one, other, compression, fragment_size, arrays):
     scans = one.subscribe(
         "/scan",
         "sensor_msgs/LaserScan",

@@ -1,4 +1,4 @@
-"""CBOR: typed arrays both ways, and nothing but what a ROS message holds."""
+"""CBOR: typed arrays in both directions, and only the types of ROS messages."""
 
 import math
 import struct

@@ -1,4 +1,4 @@
-"""A proven envelope makes the same of whatever stands after it as reading all of it does; no other is taken."""
+"""A known envelope gives the same message as parsing the whole text; other envelopes are parsed."""
 
 import orjson
 import pytest

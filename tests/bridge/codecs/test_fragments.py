@@ -1,4 +1,4 @@
-"""Fragments: what servers send, in any order and as odd as they do, and what must not make a client grow."""
+"""Fragments: those of real servers, in any order, and hostile ones that must not exhaust memory."""
 
 import json
 import math

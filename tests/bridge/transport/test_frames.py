@@ -1,4 +1,4 @@
-"""Frames found and written here are the library's: whatever comes, cut wherever, means the same by both ways."""
+"""Frames are read and written as by the library, whatever arrives and however it is cut."""
 
 from itertools import islice
 
@@ -77,7 +77,7 @@ def test_whatever_comes_means_the_same_alone(rest: bytes, masked: bool, length: 
 
 
 @pytest.mark.parametrize("masked", [True, False])
-def test_what_is_no_whole_message_is_the_librarys(masked: bool) -> None:
+def test_the_library_handles_everything_but_whole_messages(masked: bool) -> None:
     for opcode in (Opcode.PING, Opcode.PONG, Opcode.CLOSE, Opcode.CONT):
         data = Frame(opcode, b"xx").serialize(mask=masked)
         assert frames.whole_messages(data, 0, masked=masked, largest=9) == ([], 0)

@@ -1,4 +1,4 @@
-"""Simulator, normaliser and model speak of the same boat: float64 fusion finds it as often as it says.
+"""Simulator, normaliser and model agree: float64 fusion finds the boat as often as it predicts.
 
 Boat.measure  ->  normalise  ->  the model's exact posterior  ->  coverage of its 95 % region
 """

@@ -23,7 +23,7 @@ def test_a_bearing_is_within_one_turn(x, y, beacon):
     assert 0 <= bearing(x, y, beacon) < 360
 
 
-def test_just_below_the_axis_is_no_full_turn():
+def test_just_below_the_axis_is_not_a_full_turn():
     assert bearing(0.0, -1e-300, BEACONS[1]) == 0.0
 
 

@@ -1,4 +1,4 @@
-"""A topic that the server refuses is reported, instead of publishing to nobody in silence."""
+"""A topic that the server refuses is reported."""
 
 import pytest
 

@@ -58,7 +58,7 @@ def test_arrays_hold_the_numbers_in_the_columns_order():
 
 
 @pytest.mark.parametrize("bad", [None, "12", math.nan, math.inf, True, [1.0]])
-def test_what_is_no_number_is_refused_by_name(bad):
+def test_a_reading_that_is_not_a_number_is_refused_by_name(bad):
     with pytest.raises(BadReadingError, match="B2"):
         read_raw({**RAW, "B2": bad}, array=False)
 

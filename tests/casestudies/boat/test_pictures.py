@@ -86,7 +86,7 @@ class TestPositions:
         draw_positions(tmp_path / "x.png", [instance(1, truth=False)])
         assert not len(pixels_of(tmp_path / "x.png", TRUTH_COLOUR))
 
-    def test_a_posterior_that_is_no_map(self):
+    def test_a_posterior_that_is_not_a_map(self):
         line = Posterior(probabilities=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0)
         with pytest.raises(OutputError):
             posterior_grid(line)

@@ -1,4 +1,4 @@
-"""The boat's three commands as processes of their own, with a pretend master between them.
+"""The boat's three commands as processes, with a pretend master between them.
 
 boat-simulator -> /boat/raw -> boat-normaliser -> /boat/sensors -> pretend master -> /BMresults -> boat-viewer
       '---------------------------- /boat/true_pose -------------------------------------------------'
@@ -161,7 +161,7 @@ async def test_ctrl_c_ends_an_endless_viewer_with_its_pictures(tmp_path):
 
 
 @pytest.mark.parametrize(("flag", "name"), [("--out", "pictures"), ("--json", "numbers.json")])
-def test_a_folder_that_cannot_be_written_is_said_at_the_start(flag, name, tmp_path):
+def test_a_folder_that_cannot_be_written_is_reported_at_the_start(flag, name, tmp_path):
     (tmp_path / "file").write_text("")
     ended = invoke(viewer.app, ["--uri", "ws://127.0.0.1:1", flag, tmp_path / "file" / name])
     assert ended.exit_code == 2  # an unreachable server is 3
@@ -229,7 +229,7 @@ async def test_a_normaliser_says_what_went_wrong_once():
     assert code == 143
 
 
-async def test_a_viewer_says_which_results_never_came():
+async def test_a_viewer_reports_missing_results():
     async with FakeRosbridge() as fake, Process("viewer", "--uri", fake.uri, "--count", "1") as viewer:
         await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
         await fake.publish("/bm/frame", frame_message({"sec": 1, "nanosec": 0}, 1, published=True))

@@ -17,7 +17,7 @@ def test_it_starts_in_the_middle():
 
 
 @given(st.integers(0, 1000), st.floats(0, 500), st.floats(0.001, 1))
-def test_it_stays_on_the_map_and_is_no_faster_than_it_may(seed, speed, seconds):
+def test_the_boat_stays_on_the_map_and_within_its_speed(seed, speed, seconds):
     boat = Boat(seed, speed)
     for _ in range(30):
         before = (boat.x, boat.y)

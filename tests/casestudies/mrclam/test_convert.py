@@ -1,4 +1,4 @@
-"""A tiny data set in the form of the public one, and what becomes of it."""
+"""Conversion of a tiny data set in the format of the public one."""
 
 import math
 import os
@@ -59,7 +59,7 @@ def run(*arguments):
     return ended.exit_code, ended.stdout, ended.stderr
 
 
-def test_seconds_in_which_it_stood(data, tmp_path):
+def test_seconds_without_motion(data, tmp_path):
     out = tmp_path / "out" / "data"
     code, said, err = run(data, "-o", out)
     assert (code, err) == (0, "")

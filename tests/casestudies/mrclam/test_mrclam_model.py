@@ -96,7 +96,7 @@ def test_bins_and_codes_are_as_accurate_as_raw_float64(robot, codes, outlier):
     assert np.median(coded) < 1.15 * np.median(raw)
 
 
-def test_a_floor_that_codes_cannot_hold_is_said(path):
+def test_a_floor_that_codes_cannot_represent_is_reported(path):
     warnings = quantise(model(path, floor=1e-3)).warnings
     assert len(warnings) == 2 * len(LANDMARKS)
     assert "range_6: its outlier floor of 0.001 vanishes" in warnings[0]

@@ -70,7 +70,7 @@ def test_wrong_files_are_refused_with_the_place(tmp_path, lines, place):
         read_recording(file(tmp_path, *lines))
 
 
-def test_files_that_are_no_files(tmp_path):
+def test_paths_that_are_not_files(tmp_path):
     with pytest.raises(DataFileError, match="no-such.csv"):
         read_recording(tmp_path / "no-such.csv")
     with pytest.raises(DataFileError):

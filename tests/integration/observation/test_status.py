@@ -1,4 +1,4 @@
-"""A real stack says of itself what it does: ready and not, who died, how many results there were."""
+"""The status of a real stack: readiness, deaths, and numbers of results."""
 
 import asyncio
 import json

@@ -1,4 +1,4 @@
-"""`master reload`: a run takes another deployment, and every frame is computed by one of them, whole.
+"""`master reload`: a run switches to another deployment, and no frame mixes the two.
 
 robot ──▶ hub ──▶ master, subscriber, publisher, pcie-app, boards   ◀── master reload
  └─ keeps what it sent, by stamp, and compares every result with what boards in this process count
@@ -37,7 +37,7 @@ from toolchain.deployment.address import to_address
 
 @cache
 def boards_of(_hash, folder, _bank):
-    """A deployment's boards in this process; kept by its hash, since folders change, and by bank, whose random bits take time."""
+    """The boards of deployments in this process, cached by hash and bank, because folders change."""
     deployment = load_deployment(folder)
     images = [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
     machine = deployment.machine

@@ -1,4 +1,4 @@
-"""`master reload` of every kind of machine and of run: written priors, several outputs, boards over TCP, replicas of cells.
+"""`master reload` for every kind of machine and run: written priors, several outputs, boards over TCP, replicas.
 
 robot ──▶ hub ──▶ master and its children ──▶ boards, its own or others'   ◀── master reload, or SIGKILL in the midst of it
 """

@@ -88,7 +88,7 @@ def test_a_flipped_counter_is_the_highest_one_of_the_final_counts(board: Emulate
 # ---- identity and capabilities ----
 
 
-def test_a_blank_board_says_who_it_is_and_computes_nothing() -> None:
+def test_a_blank_board_identifies_itself_and_computes_nothing() -> None:
     board = EmulatedBoard()
     assert board.turned == 0.0
     assert read(board, rm.ID).to_bytes(4, "little") == b"BM01"

@@ -1,4 +1,4 @@
-"""Canaries: every bit of every table that can change a count is shown, and frames of a user stay the same to the bit."""
+"""Canaries: they show every bit of a table that can change a count, and do not change the frames of a user."""
 
 import dataclasses
 
@@ -67,7 +67,7 @@ def compare_every_flip(built: BM1Machine) -> Reach:
         }
     ),
 )
-def test_a_walk_finds_the_flips_that_it_is_said_to_find(seed: int, options: dict) -> None:
+def test_a_walk_finds_the_predicted_flips(seed: int, options: dict) -> None:
     compare_every_flip(machine(seed, **options))
 
 

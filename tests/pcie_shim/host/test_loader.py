@@ -32,7 +32,7 @@ def test_a_damaged_or_missing_file_is_refused_before_the_board_is_touched(folder
         program(nowhere, path)
 
 
-def test_no_board_is_said_in_time(folder: Path) -> None:
+def test_a_missing_board_is_reported_in_time(folder: Path) -> None:
     with pytest.raises(UnreachableError):
         program(f"unix:{folder}/nobody.sock", image(machine(1)), timeout=0.05)
 

@@ -1,4 +1,4 @@
-"""Boards that a person starts: they say when they are there, when one is back, and how they ended."""
+"""Boards that a user starts: they report that they are listening, that one was restarted, and how they ended."""
 
 import os
 import re

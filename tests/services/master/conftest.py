@@ -1,4 +1,4 @@
-"""A run whose peers are in the test's hands."""
+"""A run whose peers the test controls."""
 
 import asyncio
 from types import SimpleNamespace

@@ -173,7 +173,7 @@ async def test_readings_of_other_generations_are_lost_or_wait_for_theirs(run):
     assert (run.flow.waiting, run.lost) == (3, {LossReason.IN_RELOAD: 5})
 
 
-async def test_a_run_publishes_as_many_results_as_it_was_told(boat):
+async def test_a_run_publishes_the_requested_number_of_results(boat):
     """A publisher that waits for its server has several results at once; it will publish them all."""
     run = Run(boat, queue="all", count=3)
     run.read(10)

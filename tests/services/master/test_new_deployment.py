@@ -1,4 +1,4 @@
-"""A deployment on its way into force: of the same shape, copied whole, held beside the one before."""
+"""A new deployment before it is in force: its shape, its complete copy, and the previous one next to it."""
 
 import fcntl
 import os

@@ -1,4 +1,4 @@
-"""Peers: how long the master waits for its own processes and for others, and whom it takes for a peer."""
+"""Peers: how long the master waits for its own processes and for others, and which peers it accepts."""
 
 import asyncio
 import sys

@@ -1,4 +1,4 @@
-"""Reloads: what is asked of whom, what becomes of readings meanwhile, and the way back."""
+"""Reloads: requests to the services, readings during the switch, and the return after a failure."""
 
 import asyncio
 from pathlib import Path

@@ -18,7 +18,7 @@ def publish(run, number=1, seen=None):
     run.take(run.publisher, Published(number, Outcome.PUBLISHED, seen, 9, 0.5, 7, 3_000_000))
 
 
-async def test_the_status_says_why_there_are_no_results(boat, monkeypatch):
+async def test_the_status_gives_the_reason_for_missing_results(boat, monkeypatch):
     now = [1_000_000_000_000]
     monkeypatch.setattr("time.monotonic_ns", lambda: now[0])
     run = Run(boat, ready_timeout=5)

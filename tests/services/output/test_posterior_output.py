@@ -152,7 +152,7 @@ class TestPicture:
         assert drawn.count("|\n") == 8
         assert drawn.endswith("each mark is a block of 8 x 3 cells")
 
-    def test_nobody_is_shown_colours_who_wants_none(self, monkeypatch):
+    def test_no_color_disables_colours(self, monkeypatch):
         options = {"force_terminal": True, "color_system": "truecolor"}
         assert in_colour(Console(**options))
         with Path(os.devnull).open("w") as null:

@@ -121,7 +121,7 @@ async def test_a_message_above_the_limit_of_its_topic_is_counted(boat, link):
             await running
 
 
-def test_the_status_says_since_when_there_are_no_readings(boat, link, monkeypatch):
+def test_the_status_shows_the_time_without_readings(boat, link, monkeypatch):
     monkeypatch.setattr("services.pipeline.subscriber.why_not_connected", lambda _: "")
     now = [1_000_000_000_000]
     monkeypatch.setattr("time.monotonic_ns", lambda: now[0])

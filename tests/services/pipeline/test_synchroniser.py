@@ -1,4 +1,4 @@
-"""The synchroniser: sets of one instant, whatever the order in which messages come."""
+"""The synchroniser: sets of one instant, whatever the order of the messages."""
 
 import pytest
 from hypothesis import given
@@ -125,7 +125,7 @@ def test_an_endless_topic_without_partner_stays_bounded():
 
 @st.composite
 def instants(draw):
-    """Messages of instants: each topic takes part in every n-th, with jitter, delay, drop-outs of at most two in a row."""
+    """Messages of instants: each topic has every n-th, with jitter, delay, and at most two drop-outs in a row."""
     topics = draw(st.integers(2, 4))
     needed = draw(st.lists(st.booleans(), min_size=topics, max_size=topics))
     spacing = draw(st.integers(75, 400))

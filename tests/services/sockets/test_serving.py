@@ -60,7 +60,7 @@ class Served:
             await asyncio.Event().wait()
 
     async def connect(self, hash_=None):
-        """A master's connection, the records that it gets, and an event of its end; without a hash it does not greet."""
+        """A master's connection, its records, and an event of its end; without a hash it does not greet."""
         await asyncio.wait_for(self.listens.wait(), PATIENCE)
         records, closed = [], asyncio.Event()
         protocol = await open_connection(

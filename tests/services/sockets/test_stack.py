@@ -1,4 +1,4 @@
-"""The processes of a run: found, asked at once, and shown by the command `status`."""
+"""The processes of a run: found, queried in parallel, and shown by the command `status`."""
 
 import asyncio
 import contextlib
@@ -86,7 +86,7 @@ async def test_everyone_is_asked_and_says_what_it_waits_for(tmp_path):
     assert "publisher: waiting for ws://robot:9090" in shown(stack)
 
 
-async def test_those_who_do_not_answer_are_waited_for_together(tmp_path, monkeypatch):
+async def test_silent_processes_share_one_timeout(tmp_path, monkeypatch):
     together = threading.Barrier(5)
     ask = status._ask
 

@@ -34,7 +34,7 @@ def get_status():
     return ProcessStatus(ready=True, why="all is well", frames=counts(7))
 
 
-def test_a_process_says_who_it_is(tmp_path):
+def test_a_process_identifies_itself(tmp_path):
     with serve_status_in_thread(tmp_path, "pcie-app", get_status):
         found = read_process_status(status_socket(tmp_path, "pcie-app"), PATIENCE)
     assert (found.name, found.pid, found.version) == ("pcie-app", os.getpid(), VERSION)

@@ -1,4 +1,4 @@
-"""Children: their errors kept, their other lines passed on, their ends noticed."""
+"""Children: their errors are kept, their other lines forwarded, and their ends noticed."""
 
 import asyncio
 import os

@@ -80,7 +80,7 @@ def place():
         yield Path(place)
 
 
-def test_a_parent_of_which_a_thread_still_dies_is_waited_for(place):
+def test_a_parent_with_a_dying_thread_is_awaited(place):
     done = subprocess.run(
         [sys.executable, "-c", KILLED_IN_PART],
         env=os.environ | {"TMPDIR": str(place), "XDG_RUNTIME_DIR": ""},

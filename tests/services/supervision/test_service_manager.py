@@ -37,7 +37,7 @@ def said(receiver):
     return found
 
 
-def test_ready_is_said_once_and_a_state_when_it_changes(manager):
+def test_readiness_is_sent_once_and_a_state_when_it_changes(manager):
     service = ServiceManager()
     assert {"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"}.isdisjoint(os.environ)  # not for children
     service.report("waiting", ready=False, alive=True)
@@ -50,7 +50,7 @@ def test_ready_is_said_once_and_a_state_when_it_changes(manager):
     assert said(manager) == ["STOPPING=1"]
 
 
-def test_what_a_full_queue_refused_is_said_again(manager):
+def test_messages_refused_by_a_full_queue_are_sent_again(manager):
     service = ServiceManager()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other, contextlib.suppress(BlockingIOError):
         other.setblocking(False)

@@ -1,4 +1,4 @@
-"""Mistakes in a command line: one sentence that says what, where, what was expected, and where to read on."""
+"""Mistakes in a command line: one sentence with the mistake, its place, the expected value, and where to read more."""
 
 import re
 import sys

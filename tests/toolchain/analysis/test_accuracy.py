@@ -1,4 +1,4 @@
-"""Accuracy: figures that can be computed by hand, intervals that hold what they say."""
+"""Accuracy: figures that can be computed by hand, and intervals with the stated coverage."""
 
 import numpy as np
 import pytest
@@ -82,7 +82,7 @@ def test_z_scores_are_near_1_with_fresh_bits_and_larger_without():
     assert fresh.quantising is None
 
 
-def test_the_same_frames_give_the_same_figures_and_every_frame_is_told():
+def test_the_same_frames_give_the_same_figures_and_every_frame_is_reported():
     model = corridor()
     readings = sample_readings(model, 10, seed=1)
     told = []

@@ -1,4 +1,4 @@
-"""Claims: the machine with faults is the reference where there are none, and what the thesis says can be seen."""
+"""Claims: without faults the machine equals the reference, and the claims of the thesis are visible."""
 
 import json
 

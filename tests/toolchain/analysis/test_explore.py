@@ -1,4 +1,4 @@
-"""Sweeps: every point is kept before the next begins, a sweep goes on where it stopped, the front is the front."""
+"""Sweeps: every point is saved before the next begins, a sweep resumes where it stopped, and the front is right."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Readings: drawn as often as the model says, or recorded; and a model found again in codes."""
+"""Readings: drawn with the probabilities of the model, or recorded; and a model recovered from codes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Resources: what can be counted exactly is, and what the thesis found comes out."""
+"""Resources: exact counts where possible, and the figures of the thesis."""
 
 from dataclasses import replace
 

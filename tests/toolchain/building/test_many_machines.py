@@ -1,4 +1,4 @@
-"""Replicas, and readings for each line: arrays become addresses by the one rule, and a build of each kind is what it says."""
+"""Replicas, and readings for each line: arrays become addresses by the same rule, and builds match their options."""
 
 import base64
 import math
@@ -139,7 +139,7 @@ def test_a_reading_is_missing_on_all_lines_or_on_none():
         (replace(THRESHOLD, scale=Scale.NONE), [0.1] * 11 + [1.5], ReadingError),
     ],
 )
-def test_what_is_no_such_array_is_said(options, value, error):
+def test_another_array_is_refused(options, value, error):
     deployment = deployment_of(replace(options, replicas=2))
     with pytest.raises(error):
         to_addresses(deployment, deployment.variables[0], value)

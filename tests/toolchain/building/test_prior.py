@@ -1,4 +1,4 @@
-"""A prior that a variable selects (thesis 2.1.2), and one that the host writes: from the model to what the boards compute.
+"""A prior selected by a variable (thesis 2.1.2), and one written by the host, from the model to the results.
 
 model ──▶ deployment.toml, images ──▶ addresses of a frame ──▶ row of the prior's table, codes to write ──▶ posterior
 """
@@ -193,7 +193,7 @@ def test_a_deployment_whose_prior_does_not_agree_is_refused(tmp_path):
         load_deployment(tmp_path)
 
 
-def test_a_word_that_is_no_state_is_no_number(tmp_path):
+def test_a_word_that_is_not_a_state_is_not_a_number(tmp_path):
     variable = Variable(name="v", bits=2, values=2, states=("on", "off"))
     assert to_address(variable, "off") == 1
     with pytest.raises(ReadingError, match="'of' is a string, not a number"):

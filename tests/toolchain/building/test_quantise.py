@@ -107,7 +107,7 @@ def with_floor(floor, prob_bits=8):
     return quantise(model, prob_bits=prob_bits)
 
 
-def test_a_floor_that_vanishes_is_said_and_how_to_keep_it():
+def test_a_vanishing_floor_is_reported_with_advice():
     (warning,) = with_floor(1e-3).warnings
     assert "Variable D: its outlier floor of 0.001 vanishes at" in warning
     assert "below 2^-9" in warning

@@ -1,4 +1,4 @@
-"""One part of a deployment is redone: that part follows, the rest stays to the byte, and every file is accounted for."""
+"""Regenerating one part of a deployment: it changes, the other bytes stay, and every file is reported."""
 
 import shutil
 

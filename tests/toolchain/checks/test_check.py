@@ -322,7 +322,7 @@ def deployment(tmp_path):
     return tmp_path / "out"
 
 
-def test_a_deployment_says_what_its_model_said(tmp_path):
+def test_a_deployment_contains_the_values_of_its_model(tmp_path):
     table = np.array([[0.0, 0.0, 0.0], [0.999, 0.5, 1.0], [0.001, 0.5, 0.0]])
     options = replace(OPTIONS, scale=Scale.COLUMN, rng=RngKind.LFSR16, partitions=2, rng_banks=1)
     one = model_of(table, prior=np.array([0.0, 0.5, 0.5]))

@@ -1,4 +1,4 @@
-"""Relations between columns' random bits: those that are found hold in every cycle, and none is overlooked."""
+"""Relations between columns' random bits: those found hold in every cycle, and none is missed."""
 
 from itertools import combinations
 

@@ -1,4 +1,4 @@
-"""Inspect: a deployment explained, with its model or without; what it says, and what it refuses."""
+"""`toolchain inspect`: its report, with and without the model, and its refusals."""
 
 import json
 

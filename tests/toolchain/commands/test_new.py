@@ -1,4 +1,4 @@
-"""`toolchain new` starts a model that builds as it says, and a robot that says what the model reads."""
+"""`toolchain new` writes a model that builds as printed, and a robot that publishes its readings."""
 
 import ast
 import re

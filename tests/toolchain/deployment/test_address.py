@@ -64,7 +64,7 @@ def test_a_period_comes_before_the_range_check(variable, turns):
     variables() | variables(period=True),
     st.text() | st.lists(NUMBERS, min_size=1) | st.dictionaries(st.text(), NUMBERS),
 )
-def test_what_is_no_number_is_never_one(variable, value):
+def test_a_value_that_is_not_a_number_is_never_read_as_one(variable, value):
     with pytest.raises(NotANumberError, match="not a number"):
         to_address(variable, value)
 

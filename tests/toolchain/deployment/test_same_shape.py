@@ -1,4 +1,4 @@
-"""The shape of a deployment: what may change in a run that goes on does, and what may not is named, before and after."""
+"""The shape of a deployment: permitted changes in a run, and errors that name the others with both values."""
 
 import pytest
 

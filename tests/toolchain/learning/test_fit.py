@@ -1,4 +1,4 @@
-"""Learning: what made a recording is found again, counts are Dirichlet's, and a fit is the same after its file.
+"""Learning: parameters are recovered from a recording, counts are Dirichlet's, and a fit survives its file.
 
 model ──▶ simulated readings with ground truth ──▶ fit ──▶ file ──▶ the model that made them
 """
@@ -177,7 +177,7 @@ def test_a_fit_is_the_same_after_its_file(tmp_path):
         assert np.array_equal(unfitted.known[0].table, room().known[0].table)
 
 
-def test_counted_tables_are_the_same_after_their_file_and_so_are_its_bytes(tmp_path):
+def test_counted_tables_and_their_file_survive_a_round_trip(tmp_path):
     fit, _ = learn(door(), {"x": ["a", "b"]}, {"door": [1, 0]}, method=FitMethod.COUNTS)
     for name in ("a.npz", "b.npz"):
         write_fit(tmp_path / name, fit)

@@ -1,4 +1,4 @@
-"""Recordings as columns: CSV files and bags give the same rows; what is not there is named.
+"""Recordings as columns: CSV files and bags give the same rows, and errors name what is missing.
 
 std_msgs/Float64 on /range and geometry_msgs/PointStamped on /truth, 10 ms later ──▶ ROS 1 bag, ROS 2 bag, MCAP ──▶ columns
 """

@@ -113,7 +113,7 @@ def test_mistakes_in_the_file(case, text, line):
     assert "\n" not in str(caught.value)
 
 
-def test_what_the_file_itself_refuses_is_said_in_its_own_words(case):
+def test_refusals_of_the_file_keep_their_sentence(case):
     folder = case(
         "from toolchain.errors import ModelError\ndef model():\n    raise ModelError('size is odd')"
     )

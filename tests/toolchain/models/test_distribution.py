@@ -1,4 +1,4 @@
-"""Factors: tables, normals and functions of symbols become tables; what is none is refused by its title."""
+"""Factors: tables, normals and functions of symbols become tables; others are refused by title."""
 
 import numpy as np
 import pytest

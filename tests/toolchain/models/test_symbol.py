@@ -1,4 +1,4 @@
-"""Types and symbols: which number each value is, and what is refused."""
+"""Types and symbols: the number of each value, and refused values."""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""One network in four formats is one joint distribution; whatever else a file holds is one sentence with its line.
+"""A network is the same joint distribution in four formats; mistakes in a file give one sentence with the line.
 
 Dog problem (Charniak 1991): family-out -> light-on, family-out and bowel-problem -> dog-out -> hear-bark.
 """

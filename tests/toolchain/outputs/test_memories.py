@@ -1,4 +1,4 @@
-"""Every memory of a machine as a MIF: what it holds, read back by srec_cat; the parameters, read by GHDL."""
+"""Every memory of a machine as a MIF, read back by srec_cat, and the parameters, read by GHDL."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""MIFs: what is written is read again, every form is read, and a mistake is a sentence with its line."""
+"""MIFs: written files are read back, every form is accepted, and a mistake gives a sentence with its line."""
 
 from contextlib import suppress
 

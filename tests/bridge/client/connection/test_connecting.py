@@ -1,4 +1,4 @@
-"""The first connection: what is at the URI, and what is said when it is no rosbridge server."""
+"""The first connection: rosbridge servers, and the errors for anything else at the URI."""
 
 import asyncio
 import contextlib

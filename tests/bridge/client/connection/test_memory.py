@@ -1,4 +1,4 @@
-"""Memory stays flat, however long it runs: behind a slow reader, over reconnections, calls and broken messages."""
+"""Memory of a long-running client stays flat: behind a slow reader, over reconnections, calls and broken messages."""
 
 import gc
 import json

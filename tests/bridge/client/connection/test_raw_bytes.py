@@ -1,4 +1,4 @@
-"""Anything at all on the socket after the handshake: the client lives, says why it lost the connection, and ends.
+"""Arbitrary bytes after the handshake: the client survives, reports why it lost the connection, and can be closed.
 
 Ros ──handshake──▶ a bare TCP server ──frames, parts of frames, noise──▶ Ros
 """

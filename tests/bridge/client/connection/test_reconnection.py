@@ -1,4 +1,4 @@
-"""A lost connection comes back by itself, with everything that was wanted."""
+"""Reconnection: a lost connection is restored with all subscriptions, advertisements and services."""
 
 import asyncio
 import re
@@ -288,7 +288,7 @@ async def test_the_first_message_after_losses_says_how_long_it_was_dark(fake, ro
 
 
 @pytest.mark.parametrize("queue_size", [1, 2, 5])
-async def test_darkness_is_told_even_if_its_message_is_dropped(fake, ros, queue_size):
+async def test_a_gap_is_reported_even_if_the_message_after_it_is_dropped(fake, ros, queue_size):
     subscription = ros.subscribe("/a", "p/T", queue_size=queue_size)
     await gone_and_back(fake, ros)
     await fake.wait_for_op("subscribe")

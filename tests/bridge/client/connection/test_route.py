@@ -1,4 +1,4 @@
-"""The way to a server: certificates on both sides, tokens and headers, a proxy; and that no secret is ever shown.
+"""The route to a server: certificates on both sides, tokens, headers and proxies; secrets are never shown.
 
 Ros ──(TLS)──▶ CONNECT proxy of the test ──▶ WebSocket server of the test (keeps what it was shown)
 """

@@ -1,4 +1,4 @@
-"""How messages come: CBOR, serialised bytes, pictures, fragments, arrays, qualities of service; without a network.
+"""Forms of delivery: CBOR, serialised bytes, pictures, fragments, arrays, quality of service; without a network.
 
 ClientCore ──data_to_send──▶ the test (plays the server)
     ▲                          │

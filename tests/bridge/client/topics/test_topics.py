@@ -156,7 +156,7 @@ async def test_a_slow_reader_loses_its_own_oldest_messages_and_nobody_elses(fake
     assert slow.lost == 45
 
 
-async def test_two_readers_of_one_subscription_are_told(fake, ros):
+async def test_a_second_reader_of_a_subscription_gets_an_error(fake, ros):
     subscription = ros.subscribe("/a", "p/T")
     given_up = asyncio.create_task(subscription.next(30))
     await asyncio.sleep(0)

@@ -1,4 +1,4 @@
-"""The forms of a message that subscribers ask for: PNG, CBOR, serialised, in fragments; each written once."""
+"""Encodings that subscribers request: PNG, CBOR, serialised, fragments; each is produced once."""
 
 import base64
 import json

@@ -1,4 +1,4 @@
-"""The outbox against a model of it: two plain lists, and every rule in its plainest form."""
+"""The outbox compared with a model: two plain lists, and every rule in its simplest form."""
 
 from dataclasses import dataclass, field
 from math import inf

@@ -1,4 +1,4 @@
-"""A publisher whose envelope the hub knows is heard, and refused, as one whose messages are read whole."""
+"""Messages with a known envelope are delivered and refused like those that are parsed whole."""
 
 import json
 
@@ -27,7 +27,7 @@ def say(publisher: Peer, data: bytes) -> None:
     hub.check()
 
 
-def test_a_message_goes_on_as_it_came() -> None:
+def test_a_message_is_forwarded_unchanged() -> None:
     publisher, listener = publisher_and_listener()
     for message in (b'{"a": [1.50, 2e3], "b":"\\u00e9"}', b'{"a":1,"a":2}', b"{ }"):
         say(publisher, PUBLISH + message + b"}")

@@ -1,4 +1,4 @@
-"""Long random lives of a small hub: mostly sensible clients, now and then not, in every order.
+"""Long random runs of a small hub with mostly sensible clients, in every order.
 
 Everything that must always hold is checked after each step; every call is answered exactly once.
 """
