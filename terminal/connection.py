@@ -7,9 +7,27 @@ from terminal.logs import log_libraries
 from terminal.output import say
 
 
+def report_wait(uri: str) -> Callable[[str, str], None]:
+    """Return a callback for a client's `on_state` that reports the wait for a server at the start."""
+    is_missing = False
+
+    def on_state(state: str, reason: str) -> None:
+        nonlocal is_missing
+        if state == "connecting":
+            is_missing = True
+            say(f"waiting for rosbridge at {uri} ({reason})")
+        elif state == "connected" and is_missing:
+            is_missing = False
+            say(f"rosbridge at {uri} is connected")
+
+    return on_state
+
+
 def report_connection(uri: str) -> Callable[[str, str], None]:
-    """Return a callback for a client's `on_state` that reports each lost and restored connection once."""
-    # the client itself logs a warning at each loss
+    """Return a callback for a client's `on_state` that reports each lost and restored connection once.
+
+    It hides all warnings of the client, which logs each loss itself.
+    """
     log_libraries(logging.ERROR, "%(name)s: %(message)s")
     missing = ""
 

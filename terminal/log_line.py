@@ -74,7 +74,7 @@ def json_line(level: str, message: str, *, process: str = "", **fields: object) 
     return json.dumps(line | fields, default=str)
 
 
-def said(text: str) -> str:
+def formatted(text: str) -> str:
     """Return a text for the user in the format in force.
 
     The `error: ` of a child remains text, because its parent reports it.

@@ -13,7 +13,7 @@ from typing import Any, Final, TextIO
 import orjson
 
 from terminal.errors import OutputError
-from terminal.log_line import LogFormat, log_format, relayed, said
+from terminal.log_line import LogFormat, formatted, log_format, relayed
 from terminal.one_line import one_line
 
 _CLEAR_LINE: Final = "\r\x1b[K"
@@ -52,7 +52,7 @@ class SurvivingStream:
 
 def say(text: str) -> None:
     """Print one line for the user on standard error, even if that has been closed."""
-    write_line(said(one_line(text)))
+    write_line(formatted(one_line(text)))
 
 
 def show_progress(text: str) -> None:
@@ -83,7 +83,7 @@ def say_if_slow(text: str, *, after_s: float = 2.0) -> Iterator[None]:
 
 def say_lines(text: str) -> None:
     """Print a text of several lines, such as a traceback, on standard error."""
-    write_line(said(text))
+    write_line(formatted(text))
 
 
 def relay(line: str, process: str) -> None:

@@ -13,7 +13,7 @@ from services.pipeline.timed_frames import TimedFrames
 from services.pipeline.unpublished import report_unpublished
 from services.settings import Settings
 from services.sockets.records import Reading
-from terminal.connection import report_connection
+from terminal.connection import report_wait
 from terminal.output import print_json_line, say
 from toolchain.deployment import Deployment, Source
 
@@ -27,7 +27,7 @@ def _report_state() -> OnState:
 
     def on_state(uri: str, state: State, reason: str) -> None:
         if uri not in reports:
-            reports[uri] = report_connection(uri)
+            reports[uri] = report_wait(uri)
         reports[uri](state, reason)
 
     return on_state
@@ -48,7 +48,7 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
         ca_file=settings.ca,
         max_size=settings.message_bytes,
         ros_version=settings.ros_version,
-        on_state=report_connection(source.uri),
+        on_state=report_wait(source.uri),
     ) as ros:
         subscription = ros.subscribe(
             source.topic, source.type, queue_size=RECEIVED_QUEUE, max_bytes=settings.topic_bytes

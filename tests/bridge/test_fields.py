@@ -59,7 +59,7 @@ def test_the_first_message_with_it_decides_the_place():
     assert field.place is None
     assert field.value({"a": {"v": 1}}) == (True, 1)
     assert field.place == ("a", "v")
-    # A second occurrence later is not looked for, and elsewhere is not there.
+    # A second occurrence is not searched for later, and at another place the field is absent.
     assert field.value({"a": {"v": 2}, "v": 3}) == (True, 2)
     assert field.value({"v": 3}) == (False, None)
     assert "'v': it has no 'a'; it has v" in str(field.missing({"v": 3}))

@@ -149,7 +149,7 @@ async def test_the_subscriber_alone(stage, deployment):
             await server.wait_for_op("subscribe", topic=topic, timeout=PATIENCE)
             (operation,) = server.ops("subscribe", topic=topic)
             assert operation.get("compression") == asked
-    # and a beam that is not there
+    # and a beam that does not exist
     sources = stage.where / "sources.toml"
     sources.write_text(sources.read_text().replace("ranges[90]", "ranges[360]"))
     toolchain("build", stage.where / "corridor", "-o", deployment, "--sources", sources)

@@ -54,7 +54,7 @@ def test_a_step_is_the_definitions(kind):
 
 @pytest.mark.parametrize("kind", LFSRS)
 def test_the_period_is_all_states_but_0(kind):
-    """A state's order divides 2**bits - 1, and is no divisor of it that lacks a prime."""
+    """The order of a state is 2**bits - 1: it divides that number, but not that number without one of its primes."""
     lfsr = LFSR(kind)
     state = start = words(1)
     for tables in jump_tables(kind, 1):  # 1 + 2 + 4 + ... steps: the period's

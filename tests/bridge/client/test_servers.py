@@ -84,7 +84,7 @@ async def test_refusals_of_the_server_are_reported(double, ros):
 
 @SERVERS
 async def test_no_operation_of_the_client_makes_a_server_deaf(double):
-    """A and B never answer again once they have read JSON that is no object."""
+    """A and B stop answering after JSON that is not an object."""
 
     async def echo(args):
         return args

@@ -39,7 +39,7 @@ def test_fragments_may_arrive_in_any_order(text, size, order):
     try:
         message.encode()
     except UnicodeEncodeError:
-        return  # half a character is no message
+        return  # half a character is not a message
     pieces = pieces_of(message, size)
     if len(pieces) == 1:
         return

@@ -33,7 +33,7 @@ def test_total_variation():
 
 def test_a_machine_that_is_two_cells_off():
     exact = np.eye(16)[[0, 4, 8, 12]]  # the first cell of each row
-    ours = np.eye(16)[[2, 6, 10, 12]]  # two columns further, but for the last
+    ours = np.eye(16)[[2, 6, 10, 12]]  # two columns further, except the last
     result = correctness([0, 4, 8, 12], ours, exact, width=4)
     assert result.coverage == 0.25
     assert result.exact_coverage == 1

@@ -305,7 +305,7 @@ async def test_there_must_be_a_run(stage, boat, tmp_path):
     reloading = stage.start("master", "reload", environment=environment)
     assert await reloading.end() == 2
     _, uri = await stage.hub()
-    # boards that are not there are waited for, and the run has not begun
+    # the run waits for missing boards, and has not begun
     options = ("--boards", endpoints_in(tmp_path), "--peer-timeout", "60")
     master = stage.start("master", "--loop", "-d", str(boat), "--uri", uri, *options, environment=environment)
     control = orders / "master.control.sock"

@@ -129,7 +129,7 @@ def test_a_service_switches_to_a_prepared_deployment(folder, loaded):
     refusals = [
         held.switch(Switch(5)),
         held.prepare(Prepare(5, str(folder), loaded.hash)),  # of another hash
-        held.prepare(Prepare(5, str(folder.parent), loaded.hash)),  # not there
+        held.prepare(Prepare(5, str(folder.parent), loaded.hash)),  # does not exist
     ]
     assert [(type(each), each.generation) for each in refusals] == [(NotReloaded, 5)] * 3
     assert {each.exit_code for each in refusals} == {NotPreparedError.exit_code}

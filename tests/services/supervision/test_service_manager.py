@@ -27,7 +27,7 @@ def manager(request, tmp_path, monkeypatch):
         yield receiver
 
 
-def said(receiver):
+def messages_to(receiver):
     """The assignments of the datagrams so far."""
     receiver.setblocking(False)
     found = []
@@ -42,12 +42,12 @@ def test_readiness_is_sent_once_and_a_state_when_it_changes(manager):
     assert {"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"}.isdisjoint(os.environ)  # not for children
     service.report("waiting", ready=False, alive=True)
     service.report("waiting", ready=False, alive=True)
-    assert said(manager) == ["STATUS=waiting", "WATCHDOG=1", "WATCHDOG=1"]
+    assert messages_to(manager) == ["STATUS=waiting", "WATCHDOG=1", "WATCHDOG=1"]
     service.report("results\nREADY=0", ready=True, alive=True)
     service.report("results\nREADY=0", ready=True, alive=False)
-    assert said(manager) == ["READY=1", r"STATUS=results\nREADY=0", "WATCHDOG=1"]
+    assert messages_to(manager) == ["READY=1", r"STATUS=results\nREADY=0", "WATCHDOG=1"]
     service.stopping()
-    assert said(manager) == ["STOPPING=1"]
+    assert messages_to(manager) == ["STOPPING=1"]
 
 
 def test_messages_refused_by_a_full_queue_are_sent_again(manager):
@@ -57,22 +57,22 @@ def test_messages_refused_by_a_full_queue_are_sent_again(manager):
         while True:
             other.sendto(b"FDSTORE=1", manager.getsockname())
     service.report("fine", ready=True, alive=True)
-    assert "READY=1" not in said(manager)
+    assert "READY=1" not in messages_to(manager)
     service.report("fine", ready=True, alive=True)
-    assert said(manager) == ["READY=1", "STATUS=fine", "WATCHDOG=1"]
+    assert messages_to(manager) == ["READY=1", "STATUS=fine", "WATCHDOG=1"]
 
 
 @pytest.mark.parametrize("value", ["\u00b2", "-1", "1e6", "9" * 5000])
 def test_an_odd_interval_of_the_watchdog_is_none(manager, monkeypatch, value):
     monkeypatch.setenv("WATCHDOG_USEC", value)
     ServiceManager().report("fine", ready=True, alive=True)
-    assert said(manager) == ["READY=1", "STATUS=fine"]
+    assert messages_to(manager) == ["READY=1", "STATUS=fine"]
 
 
 def test_a_watchdog_of_another_process_is_not_ours(manager, monkeypatch):
     monkeypatch.setenv("WATCHDOG_PID", str(os.getppid()))
     ServiceManager().report("", ready=False, alive=True)
-    assert said(manager) == []
+    assert messages_to(manager) == []
 
 
 def test_without_a_service_manager_nothing_is_sent(monkeypatch):
@@ -87,12 +87,12 @@ async def test_a_process_reports_and_one_that_is_stuck_gives_no_sign_of_life(man
     alive = [True]
     status = ProcessStatus(ready=True, why="fine")
     async with serve_status(None, "hub", lambda: status, is_alive=lambda: alive[0]):
-        while not (found := said(manager)):
+        while not (found := messages_to(manager)):
             await asyncio.sleep(0.05)
         assert found == ["READY=1", "STATUS=fine", "WATCHDOG=1"]
         alive[0] = False
         await asyncio.sleep(1.5)
-        said(manager)
+        messages_to(manager)
         await asyncio.sleep(1.5)
-        assert said(manager) == []
-    assert said(manager) == ["STOPPING=1"]
+        assert messages_to(manager) == []
+    assert messages_to(manager) == ["STOPPING=1"]

@@ -56,7 +56,7 @@ def test_a_machine_beside_its_model():
             getattr(accuracy.machine.total_variation, name) for name in ("low", "value", "high")
         )
         assert low < value < high
-        # The machine can be no further away than by both losses.
+        # The distance of the machine is at most the sum of both losses.
         assert value <= accuracy.quantising.total_variation.value + accuracy.sampling.total_variation.value
     assert coarse.quantising.total_variation.value > 10 * fine.quantising.total_variation.value
     assert fine.machine.total_variation.value == pytest.approx(fine.sampling.total_variation.value, rel=0.1)

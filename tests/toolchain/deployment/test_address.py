@@ -56,7 +56,7 @@ def test_a_period_comes_before_the_range_check(variable, turns):
             continue
         step = address + turns * variable.period
         value = variable.offset + step * variable.step
-        if math.floor((value - variable.offset) / variable.step + 0.5) == step:  # but for rounding
+        if math.floor((value - variable.offset) / variable.step + 0.5) == step:  # except for rounding
             assert to_address(variable, value) == address
 
 

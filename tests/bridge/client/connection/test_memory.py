@@ -35,7 +35,7 @@ def growth(play: Callable[[int], None], rounds: int) -> int:
     return after - before
 
 
-def said(msg: object, kind: str) -> list[bytes]:
+def encoded_as(msg: object, kind: str) -> list[bytes]:
     operation = {"op": "publish", "topic": "/a", "msg": msg}
     if kind == "cbor":
         return [cbor_codec.encode(operation)]
@@ -51,7 +51,7 @@ async def test_a_reader_that_never_reads(kind):
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         subscription = ros.subscribe("/a", "p/T", compression=compression, queue_size=8)
         values = np.arange(100.0)
-        pieces = said({"data": values if kind == "cbor" else values.tolist()}, kind)
+        pieces = encoded_as({"data": values if kind == "cbor" else values.tolist()}, kind)
         if kind == "broken":
             pieces = [b"{", b"[1]", b"\xff\xfe", b'{"op":"fragment","id":1,"data":"x","num":0,"total":9}']
         take = ros._session._take

@@ -69,7 +69,7 @@ async def test_the_topic_that_ends_the_connection_is_left_out_and_others_go_on(
         await fake.publish("/silent", {"n": 3})
         assert (await silent.next(PATIENCE)).msg == {"n": 3}
         assert fake.connections == connections
-        # a subscription that is there already does not change it, and a new one tries again
+        # an existing subscription does not change it, and a new one tries again
         with pytest.raises(TopicLeftOutError):
             await anext(ros.subscribe("/camera", "p/T"))
 

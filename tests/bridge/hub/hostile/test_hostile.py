@@ -228,7 +228,7 @@ async def test_a_client_that_never_reads_is_closed_and_costs_others_nothing(
         stuck = await RawClient.connect(port, receive_buffer=4096)
         stuck.send_operation(op="subscribe", topic="/big", **wish)
         await until_subscribed(witness, "/big", 2)
-        noise = base64.b85encode(os.urandom(15_000)).decode()  # a picture of it is no smaller
+        noise = base64.b85encode(os.urandom(15_000)).decode()  # its picture is not smaller
         async with asyncio.timeout(PATIENCE):
             while len((await witness.ask("/rosapi/subscribers", topic="/big"))["subscribers"]) == 2:
                 await witness.send(op="publish", topic="/big", msg={"data": noise})

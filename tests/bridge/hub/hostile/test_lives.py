@@ -185,7 +185,7 @@ def _end(hub: Harness, visitors: list[_Visitor]) -> None:
     for visitor in visitors:
         if (
             visitor.peer.client.close_reason
-        ):  # as whoever owns its socket would; goals that it never read fail now
+        ):  # as the owner of its socket would; goals that it never read fail now
             visitor.peer.disconnect()
     for _ in range(2):
         for visitor in visitors:
