@@ -1,4 +1,4 @@
-"""Pytest plugin for `coverage run`: attributes lines to tests, and writes the duration of each test."""
+"""Pytest plugin for `coverage run`: attributes lines to tests, and writes the duration of each test that passes."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ import pytest
 DURATIONS = "ROSBAYES_DURATIONS"
 """Environment variable with the file for the durations."""
 _seconds: dict[str, float] = {}
+_failed: list[str] = []
 
 
 @pytest.hookimpl(wrapper=True)
@@ -28,6 +29,14 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
         _seconds[item.nodeid] = time.perf_counter() - began
 
 
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Note a test that fails."""
+    if report.failed:
+        _failed.append(report.nodeid)
+
+
 def pytest_sessionfinish() -> None:
     """Write the durations."""
-    Path(os.environ[DURATIONS]).write_text(json.dumps(_seconds), encoding="utf-8")
+    for name in _failed:
+        _seconds.pop(name, None)
+    Path(os.environ[DURATIONS]).write_text(json.dumps([_seconds, _failed]), encoding="utf-8")
