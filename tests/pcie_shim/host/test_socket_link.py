@@ -1,0 +1,167 @@
+"""The link over a socket, towards a board whose bytes the test writes.
+
+SocketLink ──AF_UNIX── board (a socket in this process, which has greeted)
+"""
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pcie_shim import framing
+from pcie_shim import register_map as rm
+from pcie_shim.endpoint import parse_endpoint
+from pcie_shim.errors import (
+    AccessError,
+    DeviceGoneError,
+    LinkClosedError,
+    LinkTimeoutError,
+    SequenceError,
+    ShortReadError,
+)
+from pcie_shim.host.socket_link import SocketLink
+from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK
+from pcie_shim.register_map import ErrorCode
+
+GREETING = framing.encode_greeting(
+    framing.Greeting(
+        protocol_version=framing.PROTOCOL_VERSION,
+        bar_size=rm.BAR_SIZE,
+        board=0,
+        map_hash=rm.MAP_SHA256,
+        image_hash="00" * 32,
+        token=bytes(8),
+    )
+)
+PATIENCE = 60.0
+
+
+@contextlib.contextmanager
+def linked(
+    folder: Path,
+    *,
+    greets_after: float = 0.0,
+    timeout: float = PATIENCE,
+    connect_timeout: float | None = None,
+) -> Iterator[tuple[SocketLink, socket.socket]]:
+    """An open link, and the board's end of it."""
+    place = folder / "board.sock"
+    with socket.socket(socket.AF_UNIX) as listener, contextlib.ExitStack() as ends:
+        listener.bind(str(place))
+        listener.listen()
+        accepted: list[socket.socket] = []
+
+        def greet() -> None:
+            connection, _ = listener.accept()
+            accepted.append(ends.enter_context(connection))
+            time.sleep(greets_after)
+            with contextlib.suppress(OSError):  # a host that does not wait has gone
+                connection.sendall(GREETING)
+
+        thread = threading.Thread(target=greet)
+        thread.start()
+        try:
+            endpoint = parse_endpoint(f"unix:{place}")
+            link = ends.enter_context(
+                SocketLink.open(endpoint, timeout=timeout, connect_timeout=connect_timeout)
+            )
+        finally:
+            thread.join()
+        yield link, accepted[0]
+
+
+def interrupt(sequence: int, words: bytes) -> bytes:
+    return framing.encode(framing.IRQ, 0, sequence, rm.DONE, len(words) // 4, words)
+
+
+def refusal(code: ErrorCode) -> bytes:
+    return framing.encode_error(1, rm.START, code, "no")
+
+
+def test_a_board_may_take_longer_to_greet_than_to_answer(folder: Path) -> None:
+    with linked(folder, greets_after=0.5, timeout=0.05, connect_timeout=PATIENCE) as (link, _):
+        began = time.monotonic()
+        with pytest.raises(LinkTimeoutError):
+            link.read32(rm.ID)
+        assert time.monotonic() - began < PATIENCE / 2
+        assert not link.is_open
+
+
+def test_a_board_that_does_not_greet_is_not_waited_for_as_for_an_answer(folder: Path) -> None:
+    with pytest.raises(LinkTimeoutError), linked(folder, greets_after=1.0, connect_timeout=0.1):
+        pass
+
+
+@pytest.mark.parametrize("words", range(DONE_BLOCK.size // 4))
+def test_an_interrupt_without_all_its_registers_closes_the_link(folder: Path, words: int) -> None:
+    with linked(folder) as (link, board):
+        board.sendall(interrupt(1, bytes(4 * words)))
+        with pytest.raises(ShortReadError):
+            link.receive_done()
+        with pytest.raises(LinkClosedError):
+            link.take_done()
+
+
+def test_an_interrupt_without_results_is_taken(folder: Path) -> None:
+    with linked(folder) as (link, board):
+        for sequence in (1, 2):
+            board.sendall(interrupt(sequence, DONE_BLOCK.pack(7, 5, 2**40 + 1, 2**33)))
+            done = link.receive_done()
+            assert done is not None
+            assert (done.number, done.status, done.cycles) == (7, 5, 2**40 + 1)
+            assert (done.compute_ns, bytes(done.results)) == (2**33, b"")
+            assert link.take_done() is None
+
+
+@pytest.mark.parametrize(
+    ("number", "status", "gone"), [(ALL_ONES, ALL_ONES, True), (ALL_ONES, 5, False), (7, ALL_ONES, False)]
+)
+def test_only_an_interrupt_of_all_ones_is_from_no_device(
+    folder: Path, number: int, status: int, gone: bool
+) -> None:
+    with linked(folder) as (link, board):
+        board.sendall(interrupt(1, DONE_BLOCK.pack(number, status, 0, 0)))
+        with pytest.raises(DeviceGoneError) if gone else contextlib.nullcontext():
+            assert link.receive_done() is not None
+        assert link.is_open is not gone
+
+
+def test_an_interrupt_comes_in_order(folder: Path) -> None:
+    with linked(folder) as (link, board):
+        board.sendall(interrupt(2, DONE_BLOCK.pack(1, 5, 0, 0)))
+        with pytest.raises(SequenceError):
+            link.receive_done()
+
+
+@pytest.mark.parametrize("code", [ErrorCode.BUSY, ErrorCode.STALE])
+def test_the_reason_that_a_board_sent_before_it_closed_is_reported(folder: Path, code: ErrorCode) -> None:
+    with linked(folder) as (link, board):
+        board.sendall(interrupt(1, DONE_BLOCK.pack(1, 5, 0, 0)) + refusal(code))
+        board.close()
+        with pytest.raises(AccessError) as caught:
+            link.write32(rm.START, 1)
+        assert caught.value.code == code
+        assert not link.is_open
+
+
+def test_a_board_that_closes_without_a_reason_is_gone(folder: Path) -> None:
+    with linked(folder) as (link, board):
+        board.sendall(interrupt(1, DONE_BLOCK.pack(1, 5, 0, 0)))
+        board.close()
+        with pytest.raises(LinkClosedError):
+            link.write32(rm.START, 1)
+        assert not link.is_open
+
+
+@pytest.mark.parametrize(("address", "gone"), [(rm.ID, True), (rm.LIVENESS, False)])
+def test_an_id_of_all_ones_is_no_device(folder: Path, address: int, gone: bool) -> None:
+    with linked(folder) as (link, board):
+        answer = framing.encode(framing.READ, framing.REPLY, 1, address, 1, b"\xff" * 4)
+        board.sendall(answer)
+        with pytest.raises(DeviceGoneError) if gone else contextlib.nullcontext():
+            assert link.read32(address) == ALL_ONES
+        assert link.is_open is not gone
