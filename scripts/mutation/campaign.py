@@ -410,11 +410,13 @@ class Campaign:
         began = time.monotonic()
         limits = {name: LEAST_LIMIT + FACTOR * seconds.get(name, 0.0) for name in quick_first}
         outcome: Outcome = SURVIVED
-        for part in (quick_first[:QUICK], quick_first[QUICK:]):
-            if part and outcome == SURVIVED:
-                outcome = tree.outcome(own, module, mutant.source, {name: limits[name] for name in part})
+        quickest, slower = quick_first[:QUICK], quick_first[QUICK:]
+        if quickest:
+            outcome = tree.outcome(own, module, mutant.source, {name: limits[name] for name in quickest})
         if outcome == SURVIVED and not tree.type_checks_with(module, mutant.source):
             outcome = FOUND
+        if outcome == SURVIVED and slower:
+            outcome = tree.outcome(own, module, mutant.source, {name: limits[name] for name in slower})
         if outcome == SURVIVED and others and not self._options.quick:
             outcome = SURVIVED if tree.passes_with(module, mutant.source, others) else FOUND
         result = Result(
