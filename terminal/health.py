@@ -20,7 +20,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     import asyncio
@@ -163,15 +163,21 @@ async def serve_health(
     """
     import asyncio
 
-    def connected(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        writer.write(answer())
-        writer.close()
+    class Answering(asyncio.Protocol):
+        """One connection. The protocol of asyncio's streams would keep the error of a client that has gone."""
+
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            writing = cast("asyncio.Transport", transport)
+            try:
+                writing.write(answer())
+            finally:
+                writing.close()
 
     with _listening(directory, name) as listener:
         if listener is None:
             yield
             return
-        server = await asyncio.start_unix_server(connected, sock=listener)
+        server = await asyncio.get_running_loop().create_unix_server(Answering, sock=listener)
         try:
             yield
         finally:

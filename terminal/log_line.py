@@ -21,7 +21,7 @@ FORMAT_VARIABLE: Final = "BM_LOG_FORMAT"
 
 _ERROR: Final = "error: "
 _WARNING: Final = re.compile(r"(?:[\w-]+: )?warning: ")
-_FORMATTED: Final = re.compile(r'\{"time": "\d|\d{4}-\d\d-\d\dT[\d:.]+[+-]\d\d:\d\d ')
+_DATED: Final = re.compile(r"\d{4}-\d\d-\d\dT[\d:.]+[+-]\d\d:\d\d ")
 _IS_CHILD: Final = PARENT_VARIABLE in os.environ
 
 
@@ -74,17 +74,27 @@ def json_line(level: str, message: str, *, process: str = "", **fields: object) 
     return json.dumps(line | fields, default=str)
 
 
+def dated_lines(text: str) -> str:
+    """Return the lines of a text, each with date and time if that is the format in force.
+
+    Lines after the first are indented then, so that untrusted text in a traceback cannot imitate a record.
+    """
+    text = lines_of(text)
+    if log_format() is not LogFormat.DATED:
+        return text
+    time = now()
+    return f"{time} " + text.replace("\n", f"\n{time}     ")
+
+
 def formatted(text: str) -> str:
     """Return a text for the user in the format in force.
 
     The `error: ` of a child remains text, because its parent reports it.
     """
-    form = log_format()
-    if form is LogFormat.TEXT or (_IS_CHILD and text.startswith(_ERROR)):
+    if _IS_CHILD and text.startswith(_ERROR):
         return lines_of(text)
-    if form is LogFormat.DATED:
-        time = now()
-        return lines_of("\n".join(f"{time} {line}" for line in text.split("\n")))
+    if log_format() is not LogFormat.JSON:
+        return dated_lines(text)
     if text.startswith(_ERROR):
         return json_line("error", text.removeprefix(_ERROR))
     if found := _WARNING.match(text):
@@ -95,13 +105,24 @@ def formatted(text: str) -> str:
 def relayed(line: str, process: str) -> str:
     """Return a line of a child in the format in force; most have it already."""
     form = log_format()
-    if form is LogFormat.TEXT or _FORMATTED.match(line):
+    if form is LogFormat.TEXT or _is_record(line, form):
         return one_line(line)
     return (
         one_line(f"{now()} {process}: {line}")
         if form is LogFormat.DATED
         else json_line("info", line, process=process)
     )
+
+
+def _is_record(line: str, form: LogFormat) -> bool:
+    """Return whether a line has a format already: that of a child of the same version."""
+    if form is LogFormat.DATED:
+        return _DATED.match(line) is not None
+    try:
+        record = json.loads(line)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(record, dict) and {"time", "level", "process", "message"} <= record.keys()
 
 
 def logged(level: str, process: str, sentence: str, fields: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 import structlog
 from structlog.typing import FilteringBoundLogger
 
-from terminal.log_line import LogFormat, json_line, log_format, logged, now
+from terminal.log_line import LogFormat, dated_lines, json_line, log_format, logged
 from terminal.one_line import lines_of, one_line
 from terminal.output import write_line
 
@@ -28,8 +28,7 @@ class _OneLine(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         if log_format() is not LogFormat.JSON:
-            text = super().format(record)
-            return f"{now()} {text}" if log_format() is LogFormat.DATED else text
+            return dated_lines(super().format(record))
         fields = {"logger": record.name}
         if record.exc_info:
             fields["traceback"] = super().formatException(record.exc_info)

@@ -580,8 +580,9 @@ def _in_threads(handler: Callable[[A], R], most: int, busy: BridgeError) -> Call
 
 
 def _on_own_thread(callback: StateCallback) -> StateCallback:
-    """Return a function that queues the calls of another one, which a daemon thread makes in order."""
+    """Return a function that queues the calls of another one, which a daemon thread makes in order until `CLOSED`."""
     waiting: SimpleQueue[tuple[State, str]] = SimpleQueue()
+    started = False
 
     def work() -> None:
         state = None
@@ -592,8 +593,14 @@ def _on_own_thread(callback: StateCallback) -> StateCallback:
             except Exception:
                 _log.exception("on_state failed")
 
-    threading.Thread(target=work, name="on_state", daemon=True).start()
-    return lambda state, reason: waiting.put((state, reason))
+    def put(state: State, reason: str) -> None:
+        nonlocal started
+        waiting.put((state, reason))
+        if not started:
+            started = True
+            threading.Thread(target=work, name="on_state", daemon=True).start()
+
+    return put
 
 
 def _connecting(create: Callable[P, Ros]) -> Callable[P, BlockingRos]:

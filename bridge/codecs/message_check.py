@@ -26,6 +26,8 @@ SAMPLE: Final = 16
 """After `CLOSELY` messages, the whole structure of one message in this many is compared."""
 _MAX_TYPES: Final = 1000
 _MAX_FIELDS: Final = 1000
+_MAX_LENGTH: Final = (1 << 32) - 1
+"""Maximum length of an array in ROS."""
 _BYTES: Final = frozenset({"uint8", "int8", "octet", "byte", "char"})
 _PRIMITIVES: Final = _BYTES | {
     *("bool", "boolean", "int16", "uint16", "int32", "uint32", "int64", "uint64"),
@@ -65,7 +67,7 @@ def definitions_from_rosapi(answer: Any) -> Definitions:
                 "fieldarraylen": [*lengths],
             } if len(names) == len(types) == len(lengths) <= _MAX_FIELDS:
                 if all(isinstance(text, str) for text in (*names, *types)) and all(
-                    type(length) is int for length in lengths
+                    type(length) is int and SCALAR <= length <= _MAX_LENGTH for length in lengths
                 ):
                     # ROS 2's rosapi gives the slots of Python's classes: `_x` of the field `x`
                     # (rosapi/objectutils.py, `_handle_array_information`)

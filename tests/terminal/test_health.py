@@ -5,6 +5,7 @@ is_ready, read_status ──▶ NAME.status.sock ◀── serve_health (in a lo
 
 import asyncio
 import contextlib
+import gc
 import json
 import socket
 import stat
@@ -14,6 +15,7 @@ import threading
 from pathlib import Path
 
 import pytest
+import uvloop
 
 from services import ready
 from terminal.health import (
@@ -84,6 +86,34 @@ def test_every_connection_gets_one_object(server, tmp_path):
         assert json.loads(read_status(path, PATIENCE)) == status()
         assert stat.S_IMODE(Path(path).stat().st_mode) == 0o600
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("new_loop", [asyncio.new_event_loop, uvloop.new_event_loop])
+def test_a_client_that_goes_away_leaves_no_error_behind(tmp_path, new_loop):
+    path = status_socket(tmp_path, "board0")
+
+    async def serve(size):
+        async with serve_health(tmp_path, "board0", lambda: b"x" * size):
+            for turns in range(8):
+                with socket.socket(socket.AF_UNIX) as leaving:
+                    leaving.setblocking(False)
+                    leaving.connect(path)
+                    for _ in range(turns):
+                        await asyncio.sleep(0)
+            assert len(await asyncio.to_thread(read_status, path, PATIENCE)) == size
+            await asyncio.sleep(0)
+
+    gc.collect()
+    gc.disable()
+    try:
+        with asyncio.Runner(loop_factory=new_loop) as runner:
+            for size in (10, ANSWER_LIMIT):
+                runner.run(serve(size))
+        ended = [each for each in gc.get_objects() if isinstance(each, asyncio.Future) and each.done()]
+        failed = [each for each in ended if not each.cancelled() and each.exception() is not None]
+    finally:
+        gc.enable()
+    assert not failed  # the collector would report them
 
 
 def test_a_second_process_of_a_name_warns_and_leaves_it_to_the_first(server, tmp_path, capsys):

@@ -25,19 +25,22 @@ say("hub: warning: it is late")
 say("error: no robot")
 say_lines("Traceback\\n  line")
 relay("a library complains", "pcie-app")
-relay('{"time": "2026-01-01T00:00:00", "message": "of a child"}', "pcie-app")
+relay('{"time": "2026-01-01T00:00:00", "level": "info", "process": "x", "message": "of a child"}', "pcie-app")
 relay("2026-01-01T00:00:00.000000+00:00 of a child", "pcie-app")
 logging.getLogger("websockets").error("odd %s", "\\x1b")
 """
 
 
-def lines(form, **more):
+STAMP = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}[+-]\d\d:\d\d "
+
+
+def lines(form, code=CODE, **more):
     environment = {
         key: value for key, value in os.environ.items() if key not in {"BM_LOG_FORMAT", "ROSBAYES_PARENT"}
     }
     environment |= {"BM_LOG_FORMAT": form} | more
     done = subprocess.run(
-        [sys.executable, "-c", CODE], capture_output=True, text=True, timeout=240, check=True, env=environment
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=240, check=True, env=environment
     )
     return done.stderr.splitlines()
 
@@ -59,11 +62,35 @@ def test_text_is_as_ever():
 def test_dated_lines_begin_with_date_time_and_offset():
     found = lines("dated")
     assert len(found) == 10
-    undated = [
-        line for line in found if not re.match(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}[+-]\d\d:\d\d ", line)
-    ]
-    assert undated == ['{"time": "2026-01-01T00:00:00", "message": "of a child"}']
+    assert all(re.match(STAMP, line) for line in found)
+    assert found[5].endswith(":00       line")
     assert sum("of a child" in line for line in found) == 2
+
+
+IMITATING = """
+import logging
+from terminal.logs import get_logger
+from terminal.output import relay
+get_logger("master", "debug")
+line = '2026-01-01T00:00:00.000000+00:00 master: fine'
+record = '{"time": "2026-01-01T00:00:00", "level": "info", "process": "master", "message": "fine"}'
+try:
+    raise ValueError(f"odd\\n{line}\\n{record}\\nmaster: fine")
+except ValueError:
+    logging.getLogger("websockets").exception("failed", stack_info=True)
+relay('{"time": "2026-01-01T00:00:00 and so on', "pcie-app")
+"""
+
+
+def test_a_traceback_of_a_library_imitates_no_line():
+    dated = lines("dated", code=IMITATING)
+    assert all(re.match(STAMP, line) for line in dated)
+    records = [line for line in dated if re.match(STAMP + r"\S", line)]
+    assert [line.split(" ")[1] for line in records] == ["websockets:", "pcie-app:"]
+    assert len(dated) > 6
+    found = [json.loads(line) for line in lines("json", code=IMITATING)]
+    assert [each["process"] for each in found] == ["-c", "pcie-app"]
+    assert "fine" in found[0]["traceback"]
 
 
 def test_json_is_one_object_per_line():
@@ -75,9 +102,9 @@ def test_json_is_one_object_per_line():
         ("error", "no robot"),
         ("info", "Traceback\n  line"),
         ("info", "a library complains"),
-        (None, "of a child"),
+        ("info", "of a child"),
     ]
-    assert [each.get("process") for each in found] == ["master", *["board3"] * 4, "pcie-app", None]
+    assert [each.get("process") for each in found] == ["master", *["board3"] * 4, "pcie-app", "x"]
     assert (found[0]["frame"], found[0]["cycles"], found[0]["reason"]) == (17, 3, "failed")
     assert re.match(r"\d{4}-\d\d-\d\dT", found[0]["time"])
     last = json.loads(lines("json")[-1])

@@ -19,8 +19,10 @@ from bridge.errors import (
     GoalError,
     MessageTypeError,
     NoMessageError,
+    OptionError,
     ServiceError,
     UnreachableError,
+    UriError,
 )
 from tests.bridge.hub.sockets import running_hub
 from tests.fake_rosbridge import FakeRosbridge
@@ -155,6 +157,17 @@ async def test_closing_ends_a_wait_of_another_thread():
         assert time.monotonic() - begun < PATIENCE / 3
 
     await against_a_hub(program)
+
+
+@pytest.mark.parametrize(
+    ("uri", "options", "error"),
+    [("ws://127.0.0.1:1", {"ping_interval": -1}, OptionError), ("http://127.0.0.1", {}, UriError)],
+)
+def test_refused_options_leave_no_thread_behind(uri, options, error):
+    before = set(threading.enumerate())
+    with pytest.raises(error):
+        connect(uri, on_state=lambda _state, _reason: None, **options)
+    assert set(threading.enumerate()) == before
 
 
 async def test_on_state_runs_on_a_thread_of_its_own_and_may_close():

@@ -136,6 +136,9 @@ def test_a_type_that_is_not_a_standard_one_is_not_bundled():
         {"typedefs": [{"type": "a/B", "fieldnames": ["x"], "fieldtypes": [], "fieldarraylen": []}]},
         {"typedefs": [{"type": "a/B", "fieldnames": ["x"], "fieldtypes": [1], "fieldarraylen": [0]}]},
         {"typedefs": [{"type": "a/B", "fieldnames": ["x"], "fieldtypes": ["f"], "fieldarraylen": ["0"]}]},
+        {"typedefs": [{"type": "a/B", "fieldnames": ["x"], "fieldtypes": ["f"], "fieldarraylen": [-2]}]},
+        {"typedefs": [{"type": "a/B", "fieldnames": ["x"], "fieldtypes": ["f"], "fieldarraylen": [2**32]}]},
+        {"typedefs": [{"type": "a/B", "fieldnames": ["x"], "fieldtypes": ["f"], "fieldarraylen": [True]}]},
     ],
 )
 def test_an_answer_that_is_not_a_definition(answer):
