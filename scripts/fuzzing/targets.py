@@ -24,6 +24,7 @@ from bridge.client.protocol.events import (
     CallAnswered,
     GoalEnded,
     GoalFeedback,
+    MessageDiscarded,
     MessageReceived,
     ServiceRequested,
     StatusReceived,
@@ -51,6 +52,7 @@ DELIVERIES = (
     Delivery(compression="cbor-raw"),
     Delivery(compression="png", fragment_size=7),
     Delivery(arrays="numpy", qos=Qos(depth=1)),
+    Delivery(max_bytes=40),
 )
 OPS = (
     "publish",
@@ -124,6 +126,7 @@ PARTS = (
 )
 EVENTS = (
     MessageReceived,
+    MessageDiscarded,
     CallAnswered,
     ServiceRequested,
     StatusReceived,
@@ -410,6 +413,10 @@ class Play:
             assert event.subscriptions
             assert set(event.subscriptions) <= self.subscriptions
             assert type(event.msg) is dict
+        elif type(event) is MessageDiscarded:
+            assert event.size > event.limit
+            assert event.subscriptions
+            assert set(event.subscriptions) <= self.subscriptions
         elif type(event) is ServiceRequested:
             self.tickets.append(event.ticket)
         elif type(event) is Unusable:

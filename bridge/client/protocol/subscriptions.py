@@ -3,6 +3,7 @@
 Some servers deliver a first message twice, or not at all, to a client that subscribes twice.
 """
 
+import sys
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
@@ -92,8 +93,8 @@ class _Known(NamedTuple):
     subscribed: _Subscribed
 
 
-_UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, Delivery(), "", 0))
-"""Placeholder before the first envelope is known, with which no message begins."""
+_UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, Delivery(), "", sys.maxsize))
+"""Placeholder before the first envelope is known, with which no valid message begins."""
 
 
 class Subscriptions:

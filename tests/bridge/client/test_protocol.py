@@ -333,6 +333,15 @@ def test_what_is_unusable_says_so(data):
     assert 10 < len(event.reason) < 300
 
 
+def test_nonsense_after_the_known_envelopes_were_forgotten():
+    core = connected()
+    core.subscriptions.subscribe("/a")
+    core.receive(b'{"op":"publish","topic":"/a","msg":{}}', 0.0)
+    assert core.subscriptions.envelopes
+    for nonsense in (b"\xff", b"\xff" * 20 + b"}"):
+        assert isinstance(core.receive(nonsense, 0.0), Unusable)
+
+
 def test_a_known_envelope_around_nonsense():
     core = connected()
     number = core.subscriptions.subscribe("/a")
