@@ -414,7 +414,9 @@ class Session:
     @property
     def is_open(self) -> bool:
         """True while there is a connection that accepts messages."""
-        return self._websocket is not None and self._websocket.is_open
+        websocket = self._websocket
+        # one that is about to end discards messages silently
+        return websocket is not None and websocket.is_open and not websocket.is_closing
 
     def check_thread(self) -> None:
         """Raise an error if this is another thread than that of the event loop, whose data is not locked."""
@@ -431,7 +433,7 @@ class Session:
 
     def _connected(self) -> WebSocket:
         websocket = self._websocket
-        if websocket is None or not websocket.is_open:
+        if websocket is None or not websocket.is_open or websocket.is_closing:
             why = {State.CLOSED: "this client was closed", State.CONNECTING: "`async with` opens it"}
             lost = self.last_error or "the server is closing it"
             raise DisconnectedError(f"{self.uri} is not connected: {why.get(self.state, lost)}")
@@ -472,7 +474,7 @@ class Session:
         """Send the output of the core without waiting: it is small and rare, unless a server floods the client."""
         for message in self.core.data_to_send():
             websocket = self._websocket
-            if websocket is not None and websocket.is_open:
+            if websocket is not None and self.is_open:
                 self.send_now(message)
                 websocket.count_unread(len(message))
 

@@ -18,7 +18,7 @@ from scripts.campaigning.injection import Injector, steppable_clock
 from scripts.campaigning.judging.accounts import Counters, Excuses, in_transit, judge
 from scripts.campaigning.judging.expected import Addresses, Outcome, UnusableError, addresses_of
 from scripts.campaigning.judging.measures import Recovery, RoundResult, slowness
-from scripts.campaigning.judging.observer import OLDEST, Finding, Flaw, Observer
+from scripts.campaigning.judging.observer import OLDEST, Finding, Flaw, Observer, Reading
 from scripts.campaigning.stack import NotThereError, Stack, Topology
 from scripts.campaigning.wire import REPORTS, Client, now
 
@@ -77,6 +77,7 @@ class Round:
         self._paused = False
         self._driving = True
         self._last: Addresses = ()
+        self._overdue: tuple[list[Reading], int] = [], 0
 
     # --- readings and results ------------------------------------------------------------------
 
@@ -243,6 +244,9 @@ class Round:
     async def _settle(self, excuses: Excuses) -> None:
         """Stop publishing until nothing is in flight, and compare the counters with the published readings."""
         self._paused = True
+        overdue, uncounted = self._overdue
+        strict = Excuses(overdue=overdue, uncounted=uncounted)
+        excuses = replace(excuses, overdue=overdue, uncounted=uncounted)
         try:
             deadline, changed = now() + _SETTLE_LIMIT + _QUIET, now()
             last: object = None
@@ -255,7 +259,7 @@ class Round:
                     added = counters.since(self._base)
                     readings = self.observer.pending_readings()
                     findings = judge(added, readings, excuses, now())
-                    if not judge(added, readings, Excuses(), now()):
+                    if not judge(added, readings, strict, now()):
                         break
                     if (not findings and now() - changed > _QUIET) or now() > deadline:
                         break
@@ -265,6 +269,7 @@ class Round:
             self.observer.findings += findings
             cut = in_transit(added, readings)
             self._result.transit = self._result.transit[0] + cut[0], self._result.transit[1] + cut[1]
+            self._overdue = [each for each in readings if each.forwarded and each.arrived is None], cut[0]
             self.observer.settle()
             self._base = counters
             for reason, number in added.lost.items():

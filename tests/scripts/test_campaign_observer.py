@@ -13,7 +13,9 @@ from scripts.campaigning.judging.expected import (
     UnusableError,
     addresses_of,
 )
-from scripts.campaigning.judging.observer import OLDEST, Flaw, Observer
+from scripts.campaigning.judging.observer import OLDEST, Flaw, Observer, Reading
+from scripts.campaigning.round import Round
+from scripts.campaigning.stack import Topology
 
 NAMES = ("campaign1", "campaign2")
 
@@ -378,6 +380,53 @@ def test_a_reading_that_comes_after_the_counters_were_read_is_counted_next_time(
     assert judge(Counters(1, 0, {"passed over": 1}), observer.pending_readings(), Excuses(), 1.0) == []
     observer.settle()
     assert not observer.pending_readings()
+
+
+@pytest.mark.parametrize(
+    ("added", "arrives", "flaws"),
+    [
+        (Counters(7, 8), True, set()),
+        (Counters(7, 7, {"passed over": 1}), False, set()),
+        (Counters(7, 7), False, set()),
+        (Counters(7, 8), False, {Flaw.UNCOUNTED}),
+        (Counters(7, 9), True, {Flaw.MISCOUNTED, Flaw.UNCOUNTED}),
+        (Counters(7, 7, {"passed over": 2}), False, {Flaw.MISCOUNTED}),
+    ],
+)
+def test_a_reading_that_was_excused_too_early_is_counted_in_the_next_step(added, arrives, flaws):
+    late = Reading(0, (0, 0), 0.0, forwarded=True, settled=True)
+    others = [Reading(at, (0, 0), 0.0, forwarded=True, arrived=1.0) for at in range(1, 8)]
+    if arrives:
+        late.arrived = 1.0
+    found = judge(added, others, Excuses(overdue=[late], uncounted=1), 1.0)
+    assert {each.flaw for each in found} == flaws
+
+
+async def test_a_round_carries_a_late_reading_over_to_its_next_step(tmp_path):
+    played = Round(tmp_path, Topology.OWN, [tmp_path / NAMES[0]], outcome, 1, calm_frames=1)
+    observer, counted = played.observer, Counters(1, 0)
+
+    async def counters():
+        return counted
+
+    def arrive(index, number):
+        observer.report(report(index, number), 1.0)
+        observer.result(result(index, number), 1.0)
+
+    def publish(index):
+        observer.published(stamp(index), (index, index), 0.5)
+        observer.forwarded(stamp(index))
+
+    played.stack.counters = counters
+    publish(0)
+    await played._settle(Excuses(readings=True, until=1.0))
+    assert observer.findings == []
+    arrive(0, 1)  # the machine was busy, not the stack wrong
+    publish(1)
+    arrive(1, 2)
+    counted = Counters(2, 2)
+    await played._settle(Excuses())
+    assert observer.findings == []
 
 
 def test_results_of_a_killed_publisher_may_arrive():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from scripts.campaigning.judging.observer import Finding, Flaw, Reading
@@ -47,6 +47,9 @@ class Excuses:
         most: Maximum number of each; higher only if a process or connection was held before.
         since: Beginning of the fault (seconds); readings from shortly before it on are excused.
         until: Time at which the stack had recovered.
+        overdue: Readings without a result when the step before was judged.
+        uncounted: How many of them no counter included then. They are only late if the machine was busy: then they are
+            counted now.
     """
 
     readings: bool = False
@@ -54,6 +57,8 @@ class Excuses:
     most: int = MOST_IN_TRANSIT
     since: float = 0.0
     until: float = 0.0
+    overdue: Sequence[Reading] = ()
+    uncounted: int = 0
 
 
 IN_FLIGHT = 1.0
@@ -83,10 +88,11 @@ def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses, now: f
     uncounted = len(given) - added.completed - added.losses
     if uncounted > (most if excuses.readings else 0):
         findings.append(Finding(Flaw.UNCOUNTED, f"{uncounted} readings: {figures}", now))
-    if uncounted < 0:
+    if -uncounted > excuses.uncounted:
         findings.append(Finding(Flaw.MISCOUNTED, f"{-uncounted} too many: {figures}", now))
     astray = added.completed - arrived
-    if astray > (most if excuses.results else 0):
+    late = min(excuses.uncounted, sum(each.arrived is not None for each in excuses.overdue))
+    if astray > late + (most if excuses.results else 0):
         findings.append(Finding(Flaw.UNCOUNTED, f"{astray} results are counted as published: {figures}", now))
     if -astray > doubtful:
         findings.append(Finding(Flaw.MISCOUNTED, f"{-astray} results that were not counted: {figures}", now))

@@ -152,6 +152,16 @@ async def test_results_go_on_where_a_server_is(boat):
         assert (await topics.publish(result(boat, 6), look=False)).outcome == Outcome.ROSBRIDGE_AWAY
 
 
+async def test_a_result_for_a_connection_that_is_about_to_end_is_not_published(boat):
+    async with FakeRosbridge() as fake, topics_of(boat, fake, fake) as topics:
+        await topics.rosbridges[fake.uri].wait_for_state(State.CONNECTED, 30)
+        assert topics.publish_now(result(boat, 1)).outcome is Outcome.PUBLISHED
+        topics.rosbridges[fake.uri]._session._websocket.abort()
+        assert topics.must_wait
+        assert topics.publish_now(result(boat, 2)).outcome is Outcome.ROSBRIDGE_AWAY
+        assert (await topics.publish(result(boat, 3), look=False)).outcome is Outcome.ROSBRIDGE_AWAY
+
+
 async def test_a_server_that_takes_nothing_keeps_nobody_else_from_results(boat, monkeypatch):
     async with FakeRosbridge() as first, FakeRosbridge() as second, topics_of(boat, first, second) as topics:
         monkeypatch.setattr("bridge.client.handles.Publication.ready.__defaults__", (0.2,))

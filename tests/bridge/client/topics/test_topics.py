@@ -80,6 +80,15 @@ async def test_messages_of_one_moment_leave_in_one_piece(fake, ros):
         await one.publish({"n": 5})
 
 
+async def test_a_connection_that_is_about_to_end_takes_no_message(fake, ros):
+    publication = await ros.advertise("/a", "p/T")
+    ros._session._websocket.abort()  # what the watchdog does; the end is reported in a later turn of the loop
+    assert publication.must_wait
+    with pytest.raises(DisconnectedError):
+        publication.publish_nowait({"n": 1})
+    ros.subscribe("/b", "p/T")
+
+
 async def test_a_message_that_need_not_wait_does_not(fake, ros):
     publication, closed = await ros.advertise("/a", "p/T"), await ros.advertise("/a", "p/T")
     await publication.ready()
