@@ -68,6 +68,11 @@ class CanaryWalk:
         """Number of canaries of one turn, which selects every address once."""
         return len(self._steps)
 
+    @property
+    def shape(self) -> tuple[int, tuple[tuple[int, int], ...]]:
+        """Turns and addresses; walks of the same shape have the same positions."""
+        return self.turns, tuple(self._steps)
+
     def prepare(self) -> None:
         """Make the kernels in advance."""
         if not self._kernels:
@@ -104,19 +109,20 @@ class CanaryWalk:
             bank=bank,
         )
 
-    def differing_board(self, number: int, results: Sequence[BoardResult]) -> int | None:
-        """Return the first board whose result is not that of canary `number`; None if all are right."""
+    def differing_boards(self, number: int, results: Sequence[BoardResult]) -> list[int]:
+        """Return the boards whose result is not that of canary `number`."""
         known = self._known.get(number)
         if known is None:
             known = self._known[number] = self._computed(number)
             if len(self._known) == len(self):
                 self._kernels = []  # they are not needed any more
+        differing = []
         for board, (result, expected) in enumerate(zip(results, known, strict=True)):
             cycles = result.replica_cycles or (result.cycles,)
             reasons = result.replica_reasons or (result.reason,)
             if _digest(result.words, cycles, reasons) != expected:
-                return board
-        return None
+                differing.append(board)
+        return differing
 
     def _computed(self, number: int) -> tuple[bytes, ...]:
         """Compute a canary on the host; return a digest for each board."""

@@ -15,10 +15,10 @@ from typing import Any
 from scripts.campaigning.containers import ContainerStack, EngineError
 from scripts.campaigning.faults import Kind, Step, excuses_of
 from scripts.campaigning.injection import Injector, steppable_clock
-from scripts.campaigning.judging.accounts import Counters, Excuses, in_transit, judge
+from scripts.campaigning.judging.accounts import Counters, Excuses, Overdue, in_transit, judge
 from scripts.campaigning.judging.expected import Addresses, Outcome, UnusableError, addresses_of
 from scripts.campaigning.judging.measures import Recovery, RoundResult, slowness
-from scripts.campaigning.judging.observer import OLDEST, Finding, Flaw, Observer, Reading
+from scripts.campaigning.judging.observer import OLDEST, Finding, Flaw, Observer
 from scripts.campaigning.stack import NotThereError, Stack, Topology
 from scripts.campaigning.wire import REPORTS, Client, now
 
@@ -77,7 +77,7 @@ class Round:
         self._paused = False
         self._driving = True
         self._last: Addresses = ()
-        self._overdue: tuple[list[Reading], int] = [], 0
+        self._overdue = Overdue()
 
     # --- readings and results ------------------------------------------------------------------
 
@@ -244,9 +244,8 @@ class Round:
     async def _settle(self, excuses: Excuses) -> None:
         """Stop publishing until nothing is in flight, and compare the counters with the published readings."""
         self._paused = True
-        overdue, uncounted = self._overdue
-        strict = Excuses(overdue=overdue, uncounted=uncounted)
-        excuses = replace(excuses, overdue=overdue, uncounted=uncounted)
+        strict = Excuses(overdue=self._overdue)
+        excuses = replace(excuses, overdue=self._overdue)
         try:
             deadline, changed = now() + _SETTLE_LIMIT + _QUIET, now()
             last: object = None
@@ -267,9 +266,11 @@ class Round:
                     return  # the master has ended, which is a separate finding
                 await asyncio.sleep(0.02)
             self.observer.findings += findings
-            cut = in_transit(added, readings)
-            self._result.transit = self._result.transit[0] + cut[0], self._result.transit[1] + cut[1]
-            self._overdue = [each for each in readings if each.forwarded and each.arrived is None], cut[0]
+            self._overdue = cut = in_transit(added, readings, self._overdue)
+            self._result.transit = (
+                self._result.transit[0] + cut.uncounted,
+                self._result.transit[1] + cut.astray,
+            )
             self.observer.settle()
             self._base = counters
             for reason, number in added.lost.items():

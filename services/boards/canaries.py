@@ -1,7 +1,7 @@
 """Canaries between the frames of a run: which one is due, and whether its counts are right."""
 
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Collection, Sequence
+from typing import Final, NamedTuple
 
 from pcie_shim.errors import BoardError
 from pcie_shim.host.canary_walk import CanaryWalk
@@ -12,8 +12,29 @@ PAUSE: Final = 0.01
 """Seconds without a frame after which a canary is run, and between two of them."""
 
 
+class Position(NamedTuple):
+    """A position in a walk of a shape: the next canary, and how many are owed and have passed."""
+
+    shape: tuple[object, ...]
+    next: int
+    debt: int
+    passed: int
+
+
 class DamagedBoardError(BoardError):
-    """A board gave other counts for a canary than its image: a table or a counter is damaged."""
+    """Boards gave other counts for a canary than their images: a table or a counter is damaged."""
+
+    def __init__(self, boards: Sequence[int], frames: int) -> None:
+        """Take the numbers of the boards, and the frames within which canaries find a flipped bit."""
+        several = len(boards) > 1
+        names = f"{'boards' if several else 'board'} {' and '.join(map(str, boards))}"
+        super().__init__(
+            f"{names} gave wrong counts for a known reading: a table or a counter is damaged, so "
+            f"{'they are' if several else 'it is'} programmed again, and results of at most {frames} frames may be wrong "
+            "(integrity = canary)",
+            board=boards[0],
+        )
+        self.boards = tuple(boards)
 
 
 class Canaries:
@@ -52,13 +73,31 @@ class Canaries:
 
     def judge(self, output: FrameOutput) -> None:
         """Advance to the next canary, or raise a DamagedBoardError and stay at this one."""
-        board = self._walk.differing_board(self._next, output.boards)
-        if board is not None:
-            raise DamagedBoardError(
-                f"board {board} gave wrong counts for a known reading: a table or a counter is damaged, so it is programmed "
-                f"again, and results of at most {self._frames} frames may be wrong (integrity = canary)",
-                board=board,
-            )
+        damaged = self._walk.differing_boards(self._next, output.boards)
+        if damaged:
+            raise DamagedBoardError(damaged, self._frames)
         self._next = (self._next + 1) % len(self._walk)
         self._debt = max(0, self._debt - self._frames)
         self.passed += 1
+
+    def check(self, output: FrameOutput, boards: Collection[int]) -> None:
+        """Judge only boards that were programmed again, and owe this canary, which judges all boards before the next frame.
+
+        Raises:
+            DamagedBoardError: They still give wrong counts.
+        """
+        if damaged := [
+            each for each in self._walk.differing_boards(self._next, output.boards) if each in boards
+        ]:
+            raise DamagedBoardError(damaged, self._frames)
+        self._debt = max(self._debt, self._frames)
+
+    @property
+    def position(self) -> Position:
+        """The position, from which the canaries of another deployment may go on."""
+        return Position(self._walk.shape, self._next, self._debt, self.passed)
+
+    def go_on(self, position: Position) -> None:
+        """Go on from the position in a walk of the same shape, so that frequent reloads do not favour its beginning."""
+        if position.shape == self._walk.shape:
+            self._next, self._debt, self.passed = position.next, position.debt, position.passed

@@ -100,9 +100,12 @@ class DeployedBoards:
         )
 
     def _prepare_canaries(self) -> None:
-        """Begin a walk of canaries for the deployment in force, if the rule asks for one."""
-        is_canary = self._rule.kind is Integrity.CANARY
-        self.canaries = Canaries(self._images, self._rule.frames) if is_canary else None
+        """Begin a walk of canaries for the deployment in force, or continue one, if the rule asks for it."""
+        former, self.canaries = self.canaries, None
+        if self._rule.kind is Integrity.CANARY:
+            self.canaries = Canaries(self._images, self._rule.frames)
+            if former is not None:
+                self.canaries.go_on(former.position)
 
     @property
     def _images(self) -> list[Image]:
@@ -145,10 +148,7 @@ class DeployedBoards:
         self._cluster = cluster
         cluster.close()
         self.gone = dict.fromkeys(range(len(self._endpoints)), "its previous image is being restored")
-        deadline = time.monotonic() + self._settings.peer_timeout
-        while self.gone and time.monotonic() < deadline:
-            self.recover()
-            time.sleep(TICK / 4 if self.gone else 0)
+        self.recover_in_time()
 
     def _program(self, board: int, image: Image) -> None:
         """Program a board that this process does not have open, or raise a BoardError."""
@@ -268,16 +268,20 @@ class DeployedBoards:
         return output
 
     def _judge(self, canaries: Canaries, output: FrameOutput) -> None:
-        """Compare a canary's counts; a damaged board is closed, and programmed again when it is recovered."""
+        """Compare a canary's counts; damaged boards are closed, and programmed again when they are recovered."""
         cluster = self._whole_cluster()
         try:
             canaries.judge(output)
         except DamagedBoardError as error:
-            self._damaged.add(error.board)
-            self._times_damaged[error.board] += 1
-            self.gone[error.board] = str(error)
-            cluster.give_up(error.board, str(error))
+            self._are_damaged(cluster, error)
             raise
+
+    def _are_damaged(self, cluster: MiniCluster, error: DamagedBoardError) -> None:
+        for board in error.boards:
+            self._damaged.add(board)
+            self._times_damaged[board] += 1
+            self.gone[board] = str(error)
+            cluster.give_up(board, str(error))
 
     @property
     def is_canary_owed(self) -> bool:
@@ -349,10 +353,11 @@ class DeployedBoards:
         if self._damaged and self._cluster is not None and self.gone.keys() == set(back):
             try:
                 self._check_again(self._cluster)
+            except DamagedBoardError as error:
+                self._are_damaged(self._cluster, error)
+                back = [board for board in back if board not in error.boards]
             except BoardError as error:
                 self.gone[error.board] = str(error)
-                if isinstance(error, DamagedBoardError):
-                    self._damaged.add(error.board)
                 self._cluster.give_up(error.board, str(error))
                 back = [board for board in back if board != error.board]
             else:
@@ -361,10 +366,17 @@ class DeployedBoards:
             del self.gone[board]
         return back
 
+    def recover_in_time(self) -> None:
+        """Try for `peer_timeout` seconds to recover all missing boards; those that do not come back remain in `gone`."""
+        deadline = time.monotonic() + self._settings.peer_timeout
+        while self.gone and time.monotonic() < deadline:
+            self.recover()
+            time.sleep(TICK / 4 if self.gone else 0)
+
     def _check_again(self, cluster: MiniCluster) -> None:
-        """Run the canary that showed a damaged board, now that the board is programmed again."""
+        """Run the canary that showed damaged boards, now that they are programmed again."""
         if self.canaries is not None:
-            self.canaries.judge(cluster.run(self.canaries.next()))
+            self.canaries.check(cluster.run(self.canaries.next()), self._damaged)
 
     def _reopen(self, cluster: MiniCluster, board: int) -> None:
         if board in self._damaged:

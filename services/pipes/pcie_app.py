@@ -60,12 +60,12 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
 
 
 def _run_canary(boards: DeployedBoards) -> None:
-    """Run a canary; a damaged board is programmed again, once, before the next line is read."""
+    """Run a canary; a damaged board is programmed again before the next line is read."""
     try:
         boards.run_canary()
     except DamagedBoardError as error:
         say(str(error))
-        boards.recover()
+        boards.recover_in_time()
         if boards.gone:
             raise
 

@@ -4,7 +4,7 @@ import copy
 
 import pytest
 
-from scripts.campaigning.judging.accounts import Counters, Excuses, judge
+from scripts.campaigning.judging.accounts import Counters, Excuses, Overdue, judge
 from scripts.campaigning.judging.expected import (
     BANKS,
     LINES,
@@ -389,6 +389,7 @@ def test_a_reading_that_comes_after_the_counters_were_read_is_counted_next_time(
         (Counters(7, 7, {"passed over": 1}), False, set()),
         (Counters(7, 7), False, set()),
         (Counters(7, 8), False, {Flaw.UNCOUNTED}),
+        (Counters(7, 7), True, {Flaw.UNCOUNTED, Flaw.MISCOUNTED}),  # another one is in flight
         (Counters(7, 9), True, {Flaw.MISCOUNTED, Flaw.UNCOUNTED}),
         (Counters(7, 7, {"passed over": 2}), False, {Flaw.MISCOUNTED}),
     ],
@@ -398,7 +399,7 @@ def test_a_reading_that_was_excused_too_early_is_counted_in_the_next_step(added,
     others = [Reading(at, (0, 0), 0.0, forwarded=True, arrived=1.0) for at in range(1, 8)]
     if arrives:
         late.arrived = 1.0
-    found = judge(added, others, Excuses(overdue=[late], uncounted=1), 1.0)
+    found = judge(added, others, Excuses(overdue=Overdue([late], 1)), 1.0)
     assert {each.flaw for each in found} == flaws
 
 

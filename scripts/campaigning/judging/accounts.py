@@ -38,6 +38,28 @@ class Counters:
 
 
 @dataclass(frozen=True, slots=True)
+class Overdue:
+    """Readings without a result when a step was judged.
+
+    If the machine was busy, they are only late: then their results arrive and are counted in the next step.
+
+    Attributes:
+        readings: These readings.
+        uncounted: How many of them no counter included.
+        astray: How many were counted as published.
+    """
+
+    readings: Sequence[Reading] = ()
+    uncounted: int = 0
+    astray: int = 0
+
+    @property
+    def late(self) -> int:
+        """Number of uncounted readings whose results have arrived meanwhile."""
+        return min(self.uncounted, sum(each.arrived is not None for each in self.readings))
+
+
+@dataclass(frozen=True, slots=True)
 class Excuses:
     """Losses by a fault that no counter of the stack can include.
 
@@ -47,9 +69,7 @@ class Excuses:
         most: Maximum number of each; higher only if a process or connection was held before.
         since: Beginning of the fault (seconds); readings from shortly before it on are excused.
         until: Time at which the stack had recovered.
-        overdue: Readings without a result when the step before was judged.
-        uncounted: How many of them no counter included then. They are only late if the machine was busy: then they are
-            counted now.
+        overdue: What was missing when the step before was judged.
     """
 
     readings: bool = False
@@ -57,19 +77,25 @@ class Excuses:
     most: int = MOST_IN_TRANSIT
     since: float = 0.0
     until: float = 0.0
-    overdue: Sequence[Reading] = ()
-    uncounted: int = 0
+    overdue: Overdue = Overdue()
 
 
 IN_FLIGHT = 1.0
 """Maximum number of seconds that a reading is in flight when a fault begins."""
 
 
-def in_transit(added: Counters, readings: Iterable[Reading]) -> tuple[int, int]:
-    """Return the readings and results that no counter includes, as they were cut off between two processes."""
+def in_transit(added: Counters, readings: Iterable[Reading], overdue: Overdue) -> Overdue:
+    """Return what no counter includes, as it was cut off between two processes, or is late."""
+    uncounted, astray = _difference(added, readings, overdue)
+    missing = [each for each in readings if each.forwarded and each.arrived is None]
+    return Overdue(missing, max(0, uncounted), max(0, astray))
+
+
+def _difference(added: Counters, readings: Iterable[Reading], overdue: Overdue) -> tuple[int, int]:
+    """Return the numbers of uncounted readings, and of results that are counted and have not arrived."""
     given = [each for each in readings if each.forwarded]
-    arrived = sum(each.arrived is not None for each in given)
-    return max(0, len(given) - added.completed - added.losses), max(0, added.completed - arrived)
+    arrived = sum(each.arrived is not None for each in given) + overdue.late
+    return len(given) + overdue.late - added.completed - added.losses, added.completed - arrived
 
 
 def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses, now: float) -> list[Finding]:
@@ -85,15 +111,14 @@ def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses, now: f
     ]
     most = min(len(excusable), excuses.most)
     figures = f"{len(given)} readings, {arrived} results; counted: {added}"
-    uncounted = len(given) - added.completed - added.losses
-    if uncounted > (most if excuses.readings else 0):
+    uncounted, astray = _difference(added, readings, excuses.overdue)
+    slack = min(excuses.overdue.late, excuses.overdue.astray)  # of these, the readings were counted before
+    if uncounted > slack + (most if excuses.readings else 0):
         findings.append(Finding(Flaw.UNCOUNTED, f"{uncounted} readings: {figures}", now))
-    if -uncounted > excuses.uncounted:
+    if -uncounted > slack + excuses.overdue.uncounted - excuses.overdue.late:
         findings.append(Finding(Flaw.MISCOUNTED, f"{-uncounted} too many: {figures}", now))
-    astray = added.completed - arrived
-    late = min(excuses.uncounted, sum(each.arrived is not None for each in excuses.overdue))
-    if astray > late + (most if excuses.results else 0):
+    if astray > (most if excuses.results else 0):
         findings.append(Finding(Flaw.UNCOUNTED, f"{astray} results are counted as published: {figures}", now))
-    if -astray > doubtful:
+    if -astray > doubtful + slack:
         findings.append(Finding(Flaw.MISCOUNTED, f"{-astray} results that were not counted: {figures}", now))
     return findings
