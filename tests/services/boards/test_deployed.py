@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from machines.kernel import warm_up
 from pcie_shim.endpoint import parse_endpoint
 from services.boards.canaries import DamagedBoardError
 from services.boards.deployed import DeployedBoards
@@ -26,6 +27,7 @@ _numbers = itertools.count()
 @pytest.fixture
 def open_boards(boat, tmp_path) -> Iterator:
     """A function that starts four boards with these misbehaviours, by number, and opens them."""
+    warm_up()  # the boards' processes inherit the kernels
     processes, opened = [], []
 
     def open_boards(misbehaviours: dict[int, str], **settings) -> DeployedBoards:
