@@ -20,7 +20,7 @@ from cyclonedx.output.json import JsonV1Dot6
 from license_expression import get_spdx_licensing
 from packageurl import PackageURL
 
-from scripts.flags import ScriptParser
+from scripts.flags import ScriptParser, output_file
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 LICENCES: Final = ROOT / "scripts" / "licences.toml"
@@ -139,7 +139,9 @@ def bill(lock: Path, dev_lock: Path) -> Bom:
 def main() -> int:
     """Write the bill."""
     parser = ScriptParser(prog="scripts/bill-of-materials", description=__doc__)
-    parser.add_argument("--json", type=Path, metavar="FILE", default=ROOT / "out" / "rosbayes.cdx.json")
+    parser.add_argument(
+        "--json", type=output_file, metavar="FILE", default=ROOT / "out" / "rosbayes.cdx.json"
+    )
     file: Path = parser.parse_args().json
     try:
         whole = bill(ROOT / "requirements.lock", ROOT / "requirements-dev.lock")

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 from rich.console import Console
 from rich.table import Table
 
-from scripts.flags import ScriptParser
+from scripts.flags import ScriptParser, output_file
 from scripts.other_clients.installation import install_roslib, install_roslibpy
 from scripts.processes import ROOT, Process, run_script
 from services.errors import StackError
@@ -579,7 +579,7 @@ def main() -> int:
         prog="scripts/bench bridge",
         description="Compare rosbridge clients on the hub, and the hub with a model of the reference server.",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     return run_script(lambda: bench(arguments), 300)
 

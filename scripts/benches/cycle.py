@@ -25,7 +25,7 @@ from rich.table import Table
 
 from bridge.client import Publication, Ros, Subscription, connect
 from bridge.stamps import header, header_stamp_ns
-from scripts.flags import ScriptParser
+from scripts.flags import ScriptParser, output_file
 from scripts.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 
 STAGES = (
@@ -341,7 +341,7 @@ def main() -> int:
     parser.add_argument(
         "--seed", type=int, shown="a new one each time", help="seed of the positions of the boat"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     if min(arguments.frames, arguments.turn) < 1:
         parser.error("--frames and --turn must be 1 or more")

@@ -19,7 +19,7 @@ from rich.table import Table
 
 from bridge.client import connect
 from scripts.benches.cycle import one_by_one, per_second, quantile, readings
-from scripts.flags import ScriptParser
+from scripts.flags import ScriptParser, output_file
 from scripts.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 
 RULES: dict[str, tuple[str, ...]] = {
@@ -99,7 +99,7 @@ def main() -> int:
     parser.add_argument(
         "--seed", type=int, default=random.randrange(2**32), help="seed of the positions of the boat"
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     if min(arguments.frames, arguments.turns) < 1:
         parser.error("--frames and --turns must be 1 or more")

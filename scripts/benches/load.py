@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from scripts.benches.bridge import TYPE, Bare, bare, frame, settled
-from scripts.flags import ScriptParser
+from scripts.flags import ScriptParser, output_file
 from scripts.processes import Process, run_script
 
 TOPICS = 200
@@ -341,7 +341,7 @@ def main() -> int:
     )
     parser.add_argument("--clients", type=int, default=500, help="number of clients")
     parser.add_argument("--seconds", type=float, default=10.0, help="duration of each phase in seconds")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     return run_script(lambda: bench(arguments), 600)
 

@@ -21,7 +21,7 @@ from rich.table import Table
 
 from bridge.client import Publication, Subscription, connect
 from scripts.benches.cycle import WINDOW, message, processes_of, quantile, readings
-from scripts.flags import ScriptParser
+from scripts.flags import ScriptParser, output_file
 from scripts.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, build, run_script
 
 WARM_UP = 200
@@ -179,12 +179,12 @@ def main() -> int:
     )
     parser.add_argument(
         "--picture",
-        type=Path,
+        type=output_file,
         metavar="FILE",
         default=ROOT / "out" / "loop.png",
         help="picture of the figures",
     )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     if arguments.minutes < 1:
         parser.error("--minutes must be 1 or more")

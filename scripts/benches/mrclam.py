@@ -24,7 +24,7 @@ from casestudies.mrclam.landmarks import Landmark, read_landmarks
 from casestudies.mrclam.model import model
 from casestudies.mrclam.player import median_distance, play
 from casestudies.mrclam.recording import RecordedFrame, area_grid, read_recording
-from scripts.flags import ScriptParser
+from scripts.flags import ScriptParser, output_file
 from scripts.processes import ROOT, Process, build, run_script
 from toolchain.deployment.address import to_address
 from toolchain.models import Model, exact_posterior
@@ -241,7 +241,7 @@ def main() -> int:
         "learnt now and written to it",
     )
     parser.add_argument("--cells", type=int, default=32, help="number of cells along x, and along y")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write all figures")
     arguments = parser.parse_args()
     if not 1 <= arguments.cells <= 128:  # four boards hold 4096 lines each
         parser.error("--cells must be 1 to 128")

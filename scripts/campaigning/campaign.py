@@ -27,7 +27,7 @@ from scripts.campaigning.round import POOL, Round
 from scripts.campaigning.shrinking import shrink
 from scripts.campaigning.stack import Topology
 from scripts.campaigning.wire import TOPIC, TYPE
-from scripts.flags import ScriptParser
+from scripts.flags import ScriptParser, output_file
 from scripts.processes import ROOT, Process, run_script
 
 FRAMES = 100_000
@@ -269,7 +269,7 @@ def main() -> int:
         default=SHRINKING,
         help="seconds in which to shorten a failed schedule",
     )
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=output_file, help="write the figures to this file")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="bmc") as folder:
         return run_script(lambda: Campaign(options, Path(folder)).run(), LIMIT)

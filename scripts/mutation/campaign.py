@@ -9,6 +9,7 @@ import hashlib
 import json
 import os
 import queue
+import select
 import shutil
 import signal
 import subprocess
@@ -255,18 +256,27 @@ def _end_all(process: subprocess.Popen[Any], mark: str) -> None:
     _kill_marked(mark, spared=0)
 
 
-def _kill_marked(mark: str, spared: int) -> None:
+def _kill_marked(mark: str, spared: int) -> int:
+    """Kill the processes of a mark, and return their number."""
+    killed = 0
     for other in psutil.process_iter():
         try:
-            if other.pid != spared and other.environ().get(MARK) == mark:
+            if other.pid != spared and other.environ().get(MARK, "").startswith(mark):
                 other.kill()
+                killed += 1
         except psutil.Error:
             continue
+    return killed
 
 
 def new_mark() -> str:
     """Return a value of `MARK` for a process and all that it starts."""
-    return f"{os.getpid()}-{time.monotonic_ns()}"
+    return f"{_own_mark()}{time.monotonic_ns()}"
+
+
+def _own_mark() -> str:
+    """Return the beginning of all values of `MARK` of this run."""
+    return f"{os.getpid()}-"
 
 
 def environment(folder: Path, mark: str) -> dict[str, str]:
@@ -295,7 +305,7 @@ class Warm:
             text=True,
             start_new_session=True,
         )
-        if self._answer() != 0:
+        if self._answer(BASELINE_LIMIT) != 0:
             raise MutationError(f"{' '.join(group)} cannot be collected")
 
     def attempt(self, path: str, limits: Mapping[str, float]) -> tuple[int | None, str]:
@@ -303,12 +313,14 @@ class Warm:
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps({"path": path, "limits": dict(limits)}) + "\n")
         self._process.stdin.flush()
-        code, test = self._answer()
+        code, test = self._answer(BASELINE_LIMIT + sum(limits.values()))
         _kill_marked(self._mark, spared=self._process.pid)
         return code, test
 
-    def _answer(self) -> Any:
+    def _answer(self, limit: float) -> Any:
         assert self._process.stdout is not None
+        if not select.select([self._process.stdout], [], [], limit)[0]:
+            raise MutationError(f"the process that runs the tests did not answer within {limit:.0f} s")
         line = self._process.stdout.readline()
         if not line:
             raise MutationError("the process that runs the tests was ended")
@@ -348,6 +360,7 @@ class Campaign:
         self._lock = threading.Lock()
         self._coverage: dict[tuple[str, ...], tuple[LineTests, dict[str, float]]] = {}
         self._failure: Exception | None = None
+        self._stopped = False
 
     def run(self) -> None:
         """Try the mutants without a result, until the time is over.
@@ -369,10 +382,11 @@ class Campaign:
             try:
                 for worker in workers:
                     worker.join()
-            finally:
-                self._end = 0.0  # an interrupted run ends after the mutants that are being tried
-                for worker in workers:
-                    worker.join()
+            except KeyboardInterrupt:
+                self._stopped = True
+                while _kill_marked(_own_mark(), spared=0) or any(worker.is_alive() for worker in workers):
+                    time.sleep(0.1)
+                raise
         if self._failure is not None:
             raise self._failure
 
@@ -394,7 +408,7 @@ class Campaign:
             tree.close()
 
     def _try_all(self, tree: Tree, waiting: queue.SimpleQueue[tuple[str, Mutant]]) -> None:
-        while time.monotonic() < self._end and self._failure is None:
+        while time.monotonic() < self._end and self._failure is None and not self._stopped:
             try:
                 module, mutant = waiting.get_nowait()
             except queue.Empty:
@@ -419,6 +433,8 @@ class Campaign:
             outcome = tree.outcome(own, module, mutant.source, {name: limits[name] for name in slower})
         if outcome == SURVIVED and others and not self._options.quick:
             outcome = SURVIVED if tree.passes_with(module, mutant.source, others) else FOUND
+        if self._stopped:  # the tests were killed, which says nothing about the mutant
+            return
         result = Result(
             module=module,
             digest=_digest(mutant),
@@ -537,11 +553,12 @@ def main() -> int:
     campaign = Campaign(options)
     try:
         campaign.run()
-    except KeyboardInterrupt:
-        return 130
     except MutationError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted (Ctrl-C); the same command continues", file=sys.stderr)
+        return 130
     return campaign.report()
 
 

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from scripts.flags import ScriptParser
+from scripts.flags import ScriptParser, output_file
 from scripts.other_clients.fibonacci_server import fibonacci_server
 from scripts.other_clients.installation import install_roslib, install_roslibpy
 from scripts.processes import Process, run_script
@@ -215,7 +215,7 @@ def main() -> int:
     )
     parser.add_argument("--only", choices=("roslibpy", "roslib"), shown="both", help="one client")
     parser.add_argument("--ros-version", choices=("1", "2"), shown="both", help="the hub as one ROS version")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all outcomes")
+    parser.add_argument("--json", type=output_file, metavar="FILE", help="write all outcomes")
     arguments = parser.parse_args()
     return run_script(lambda: check(arguments), 1800)
 

@@ -227,7 +227,10 @@ def has_compose():
     docker = shutil.which("docker")
     return (
         bool(docker)
-        and subprocess.run([docker, "compose", "version"], capture_output=True, check=False).returncode == 0
+        and subprocess.run(
+            [docker, "compose", "version"], capture_output=True, check=False, timeout=60
+        ).returncode
+        == 0
     )
 
 
@@ -241,6 +244,7 @@ def test_compose_understands_it():
             cwd=ROOT,
             env={"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": "/", **variables},
             capture_output=True,
+            timeout=60,
             check=False,
             text=True,
         )

@@ -13,7 +13,11 @@ IGNORED = (ROOT / ".dockerignore").read_text().splitlines()
 def test_linter_finds_nothing():
     hadolint = Path(sys.executable).with_name("hadolint")
     done = subprocess.run(
-        [hadolint, "--no-color", ROOT / "Dockerfile"], capture_output=True, check=False, text=True
+        [hadolint, "--no-color", ROOT / "Dockerfile"],
+        capture_output=True,
+        check=False,
+        text=True,
+        timeout=60,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert not done.stdout
