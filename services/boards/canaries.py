@@ -81,7 +81,7 @@ class Canaries:
         self.passed += 1
 
     def check(self, output: FrameOutput, boards: Collection[int]) -> None:
-        """Judge only boards that were programmed again, and owe this canary, which judges all boards before the next frame.
+        """Judge only reprogrammed boards, and owe this canary, which judges all boards before the next frame.
 
         Raises:
             DamagedBoardError: They still give wrong counts.

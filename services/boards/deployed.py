@@ -367,7 +367,7 @@ class DeployedBoards:
         return back
 
     def recover_in_time(self) -> None:
-        """Try for `peer_timeout` seconds to recover all missing boards; those that do not come back remain in `gone`."""
+        """Try for `peer_timeout` seconds to recover all missing boards; the others remain in `gone`."""
         deadline = time.monotonic() + self._settings.peer_timeout
         while self.gone and time.monotonic() < deadline:
             self.recover()

@@ -178,7 +178,7 @@ class MasterLink(Link):
         self.send(record)
 
     def notice(self, level: str, sentence: str) -> None:
-        """Send a message for the user now, or to the next master: a service may wait before its master has connected."""
+        """Send a message for the user now, or later to the next master, because a service may wait before it has one."""
         if not self.send(record := Notice(level, sentence)):
             self._unsaid.append(record)
 

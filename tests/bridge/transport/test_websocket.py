@@ -154,8 +154,8 @@ async def test_client_reads_any_stream_as_the_library_does(
 ) -> None:
     """After every piece: the same messages, the same answers, the same state, the same reason.
 
-    The handshake's answer is ``apart`` or not, reading starts ``idle`` pieces later, and this side closes the connection
-    after piece ``closed``.
+    The handshake's answer is ``apart`` or not, reading starts ``idle`` pieces later, and this side closes the
+    connection after piece ``closed``.
     """
     heard: list[bytes] = []
     lost: list[str] = []
