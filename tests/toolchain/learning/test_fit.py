@@ -173,6 +173,8 @@ def test_a_fit_is_the_same_after_its_file(tmp_path):
     assert with_fit(room(cells=40), tmp_path / "fit.toml").lines == 1600
     few, _ = learn(room(), *simulated(LEAST_READINGS - 1))
     assert few.file.variables == ()
+    enough, _ = learn(room(), *simulated(LEAST_READINGS))
+    assert [each.rows for each in enough.file.variables] == [LEAST_READINGS] * 2
     for unfitted in (with_fit(room(), None), apply_fit(room(), few)):  # as it was set by hand
         assert np.array_equal(unfitted.known[0].table, room().known[0].table)
 

@@ -26,6 +26,15 @@ def test_a_model_has_a_uniform_prior_and_as_few_bits_as_will_do():
     assert [k.as_variable().values for k in model.known] == [3, 4]
 
 
+def test_a_model_searches_at_most_the_maximum_of_values(monkeypatch):
+    monkeypatch.setattr("toolchain.models.model.MAX_LINES", 6)
+    width = dimension("x", size=3)
+    largest = Model(name="m", searched=(dimension("y", size=2), width), known=(known(lines=6),))
+    assert largest.lines == 6
+    with pytest.raises(ModelError):
+        Model(name="m", searched=(width, dimension("y", size=3)), known=(known(lines=9),))
+
+
 def test_tables_are_copies_that_cannot_be_written():
     table = np.full((2, 4), 0.5)
     one = Known(name="K", table=table)
