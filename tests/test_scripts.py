@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from scripts import processes
+from scripts.running import processes
 
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPTS = sorted(path for path in (ROOT / "scripts").iterdir() if path.is_file() and os.access(path, os.X_OK))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from scripts.bill_of_materials import LicenceError, Package, check, licence_of, locked
+from scripts.supply_chain.bill_of_materials import LicenceError, Package, check, licence_of, locked
 
 ROOT = Path(__file__).resolve().parent.parent
 PATIENCE = 300

@@ -25,8 +25,8 @@ from rich.table import Table
 
 from bridge.client import Publication, Ros, Subscription, connect
 from bridge.stamps import header, header_stamp_ns
-from scripts.flags import ScriptParser, output_file
-from scripts.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
+from scripts.running.flags import ScriptParser, output_file
+from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 
 STAGES = (
     "wire_in",

@@ -19,8 +19,8 @@ from rich.table import Table
 
 from bridge.client import connect
 from scripts.benches.cycle import one_by_one, per_second, quantile, readings
-from scripts.flags import ScriptParser, output_file
-from scripts.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
+from scripts.running.flags import ScriptParser, output_file
+from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 
 RULES: dict[str, tuple[str, ...]] = {
     "off": ("--integrity", "off"),

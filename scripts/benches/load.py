@@ -26,8 +26,8 @@ from rich.console import Console
 from rich.table import Table
 
 from scripts.benches.bridge import TYPE, Bare, bare, frame, settled
-from scripts.flags import ScriptParser, output_file
-from scripts.processes import Process, run_script
+from scripts.running.flags import ScriptParser, output_file
+from scripts.running.processes import Process, run_script
 
 TOPICS = 200
 PUBLISHERS = 50

@@ -21,8 +21,8 @@ from rich.table import Table
 
 from bridge.client import Publication, Subscription, connect
 from scripts.benches.cycle import WINDOW, message, processes_of, quantile, readings
-from scripts.flags import ScriptParser, output_file
-from scripts.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, build, run_script
+from scripts.running.flags import ScriptParser, output_file
+from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, build, run_script
 
 WARM_UP = 200
 """Readings before the first minute."""

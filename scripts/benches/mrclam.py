@@ -24,8 +24,8 @@ from casestudies.mrclam.landmarks import Landmark, read_landmarks
 from casestudies.mrclam.model import model
 from casestudies.mrclam.player import median_distance, play
 from casestudies.mrclam.recording import RecordedFrame, area_grid, read_recording
-from scripts.flags import ScriptParser, output_file
-from scripts.processes import ROOT, Process, build, run_script
+from scripts.running.flags import ScriptParser, output_file
+from scripts.running.processes import ROOT, Process, build, run_script
 from toolchain.deployment.address import to_address
 from toolchain.models import Model, exact_posterior
 

@@ -27,8 +27,8 @@ from scripts.campaigning.round import POOL, Round
 from scripts.campaigning.shrinking import shrink
 from scripts.campaigning.stack import Topology
 from scripts.campaigning.wire import TOPIC, TYPE
-from scripts.flags import ScriptParser, output_file
-from scripts.processes import ROOT, Process, run_script
+from scripts.running.flags import ScriptParser, output_file
+from scripts.running.processes import ROOT, Process, run_script
 
 FRAMES = 100_000
 SHORT_SECONDS = 120.0

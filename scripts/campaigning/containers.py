@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from scripts.campaigning.stack import BOARDS_PARENT, SERVICES, NotThereError, Stack, Topology
-from scripts.processes import ROOT
+from scripts.running.processes import ROOT
 
 PROJECT: Final = "campaign"
 VOLUMES: Final = ("status", "sockets", "boards")
@@ -57,7 +57,7 @@ async def docker(
 
 def build_image() -> None:
     """Build the image from a copy of this project, because builds on this engine have no network."""
-    from scripts.verifications.containers import copy_project, fetch_wheels
+    from scripts.verifications.containers.project import copy_project, fetch_wheels
 
     wheels = Path(os.environ["ROSBAYES_ENGINE_HOME"]) / "wheels"
     fetch_wheels(wheels)

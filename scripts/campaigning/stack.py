@@ -19,7 +19,7 @@ from scripts.campaigning.judging.accounts import Counters
 from scripts.campaigning.judging.expected import BOARDS
 from scripts.campaigning.proxy import Proxy
 from scripts.campaigning.wire import process_status
-from scripts.processes import Process
+from scripts.running.processes import Process
 
 SERVICES = ("subscriber", "publisher", "pcie-app")
 BOARD_NAMES = tuple(f"board{at}" for at in range(BOARDS))

@@ -17,8 +17,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from scripts.flags import ScriptParser
 from scripts.fuzzing.targets import SEEDS, TARGETS
+from scripts.running.flags import ScriptParser
 
 ROOT = Path(__file__).resolve().parents[2]
 LOCK = Path(__file__).with_name("atheris.lock")

@@ -29,9 +29,9 @@ from typing import Any, Final, Literal
 import coverage
 import psutil
 
-from scripts.flags import ScriptParser
 from scripts.mutation import contexts, warm
 from scripts.mutation.mutants import Mutant, mutants
+from scripts.running.flags import ScriptParser
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "out" / "mutants" / "results.jsonl"

@@ -20,10 +20,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from scripts.flags import ScriptParser, output_file
 from scripts.other_clients.fibonacci_server import fibonacci_server
 from scripts.other_clients.installation import install_roslib, install_roslibpy
-from scripts.processes import Process, run_script
+from scripts.running.flags import ScriptParser, output_file
+from scripts.running.processes import Process, run_script
 
 NODE_SCRIPT = Path(__file__).with_name("conformance_roslib.mjs")
 SUITE_LIMIT = 240

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from scripts.flags import ScriptParser
 from scripts.register_maps import hardware
+from scripts.running.flags import ScriptParser
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -9,8 +9,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from scripts.flags import ScriptParser
-from scripts.processes import Process, run_script
+from scripts.running.flags import ScriptParser
+from scripts.running.processes import Process, run_script
 from scripts.verifications import real_rosbridge
 
 SERVER_LIMIT = 15.0

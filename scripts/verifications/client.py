@@ -25,7 +25,7 @@ from bridge.client import Message, Qos, Ros, State, connect
 from bridge.client.protocol import Compression
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import BridgeError, EncodeError, GoalError, NoMessageError, ServiceError
-from scripts.processes import ROOT, Process
+from scripts.running.processes import ROOT, Process
 from scripts.verifications.checks import KINDS, CheckError, Kind, Tally, expect, on_servers, serving
 
 LIMIT = 240.0

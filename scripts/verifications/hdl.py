@@ -17,7 +17,7 @@ from typing import TypeVar
 from hdl.test.mutants import MUTANTS, Mutant, caught_by
 from hdl.test.simulation import HardwareToolError
 from hdl.test.verification import Check, formal, sessions, units
-from scripts.flags import ScriptParser
+from scripts.running.flags import ScriptParser
 from scripts.verifications.debian import MissingToolError, install
 
 _Item = TypeVar("_Item")

@@ -27,7 +27,7 @@ import numpy as np
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters, RngKind
 from machines.posterior import posterior
-from scripts.flags import ScriptParser
+from scripts.running.flags import ScriptParser
 from toolchain.building.quantise import quantise
 from toolchain.errors import ModelError
 from toolchain.models.distribution import Distribution

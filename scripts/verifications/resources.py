@@ -20,7 +20,7 @@ from hdl.test.netlist import Netlist, synthesised
 from hdl.test.project import image_of_parameters
 from hdl.test.simulation import HardwareToolError
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
-from scripts.flags import ScriptParser
+from scripts.running.flags import ScriptParser
 from scripts.verifications.debian import MissingToolError, install
 from toolchain.analysis.resources.logic import COSTS, WORST_ERROR, Of, logic_of
 

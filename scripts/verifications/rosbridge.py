@@ -27,7 +27,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from casestudies.boat import geometry
-from scripts.processes import BOAT_TOPIC, ROOT, Process, build
+from scripts.running.processes import BOAT_TOPIC, ROOT, Process, build
 from scripts.verifications.checks import (
     KINDS,
     SERVER_LIMIT,

@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from bridge.discovery import UnknownRobotError
-from scripts import demo
+from scripts.running import demo
 
 
 def test_a_robot_is_looked_up_before_anything_starts(tmp_path, monkeypatch, capsys):

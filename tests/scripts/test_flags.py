@@ -4,7 +4,7 @@ import argparse
 
 import pytest
 
-from scripts.flags import output_file
+from scripts.running.flags import output_file
 
 
 def test_a_file_that_cannot_be_written_is_refused(tmp_path):

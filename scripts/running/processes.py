@@ -20,7 +20,7 @@ from terminal.errors import ExitCode, StoppedError
 from terminal.signals import run_async
 from toolchain.errors import ToolchainError
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SILENCE = 1.5
 """Seconds of silence, after which a `Screen` shows that the work goes on."""
 BOAT_TOPIC, BOAT_TYPE = "/boat/sensors", "boat_msgs/Sensors"

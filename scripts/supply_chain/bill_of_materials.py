@@ -20,10 +20,10 @@ from cyclonedx.output.json import JsonV1Dot6
 from license_expression import get_spdx_licensing
 from packageurl import PackageURL
 
-from scripts.flags import ScriptParser, output_file
+from scripts.running.flags import ScriptParser, output_file
 
-ROOT: Final = Path(__file__).resolve().parent.parent
-LICENCES: Final = ROOT / "scripts" / "licences.toml"
+ROOT: Final = Path(__file__).resolve().parents[2]
+LICENCES: Final = Path(__file__).with_name("licences.toml")
 _PINNED: Final = re.compile(r"^([A-Za-z0-9._-]+)==([^\s;\\]+)")
 _HASH: Final = re.compile(r"--hash=sha256:([0-9a-f]{64})")
 _NAMESPACE: Final = uuid.UUID("6ba7b811-9dad-11d1-80b4-00c04fd430c8")

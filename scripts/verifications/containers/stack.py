@@ -16,12 +16,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
 
-from scripts.processes import ROOT
+from scripts.running.processes import ROOT
 from scripts.verifications.checks import CheckError, expect
 
 OUT: Final = ROOT / "out" / "verify-containers"
 ENGINE: Final = ROOT / "scripts" / "container-engine"
-CLIENT: Final = Path(__file__).resolve().with_name("containers_client.py")
+CLIENT: Final = Path(__file__).resolve().with_name("client.py")
 
 UP_LIMIT, FLOW_LIMIT = 240.0, 180.0
 """Seconds until all services are healthy, and until results arrive; ten times those of a quiet machine.
@@ -125,7 +125,7 @@ class Result:
 
 
 class Client:
-    """containers_client.py in a container that runs until the context ends."""
+    """client.py in a container that runs until the context ends."""
 
     def __init__(self, stack: Stack, uri: str, network: str, *flags: str) -> None:
         self._stack = stack

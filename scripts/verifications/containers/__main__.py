@@ -6,7 +6,6 @@ this folder.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 import shutil
@@ -20,10 +19,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from scripts.flags import ScriptParser
-from scripts.processes import ROOT
+from scripts.running.flags import ScriptParser
+from scripts.running.processes import ROOT
 from scripts.verifications.checks import CheckError, Tally, expect
-from scripts.verifications.container_stack import (
+from scripts.verifications.containers.project import copy_project, fetch_wheels
+from scripts.verifications.containers.stack import (
     BOARDS,
     CORE,
     ENGINE,
@@ -38,7 +38,7 @@ from scripts.verifications.container_stack import (
     check_results,
     seconds,
 )
-from scripts.verifications.container_starts import (
+from scripts.verifications.containers.starts import (
     check_absent_robot,
     check_hub_alone,
     check_own_model,
@@ -50,7 +50,7 @@ from toolchain.deployment import load_deployment
 
 LIMIT: Final = 2400
 """Time limit of the verification, in seconds."""
-FETCH_LIMIT, BUILD_LIMIT = 600.0, 900.0
+BUILD_LIMIT = 900.0
 FIRST_RESULT: Final = 15.0
 """Maximum of seconds from `docker compose up` to the first result."""
 STARTS: Final = 4
@@ -421,48 +421,6 @@ def check_processor(stack: Stack) -> None:
 
 
 # Preparation
-
-
-def copy_project(folder: Path, wheels: Path) -> None:
-    """Copy the image's sources: the files known to git, and the wheels, because builds here have no network."""
-    shutil.rmtree(folder, ignore_errors=True)
-    listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        check=True,
-        timeout=60,
-    ).stdout.decode()
-    for name in filter(None, listed.split("\0")):
-        if (ROOT / name).is_file():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(ROOT / name, folder / name)
-    shutil.copytree(wheels, folder / "wheelhouse")
-
-
-def fetch_wheels(folder: Path) -> None:
-    """Download the wheels of the lock file, with hashes checked, for the image's Python.
-
-    Raises:
-        CheckError: pip cannot download them.
-    """
-    lock = ROOT / "requirements.lock"
-    made = folder / ".made"
-    stamp = hashlib.sha256(lock.read_bytes()).hexdigest()
-    if made.exists() and made.read_text() == stamp:
-        return
-    shutil.rmtree(folder, ignore_errors=True)
-    pip = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check"]
-    what = ["--require-hashes", "--no-deps", "--only-binary", ":all:", "--python-version", "3.11"]
-    done = subprocess.run(
-        [*pip, *what, "--dest", str(folder), "--requirement", str(lock)],
-        stderr=subprocess.PIPE,
-        text=True,
-        timeout=FETCH_LIMIT,
-        check=False,
-    )
-    expect(done.returncode == 0, f"pip could not get the wheels of {lock.name}: {done.stderr.strip()[-500:]}")
-    made.write_text(stamp)
 
 
 def hash_of(folder: Path) -> str:

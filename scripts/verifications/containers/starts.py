@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from scripts.verifications.checks import expect
-from scripts.verifications.container_stack import (
+from scripts.verifications.containers.stack import (
     BOARDS,
     CORE,
     FLOW_LIMIT,

@@ -10,8 +10,8 @@ import time
 from pathlib import Path
 
 from bridge.discovery import announced_uri
-from scripts.flags import ScriptParser
-from scripts.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, Screen, build, run_script
+from scripts.running.flags import ScriptParser
+from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, ROOT, Process, Screen, build, run_script
 
 LIMIT = 180.0
 """Time limit of the demo, in seconds."""
