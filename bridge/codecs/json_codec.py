@@ -36,6 +36,8 @@ _COUNTED: Final = 4096
 """Size in bytes up to which counting a character is faster than searching for each occurrence."""
 _HOPS: Final = 64
 """Number of occurrences of one character to check before searching for the whole word."""
+_N: Final = ord("n")
+"""The first byte of `null`; testing for a number is ten times as fast as for a byte string."""
 _NO_BRACKETS: Final = bytes(byte for byte in range(256) if byte not in b"[]{}")
 _BRACKETS: Final = bytes.maketrans(b"{}", b"[]")
 _STEPS: Final = bytes.maketrans(b"[]", b"\x01\xff")
@@ -182,14 +184,15 @@ def encode(
         raise EncodeError(f"the message is nested deeper than {max_depth} levels") from None
     if len(data) > max_size:
         raise MessageTooLargeError(f"the message has {len(data)} bytes as JSON, expected at most {max_size}")
-    if nonfinite == "refuse" and _has_null(data):
+    # The first condition is the first one of `_has_null`, and the other is that of `is_deeper`, without their calls.
+    if nonfinite == "refuse" and _N in data and _has_null(data):
         place = find_nonfinite(message)
         if place is not None:
             raise EncodeError(
                 f"{place} is NaN or infinite, which JSON cannot represent and rosbridge servers silently drop: "
                 "omit it, or send None if the receiver accepts null"
             )
-    if is_deeper(data, max_depth):
+    if len(data) > 2 * max_depth and is_deeper(data, max_depth):
         raise EncodeError(f"the message is nested deeper than {max_depth} levels")
     return data
 

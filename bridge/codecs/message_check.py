@@ -8,8 +8,8 @@ left to the server.
 """
 
 import difflib
-from collections.abc import Mapping
-from itertools import cycle
+from collections.abc import Callable, Mapping
+from operator import itemgetter
 from types import NoneType
 from typing import Any, Final, NamedTuple
 
@@ -124,13 +124,12 @@ class _Shape(NamedTuple):
 
 
 _NO_SHAPE: Final = _Shape(("",), (), (), ())
+_NONE: Final = -1
+"""Instead of a number of keys: no message is trusted."""
 
 
 class MessageCheck:
-    """The check of messages of one type, which remembers the last structure.
-
-    A caller may skip it for a message with `trusted_keys`, unless the next item of `is_due` is true.
-    """
+    """The check of messages of one type, which remembers the last structure; a message that `is_trusted` needs none."""
 
     def __init__(self, type_name: str, definitions: Definitions) -> None:
         """Prepare the check of a type that is among the definitions; its name has the form of ROS 1."""
@@ -138,8 +137,9 @@ class MessageCheck:
         self._definitions = definitions
         self._last = _NO_SHAPE
         self._count = 0
-        self.trusted_keys = _NO_SHAPE.keys
-        self.is_due = cycle((True, *(False,) * (SAMPLE - 1)))
+        self._trusted_size = _NONE
+        self._trusted_fields: Callable[[dict[str, Any]], object] = itemgetter("")
+        self._until_due = 0
 
     def __call__(self, msg: Mapping[str, Any]) -> None:
         """Check a message.
@@ -151,7 +151,24 @@ class MessageCheck:
             self._last = self._shape(self._type, msg, "")
             self._count = 0
         self._count += 1
-        self.trusted_keys = self._last.keys if self._count >= CLOSELY else _NO_SHAPE.keys
+        keys = self._last.keys
+        if self._count < CLOSELY or not keys:
+            self._trusted_size = _NONE
+        elif self._trusted_size == _NONE:
+            self._trusted_size, self._trusted_fields = len(keys), itemgetter(*keys)
+            self._until_due = 0
+
+    def is_trusted(self, msg: Mapping[str, Any]) -> bool:
+        """Return whether a message need not be checked: it has the keys of many before it, and is not a sample."""
+        if self._until_due and len(msg) == self._trusted_size and type(msg) is dict:
+            try:
+                self._trusted_fields(msg)  # takes half the time of comparing the keys
+            except KeyError:
+                return False
+            self._until_due -= 1
+            return True
+        self._until_due = SAMPLE - 1
+        return False
 
     def _shape(self, type_name: str, msg: Any, place: str) -> _Shape:
         """Check an object completely, and return its structure."""

@@ -35,15 +35,13 @@ from bridge.hub.graph import Client, Graph
 from bridge.hub.handlers.actions import Actions
 from bridge.hub.handlers.calls import Calls
 from bridge.hub.handlers.rosapi import NODE, ROSOUT, Rosapi
-from bridge.hub.handlers.topics import Topics
+from bridge.hub.handlers.topics import TURN_WORK, Topics
 from bridge.hub.limits import HubLimits
 from bridge.hub.operations import Operation, is_logged, text
 from bridge.stamps import stamp
 
 log = logging.getLogger(__name__)
 
-TURN_WORK: Final = 10_000
-"""Units of work, of about a microsecond each, after which a client's turn ends."""
 _OPERATION_WORK: Final = 20
 _LARGE: Final = 64 * 1024
 """Bytes from which a message is handled without collections of garbage."""
@@ -177,25 +175,27 @@ class Broker:
             is true.
         """
         self._now, self._operation_id = now, None
-        dispatcher, publish_again, outbox = self._dispatcher, self._topics.publish_again, client.outbox
-        dispatcher.work = 0
-        for number, data in enumerate(messages):
-            if dispatcher.work > TURN_WORK or (outbox.undroppable and outbox.congested):
-                return number
+        dispatcher, outbox = self._dispatcher, client.outbox
+        dispatcher.work = number = 0
+        while number < len(messages):
+            if outbox.undroppable and outbox.congested:
+                break
+            number = self._topics.publish_known(client, messages, number, now, _LARGE)
+            if number == len(messages) or dispatcher.work > TURN_WORK:
+                break
+            data = messages[number]
             try:
                 if len(data) > _LARGE:
                     with _garbage_collection_paused():
-                        self._receive_any(client, data, now)
-                elif not publish_again(client, data, now):
+                        if not self._topics.publish_known(client, [data], 0, now, len(data)):
+                            self.receive(client, data, now)
+                else:
                     self.receive(client, data, now)
             except DefinitionsPendingError as error:
                 messages[number] = error.data or data
-                return number
-        return len(messages)
-
-    def _receive_any(self, client: Client, data: bytes, now: float) -> None:
-        if not self._topics.publish_again(client, data, now):
-            self.receive(client, data, now)
+                break
+            number += 1
+        return number
 
     def _perform(self, client: Client, data: bytes, now: float, *, is_whole: bool) -> None:
         """Perform the operation in a message, which may be a fragment only if the message arrived whole."""

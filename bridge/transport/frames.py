@@ -8,8 +8,7 @@ Source: RFC 6455, sections 5.2, 5.3 and 10.3.
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from functools import lru_cache
+from collections.abc import Sequence
 from struct import Struct
 from typing import Final
 
@@ -32,6 +31,7 @@ _LONGEST_HEADER: Final = 8
 """Length in bytes of the longest header that `only_message` reads; shorter data is left to the others."""
 _SOUND: Final = frozenset(end | opcode for end in (0, 0x80) for opcode in (0, 1, 2, 8, 9, 10))
 """First bytes of valid frames: with or without FIN, no reserved bit, a defined opcode."""
+_KEPT_HEADERS: Final = 4096
 _KEYS: Final = 1024
 """Number of masking keys generated at once."""
 
@@ -136,7 +136,8 @@ def unmasked(payloads: Sequence[bytes]) -> bytes:
     """Return the frames of a server for whole messages: text for JSON objects, binary for CBOR."""
     parts: list[bytes] = []
     for payload in payloads:
-        parts += _header(_TEXT if payload[0] == _BRACE else _BINARY, 0, len(payload)), payload
+        headers = _TEXT_HEADERS if payload[0] == _BRACE else _BINARY_HEADERS
+        parts += headers[len(payload)], payload
     return b"".join(parts)
 
 
@@ -144,30 +145,49 @@ class Masker:
     """Encoder of a client's frames for whole text messages, each masked with a new key."""
 
     def __init__(self) -> None:
-        self._keys = mask_keys()
+        self._keys: list[bytes] = []
 
-    def __call__(self, payloads: Sequence[bytes]) -> bytes:
+    def encode(self, payloads: Sequence[bytes]) -> bytes:
         """Return the frames of the messages."""
+        keys = self._keys
+        if len(keys) < len(payloads):
+            keys += mask_keys(max(_KEYS, len(payloads)))
+        if len(payloads) == 1:  # in half the time
+            payload, key = payloads[0], keys.pop()
+            return _MASKED_HEADERS[len(payload)] + key + apply_mask(payload, key)
         parts: list[bytes] = []
         for payload in payloads:
-            key = next(self._keys)
-            parts += _header(_TEXT, _MASKED, len(payload)), key, apply_mask(payload, key)
+            key = keys.pop()
+            parts += _MASKED_HEADERS[len(payload)], key, apply_mask(payload, key)
         return b"".join(parts)
 
 
-def mask_keys() -> Iterator[bytes]:
-    """Yield unpredictable masking keys indefinitely."""
-    while True:
-        drawn = os.urandom(4 * _KEYS)
-        for at in range(0, len(drawn), 4):
-            yield drawn[at : at + 4]
+def mask_keys(count: int) -> list[bytes]:
+    """Return new unpredictable masking keys."""
+    drawn = os.urandom(4 * count)
+    return [drawn[at : at + 4] for at in range(0, 4 * count, 4)]
 
 
-@lru_cache(maxsize=4096)
-def _header(first: int, mask_bit: int, length: int) -> bytes:
-    """Return the header of a frame, up to its masking key if it has one."""
-    if length < _MEDIUM:
-        return bytes((first, mask_bit | length))
-    if length < _LONG:
-        return _MEDIUM_HEADER(first, mask_bit | _MEDIUM, length)
-    return _LONG_HEADER(first, mask_bit | (_MEDIUM + 1), length)
+class _Headers(dict[int, bytes]):
+    """The headers of frames by the lengths of their payloads, up to the masking key if there is one."""
+
+    def __init__(self, first: int, mask_bit: int) -> None:
+        super().__init__()
+        self._first = first
+        self._mask_bit = mask_bit
+
+    def __missing__(self, length: int) -> bytes:
+        if length < _MEDIUM:
+            header = bytes((self._first, self._mask_bit | length))
+        elif length < _LONG:
+            header = _MEDIUM_HEADER(self._first, self._mask_bit | _MEDIUM, length)
+        else:
+            header = _LONG_HEADER(self._first, self._mask_bit | (_MEDIUM + 1), length)
+        if len(self) < _KEPT_HEADERS:
+            self[length] = header
+        return header
+
+
+_TEXT_HEADERS: Final = _Headers(_TEXT, 0)
+_BINARY_HEADERS: Final = _Headers(_BINARY, 0)
+_MASKED_HEADERS: Final = _Headers(_TEXT, _MASKED)

@@ -67,7 +67,7 @@ class WebSocketTransport(asyncio.Protocol):
         self._write_limit = write_limit
         self._max_size = max_size
         self._is_server = isinstance(protocol, ServerProtocol)
-        self._encode = frames.unmasked if self._is_server else frames.Masker()
+        self._encode = frames.unmasked if self._is_server else frames.Masker().encode
         self._in_handshake = True
         self._handshake_tail = b""
         self._quick = False

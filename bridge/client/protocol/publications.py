@@ -109,7 +109,7 @@ class Publications:
         advertised = self._advertisements[advertisement]
         prefix, check = advertised.prefix, advertised.check
         try:
-            if check is not None and (tuple(msg) != check.trusted_keys or next(check.is_due)):
+            if check is not None and not check.is_trusted(msg):
                 check(msg)
             body = encode(
                 msg,
@@ -119,7 +119,7 @@ class Publications:
             )
         except EncodeError as error:
             raise type(error)(f"a message of {advertised.topic} cannot be published: {error}") from None
-        data = b"%b%b}" % (prefix, body)
+        data = prefix + body + b"}"
         if advertised.latch:
             advertised.latched = data
         return data

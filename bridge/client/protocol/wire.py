@@ -1,6 +1,6 @@
 """The outbox of a client: whole messages in order, while there is a connection."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Any, Final, Literal
 
@@ -70,9 +70,8 @@ class Wire:
         """Drop everything that was not sent."""
         self._outbox.clear()
 
-    def pieces(self, data: bytes) -> Iterator[bytes]:
-        """Yield a message, or its fragments if it is too large for one."""
+    def pieces(self, data: bytes) -> Sequence[bytes]:
+        """Return a message, or its fragments if it is too large for one."""
         if self.fragment_size is None or len(data) <= self.fragment_size:
-            yield data
-        else:
-            yield from split(data, self.fragment_size, f"fragment:{self.number()}")
+            return (data,)
+        return tuple(split(data, self.fragment_size, f"fragment:{self.number()}"))

@@ -4,13 +4,15 @@ The reference server builds a ROS message from the JSON and forwards that (`_to_
 rosbridge_library/internal/message_conversion.py): an absent field has the message's default, and the stamp of a
 `std_msgs/Header` without one is the time of receipt. So is that of an absent header, as the specification says
 (ROSBRIDGE_PROTOCOL.md, 3.3.3). Unlike the reference server, the hub does not check present values.
+
+Each message is filled by a function that is compiled for its type. A message that only lacks outermost fields, as most
+do, keeps its own JSON, and the JSON of these fields is appended.
 """
 
 import itertools
 from base64 import b64encode
 from collections.abc import Callable, Container, Mapping
-from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NoReturn
 
 import orjson
 
@@ -20,27 +22,29 @@ from bridge.stamps import stamp
 RosVersion = Literal[1, 2]
 FieldTypes = Mapping[str, tuple[str, int]]
 """The types of a message's fields or of their elements, and their lengths: -1 for a scalar, 0 for any."""
-_Fill = Callable[[Any, "_Room"], None]
-"""Fills a value in place."""
+Fill = Callable[[dict[str, Any], int], bytes | None]
+"""Fills the absent fields of a message in place; a value of another type than its field's stays.
 
-_BRACE: Final = ord("}")
+Args:
+    message: The message.
+    room: Bytes by which its parts may grow.
+
+Returns:
+    What to put in place of the last two braces of an operation that ends with the message, both as JSON. It is empty
+    if nothing was absent, and None if the message must be written again.
+
+Raises:
+    RefusedError: They would grow by more.
+"""
+
 HEADER: Final = "std_msgs/msg/Header"
 _TIME: Final = {1: ("secs", "nsecs"), 2: ("sec", "nanosec")}
 _TIME_SIZE: Final = len('"nanosec":0000000000,')
+_CLOSING: Final = b"}}"
+_TAILS: Final = 32
+"""Maximum number of tails that are kept for one type."""
 _ONE: Final = {("geometry_msgs/msg/Quaternion", "w"): 1.0}
 """The only field of the common ROS 2 messages whose default is not zero."""
-
-
-@dataclass(slots=True)
-class _Room:
-    """The bytes by which one message may grow."""
-
-    left: int
-
-    def spend(self, size: int) -> None:
-        self.left -= size
-        if self.left < 0:
-            raise RefusedError("a message is too large with the default values of its absent fields")
 
 
 class Filler:
@@ -48,78 +52,31 @@ class Filler:
 
     def __init__(self, types: "Types", name: str) -> None:
         """Prepare the defaults of a known type."""
-        self._check = _compiled_check(types, name)
-        self._fill = types.fill(name)
-        self._new_header = types.new_header
-        is_special = name == HEADER or name in types.times
-        self._defaults = {} if is_special else types.defaults(name)
-        self._headers: frozenset[str] = frozenset() if is_special else types.headers(name)
-        self._usual: dict[str, Any] = {}
-        """The defaults that were last appended, because a publisher usually leaves out the same fields."""
-        self._usual_fields: frozenset[str] = frozenset()
-        self._usual_tail = b""
-
-    def fill(self, message: dict[str, Any], data: bytes | None, room: int) -> bytes | None:
-        """Fill the absent fields of a message in place.
-
-        Args:
-            message: The message.
-            data: The same as JSON, or None.
-            room: Bytes by which it may grow.
-
-        Returns:
-            None if nothing was absent, otherwise the whole message as JSON. A value of another type than the
-            field's counts as absent and is left as it is.
-
-        Raises:
-            RefusedError: It would grow by more.
-        """
-        if self._usual and message and self._usual_fields.isdisjoint(message):
-            message.update(self._usual)
-            if data is None or data[-1] != _BRACE or not self._is_complete(message):
-                return self._fill_absent(message, None, _Room(room))
-            return data[:-1] + self._usual_tail
-        try:  # `_is_complete` without its call
-            self._check(message)
-        except (KeyError, TypeError):
-            return self._fill_absent(message, data, _Room(room))
-        return None
+        # The stamp of a header and the fields of a time have no constant defaults, so they are filled as in a part.
+        is_like_part = name == HEADER or name in types.times or not types.fields(name)
+        self._defaults = {} if is_like_part else types.defaults(name)
+        self._headers: frozenset[str] = frozenset() if is_like_part else types.headers(name)
+        self._tails = {0: b""}
+        """By the number of the absent fields (see `_compiled_fill`)."""
+        self.fill: Fill = _compiled_fill(types, name, self._tails, self._tail, like_part=is_like_part)
 
     def named(self, values: list[Any]) -> dict[str, Any]:
         """Return the message with these values in the order of the fields, as arguments of services may be given."""
         return dict(zip(self._defaults, values, strict=False))
 
-    def _fill_absent(self, message: dict[str, Any], data: bytes | None, room: _Room) -> bytes:
-        if not message.keys() >= self._defaults.keys():
-            was_empty = not message
-            added = self._add(message)
-            room.spend(len(added) + 1)
-            if data is not None and self._is_complete(message):
-                # The fields are appended, because rewriting takes long if the message has long arrays.
-                return b"{%b}" % added if was_empty else b"%b,%b}" % (data[: data.rindex(b"}")], added)
-        self._fill(message, room)
-        return orjson.dumps(message)
-
-    def _is_complete(self, message: dict[str, Any]) -> bool:
-        try:
-            self._check(message)
-        except (KeyError, TypeError):
-            return False
-        return True
-
-    def _add(self, message: dict[str, Any]) -> bytes:
-        """Add the absent fields to a message, and return their JSON without the braces."""
-        absent = {
-            field: self._new_header() if field in self._headers else default
-            for field, default in self._defaults.items()
-            if field not in message
-        }
-        message |= absent
-        if not self._headers.isdisjoint(absent):
-            return orjson.dumps(absent)[1:-1]
-        added = orjson.dumps(absent)[1:-1]
-        self._usual, self._usual_fields, self._usual_tail = absent, frozenset(absent), b",%b}" % added
-        return added
+    def _tail(self, absent: int, message: dict[str, Any]) -> bytes:
+        """Return the JSON of the fields that were absent, and keep it if it has no time of receipt."""
+        fields = {field: message[field] for bit, field in enumerate(self._defaults) if absent >> bit & 1}
+        was_empty = absent >> len(self._defaults)
+        tail = b"" if was_empty else b","
+        tail += orjson.dumps(fields)[1:-1] + _CLOSING
+        if self._headers.isdisjoint(fields):
+            if len(self._tails) == _TAILS:
+                del self._tails[
+                    next(reversed(self._tails))
+                ]  # one of a rare message rather than of the first ones
+            self._tails[absent] = tail
+        return tail
 
 
 class Types:
@@ -148,7 +105,6 @@ class Types:
         self._ros_version = ros_version
         self._wall_clock = wall_clock
         self._defaults: dict[str, dict[str, Any]] = {}
-        self._fills: dict[str, _Fill] = {}
 
     def new_header(self) -> dict[str, Any]:
         """Return a `std_msgs/Header` with the current time."""
@@ -189,95 +145,98 @@ class Types:
         # as the reference server writes bytes
         return b64encode(bytes(length)).decode() if element in {"uint8", "char"} else [one] * length
 
-    def fill(self, name: str) -> _Fill:
-        """Return the function that fills a message of this type in place."""
-        known = self._fills.get(name)
-        if known is None:
-            known = self._fills[name] = (
-                _fill_time(self._ros_version) if name in self.times else self._message_fill(name)
-            )
-        return known
-
     def fields(self, name: str) -> FieldTypes:
         """Return the types of a message's fields, and their lengths."""
         if name in self.times:
             return dict.fromkeys(_TIME[self._ros_version], ("uint32", -1))
         return self._field_types(name)
 
-    def is_scalar(self, name: str) -> bool:
-        """Return whether a type is a basic one, without fields."""
-        return name in self._scalars
+    def has_fields(self, name: str) -> bool:
+        """Return whether a type is neither a basic one nor an empty message."""
+        return name not in self._scalars and bool(self.fields(name))
 
-    def _message_fill(self, name: str) -> _Fill:
-        nested = [
-            (field, _fill_each(self.fill(element)) if length >= 0 else self.fill(element))
-            for field, (element, length) in self._field_types(name).items()
-            if element not in self._scalars
-        ]
-        defaults = self.defaults(name)
-        sizes = {field: len(orjson.dumps({field: default})) - 1 for field, default in defaults.items()}
-        new: dict[str, Callable[[], Any]] = {"stamp": self.new_stamp} if name == HEADER else {}
-        new |= dict.fromkeys(self.headers(name), self.new_header)
-
-        def fill(message: Any, room: _Room) -> None:
-            if type(message) is not dict:
-                return
-            for field in defaults:
-                if field not in message:
-                    room.spend(sizes[field])
-                    message[field] = new[field]() if field in new else defaults[field]
-            for field, fill_value in nested:
-                fill_value(message[field], room)
-
-        return fill
+    def other_field(self, name: str, field: str) -> str | None:
+        """Return the field of the other ROS version for a field of a time, and None for other types."""
+        if name not in self.times:
+            return None
+        return dict(zip(_TIME[self._ros_version], _TIME[3 - self._ros_version], strict=True))[field]
 
 
-def _compiled_check(types: Types, name: str) -> Callable[[dict[str, Any]], None]:
-    """Return a function that raises a KeyError or a TypeError unless all fields of a message are present.
+def _compiled_fill(
+    types: Types,
+    name: str,
+    tails: Mapping[int, bytes],
+    new_tail: Callable[[int, dict[str, Any]], bytes],
+    *,
+    like_part: bool,
+) -> Fill:
+    """Return the function that fills messages of a type.
 
-    It runs for every message, most of which are complete, and takes a fifth of the time of a loop over the fields.
+    It runs for every message, most of which have complete parts, and takes a fifth of the time of a loop over the
+    fields.
+
+    Args:
+        types: All types.
+        name: The type.
+        tails: What to put in place of the last two braces of an operation, by the number of the absent fields: a bit
+            each, and one more if the message is empty. Their size is limited by the type.
+        new_tail: Returns the same for a message that was filled.
+        like_part: Whether the message is filled like a part, so that it must be written again.
     """
-    lines = ["def check(m0):"]
+    lines = ["def fill(m0, room):", " left = room"]
+    if not like_part:
+        lines.append(f" absent = 0 if m0 else {1 << len(types.fields(name))}")
     numbers = itertools.count(1)
+    namespace: dict[str, Any] = {
+        "new_stamp": types.new_stamp,
+        "new_header": types.new_header,
+        "tails": tails,
+        "new_tail": new_tail,
+        "refuse": _refuse,
+    }
 
-    def add(part: str, variable: str, indent: str) -> None:
-        lines.append(f"{indent}pass")
-        for field, (element, length) in types.fields(part).items():
-            value = f"{variable}[{field!r}]"
-            if types.is_scalar(element):
-                lines.append(f"{indent}{value}")
-                continue
-            inner = f"m{next(numbers)}"
-            is_one = length < 0
-            lines.append(f"{indent}{inner} = {value}" if is_one else f"{indent}for {inner} in {value}:")
-            add(element, inner, indent if is_one else indent + " ")
+    def add_fields(part: str, message: str, indent: str) -> None:
+        """Add the lines that fill a dictionary."""
+        defaults = types.defaults(part)
+        for bit, (field, (element, length)) in enumerate(types.fields(part).items()):
+            default = f"d{next(numbers)}"
+            namespace[default] = defaults[field]
+            size = len(orjson.dumps({field: defaults[field]})) - 1
+            other = types.other_field(part, field)
+            if other is not None:
+                size, default = _TIME_SIZE, f"t if type(t := {message}.get({other!r})) is int else 0"
+            elif part == HEADER and field == "stamp":
+                default = "new_stamp()"
+            elif element == HEADER and length < 0:
+                default = "new_header()"
+            count = f"left -= {size}" if like_part or message != "m0" else f"absent |= {1 << bit}"
+            lines.append(f"{indent}if {field!r} not in {message}:")
+            lines.append(f"{indent} {message}[{field!r}] = {default}; {count}")
+            if types.has_fields(element):
+                lines.append(f"{indent}else:")
+                add_value(element, length, f"{message}[{field!r}]", indent + " ")
 
-    add(name, "m0", " ")
-    namespace: dict[str, Any] = {}
+    def add_value(element: str, length: int, value: str, indent: str) -> None:
+        """Add the lines that fill a value, if it is a dictionary, or a list of them if that is its type."""
+        inner = f"m{next(numbers)}"
+        lines.append(f"{indent}{inner} = {value}")
+        if length >= 0:
+            lines.append(f"{indent}for {inner} in {inner} if type({inner}) is list else ():")
+            indent += " "
+            lines.append(f"{indent}if left < 0: refuse()")
+        lines.append(f"{indent}if type({inner}) is dict:")
+        add_fields(element, inner, indent + " ")
+
+    add_fields(name, "m0", " ")
+    if like_part:
+        lines.append(" tail = b''")
+    else:
+        lines += [" try: tail = tails[absent]", " except KeyError: tail = new_tail(absent, m0)"]
+    lines += [" if left == room: return tail", " if left < 0: refuse()"]
     exec("\n".join(lines), namespace)  # noqa: S102 - the names of fields are those of installed definitions
-    check: Callable[[dict[str, Any]], None] = namespace["check"]
-    return check
-
-
-def _fill_each(fill: _Fill) -> _Fill:
-    def fill_each(values: Any, room: _Room) -> None:
-        if type(values) is list:
-            for value in values:
-                fill(value, room)
-
-    return fill_each
-
-
-def _fill_time(ros_version: RosVersion) -> _Fill:
-    """Return the function for times, which takes an absent field from the other ROS version's, if that is present."""
-    fields, others = _TIME[ros_version], _TIME[3 - ros_version]
-
-    def fill(time: Any, room: _Room) -> None:
-        if type(time) is dict:
-            for field, other in zip(fields, others, strict=True):
-                if field not in time:
-                    room.spend(_TIME_SIZE)
-                    given = time.get(other)
-                    time[field] = given if type(given) is int else 0
-
+    fill: Fill = namespace["fill"]
     return fill
+
+
+def _refuse() -> NoReturn:
+    raise RefusedError("a message is too large with the default values of its absent fields")

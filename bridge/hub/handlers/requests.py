@@ -62,7 +62,7 @@ def filled(filler: Filler | None, values: Any, room: int) -> Any:
         if isinstance(values, list):
             values = filler.named(values)
         if isinstance(values, dict):
-            filler.fill(values, None, room)
+            filler.fill(values, room)
     return values
 
 

@@ -1,7 +1,7 @@
 """Topics: advertising, publishing, subscribing, latching; a message is encoded once for all subscribers."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import orjson
@@ -50,6 +50,8 @@ _SHORT: Final = 4096
 """
 _MESSAGE_WORK: Final = 20
 """Units of work of one message, besides those for each subscriber."""
+TURN_WORK: Final = 10_000
+"""Units of work, of about a microsecond each, after which a client's turn ends."""
 _PLAIN: Final = Compression.NONE
 
 
@@ -124,65 +126,72 @@ class Topics:
             )
         elif raw is not None and len(operation) == _ENVELOPE_KEYS:
             _learn_envelope(advertisement, name, raw)
-        topic = advertisement.topic
+        topic, filler = advertisement.topic, advertisement.filler
         if topic.subscriptions or topic.latching:
             data = _cut_out(operation, raw)
-            filler = advertisement.filler
-            filled = filler.fill(parsed, data, self._limits.message_bytes) if filler else None
-            self.distribute(topic, parsed, filled or data, now)
+            tail = filler.fill(parsed, self._limits.message_bytes) if filler else b""
+            if tail is None:
+                data = None
+            elif tail and data is not None:
+                data = data[: data.rindex(b"}")] + tail[:-1]
+            self.distribute(topic, parsed, data, now)
 
-    def publish_again(self, client: Client, data: bytes, now: float) -> bool:
-        """Perform a `publish` with a known envelope: only its message is parsed, and forwarded as received.
+    def publish_known(
+        self, client: Client, messages: Sequence[bytes], first: int, now: float, largest: int
+    ) -> int:
+        """Perform `publish` operations with known envelopes: only their messages are parsed, and forwarded as received.
 
         Args:
             client: The publisher.
-            data: Any received data.
+            messages: Any received data.
+            first: The index of the first one to perform.
             now: Monotonic seconds.
+            largest: Maximum bytes of a message to perform.
 
         Returns:
-            Whether it was one. If not, nothing was done, and the data must be parsed in full.
+            The index of the first one that was not performed: it is larger, must be parsed in full, or exceeds a turn.
         """
         advertisement = client.last_published
         if advertisement is None:
-            return False
-        if not data.startswith(advertisement.envelope):
-            known = client.envelopes.get(envelope_of(data))
-            if known is None:
-                return False
-            client.last_published = advertisement = known
-        envelope, topic = advertisement.envelope, advertisement.topic
-        if data[-1] != BRACE:
-            return False
-        message = data[len(envelope) : -1]
-        if len(topic.name) + len(message) + AROUND > self._limits.message_bytes:
-            return False
-        try:
-            parsed = orjson.loads(message)
-        except orjson.JSONDecodeError:
-            return False
-        if type(parsed) is not dict or is_deeper(message, self._limits.depth - 1):
-            return False
-        if topic.subscriptions or topic.latching:
+            return first
+        dispatcher, room, depth = self._dispatcher, self._limits.message_bytes, self._limits.depth - 1
+        topic, filler, envelope = advertisement.topic, advertisement.filler, advertisement.envelope
+        begin = len(envelope)
+        for index in range(first, len(messages)):
+            data = messages[index]
+            if dispatcher.work > TURN_WORK:
+                return index
+            if not data.startswith(envelope):
+                advertisement = client.envelopes.get(envelope_of(data))
+                if advertisement is None:
+                    return index
+                client.last_published = advertisement
+                topic, filler, envelope = advertisement.topic, advertisement.filler, advertisement.envelope
+                begin = len(envelope)
+            if data[-1] != BRACE or len(data) > largest:
+                return index
+            message = data[begin:-1]
             try:
-                filler = advertisement.filler
-                filled = filler.fill(parsed, message, self._limits.message_bytes) if filler else None
-                if filled is None:
-                    self.distribute(topic, parsed, message, now, envelope, data)
-                else:
-                    self.distribute(topic, parsed, filled, now)
-            except RefusedError:
-                return False
-        return True
+                parsed = orjson.loads(message)
+            except orjson.JSONDecodeError:
+                return index
+            # The second condition is the first one of `is_deeper`, without its call.
+            if type(parsed) is not dict or (len(message) > 2 * depth and is_deeper(message, depth)):
+                return index
+            if topic.subscriptions or topic.latching:
+                try:
+                    if filler is not None:
+                        tail = filler.fill(parsed, room)
+                        if tail is None or (tail and data[-2] != BRACE):
+                            data = b"%b%b}" % (envelope, orjson.dumps(parsed))
+                        elif tail:
+                            data = data[:-2] + tail
+                    self._deliver(topic, parsed, data, envelope, now)
+                except RefusedError:
+                    return index
+        return len(messages)
 
-    def distribute(
-        self,
-        topic: Topic,
-        parsed: dict[str, Any],
-        data: bytes | None,
-        now: float,
-        prefix: bytes = b"",
-        payload: bytes = b"",
-    ) -> None:
+    def distribute(self, topic: Topic, parsed: dict[str, Any], data: bytes | None, now: float) -> None:
         """Deliver a message to all subscribers of its topic.
 
         Args:
@@ -190,29 +199,33 @@ class Topics:
             parsed: The message.
             data: The message as JSON, or None if it must be written.
             now: Monotonic seconds.
-            prefix: The bytes before the message, if it can be forwarded as received.
-            payload: In this case, the operation as received.
         """
-        data = orjson.dumps(parsed) if data is None else data
+        self._deliver(topic, parsed, (orjson.dumps(parsed) if data is None else data) + b"}", b"", now)
+
+    def _deliver(
+        self, topic: Topic, parsed: dict[str, Any], payload: bytes, prefix: bytes, now: float
+    ) -> None:
+        """Deliver a message, which is in `payload` as JSON, after a prefix and before a brace."""
+        size = len(payload) - len(prefix) - 1
         # Rewriting can lengthen a message (1e15 becomes 1000000000000000.0).
-        if len(topic.name) + len(data) + AROUND > self._limits.message_bytes:
+        if len(topic.name) + size + AROUND > self._limits.message_bytes:
             raise RefusedError(
                 f"the message for {topic.name} has more than {self._limits.message_bytes} bytes"
             )
         if topic.latching:
             room = self._limits.latched_bytes - self._graph.latched_bytes + len(topic.latched or b"")
-            self._graph.latch(topic, data if len(data) <= room else None)
+            self._graph.latch(topic, payload[len(prefix) : -1] if size <= room else None)
         self._dispatcher.work += _MESSAGE_WORK + 2 * len(topic.subscriptions)
         # Subscribers that use the same name for the topic share one payload.
         message: Message | None = None
         for subscription in topic.subscriptions.values():
             if subscription.compression is _PLAIN:
                 if subscription.prefix != prefix:
+                    payload = subscription.prefix + payload[len(prefix) :]
                     prefix = subscription.prefix
-                    payload = prefix + data + b"}"
                 self._dispatcher.offer(subscription.client, subscription.lane, payload, now)
             else:
-                message = message or self._message(topic, data, parsed)
+                message = message or self._message(topic, payload[len(prefix) : -1], parsed)
                 self._deliver_encoded(subscription, message, now)
 
     def _message(self, topic: Topic, data: bytes, parsed: dict[str, Any] | None) -> Message:

@@ -1,6 +1,7 @@
 """Absent fields of messages, which every subscriber sees with their defaults."""
 
 import json
+from functools import cache
 from typing import Any
 
 import pytest
@@ -9,6 +10,8 @@ from hypothesis import strategies as st
 
 from bridge.codecs import cbor_codec, png
 from bridge.hub.delivery.definitions import Definitions
+from bridge.hub.delivery.filling import _TAILS, HEADER
+from bridge.names import ros2_type
 from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer, publisher_and_subscriber
 
 _SECONDS, _NANOSECONDS = divmod(WALL_CLOCK, 10**9)
@@ -156,28 +159,142 @@ def test_a_message_may_not_outgrow_the_limit(text: bytes) -> None:
     assert json.loads(subscriber.payloads()[0])["msg"]["markers"][0]["pose"]["orientation"]["w"] == 0.0
 
 
-@given(
-    st.lists(
-        st.dictionaries(
-            st.sampled_from(["header", "name", "position", "velocity", "effort", "more"]),
-            st.sampled_from([{}, {"frame_id": "a"}, [], [1.5], None]),
-        ),
-        min_size=1,
-        max_size=8,
-    )
+_TYPES = (
+    *(
+        "std_msgs/Header",
+        "std_msgs/Time",
+        "std_msgs/Empty",
+        "std_msgs/Float64MultiArray",
+        "actionlib_msgs/GoalID",
+    ),
+    *("sensor_msgs/JointState", "geometry_msgs/Twist", "geometry_msgs/PoseStamped", "tf2_msgs/TFMessage"),
+    *("nav_msgs/Odometry", "visualization_msgs/MarkerArray", "move_base_msgs/MoveBaseActionFeedback"),
 )
-def test_messages_are_filled_alike_whatever_was_absent_before(messages: list[dict[str, Any]]) -> None:
-    definitions = Definitions(1, lambda: WALL_CLOCK)
-    used = definitions.filler("sensor_msgs/JointState")
-    assert used is not None
-    for given_message in messages:
-        data = json.dumps(given_message).encode()
-        message, other = json.loads(data), json.loads(data)
-        fresh = Definitions(1, lambda: WALL_CLOCK).filler("sensor_msgs/JointState")
-        assert fresh is not None
-        filled, expected = used.fill(message, data, 10_000), fresh.fill(other, data, 10_000)
-        assert message == other
-        assert (filled is None) == (expected is None)
-        assert json.loads(filled or data) == message
-        kept = [field for field in given_message if field != "header"]
-        assert [message[field] for field in kept] == [given_message[field] for field in kept]
+_LEAVES = st.sampled_from(
+    [0, 1.5, "a", None, True, [], {}, [{}], {"x": 1}, {"sec": 3, "nsecs": True}, ["a", 1]]
+)
+
+
+class Slow:
+    """Filling as the reference server does it: field by field, for each message."""
+
+    def __init__(self, definitions: Definitions) -> None:
+        self.types = definitions._types
+
+    def filled(self, name: str, value: Any) -> Any:
+        """Return a message with all its fields, in the order of the text with the absent ones appended."""
+        if type(value) is not dict:
+            return value
+        fields = self.types.fields(name)
+        whole = dict(value)
+        for field, (element, length) in fields.items():
+            if field not in value:
+                whole[field] = self.default(name, field, value)
+            elif element not in self.types._scalars:
+                whole[field] = (
+                    self.filled(element, value[field]) if length < 0 else self.each(element, value[field])
+                )
+        return whole
+
+    def each(self, element: str, values: Any) -> Any:
+        return [self.filled(element, value) for value in values] if type(values) is list else values
+
+    def default(self, name: str, field: str, value: dict[str, Any]) -> Any:
+        now = _NOW[self.types._ros_version]
+        default = self.types.defaults(name)[field]
+        if name in self.types.times:
+            given = value.get({"sec": "secs", "secs": "sec", "nanosec": "nsecs", "nsecs": "nanosec"}[field])
+            return given if type(given) is int else 0
+        if name == HEADER and field == "stamp":
+            return now
+        return default | {"stamp": now} if self.types.fields(name)[field] == (HEADER, -1) else default
+
+
+def _messages(definitions: Definitions, name: str) -> st.SearchStrategy[Any]:
+    """Return messages of a type, mostly of its form, with some of the fields."""
+    types = definitions._types
+    fields: dict[str, st.SearchStrategy[Any]] = {"more": _LEAVES}
+    for field, (element, length) in types.fields(name).items():
+        if element in types._scalars:
+            fields[field] = _LEAVES
+        else:
+            part = _messages(definitions, element)
+            fields[field] = (part if length < 0 else st.lists(part, max_size=2)) | _LEAVES
+    order = st.permutations(list(fields))
+    return st.tuples(order, st.fixed_dictionaries({}, optional=fields)).map(
+        lambda drawn: {field: drawn[1][field] for field in drawn[0] if field in drawn[1]}
+    )
+
+
+@cache
+def _known(ros_version: Any) -> Definitions:
+    definitions = Definitions(ros_version, lambda: WALL_CLOCK)
+    definitions.load()
+    return definitions
+
+
+@cache
+def _messages_of(ros_version: Any, name: str) -> st.SearchStrategy[Any]:
+    definitions = _known(ros_version)
+    assert definitions.filler(name)
+    return _messages(definitions, ros2_type(name))
+
+
+@pytest.mark.parametrize("ros_version", [1, 2])
+@pytest.mark.parametrize("name", _TYPES)
+@given(data=st.data())
+def test_messages_are_filled_as_field_by_field(name: str, ros_version: Any, data: st.DataObject) -> None:
+    definitions = _known(ros_version)
+    filler = definitions.filler(name)
+    if filler is None:
+        return  # a type of the other version
+    slow = Slow(definitions)
+    for given_message in data.draw(st.lists(_messages_of(ros_version, name), min_size=1, max_size=4)):
+        expected = slow.filled(ros2_type(name), given_message)
+        operation = json.dumps({"op": "publish", "topic": "/t", "msg": given_message}).encode()
+        message = json.loads(operation)["msg"]
+        tail = filler.fill(message, 100_000)
+        assert json.dumps(message) == json.dumps(expected)
+        if tail is not None:
+            spliced = operation[:-2] + tail if tail else operation
+            assert json.dumps(json.loads(spliced)["msg"]) == json.dumps(expected)
+        assert (tail == b"") == (expected == given_message)
+
+
+@pytest.mark.parametrize(
+    "name", ["std_msgs/Float64MultiArray", "geometry_msgs/PoseStamped", "std_msgs/Header"]
+)
+@given(data=st.data())
+def test_subscribers_of_a_burst_get_messages_filled_field_by_field(name: str, data: st.DataObject) -> None:
+    """The broker forwards a message as received, with appended fields or written again, to each name of the topic."""
+    slow = Slow(_known(1))
+    hub = Harness()
+    publisher, same, other, latecomer = (hub.connect() for _ in range(4))
+    publisher.advertise("/t", name, latch=True)
+    same.subscribe("/t")
+    other.subscribe("t")
+    messages = data.draw(st.lists(_messages_of(1, name), min_size=1, max_size=6))
+    ends = data.draw(st.lists(st.sampled_from(["}", " }", "\n}"]), min_size=6, max_size=6))
+    texts = [json.dumps(message) for message in messages]
+    _send(
+        publisher,
+        *(
+            f'{{"op":"publish","topic":"/t","msg":{text}{end}'.encode()
+            for text, end in zip(texts, ends, strict=False)
+        ),
+    )
+    expected = [slow.filled(ros2_type(name), message) for message in messages]
+    for peer in (same, other):
+        assert json.dumps(peer.messages()) == json.dumps(expected)
+    latecomer.subscribe("/t")
+    assert json.dumps(latecomer.messages()) == json.dumps(expected[-1:])
+
+
+def test_the_tails_of_few_kinds_of_messages_are_kept() -> None:
+    filler = _known(1).filler("sensor_msgs/CameraInfo")
+    assert filler is not None
+    fields = ["header", "height", "width", "distortion_model", "D", "K", "R", "P"]
+    for number in range(1 << len(fields)):
+        message = {field: 0 for bit, field in enumerate(fields) if number >> bit & 1}
+        assert filler.fill(message, 10_000)
+    assert len(filler._tails) <= _TAILS
