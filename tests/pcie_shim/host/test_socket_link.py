@@ -137,6 +137,14 @@ def test_an_interrupt_comes_in_order(folder: Path) -> None:
             link.receive_done()
 
 
+def test_an_answer_without_a_request_closes_the_link(folder: Path) -> None:
+    with linked(folder) as (link, board):
+        board.sendall(framing.encode(framing.WRITE, framing.REPLY, 1, rm.START, 0))
+        with pytest.raises(SequenceError):
+            link.receive_done()
+        assert not link.is_open
+
+
 @pytest.mark.parametrize("code", [ErrorCode.BUSY, ErrorCode.STALE])
 def test_the_reason_that_a_board_sent_before_it_closed_is_reported(folder: Path, code: ErrorCode) -> None:
     with linked(folder) as (link, board):
