@@ -160,8 +160,9 @@ def test_a_board_that_closes_without_a_reason_is_gone(folder: Path) -> None:
     with linked(folder) as (link, board):
         board.sendall(interrupt(1, DONE_BLOCK.pack(1, 5, 0, 0)))
         board.close()
-        with pytest.raises(LinkClosedError):
+        with pytest.raises(LinkClosedError) as caught:
             link.write32(rm.START, 1)
+        assert str(link.endpoint) in str(caught.value)
         assert not link.is_open
 
 
