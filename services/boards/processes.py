@@ -2,13 +2,14 @@
 
 import contextlib
 import os
+import select
 import signal
 import socket
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from typing import Final, NoReturn
 
 from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.board.misbehaviour import Misbehaviour
@@ -20,11 +21,15 @@ from services.sockets.reporting import STUCK_S, serve_status_in_thread, shifted
 from services.sockets.status import BoardStatus, ProcessStatus
 from services.supervision.child import RESTARTS_WITHIN, describe_exit
 from services.supervision.parent import end_with_parent
+from services.supervision.service_manager import ServiceManager
 from terminal.errors import StoppedError, exit_code_of
 from terminal.log_line import PARENT_VARIABLE, name_process
 from terminal.output import say
 from terminal.private_directory import remove_stale_sockets
 from terminal.signals import check_signals
+
+_LISTENS: Final = 128
+"""Added to the number of a board whose sign says that it listens; otherwise it only lives."""
 
 
 def serve_one(
@@ -36,11 +41,12 @@ def serve_one(
     metrics: str = "",
     restarts: int = 0,
     on_ready: Callable[[], None],
+    on_alive: Callable[[], None] = lambda: None,
 ) -> int:
     """Serve one board in this process until a signal, and return the signal's number.
 
     `directory` is the folder of its status socket, if any; `on_ready` is called when both its sockets are
-    listening.
+    listening, and `on_alive` every second while the board is not stuck.
     """
     stop = StopSignal()
     ended_by: list[int] = []
@@ -69,30 +75,15 @@ def serve_one(
 
     def is_alive() -> bool:
         turned = listening[0].turned if listening else 0.0
-        return not turned or time.monotonic() - turned < STUCK_S
+        is_alive = not turned or time.monotonic() - turned < STUCK_S
+        if is_alive:
+            on_alive()
+        return is_alive
 
     name = f"board{index}"
     with serve_status_in_thread(directory, name, status, metrics=metrics, is_alive=is_alive):
         serve_board(endpoint, index=index, stop=stop, misbehave=misbehave, on_ready=ready)
     return ended_by[0] if ended_by else 0
-
-
-class _Arrivals:
-    """Detection of the last of several processes: each takes a byte from a pipe, and the last empties it."""
-
-    def __init__(self, count: int) -> None:
-        self._left, write = os.pipe()
-        os.set_blocking(self._left, False)
-        os.write(write, bytes(count - 1))
-        self._kept_open = write  # otherwise reading an empty pipe would return end of file
-
-    def is_last(self) -> bool:
-        """Arrive, and return whether this is the last process, or a later one."""
-        try:
-            os.read(self._left, 1)
-        except BlockingIOError:
-            return True
-        return False
 
 
 def _check_free(endpoint: Endpoint) -> None:
@@ -115,7 +106,11 @@ class BoardProcesses:
         self._run_directory = run_directory
         self._metrics = metrics
         self._reports = PARENT_VARIABLE not in os.environ  # a master monitors its boards itself
-        self._arrivals = _Arrivals(count)
+        self._manager = ServiceManager()  # here, because a service manager hears only its own child
+        self._signs, self._write_sign = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._heard = [0.0] * count
+        self._listening: set[int] = set()
+        self._announced = False
         self._started: dict[int, int] = {}
         self._starts = [0] * count
         self._ends: list[float] = []
@@ -133,16 +128,48 @@ class BoardProcesses:
                 self._fork(at)
             while True:
                 check_signals()
-                pid, status = os.wait()
-                at = self._started.pop(pid, -1)
-                if at >= 0:
-                    self._ended(at, os.waitstatus_to_exitcode(status))
+                self._wait()
+                self._report()
         finally:
+            self._manager.stopping()
             self._end_all()
+
+    def _wait(self) -> None:
+        """Handle signs and exits of boards, for at most a second."""
+        poll = select.poll()
+        poll.register(self._signs, select.POLLIN)
+        with contextlib.ExitStack() as descriptors:
+            for pid in self._started:
+                descriptor = os.pidfd_open(pid)
+                descriptors.callback(os.close, descriptor)
+                poll.register(descriptor, select.POLLIN)
+            poll.poll(1000)
+        with contextlib.suppress(BlockingIOError):
+            for sign in os.read(self._signs, 1 << 12):
+                self._hear(sign % _LISTENS, listens=sign >= _LISTENS)
+        for pid in list(self._started):
+            ended, status = os.waitpid(pid, os.WNOHANG)
+            if ended:
+                self._ended(self._started.pop(pid), os.waitstatus_to_exitcode(status))
+
+    def _report(self) -> None:
+        """Tell the service manager how many boards listen, and that none of them is stuck."""
+        count, now = len(self._endpoints), time.monotonic()
+        self._manager.report(
+            f"{len(self._listening)} of {count} boards listen",
+            ready=len(self._listening) == count,
+            alive=all(now - heard < STUCK_S for heard in self._heard),
+        )
+
+    def _tell(self, sign: int) -> None:
+        """Write a sign of a board, in its process; the parent reads them all the time."""
+        with contextlib.suppress(OSError):
+            os.write(self._write_sign, bytes([sign]))
 
     def _fork(self, at: int) -> None:
         parent = os.getpid()
         self._starts[at] += 1
+        self._heard[at] = time.monotonic()
         pid = os.fork()
         if pid:
             self._started[pid] = at
@@ -159,7 +186,8 @@ class BoardProcesses:
                 self._run_directory,
                 metrics=shifted(self._metrics, at),
                 restarts=self._starts[at] - 1,
-                on_ready=lambda: self._ready(at),
+                on_ready=lambda: self._tell(_LISTENS + at),
+                on_alive=lambda: self._tell(at),
             )
             code = 128 + ended_by if ended_by else 0
         except StoppedError as stopped:
@@ -172,11 +200,17 @@ class BoardProcesses:
                 sys.stderr.flush()
             os._exit(code)
 
-    def _ready(self, at: int) -> None:
-        """Print that all boards are ready, or that one is back; runs in the process of a board."""
-        if not self._arrivals.is_last() or not self._reports:
+    def _hear(self, at: int, *, listens: bool) -> None:
+        """Take a sign of a board, and print that all boards are ready, or that one is back."""
+        self._heard[at] = time.monotonic()
+        if not listens:
             return
-        if self._starts[at] > 1:
+        self._listening.add(at)
+        is_back = self._announced
+        self._announced = is_back or len(self._listening) == len(self._endpoints)
+        if not self._reports or not self._announced:
+            return
+        if is_back:
             say(f"board {at} listens again at {self._endpoints[at]}")
         elif len(self._endpoints) == 1:
             say(f"board 0 listens at {self._endpoints[0]}")
@@ -184,6 +218,7 @@ class BoardProcesses:
             say(f"{len(self._endpoints)} boards listen at {self._endpoints[0]} ... {self._endpoints[-1]}")
 
     def _ended(self, at: int, code: int) -> None:
+        self._listening.discard(at)
         now = time.monotonic()
         self._ends = [each for each in self._ends if now - each <= RESTARTS_WITHIN] + [now]
         if len(self._ends) > self._restarts:

@@ -3,6 +3,8 @@
 import os
 import re
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import time
@@ -10,6 +12,9 @@ from pathlib import Path
 
 import psutil
 import pytest
+
+from services.boards.processes import BoardProcesses
+from services.sockets.reporting import STUCK_S
 
 BOARD = str(Path(sys.executable).parent / "board")
 
@@ -82,3 +87,43 @@ def test_a_second_signal_close_behind_the_first_changes_nothing(start, tmp_path)
         _, rest = boards.communicate(timeout=120)
         assert boards.returncode in {130, 143}
         assert rest.count("\n") == 1
+
+
+def test_the_service_manager_hears_one_process_when_all_boards_listen(start, tmp_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+        manager.settimeout(60)
+        watched = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "60000000"}
+        boards = start("--boards", "3", "--directory", str(tmp_path / "b"), **watched)
+        heard: list[str] = []
+        while not ("READY=1" in heard and heard.count("WATCHDOG=1") > 3):
+            text, ancillary, _, _ = manager.recvmsg(1 << 12, 1 << 10)
+            assert struct.unpack("3i", ancillary[0][2])[0] == boards.pid
+            heard += text.decode().split("\n")
+            if "READY=1" in heard:
+                for at in range(3):
+                    with socket.socket(socket.AF_UNIX) as client:
+                        client.connect(str(tmp_path / "b" / f"board{at}.sock"))
+        assert heard.count("READY=1") == 1
+        assert "STATUS=3 of 3 boards listen" in heard
+        boards.terminate()
+        while "STOPPING=1" not in heard:
+            heard += manager.recv(1 << 12).decode().split("\n")
+        assert heard.count("STOPPING=1") == 1
+
+
+def test_a_stuck_board_is_no_sign_of_life_of_its_parent(tmp_path, monkeypatch):
+    reports = []
+    boards = BoardProcesses(tmp_path, 2, 0, None)
+    monkeypatch.setattr(
+        boards._manager, "report", lambda _status, *, ready, alive: reports.append((ready, alive))
+    )
+    for at in range(2):
+        boards._hear(at, listens=True)
+    boards._report()
+    boards._heard[1] -= STUCK_S + 1
+    boards._report()
+    boards._hear(1, listens=False)
+    boards._report()
+    assert reports == [(True, True), (True, False), (True, True)]
