@@ -98,8 +98,9 @@ def test_a_prior_may_have_a_topic_of_its_own(needed):
     (reading,) = frames.take(1, stamped(0, belief=[1, 2, 2, 0]), 2, 2)
     assert reading.addresses == [1]
     assert reading.prior_codes == struct.pack("<4H", 128, 255, 255, 0)
-    with pytest.raises(VariableError) if needed else nullcontext():
-        frames.take(1, stamped(100), 3, 3)
+    for without in ({}, {"belief": None}):
+        with pytest.raises(VariableError) if needed else nullcontext():
+            frames.take(1, stamped(100, **without), 3, 3)
 
 
 def far_apart(ms, count=UNPAIRED_WARNING, **second):

@@ -250,3 +250,4 @@ async def test_one_result_that_nobody_can_receive_is_an_error(boat, link, other)
         with pytest.raises(NotReceivableError) as caught:
             await running
         assert caught.value.exit_code == 3
+        assert not any(isinstance(each, Published) for each in link.sent)
