@@ -25,6 +25,8 @@ MAX_TRANSFORMS: Final = 250_000
 """Maximum number of stored transforms of all frames, about 100 MB; then the older half of each frame is dropped."""
 MAX_NAME: Final = 1000
 """Maximum length of a frame's name; longer ones are ignored."""
+LARGEST: Final = 1e100
+"""Maximum absolute value of a coordinate, so that chains of transforms do not overflow; larger ones are unusable."""
 _NEARLY_PARALLEL: Final = 0.9995
 
 Vector = NDArray[np.float64]
@@ -171,9 +173,10 @@ class TransformTree:
                 stamp = 0 if static else stamp_ns(header["stamp"])
                 translation = _numbers(body["translation"], "xyz")
                 rotation = _numbers(body["rotation"], "xyzw")
-                norm = float(np.linalg.norm(rotation))
+                norm = float(np.linalg.norm(rotation.clip(-2, 2)))
                 usable = (
-                    bool(np.isfinite(translation).all())
+                    bool((np.abs(translation) <= LARGEST).all())
+                    and bool((np.abs(rotation) <= 2).all())
                     and 0.5 < norm < 1.5
                     and 0 < len(parent) <= MAX_NAME
                     and 0 < len(child) <= MAX_NAME

@@ -35,6 +35,7 @@ from bridge.errors import (
     UnreachableError,
     UriError,
 )
+from bridge.transport.frames import is_impossible
 from bridge.transport.websocket import MESSAGE_BYTES_HEADER, WebSocketTransport
 
 WRITE_LIMIT: Final = 1 << 16
@@ -199,7 +200,7 @@ class WebSocket(WebSocketTransport):
     def loss(self) -> Loss:
         """Cause of the end of the connection."""
         closed = self._protocol.close_exc
-        if isinstance(closed.__cause__, PayloadTooBig):
+        if isinstance(closed.__cause__, PayloadTooBig) and not is_impossible(self.refused):
             return Loss.RECEIVED_TOO_LARGE
         if closed.rcvd is not None and closed.rcvd.code == CloseCode.MESSAGE_TOO_BIG:
             return Loss.SENT_TOO_LARGE

@@ -191,3 +191,8 @@ class _Headers(dict[int, bytes]):
 _TEXT_HEADERS: Final = _Headers(_TEXT, 0)
 _BINARY_HEADERS: Final = _Headers(_BINARY, 0)
 _MASKED_HEADERS: Final = _Headers(_TEXT, _MASKED)
+
+
+def is_impossible(header: bytes) -> bool:
+    """Return whether a frame has a length of 2**63 or more, which no message has (RFC 6455, 5.2)."""
+    return len(header) > 2 and header[1] & ~_MASKED == _MEDIUM + 1 and header[2] >= 0x80

@@ -93,6 +93,20 @@ async def test_a_topic_that_is_left_out_may_be_subscribed_again(fake, monkeypatc
         }  # read from the refused messages
 
 
+async def test_a_frame_of_an_impossible_length_leaves_no_topic_out(fake):
+    async with connect(fake.uri) as ros:
+        subscription = ros.subscribe("/a", "p/T")
+        for number in range(1, 4):
+            await fake.wait_for_op("subscribe", topic="/a", count=number)
+            for client in fake._clients:
+                client.connection.transport.write(b"\x81\x7f" + b"\xff" * 8)
+            while ros.reconnections < number:
+                await asyncio.sleep(0.01)
+        await fake.wait_for_op("subscribe", topic="/a", count=4)
+        await fake.publish("/a", {"n": 1})
+        assert (await subscription.next(PATIENCE)).msg == {"n": 1}
+
+
 async def test_an_answer_that_is_too_large_leaves_no_topic_out(fake):
     fake.serve("/large", lambda _args: LARGE)
     async with connect(fake.uri, max_size=LIMIT) as ros:
