@@ -158,7 +158,7 @@ begin
           address_bits => ADDRESS_BITS(c),
           table_file   => MEMORY_PREFIX & "column" & padded(c, SENSORS) & ".mif",
           lines        => LINES,
-          line         => l
+          line         => l * to_natural(MODE = SENSOR_CELL)
         )
         port map (
           clk_i    => clk_i,

@@ -41,6 +41,10 @@ class FrameInputError(PcieShimError):
     exit_code = 2
 
 
+class SimulationError(PcieShimError):
+    """A simulation of a board's hardware that cannot be started, ended, hangs, or answers garbage."""
+
+
 class LinkError(PcieShimError):
     """An unusable link to a board."""
 

@@ -11,7 +11,8 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from hdl.test.simulation import HDL, ROOT, SOURCES
+from hdl.test.project import HDL, SOURCES
+from hdl.test.simulation import ROOT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

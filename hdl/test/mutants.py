@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from hdl.test.simulation import HDL
+from hdl.test.project import HDL
 from hdl.test.verification import Check, formal, units
 
 

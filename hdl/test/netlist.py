@@ -6,18 +6,14 @@ Tables are left out: they are memories, and only the logic around them is counte
 from __future__ import annotations
 
 import json
-import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from hdl.test.project import write_hardware_files
-from hdl.test.simulation import HDL, SOURCES, run_tool
+from hdl.test.project import run_tool, verilog, write_hardware_files
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from hdl.test.project import Image
 
 BLACK_BOX: Final = """
@@ -58,51 +54,14 @@ class Netlist:
         return 0.5 * (sum(small) + self.sums) + 0.75 * fives + sixes
 
 
-def verilog(
-    image: Image,
-    folder: Path,
-    top: str = "bm1",
-    *,
-    table: str = BLACK_BOX,
-    hdl: Path = HDL,
-    more_sources: Sequence[str] = (),
-    generics: Mapping[str, int] | None = None,
-) -> str:
-    """Return an image's hardware as Verilog.
-
-    Args:
-        image: Image of the board.
-        folder: Working folder of GHDL.
-        top: Top-level entity.
-        table: Verilog of a table.
-        hdl: Folder of the VHDL.
-        more_sources: Further VHDL files, relative to `hdl`.
-        generics: Generics of the top-level entity.
-
-    Raises:
-        HardwareToolError: GHDL is not installed or failed.
-    """
-    write_hardware_files(image, folder)
-    # without its entity, the table's component remains unbound: a black box
-    names = [name for name in SOURCES if name != "bm1_table.vhd"]
-    sources = [
-        hdl / names[0],
-        folder / "bm1_parameters.vhd",
-        *(hdl / name for name in [*names[1:], *more_sources]),
-    ]
-    run_tool(["ghdl", "-a", "--std=08", "-Wno-binding", *map(str, sources)], folder)
-    options = [f"-g{name}={value}" for name, value in (generics or {}).items()]
-    text = run_tool(["ghdl", "--synth", "--std=08", "--out=verilog", *options, top], folder, separate=True)
-    return re.sub(r"^module bm1_table\n.*?^endmodule\n", "", text, flags=re.DOTALL | re.MULTILINE) + table
-
-
 def synthesised(image: Image, folder: Path) -> Netlist:
     """Return the cells into which yosys synthesises an image's hardware, without its tables.
 
     Raises:
         HardwareToolError: A tool is not installed or failed.
     """
-    (folder / "bm1.v").write_text(verilog(image, folder))
+    write_hardware_files(image, folder)
+    (folder / "bm1.v").write_text(verilog(folder, table=BLACK_BOX))
     run_yosys(
         f"read_verilog bm1.v; synth_intel_alm -top bm1 -family {_FAMILY} -noiopad -noclkbuf; tee -q -o stat.json stat -json",
         folder,

@@ -1,6 +1,6 @@
 """Imports of the hardware's verification from the rest of the project.
 
-Machines, their emulation, the emulated board and the files of a build are imported only here.
+Machines, their emulation, the emulated board and the toolchain are imported only here.
 """
 
 from __future__ import annotations
@@ -18,19 +18,23 @@ from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.programming_file import Image, Partition, image_bytes, interface_words
 from pcie_shim.register_layout import next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode
+from toolchain.hardware.sources import HDL, PARAMETERS, SOURCES, in_order, verilog
+from toolchain.hardware.tools import HardwareToolError, run_tool
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from toolchain.deployment import Deployment
-
 __all__ = [
+    "HDL",
+    "PARAMETERS",
+    "SOURCES",
     "BM1Kernel",
     "BM1Machine",
     "BM1Parameters",
     "BoardState",
     "EmulatedBoard",
     "ErrorCode",
+    "HardwareToolError",
     "Image",
     "Partition",
     "PriorMode",
@@ -44,15 +48,15 @@ __all__ = [
     "image_bytes",
     "image_of",
     "image_of_parameters",
+    "in_order",
     "interface_words",
     "next_doorbell",
     "reference_kernel",
     "register_map",
+    "run_tool",
+    "verilog",
     "write_hardware_files",
 ]
-
-PARAMETERS_FILE: Final = "bm1_parameters.vhd"
-MEMORY_FOLDER: Final = "Memory_MIFs"
 
 _NO_MODEL: Final = "0" * 64
 
@@ -90,56 +94,7 @@ def image_of_parameters(parameters: BM1Parameters) -> Image:
 
 def write_hardware_files(image: Image, folder: Path) -> None:
     """Write the files of an image's hardware, as a build does: the package of parameters and all memories."""
-    # imported here, because benches do not need the toolchain and dozens of simulations are started
-    from toolchain.outputs.memories import memories
-    from toolchain.outputs.vhdl_parameters import parameters_vhd
+    # imported here, because benches do not need it and dozens of simulations are started
+    from toolchain.hardware.board_files import write_board_files
 
-    deployment = _deployment(image)
-    (folder / PARAMETERS_FILE).write_text(parameters_vhd(deployment, [image]), "ascii")
-    (folder / MEMORY_FOLDER).mkdir(exist_ok=True)
-    for memory in memories(deployment, [image]):
-        (folder / MEMORY_FOLDER / memory.name).write_text("".join(memory.lines()), "ascii")
-
-
-def _deployment(image: Image) -> Deployment:
-    """Return a deployment with one board, which has this image."""
-    from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
-
-    parameters = image.machine.parameters
-    widths = [*parameters.sensor_bits, *([parameters.prior_bits] if parameters.prior_bits else [])]
-    return Deployment(
-        name="random machine",
-        sources=(Source(uri="ws://localhost:9090", topic="/readings", type="std_msgs/Float64MultiArray"),),
-        variables=tuple(
-            Variable(
-                name=f"variable {at}",
-                path=f"data[{at}]",
-                kind="sensor" if at < parameters.sensors else "prior_select",
-                bits=bits,
-                values=2**bits - 1,
-            )
-            for at, bits in enumerate(widths)
-        ),
-        searched=(Dimension(label="line", size=parameters.lines),),
-        machine=MachineSection(
-            lines=parameters.lines,
-            interface=f"{image.interface_sensors}x{image.interface_results}",
-            prob_bits=parameters.prob_bits,
-            prior_bits=parameters.prior_bits,
-            prior_mode=parameters.prior_mode,
-            counter_bits=parameters.counter_bits,
-            rng=parameters.rng,
-            rng_banks=parameters.rng_banks,
-            rng_reset=parameters.rng_reset,
-            shared=parameters.shared,
-            steps_per_clock=parameters.steps_per_clock,
-            target_count=min(255, parameters.target_count_max),
-            sensor_mode=parameters.sensor_mode,
-            replicas=parameters.replicas,
-        ),
-        boards=(
-            Board(
-                image="boards/board0.bm", image_hash=image.image_hash, line_offset=0, lines=parameters.lines
-            ),
-        ),
-    )
+    write_board_files(image, folder)

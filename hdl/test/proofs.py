@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from hdl.test.guard_generics import GENERICS
-from hdl.test.netlist import run_yosys, verilog
+from hdl.test.netlist import run_yosys
+from hdl.test.project import HDL, HardwareToolError, verilog, write_hardware_files
 from hdl.test.random_machines import random_case
-from hdl.test.simulation import HDL, HardwareToolError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -49,10 +49,10 @@ def failed_proof(name: str, folder: Path, hdl: Path = HDL) -> str | None:
     Raises:
         HardwareToolError: GHDL is not installed or refuses the hardware.
     """
-    image = random_case(0).image
+    write_hardware_files(random_case(0).image, folder)
     if name == "guard":
         top, generics, command, define = "guard_properties", GENERICS, _COMBINATIONAL, ""
-        text = verilog(image, folder, "bm1_guard", table="", hdl=hdl, generics=generics)
+        text = verilog(folder, "bm1_guard", table="", hdl=hdl, generics=generics)
     else:
         replicas = 2 if "two" in name else 1
         bounded = name == "every start ends"
@@ -60,7 +60,6 @@ def failed_proof(name: str, folder: Path, hdl: Path = HDL) -> str | None:
         command, define = (_BOUNDED, "-DBOUNDED") if bounded else (_INDUCTION, "")
         sources = [f"{_FORMAL}/core_under_proof.vhd"]
         text = verilog(
-            image,
             folder,
             "core_under_proof",
             table=_ANY_TABLE,

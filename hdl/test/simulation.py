@@ -3,55 +3,30 @@
 from __future__ import annotations
 
 import os
-import shutil
-import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from hdl.test.project import write_hardware_files
+from hdl.test.project import (
+    HDL,
+    PARAMETERS,
+    SOURCES,
+    HardwareToolError,
+    in_order,
+    run_tool,
+    write_hardware_files,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+    from pathlib import Path
 
     from hdl.test.project import Image
 
-HDL: Final = Path(__file__).resolve().parent.parent
 ROOT: Final = HDL.parent
 
-SOURCES: Final = (
-    "bm_register_map.vhd",
-    "bm1_utilities.vhd",
-    "bm_register_block.vhd",
-    "bm1_table.vhd",
-    "bm1_stochastic_bitstream_generator.vhd",
-    "bm1_prior_element.vhd",
-    "bm1_tile_element.vhd",
-    "bm1_counter.vhd",
-    "bm1_lfsr.vhd",
-    "bm1_table_player.vhd",
-    "bm1_generators.vhd",
-    "bm1_control.vhd",
-    "bm1_matrix.vhd",
-    "bm1_core.vhd",
-    "bm1_words.vhd",
-    "bm1_readout.vhd",
-    "bm1_guard.vhd",
-    "bm1_registers.vhd",
-    "bm1_axi.vhd",
-    "bm1.vhd",
-)
-"""The hardware's files in the order of analysis, after the generated package of parameters."""
-
 SIMULATED_TABLE: Final = "simulation/bm1_table_textio.vhd"
-
-_LIMIT_S: Final = 1200.0
-
-
-class HardwareToolError(Exception):
-    """A tool is missing or failed; the text names it and ends with its output."""
 
 
 @dataclass(frozen=True)
@@ -79,9 +54,9 @@ def prepare(image: Image, folder: Path, hdl: Path = HDL, more_sources: Sequence[
         HardwareToolError: GHDL is not installed or refused a file.
     """
     write_hardware_files(image, folder)
-    sources = [hdl / SOURCES[0], folder / "bm1_parameters.vhd", *(hdl / name for name in SOURCES[1:])]
-    sources += [hdl / SIMULATED_TABLE, *(hdl / name for name in more_sources)]
-    run_tool(["ghdl", "-a", "--std=08", *map(str, sources)], folder)
+    names = [*SOURCES, SIMULATED_TABLE, *more_sources]
+    sources = in_order([hdl / name for name in names], folder / PARAMETERS)
+    run_tool(["ghdl", "-a", "--std=08", *sources], folder)
 
 
 def run_bench(
@@ -144,34 +119,6 @@ def run_bench(
         message = f"{module} has no test"
         raise HardwareToolError(message)
     return Outcome(tuple(failures))
-
-
-def run_tool(
-    command: Sequence[str],
-    folder: Path,
-    environment: Mapping[str, str] | None = None,
-    *,
-    separate: bool = False,
-) -> str:
-    """Run a tool in a folder and return its output, with `separate` without its warnings.
-
-    Raises:
-        HardwareToolError: It is not installed, failed, or did not end in time.
-    """
-    if shutil.which(command[0]) is None:
-        message = f"{command[0]} is not installed (Debian: apt-get install {command[0]})"
-        raise HardwareToolError(message)
-    try:
-        done = subprocess.run(
-            command, check=True, cwd=folder, env=environment, capture_output=True, text=True, timeout=_LIMIT_S
-        )
-    except subprocess.TimeoutExpired:
-        message = f"{command[0]} did not end within {_LIMIT_S:.0f} s"
-        raise HardwareToolError(message) from None
-    except subprocess.CalledProcessError as error:
-        message = f"{command[0]} failed: {(error.stdout + error.stderr).strip()[-1500:]}"
-        raise HardwareToolError(message) from None
-    return done.stdout if separate else done.stdout + done.stderr
 
 
 def unit_benches() -> dict[str, tuple[str, dict[str, int]]]:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from hdl.test.project import HDL
 from hdl.test.proofs import failed_proof, proofs
 from hdl.test.random_machines import random_case
-from hdl.test.simulation import HDL, prepare, run_bench, unit_benches
+from hdl.test.simulation import prepare, run_bench, unit_benches
 
 BOARD_BENCH: Final = "hdl.test.bench_board"
 _OPTIONS: Final = ("-gMEMORY_FOLDER=Memory_MIFs/",)

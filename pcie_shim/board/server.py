@@ -1,4 +1,4 @@
-"""The server of an emulated board: one thread that serves the registers to one host at a time, and a loader.
+"""The server of a board: one thread that serves the registers to one host at a time, and a loader.
 
 The loop polls its sockets between two chunks of the machine, so a reset, a second host or the end of the
 process never waits longer than one chunk. When a host disconnects, the board is free for the next one. A host
@@ -19,6 +19,7 @@ from functools import partial
 from typing import Final
 
 from pcie_shim import credentials, framing, register_map
+from pcie_shim.board.board import Board
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.board.misbehaviour import Misbehaviour, MisbehaviourKind
 from pcie_shim.endpoint import Endpoint, listen, no_delay, parse_endpoint, remove_listener
@@ -74,17 +75,19 @@ def serve_board(
     *,
     index: int,
     stop: StopSignal,
+    board: Board | None = None,
     misbehave: Misbehaviour | None = None,
     pin: bool = True,
-    on_ready: Callable[[EmulatedBoard], None] | None = None,
+    on_ready: Callable[[Board], None] | None = None,
 ) -> None:
-    """Serve one emulated board, initially blank, until `stop` is set; then remove the socket files.
+    """Serve one board, initially blank, until `stop` is set; then remove the socket files.
 
     Args:
         endpoint: Endpoint of the registers; `Endpoint.programming` is the programming port.
         index: Number of the board, for the greeting.
         stop: Ends the loop.
-        misbehave: The fault of the board, for tests of hosts.
+        board: The board; None for an emulated one.
+        misbehave: The fault of an emulated board, for tests of hosts.
         pin: Pin this thread to one of its allowed cores, number `index` modulo their number. Boards compute
             for tenths of a millisecond, too short for Linux to distribute the threads woken by one host over
             the cores: without pinning, the boards of a mini-cluster would compute one after the other. The
@@ -107,7 +110,7 @@ def serve_board(
         remove_listener(where, registers)
         raise
     try:
-        server = _Server(where, registers, programming, index, stop, misbehave)
+        server = _Server(where, registers, programming, index, stop, board or EmulatedBoard(), misbehave)
         if on_ready is not None:
             on_ready(server.board)
         server.run()
@@ -234,6 +237,7 @@ class _Server:
         programming: socket.socket,
         index: int,
         stop: StopSignal,
+        board: Board,
         misbehave: Misbehaviour | None,
     ) -> None:
         self._endpoint = endpoint
@@ -245,7 +249,7 @@ class _Server:
         self._starts = 0
         self._faults = 0
         self._last_results = b""
-        self.board = EmulatedBoard()
+        self.board = board
         self._host: _Host | None = None
         self._silent_hosts: dict[int, _Host] = {}
         self._loader: _Loader | None = None
@@ -366,7 +370,7 @@ class _Server:
             self._send(host, framing.READ, framing.REPLY, sequence, address, board.read(address, count))
         elif operation == framing.WRITE:
             done = board.done
-            if self._misbehaviour is not None and not board.running:
+            if self._misbehaviour is not None and isinstance(board, EmulatedBoard) and not board.running:
                 rings = address <= register_map.RESUME and address + 4 * count > register_map.START
                 board.stuck = rings and self._misbehaves(MisbehaviourKind.NEVER_DONE, ahead=1)
                 if rings and self._misbehaves(MisbehaviourKind.DONE_EARLY, ahead=1):
@@ -431,8 +435,13 @@ class _Server:
             last, self._last_results = self._last_results, words
             if last and self._misbehaves(MisbehaviourKind.STALE_RESULT):
                 words = last
-            if not self.board.is_sliced and self._misbehaves(MisbehaviourKind.FLIP_COUNTER):
-                words = self.board.with_flipped_counter(words)
+            board = self.board
+            if (
+                isinstance(board, EmulatedBoard)
+                and not board.is_sliced
+                and self._misbehaves(MisbehaviourKind.FLIP_COUNTER)
+            ):
+                words = board.with_flipped_counter(words)
         if words and self._misbehaves(MisbehaviourKind.SHORT_READ):
             words = words[:-4]
         if words and self._misbehaves(MisbehaviourKind.ALL_ONES):

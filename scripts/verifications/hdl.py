@@ -1,6 +1,7 @@
 """Verification of the VHDL: comparison with the emulated board, and proofs (scripts/verify hdl).
 
 random machines --> GHDL, driven through AXI4-Lite --> what the emulated board answers?
+the boat        --> GHDL or Verilator, behind the link   --> what four emulated boards answer?
 units           --> GHDL                           --> values that no machine reaches
 VHDL            --> Verilog (GHDL) --> yosys        --> properties for every input
 """
@@ -15,10 +16,12 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 from hdl.test.mutants import MUTANTS, Mutant, caught_by
-from hdl.test.simulation import HardwareToolError
+from hdl.test.project import HardwareToolError
 from hdl.test.verification import Check, formal, sessions, units
 from scripts.running.flags import ScriptParser
 from scripts.verifications.debian import MissingToolError, install
+from scripts.verifications.simulated_boat import FRAMES, SimulatedBoat
+from toolchain.hardware.simulation import Simulator
 
 _Item = TypeVar("_Item")
 
@@ -36,7 +39,7 @@ def main() -> int:
     parser.add_argument("--only", default="", metavar="TEXT", help="what has this in its name")
     arguments = parser.parse_args()
     try:
-        install({"ghdl": "ghdl"})
+        install({"ghdl": "ghdl"} if arguments.mutants else {tool: tool for tool in Simulator.VERILATOR.tools})
     except MissingToolError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -45,8 +48,9 @@ def main() -> int:
         mutants = [each for each in MUTANTS if arguments.only in each.name]
         verdicts = _together(_try_mutant, mutants)
     else:
-        checks = [*units(), *formal(), *sessions(arguments.sessions)]
-        checks = [each for each in checks if arguments.only in each.name]
+        boat = [SimulatedBoat("verilator", FRAMES), SimulatedBoat("ghdl", 1)]
+        every: list[Check | SimulatedBoat] = [*boat, *units(), *formal(), *sessions(arguments.sessions)]
+        checks = [each for each in every if arguments.only in each.name]
         verdicts = _together(_try_check, checks)
     passed = sum(verdicts)
     if not verdicts:
@@ -61,7 +65,7 @@ def _together(run: Callable[[_Item], bool], items: Sequence[_Item]) -> list[bool
         return list(pool.map(run, items))
 
 
-def _try_check(check: Check) -> bool:
+def _try_check(check: Check | SimulatedBoat) -> bool:
     began = time.monotonic()
     try:
         why = check.failure()

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdl.test.netlist import Netlist, synthesised
-from hdl.test.project import image_of_parameters
-from hdl.test.simulation import HardwareToolError
+from hdl.test.project import HardwareToolError, image_of_parameters
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
 from scripts.running.flags import ScriptParser
 from scripts.verifications.debian import MissingToolError, install

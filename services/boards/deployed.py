@@ -62,7 +62,7 @@ class DeployedBoards:
         """
         self._settings = settings
         self._rule = integrity_rule(settings, deployment)
-        self.generations = Generations(deployment, _images_of, images=True)
+        self.generations = Generations(deployment, images_of, images=True)
         self._reprogram = reprogram
         self._endpoints = list(endpoints)
         self._cluster: MiniCluster | None = None
@@ -395,5 +395,6 @@ class DeployedBoards:
             self._cluster.close()
 
 
-def _images_of(deployment: Deployment) -> list[Image]:
+def images_of(deployment: Deployment) -> list[Image]:
+    """Return the images of a deployment's boards."""
     return [read_image(deployment.image_path(at)) for at in range(len(deployment.boards))]

@@ -11,10 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NoReturn
 
-from pcie_shim.board.emulated_board import EmulatedBoard
+from pcie_shim.board.board import Board
 from pcie_shim.board.misbehaviour import Misbehaviour
+from pcie_shim.board.rtl_board import RtlBoard
 from pcie_shim.board.server import StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint
+from services.boards.hardware import SimulatedHardware
 from services.errors import BoardFailedError, SettingsError
 from services.settings import endpoint_in
 from services.sockets.reporting import STUCK_S, serve_status_in_thread, shifted
@@ -38,6 +40,7 @@ def serve_one(
     misbehave: Misbehaviour | None,
     directory: Path | None,
     *,
+    board: RtlBoard | None = None,
     metrics: str = "",
     restarts: int = 0,
     on_ready: Callable[[], None],
@@ -45,8 +48,9 @@ def serve_one(
 ) -> int:
     """Serve one board in this process until a signal, and return the signal's number.
 
-    `directory` is the folder of its status socket, if any; `on_ready` is called when both its sockets are
-    listening, and `on_alive` every second while the board is not stuck.
+    `board` is None for an emulated one, and is closed at the end; `directory` is the folder of its status socket,
+    if any; `on_ready` is called when both its sockets are listening, and `on_alive` every second while the board
+    is not stuck.
     """
     stop = StopSignal()
     ended_by: list[int] = []
@@ -57,7 +61,7 @@ def serve_one(
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, end)
-    listening: list[EmulatedBoard] = []
+    listening: list[Board] = []
 
     def status() -> ProcessStatus:
         image = listening[0].image_hash if listening else ""
@@ -69,7 +73,7 @@ def serve_one(
         where = f"listening at {endpoint}, {state}" if listening else f"starting at {endpoint}"
         return ProcessStatus(ready=bool(listening), why=where, boards=[board])
 
-    def ready(board: EmulatedBoard) -> None:
+    def ready(board: Board) -> None:
         listening.append(board)
         on_ready()
 
@@ -81,8 +85,12 @@ def serve_one(
         return is_alive
 
     name = f"board{index}"
-    with serve_status_in_thread(directory, name, status, metrics=metrics, is_alive=is_alive):
-        serve_board(endpoint, index=index, stop=stop, misbehave=misbehave, on_ready=ready)
+    try:
+        with serve_status_in_thread(directory, name, status, metrics=metrics, is_alive=is_alive):
+            serve_board(endpoint, index=index, stop=stop, board=board, misbehave=misbehave, on_ready=ready)
+    finally:
+        if board is not None:
+            board.close()
     return ended_by[0] if ended_by else 0
 
 
@@ -99,12 +107,19 @@ class BoardProcesses:
     """Boards 0 to n-1, each in a process forked from this one."""
 
     def __init__(
-        self, directory: Path, count: int, restarts: int, run_directory: Path | None, metrics: str = ""
+        self,
+        directory: Path,
+        count: int,
+        restarts: int,
+        run_directory: Path | None,
+        metrics: str = "",
+        hardware: SimulatedHardware | None = None,
     ) -> None:
         self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
         self._restarts = restarts
         self._run_directory = run_directory
         self._metrics = metrics
+        self._hardware = hardware
         self._reports = PARENT_VARIABLE not in os.environ  # a master monitors its boards itself
         self._manager = ServiceManager()  # here, because a service manager hears only its own child
         self._signs, self._write_sign = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -184,6 +199,7 @@ class BoardProcesses:
                 at,
                 None,
                 self._run_directory,
+                board=None if self._hardware is None else self._hardware.board(at),
                 metrics=shifted(self._metrics, at),
                 restarts=self._starts[at] - 1,
                 on_ready=lambda: self._tell(_LISTENS + at),

@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final
@@ -11,10 +12,12 @@ import typer
 from pcie_shim.board.misbehaviour import Misbehaviour
 from pcie_shim.credentials import Credentials, board_tls, read_key
 from pcie_shim.endpoint import Endpoint
+from services.boards.deployed import images_of
+from services.boards.hardware import Engine, SimulatedHardware
 from services.boards.processes import BoardProcesses, serve_one
 from services.commands import flags as options
 from services.errors import SettingsError
-from services.settings import load_settings
+from services.settings import Settings, load_settings
 from services.sockets.reporting import check_metrics
 from services.sockets.serving import deployment_for, endpoint_from
 from services.supervision.child import RESTARTS
@@ -37,6 +40,13 @@ app = CommandLine(
 @app.command(help=app.info.help)
 def board(
     listen: options.Listen = None,
+    engine: Annotated[
+        Engine,
+        typer.Option(
+            help="The machine behind the registers: emulated, or simulated from the VHDL by ghdl or verilator; "
+            "rtl is verilator if it is installed, otherwise ghdl.",
+        ),
+    ] = Engine.EMULATED,
     index: Annotated[int, typer.Option(min=0, help="Number of the board, for its messages.")] = 0,
     boards: Annotated[
         int | None,
@@ -111,23 +121,43 @@ def board(
             raise SettingsError(
                 f"--directory {directory} can be entered by other users, who could replace the boards' sockets: run chmod 700 {directory}"
             )
-        BoardProcesses(directory, boards, restarts, run_directory, settings.metrics).run()
+        hardware = _hardware(engine, settings, range(boards))
+        BoardProcesses(directory, boards, restarts, run_directory, settings.metrics, hardware).run()
+    if engine is not Engine.EMULATED and misbehave:
+        raise SettingsError("--misbehave belongs to an emulated board: leave out --engine")
     name_process(f"board{index}")
     from machines.kernel import warm_up
 
     warm_up()
     check_signals()
     endpoint = _endpoint(listen or "", settings.key_file, tls_cert, tls_key, insecure=insecure)
+    hardware = _hardware(engine, settings, (index,))
 
     def on_ready() -> None:
         if PARENT_VARIABLE not in os.environ:  # a master monitors its boards itself
             say(f"board {index} listens at {endpoint}")
 
     fault = Misbehaviour.parse(misbehave) if misbehave else None
-    ended_by = serve_one(endpoint, index, fault, run_directory, metrics=settings.metrics, on_ready=on_ready)
+    ended_by = serve_one(
+        endpoint,
+        index,
+        fault,
+        run_directory,
+        board=None if hardware is None else hardware.board(index),
+        metrics=settings.metrics,
+        on_ready=on_ready,
+    )
     if ended_by:
         raise stopped_error(ended_by)
     return 0
+
+
+def _hardware(engine: Engine, settings: Settings, boards: Collection[int]) -> SimulatedHardware | None:
+    """Return the simulated hardware, compiled for the deployment if one is given; None for emulated boards."""
+    if engine is Engine.EMULATED:
+        return None
+    images = images_of(deployment_for(settings)) if settings.deployment is not None else []
+    return SimulatedHardware(engine, {at: image for at, image in enumerate(images) if at in boards})
 
 
 def _endpoint(

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hdl.test.datasheets import PAGES, THEORY, main, units
-from hdl.test.simulation import HDL
+from hdl.test.project import HDL
 
 
 @pytest.mark.parametrize("unit", units(), ids=lambda unit: unit.name)

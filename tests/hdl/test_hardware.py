@@ -5,8 +5,8 @@ import shutil
 import pytest
 
 from hdl.test.mutants import MUTANTS
+from hdl.test.project import HDL, SOURCES
 from hdl.test.random_machines import MOST_CELLS, random_case
-from hdl.test.simulation import HDL, SOURCES
 from hdl.test.verification import Check, formal, units
 
 needs_ghdl = pytest.mark.skipif(

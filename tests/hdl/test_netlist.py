@@ -5,8 +5,7 @@ import shutil
 import pytest
 
 from hdl.test.netlist import synthesised
-from hdl.test.project import BM1Parameters, RngKind, SensorMode, image_of_parameters
-from hdl.test.simulation import HDL, run_tool
+from hdl.test.project import HDL, BM1Parameters, RngKind, SensorMode, image_of_parameters, run_tool
 from toolchain.analysis.resources.logic import WORST_ERROR, logic_of
 
 needs_ghdl = pytest.mark.skipif(

@@ -19,6 +19,7 @@ from machines.kernel import make_kernel
 from pcie_shim import framing
 from pcie_shim import register_map as rm
 from pcie_shim.board import server as board_module
+from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.endpoint import connect, listen, parse_endpoint
 from pcie_shim.errors import (
     AccessError,
@@ -196,7 +197,7 @@ def test_a_host_that_vanishes_leaves_the_board_well(start_board: StartBoard) -> 
 def test_a_host_that_has_just_left_does_not_hold_the_board(folder: Path) -> None:
     endpoint, port = (parse_endpoint(f"unix:{folder}/{name}.sock") for name in ("registers", "programming"))
     stop = board_module.StopSignal()
-    server = board_module._Server(endpoint, listen(endpoint), listen(port), 0, stop, None)
+    server = board_module._Server(endpoint, listen(endpoint), listen(port), 0, stop, EmulatedBoard(), None)
     for where, accept in ((endpoint, server._accept_host), (port, server._accept_loader)):
         first = connect(where, timeout=PATIENCE)
         accept()

@@ -1,0 +1,173 @@
+"""A simulation of a board's hardware: a child process that executes requests on its AXI4-Lite slave.
+
+Requests and answers are lines of hexadecimal numbers (docs/hardware/simulation.md). The hardware's clock stands
+still between requests, and the child ends with its standard input.
+"""
+
+import contextlib
+import os
+import re
+import select
+import subprocess
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple, NoReturn, Self
+
+from pcie_shim.errors import SimulationError
+
+MOST_WORDS: Final = 256
+"""Maximum number of words that one request reads."""
+ACCESS_CLOCKS: Final = 8
+"""Upper bound of an access in clocks, once the memories are filled."""
+ANSWER_S: Final = 20.0
+"""Seconds for an answer, in addition to ten times those that its clocks usually take."""
+START_S: Final = 600.0
+"""Seconds until the first answer, before which the simulator elaborates the hardware."""
+
+_ANSWER: Final = re.compile(rb"([0-9A-Fa-f]) ([0-9A-Fa-f]{8}) ((?:[0-9A-Fa-f]{8})*)")
+_CLOSE_S: Final = 1.0
+_LONGEST_ANSWER: Final = 8 * MOST_WORDS + 64
+_LAST_OUTPUT: Final = 400  # bytes
+
+
+class Answer(NamedTuple):
+    """The answer to one request."""
+
+    response: int
+    """Of an access: 0, or the error of the last word, SLVERR or DECERR. Of a run: 1 if an interrupt ended it."""
+    clocks: int
+    """Clocks that the request took."""
+    words: bytes
+    """The words that were read before that, little-endian."""
+
+
+class Simulation:
+    """A running simulation.
+
+    Attributes:
+        speed: Clocks per second while the machine runs; 0 until it is measured.
+    """
+
+    def __init__(self, command: Sequence[str], folder: Path) -> None:
+        """Start the child; its first answer may take START_S.
+
+        Raises:
+            SimulationError: It cannot be started.
+        """
+        self.speed = 0.0
+        self._received = bytearray()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
+        try:
+            self._child = subprocess.Popen(
+                command,
+                cwd=folder,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                bufsize=0,
+                start_new_session=True,  # a Ctrl-C is for the board, which ends the child
+            )
+        except OSError as error:
+            self._errors.close()
+            raise SimulationError(
+                f"the simulation of the hardware cannot be started: {command[0]}: {error.strerror}"
+            ) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def process(self) -> int:
+        """Process number of the child."""
+        return self._child.pid
+
+    def close(self) -> None:
+        """End the child, by force if it does not end at once."""
+        assert self._child.stdin is not None  # noqa: S101 - it is a pipe
+        assert self._child.stdout is not None  # noqa: S101 - it is a pipe
+        with contextlib.suppress(OSError):
+            self._child.stdin.close()
+        try:
+            self._child.wait(_CLOSE_S)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            self._child.wait()
+        self._child.stdout.close()
+        self._errors.close()
+
+    def power_up(self) -> None:
+        """Reset the hardware with its pin."""
+        self._execute("z", 0, 0, 2, START_S)
+
+    def run(self, clocks: int) -> Answer:
+        """Run until an interrupt, at most this number of clocks."""
+        return self._execute("c", clocks, 0, clocks)
+
+    def read(self, address: int, count: int) -> Answer:
+        """Read up to MOST_WORDS words, ending with the first that is refused."""
+        answer = self._execute("r", address, count, ACCESS_CLOCKS * count)
+        if len(answer.words) != 4 * count and not (answer.response and len(answer.words) < 4 * count):
+            self._fail("answered a read with another number of words")
+        return answer
+
+    def write(self, address: int, word: int) -> bool:
+        """Write a word, and return whether the hardware accepts it."""
+        return not self._execute("w", address, word, ACCESS_CLOCKS).response
+
+    # ---- requests -------------------------------------------------------------------------------------
+
+    def _execute(self, operation: str, first: int, second: int, clocks: int, limit: float = 0.0) -> Answer:
+        """Send a request that takes about this number of clocks, and return its answer."""
+        assert self._child.stdin is not None  # noqa: S101 - it is a pipe
+        limit = limit or ANSWER_S + (10 * clocks / self.speed if self.speed else 0)
+        try:
+            self._child.stdin.write(f"{operation} {first:08x} {second:08x}\n".encode())
+        except OSError:
+            self._ended()
+        line = self._next_line(time.monotonic() + limit, limit)
+        match = _ANSWER.fullmatch(line)
+        if match is None:
+            self._fail(f"answered {line[:80]!r}, which is not an answer")
+        response, ran, text = match.groups()
+        numbers = bytes.fromhex(text.decode())  # each with the highest digit first
+        words = b"".join(numbers[at : at + 4][::-1] for at in range(0, len(numbers), 4))
+        return Answer(int(response, 16), int(ran, 16), words)
+
+    def _next_line(self, deadline: float, limit: float) -> bytes:
+        assert self._child.stdout is not None  # noqa: S101 - it is a pipe
+        output = self._child.stdout.fileno()
+        while (end := self._received.find(b"\n")) < 0:
+            if len(self._received) > _LONGEST_ANSWER:
+                self._fail(f"answered {bytes(self._received[:80])!r}, which is not an answer")
+            remaining = deadline - time.monotonic()
+            if remaining <= 0 or not select.select([output], [], [], remaining)[0]:
+                self._fail(f"did not answer within {limit:.0f} s")
+            found = os.read(output, 65536)
+            if not found:
+                self._ended()
+            self._received += found
+        line = bytes(self._received[:end])
+        del self._received[: end + 1]
+        return line
+
+    def _ended(self) -> NoReturn:
+        """Fail because the child has closed its pipes."""
+        try:
+            code = self._child.wait(_CLOSE_S)
+        except subprocess.TimeoutExpired:
+            self._fail("closed its output")
+        self._fail(f"ended by signal {-code}" if code < 0 else f"ended with exit code {code}")
+
+    def _fail(self, why: str) -> NoReturn:
+        """Kill the child, and raise the error."""
+        self._child.kill()
+        self._child.wait()
+        size = self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(0, size - _LAST_OUTPUT))
+        said = " ".join(self._errors.read().decode(errors="replace").split())
+        raise SimulationError(f"the simulation of the hardware {why}{f': {said}' if said else ''}")

@@ -1,0 +1,76 @@
+"""Boards whose hardware is simulated, for `board --engine`."""
+
+from collections.abc import Mapping
+from enum import StrEnum
+
+from pcie_shim.board.rtl_board import RtlBoard
+from pcie_shim.board.simulation import Simulation
+from pcie_shim.errors import SimulationError
+from pcie_shim.programming_file import Image
+from services.errors import SettingsError
+from terminal.output import say
+from toolchain.hardware.simulation import Compiled, Simulator, check_tools, compiled
+from toolchain.hardware.tools import HardwareToolError, missing
+
+
+class Engine(StrEnum):
+    """The machine behind the registers of a board."""
+
+    EMULATED = "emulated"
+    RTL = "rtl"
+    GHDL = "ghdl"
+    VERILATOR = "verilator"
+
+
+class SimulatedHardware:
+    """The simulator of an engine, and the boards that use it."""
+
+    def __init__(self, engine: Engine, images: Mapping[int, Image]) -> None:
+        """Choose the simulator (for `rtl` Verilator if it is installed, otherwise GHDL), and compile the images.
+
+        Args:
+            engine: Not `EMULATED`.
+            images: Images with which boards will be programmed, by the numbers of the boards, as far as known.
+
+        Raises:
+            SettingsError: The simulator is not installed, or the VHDL is missing.
+            SimulationError: An image cannot be compiled.
+        """
+        self._images = images
+        self._is_any = engine is Engine.RTL
+        if self._is_any:
+            self._simulator = Simulator.GHDL if missing(Simulator.VERILATOR.tools) else Simulator.VERILATOR
+        else:
+            self._simulator = Simulator(engine.value)
+        try:
+            check_tools(self._simulator)
+        except HardwareToolError as error:
+            raise SettingsError(f"--engine {engine}: {error}") from None
+        for image in images.values():
+            self._compiled(image)
+
+    def board(self, index: int) -> RtlBoard:
+        """Return a blank board, which has started the hardware of its image if that is known.
+
+        Raises:
+            SimulationError: The hardware cannot be compiled or started.
+        """
+        board = RtlBoard(self._simulate)
+        image = self._images.get(index)
+        if image is not None:
+            board.prepare(image)
+        return board
+
+    def _simulate(self, image: Image) -> Simulation:
+        found = self._compiled(image)
+        return Simulation(found.command, found.folder)
+
+    def _compiled(self, image: Image) -> Compiled:
+        try:
+            return compiled(image, self._simulator, say)
+        except HardwareToolError as error:
+            if not self._is_any or self._simulator is Simulator.GHDL:
+                raise SimulationError(str(error)) from error
+            say(f"warning: Verilator cannot compile this hardware, GHDL runs it: {error}")
+            self._simulator = Simulator.GHDL
+            return self._compiled(image)
