@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shutil
 import sys
 import tempfile
 import threading
@@ -64,7 +65,9 @@ def show_progress(text: str) -> None:
         say(text)
         return
     stream = SurvivingStream(sys.stderr)
-    stream.write(one_line(text))
+    stream.write(
+        one_line(text)[: shutil.get_terminal_size().columns - 1]
+    )  # a longer one could not be replaced
     stream.flush()
     _progress.shown = True
 

@@ -77,6 +77,7 @@ def master(
     log_level: options.LogLevel = None,
     log_format: options.LogFormat = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per result.")] = False,
+    plot: Annotated[bool, typer.Option("--plot", help="Draw the newest posterior in the terminal.")] = False,
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print the resulting settings and exit.")
     ] = False,
@@ -127,6 +128,8 @@ def master(
     if check:
         _check(settings)
         return ExitCode.DONE
+    if json and plot:
+        raise SettingsError("--json and --plot both use standard output: give one of them")
     if once == loop:
         raise SettingsError("choose one of --once and --loop")
     if once and count is not None:
@@ -134,7 +137,7 @@ def master(
     check_metrics(settings.metrics, insecure=insecure)
     loaded = deployment_for(settings)
     integrity_rule(settings, loaded)  # refuse an unsound rule before processes are started
-    return run_async(run_master(settings, loaded, once=once, count=count, json=json))
+    return run_async(run_master(settings, loaded, once=once, count=count, json=json, plot=plot))
 
 
 def _check(settings: Settings) -> None:

@@ -109,6 +109,8 @@ class FrameFlow:
         """The last frames."""
         self._failures: deque[float] = deque(maxlen=RESTARTS + 1)
         self.published = 0
+        self.newest: Publish | None = None
+        """The newest result that went to the publisher."""
         self.first_reading_at: float | None = None
         """Monotonic time of the first complete reading."""
         self.has_data = False
@@ -333,6 +335,7 @@ class FrameFlow:
         )
         if not self._at_publisher:
             self._published_at = time.monotonic()
+        self.newest = record
         self.history.computed(result)
         self._at_publisher += 1  # before sending: a publisher in this process answers at once
         if publisher is None or not publisher.send(record):

@@ -6,18 +6,19 @@ import sys
 import time
 from collections.abc import Coroutine
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from services.errors import NoDataError
 from services.master.children import ChildrenWatch
 from services.master.flow import FrameFlow
 from services.master.peers import ROLE, Peers
 from services.master.reload import Reloads
-from services.output.master_output import print_json, print_sentence
+from services.output.axes import deployment_axes
+from services.output.master_output import print_json, sentence
 from services.pipeline.generations import InForce
 from services.settings import Settings
 from services.sockets.control_socket import serve_control
-from services.sockets.records import LossReason, Published
+from services.sockets.records import LossReason, Publish, Published
 from services.sockets.reporting import serve_status
 from services.sockets.status import ProcessStatus
 from terminal.errors import ExitCode
@@ -25,7 +26,12 @@ from terminal.logs import get_logger
 from terminal.output import say, show_progress
 from toolchain.deployment import Deployment
 
+if TYPE_CHECKING:
+    from services.output.posterior_lines import Show
+
 _PROGRESS_EVERY = 1.0
+_DRAWN_EVERY = 0.2
+"""Minimum number of seconds between two pictures, so that drawing takes little time from the frames."""
 _GRACE_PERIOD = 2.0
 """Seconds in which the subscriber may report a missing reading itself, with more details."""
 
@@ -34,12 +40,22 @@ class Master:
     """A run with a deployment, once or in a loop."""
 
     def __init__(
-        self, settings: Settings, deployment: Deployment, *, once: bool, count: int | None, json: bool
+        self,
+        settings: Settings,
+        deployment: Deployment,
+        *,
+        once: bool,
+        count: int | None,
+        json: bool,
+        plot: bool = False,
     ) -> None:
         self._settings = settings
         self._once = once
         self._count = 1 if once else count
         self._json = json
+        self._plot = plot
+        self._newest: Published | None = None
+        self._drawn: Publish | None = None
         self._log = get_logger(ROLE, settings.log_level)
         self._in_force = InForce(deployment, Path(settings.deployment or deployment.directory).absolute())
         self._peers = Peers(settings, self._in_force, self._log, once=once)
@@ -81,11 +97,20 @@ class Master:
                 await sockets.enter_async_context(serve_control(control, self._reloads.order))
                 self._begin_task(self._reloads.keep_first())
                 # results on the terminal show the progress themselves
-                if sys.stderr.isatty() and not (self._json and sys.stdout.isatty()):
+                if sys.stderr.isatty() and not ((self._json or self._plot) and sys.stdout.isatty()):
                     self._begin_task(self._show_progress())
             self._begin_task(self._expect_data())
-            await peers.start(self._flow)
-            await self._flow.end
+            if not self._plot:
+                await peers.start(self._flow)
+                await self._flow.end
+            else:
+                from services.output.posterior_lines import drawing  # rich takes long to load
+
+                with drawing() as show:
+                    self._begin_task(self._keep_drawing(show))
+                    await peers.start(self._flow)
+                    await self._flow.end
+                    self._draw(show)
         finally:
             for task in self._tasks:
                 task.cancel()
@@ -135,10 +160,11 @@ class Master:
 
     def _show(self, record: Published) -> None:
         """Print a published result if requested."""
+        self._newest = record
         if self._json:
             print_json(record, self._in_force)
-        elif self._once:
-            print_sentence(record, self._in_force)
+        elif self._once and not self._plot:
+            print(sentence(record, self._in_force), flush=True)
         if record.seen is False:
             say(
                 f"the result was published, but not seen on the wire within {self._settings.seen_timeout:g} s"
@@ -162,12 +188,30 @@ class Master:
                 began = max(before, self._flow.first_reading_at or before)
                 rate = (published - count) / (now - began) if now > began else 0.0
                 of = f" of {self._count}" if self._count else ""
-                show_progress(f"{ROLE}: {published}{of} results, {rate:.0f} a second")
+                newest = "" if self._newest is None else f"; {sentence(self._newest, self._in_force)}"
+                show_progress(f"{ROLE}: {published}{of} results, {rate:.0f} a second{newest}")
             before, count = now, published
+
+    async def _keep_drawing(self, show: "Show") -> None:
+        while True:
+            await asyncio.sleep(_DRAWN_EVERY)
+            self._draw(show)
+
+    def _draw(self, show: "Show") -> None:
+        """Draw the newest posterior, unless it is drawn already."""
+        from services.output.newest_posterior import posterior_of
+
+        newest = self._flow.newest
+        if newest is None or newest is self._drawn:
+            return
+        self._drawn = newest
+        posterior = posterior_of(newest, self._in_force)
+        if posterior is not None:
+            show(posterior, deployment_axes(self._in_force.deployment))
 
 
 async def run_master(
-    settings: Settings, deployment: Deployment, *, once: bool, count: int | None, json: bool
+    settings: Settings, deployment: Deployment, *, once: bool, count: int | None, json: bool, plot: bool
 ) -> int:
     """Run a master until its end (see `Master.run`)."""
-    return await Master(settings, deployment, once=once, count=count, json=json).run()
+    return await Master(settings, deployment, once=once, count=count, json=json, plot=plot).run()

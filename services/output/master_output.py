@@ -36,13 +36,12 @@ def print_json(record: Published, in_force: InForce) -> None:
         raise StackError(f"standard output cannot be written: {error.strerror or error}") from error
 
 
-def print_sentence(record: Published, in_force: InForce) -> None:
-    """Print a result as a line, with the words of `listen`."""
+def sentence(record: Published, in_force: InForce) -> str:
+    """Return a result as a line, with the words of `listen`."""
     axes = deployment_axes(in_force.deployment)
-    print(
+    return (
         f"frame {record.number}: {in_words(axes, _cell(axes, record.best_line))} with {record.best_probability:.3g}; "
-        f"{record.cycles} cycles; {record.total_ns / 1e6:.2f} ms",
-        flush=True,
+        f"{record.cycles} cycles; {record.total_ns / 1e6:.2f} ms"
     )
 
 

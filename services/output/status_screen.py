@@ -83,8 +83,8 @@ def _processes(stack: StackStatus) -> Table:
             str(process.pid),
             _duration(process.uptime_s),
             "" if known is None else str(known),
-            # the processes of the boat do not report the recent CPU time, and older ones not their memory
-            f"{process.cpu_percent:.1f}" if process.version else "",
+            # the processes of the boat report no recent CPU time, so theirs is the mean since the start
+            f"{process.cpu_percent if process.version else 100 * process.cpu_s / max(process.uptime_s, 1):.1f}",
             f"{process.memory_bytes / 1e6:.0f}" if process.memory_bytes else "",
             *map(Text, _counts(process.frames)),
         )

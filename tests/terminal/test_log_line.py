@@ -129,6 +129,10 @@ def test_progress_is_one_line_that_the_next_line_replaces(capsys, monkeypatch):
     say("a warning")
     say("another")
     assert capsys.readouterr().err == "1 result\\n\r\x1b[K2 results\r\x1b[Ka warning\nanother\n"
+    monkeypatch.setenv("COLUMNS", "20")
+    show_progress("x" * 20)  # a line that wraps could not be replaced
+    say("end")
+    assert capsys.readouterr().err.startswith("x" * 19 + "\r")
     monkeypatch.setenv("BM_LOG_FORMAT", "json")
     show_progress("3 results")
     assert json.loads(capsys.readouterr().err)["message"] == "3 results"

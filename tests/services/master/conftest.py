@@ -46,8 +46,8 @@ class Service:
 class Run:
     """A master with three services in the test's hands."""
 
-    def __init__(self, boat, *, once=False, count=None, json=False, **settings):
-        self.master = Master(Settings(**settings), boat, once=once, count=count, json=json)
+    def __init__(self, boat, *, once=False, count=None, json=False, plot=False, **settings):
+        self.master = Master(Settings(**settings), boat, once=once, count=count, json=json, plot=plot)
         self.flow, self.reloads = self.master._flow, self.master._reloads
         self.peers = self.master._peers
         self.peers._events = self.flow

@@ -6,8 +6,12 @@ from contextlib import nullcontext
 from unittest.mock import AsyncMock, Mock
 
 import msgspec
+import numpy as np
 import pytest
 
+from machines.bm1 import StopReason
+from pcie_shim.host.frame import BoardResult
+from services.boards.frames import encode_boards
 from services.errors import NoDataError
 from services.sockets.records import FrameResult, LossReason, Outcome, Published
 from tests.services.master.conftest import Run
@@ -112,7 +116,29 @@ async def test_progress_tells_the_rate_since_the_last_time(boat, monkeypatch, co
     monkeypatch.setattr(asyncio, "sleep", sleep)
     with pytest.raises(RuntimeError):  # there are no more seconds
         await run.master._show_progress()
-    assert shown == [f"master: 4{of} results, 2 a second", f"master: 6{of} results, 1 a second"]
+    # the newest posterior follows
+    assert [line.split("; frame ")[0] for line in shown] == [
+        f"master: 4{of} results, 2 a second",
+        f"master: 6{of} results, 1 a second",
+    ]
+    assert [line.split("; frame ")[1].split(":")[0] for line in shown] == ["4", "6"]
+
+
+async def test_the_newest_posterior_is_drawn_once(boat):
+    run, drawn = Run(boat, queue="all", plot=True), []
+    boards = len(boat.boards)
+    counts = np.split(np.arange(sum(board.lines for board in boat.boards), dtype="<u4"), boards)
+    whole = [BoardResult(part.tobytes(), 255, StopReason.OVERFLOW) for part in counts]
+    none = [BoardResult(bytes(part.nbytes), 0, StopReason.IMPOSSIBLE) for part in counts]
+    run.read(2)
+    for number, boards in ((1, whole), (2, none)):
+        run.take(run.app, FrameResult(number, encode_boards(boards), 0, 0, 0, 0))
+        for _ in range(2):
+            run.master._draw(lambda posterior, axes: drawn.append((posterior, axes)))
+    ((posterior, axes),) = drawn  # the second frame has none
+    assert (posterior.number, posterior.cycles) == (1, 255)
+    assert posterior.best() == {axis.label: axis.size - 1 for axis in axes}
+    assert [axis.label for axis in axes] == ["y", "x"]
 
 
 @pytest.mark.parametrize("once", [True, False])

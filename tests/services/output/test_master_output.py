@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from services.output.axes import axes_of
-from services.output.master_output import print_json, print_sentence
+from services.output.master_output import print_json, sentence
 from services.output.posterior_file import record
 from services.output.posterior_lines import line
 from services.pipeline.generations import InForce
@@ -35,9 +35,8 @@ def result():
     return published, InForce(MAP, Path())
 
 
-def test_the_line_of_a_master_begins_with_the_words_of_listen(result, capsys):
-    print_sentence(*result)
-    said = capsys.readouterr().out.strip()
+def test_the_line_of_a_master_begins_with_the_words_of_listen(result):
+    said = sentence(*result)
     assert said == "frame 7: y 0.5 m, size large with 0.5; 812 cycles; 3.21 ms"
     heard = line(POSTERIOR, axes_of(POSTERIOR, MAP))
     assert heard == said.replace("with 0.5;", "with 0.5; mean y 1.5 m;")

@@ -131,6 +131,18 @@ async def test_one_screen_has_services_boards_rates_and_losses(tmp_path):
     assert row[:4] == ["1", "programmed", "abababababab", "3"]
 
 
+def test_every_process_has_its_cpu_time():
+    """Those of the boat report no recent one."""
+    shown = io.StringIO()
+    boat = process(name="boat-simulator", version="", cpu_s=3.0, uptime_s=40.0)
+    hub = process(name="hub", version="1", cpu_percent=2.5, cpu_s=9.0, uptime_s=40.0)
+    stack = status.StackStatus(directory="here", ready=True, why=[], processes=[boat, hub], silent=[])
+    Console(file=shown, width=200).print(screen(stack))
+    rows = {line.split()[0]: line.split() for line in shown.getvalue().splitlines() if line[:1].isalpha()}
+    assert "7.5" in rows["boat-simulator"]
+    assert "2.5" in rows["hub"]
+
+
 async def test_what_a_process_says_can_not_write_over_the_terminal(tmp_path):
     sly = process(is_ready=False, why="[red]\x1b[2Jgone\r\nall ready" + "x" * 10_000)
     async with served(tmp_path, hub=sly):
