@@ -490,14 +490,18 @@ class Campaign:
 
 
 def statement_lines(source: str, line: int) -> tuple[int, int]:
-    """Return the first and last line of the innermost statement at a line; of a compound one, those of its header."""
+    """Return the first and last line of the innermost statement at a line; of a compound one, those of its header.
+
+    A function has all its lines, because the tests that use its defaults do not execute its header.
+    """
     around = [(line, line)]
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.stmt):
             body = getattr(node, "body", None)
             last = max(node.lineno, body[0].lineno - 1) if body else node.end_lineno or node.lineno
             if node.lineno <= line <= last:
-                around.append((node.lineno, last))
+                is_function = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+                around.append((node.lineno, node.end_lineno or last if is_function else last))
     return min(around, key=lambda lines: (lines == (line, line), -lines[0]))
 
 

@@ -3,6 +3,8 @@
 Run.read ──▶ FrameFlow ──▶ app.frames;  computed(), failed() ──▶ publisher;  published() ──▶ counts
 """
 
+import time
+
 import msgspec
 import pytest
 
@@ -105,6 +107,18 @@ async def test_frames_wait_for_a_publisher_that_does_not_answer(run):
     run.flow.ready(run.peers.app)
     assert len(run.app.frames) == MOST_AT_PUBLISHER + 2
     assert run.flow.in_flight == 1
+
+
+async def test_a_publisher_has_its_time_from_the_first_result_or_its_last_answer_on(run):
+    run.read(3)
+    began = time.monotonic()
+    computed(run)
+    first = run.flow.awaited(run.peers.publisher).since
+    assert began <= first <= time.monotonic()
+    computed(run)
+    assert run.flow.awaited(run.peers.publisher).since == first
+    published(run, 1)
+    assert run.flow.awaited(run.peers.publisher).since > first
 
 
 async def test_no_frame_is_computed_whose_result_nobody_could_get(run):

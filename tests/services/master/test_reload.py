@@ -1,6 +1,7 @@
 """Reloads: requests to the services, readings during the switch, and the return after a failure."""
 
 import asyncio
+import time
 from pathlib import Path
 from unittest.mock import AsyncMock, Mock, call
 
@@ -92,7 +93,10 @@ async def test_readings_that_still_wait_after_the_drain_are_lost(begun, order, m
 
 async def test_boards_get_no_frame_while_they_are_programmed(begun, order):
     begun.app.before_switch = begun.read
-    assert f"; {describe_frames(0, 1)}, " in await begun.reloads.order(order)
+    began = time.monotonic()
+    sentence = await begun.reloads.order(order)
+    assert f"; {describe_frames(0, 1)}, " in sentence
+    assert 0 <= float(sentence.split()[-2]) <= (time.monotonic() - began) * 1000 + 1  # its last words: 12 ms
     assert begun.app.frames == []
 
 
