@@ -137,7 +137,8 @@ async def test_the_example_without_asyncio_reads_with_a_callback_and_with_an_ite
     async with running_hub(ros_version=ROS_VERSION) as port:
         out = await run(EXAMPLES["Topics and services"], f"ws://127.0.0.1:{port}")
     # threads print at the same time, so a line may follow another before its line break
-    assert "heard hello" in out and "read hello" in out
+    assert "heard hello" in out
+    assert "read hello" in out
 
 
 async def test_what_is_published_is_heard():
