@@ -373,7 +373,8 @@ def test_the_command_as_words_or_json(case):
     result = toolchain("check", case, "--set", "bits=1")
     assert result.exit_code == 2
     assert "line 7: variable 'K'" in result.stdout
-    result = toolchain("check", case, "--json", "--rng-banks", 1, "--prob-bits", 17, "--bits", "K=4")
+    unbuildable = ("--counter-bits", 4, "--target-count", 300)
+    result = toolchain("check", case, "--json", "--rng-banks", 1, *unbuildable, "--bits", "K=4")
     assert (result.exit_code, result.stderr) == (2, "")
     finding = json.loads(result.stdout)
     assert list(finding) == ["severity", "check", "about", "what", "advice"]
