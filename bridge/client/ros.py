@@ -38,7 +38,7 @@ from bridge.codecs.cbor_codec import Arrays
 from bridge.codecs.json_codec import MAX_SIZE
 from bridge.codecs.message_check import Definitions
 from bridge.errors import OptionError
-from bridge.names import absolute, ros_version_of_type
+from bridge.names import absolute, ros2_type, ros_version_of_type
 from bridge.qos import Qos
 
 if TYPE_CHECKING:
@@ -371,8 +371,9 @@ class Ros:
             handler: Coroutine function that is called with each goal, and executes it: it may send feedback,
                 and should check whether the goal has been cancelled. The goal succeeds with the fields that it
                 returns, or is cancelled with them if the sender asked for that, unless the handler has ended
-                the goal differently. If it raises an error, the goal is aborted, and the error is logged. Up to
-                64 goals are executed concurrently. It is cancelled when the connection is lost (ROS 2).
+                the goal differently. If it raises an error, the goal is aborted, and the error is logged; so is
+                a result or feedback that does not fit the type. Up to 64 goals are executed concurrently. It is
+                cancelled when the connection is lost (ROS 2).
 
         Raises:
             NameFormError: The name or the type is malformed.
@@ -382,7 +383,12 @@ class Ros:
         if await self._uses_actionlib(type, DETECT_TIMEOUT):
             self._publishes = True
             return await ActionlibServer(self, self._session, action, type, handler).start()
-        return ActionServer(self._session, action, type, handler)
+        server = ActionServer(self._session, action, type, handler)
+        if self._types is not None:
+            name = ros2_type(type, "action")
+            server.result_check = await self._types.part("action_result", name)
+            server.feedback_check = await self._types.part("action_feedback", name)
+        return server
 
     # Information about the server
 

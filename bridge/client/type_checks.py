@@ -26,7 +26,7 @@ _MAX_SERVICES: Final = 1000
 
 _log = logging.getLogger("bridge")
 
-_Part = Literal["service_request", "service_response", "action_goal"]
+_Part = Literal["service_request", "service_response", "action_goal", "action_result", "action_feedback"]
 
 
 class TypeChecks:

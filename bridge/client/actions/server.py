@@ -11,6 +11,7 @@ from typing import Any
 from bridge.client.handles import Handle
 from bridge.client.protocol.events import CancelRequested, GoalRequested, GoalStatus
 from bridge.client.session import Session
+from bridge.codecs.message_check import MessageCheck
 from bridge.errors import BridgeError
 from bridge.names import absolute
 
@@ -96,11 +97,15 @@ class ActionServer(Handle):
 
     Attributes:
         name: Name of the action.
+        result_check: The check of results, if their type is known.
+        feedback_check: The check of feedback, if its type is known.
     """
 
     def __init__(self, session: Session, name: str, type_name: str, handler: GoalHandler) -> None:
         super().__init__(session)
         self.name = name
+        self.result_check: MessageCheck | None = None
+        self.feedback_check: MessageCheck | None = None
         self._handler = handler
         self._goals: dict[str, tuple[GoalRequest, asyncio.Task[None]]] = {}
         session.core.actions.advertise(name, type_name)
@@ -116,10 +121,14 @@ class ActionServer(Handle):
         actions, flush, identity = self._session.core.actions, self._session.flush, event.goal
 
         def feed_back(values: Mapping[str, Any]) -> None:
+            if self.feedback_check is not None:
+                self.feedback_check(values)
             actions.feed_back(identity, values)
             flush()
 
         def end(status: GoalStatus, values: Mapping[str, Any] | str) -> None:
+            if self.result_check is not None and not isinstance(values, str):
+                self.result_check(values)
             actions.end(identity, status, values)
             flush()
 

@@ -49,6 +49,23 @@ async def test_a_goal_of_ros_2_is_fed_back_and_ends(order, status, sequence):
         assert (result.status, result.values) == (status, {"sequence": sequence})
 
 
+@pytest.mark.parametrize("wrong", ["feedback", "result"])
+async def test_feedback_or_a_result_of_another_type_aborts_the_goal(wrong):
+    async def handle(goal):
+        goal.feed_back({"sequenze": [0]} if wrong == "feedback" else {"sequence": [0]})
+        return {"sequence": [[0]]} if wrong == "result" else {"sequence": [0]}
+
+    async with (
+        running_hub(ros_version=2) as port,
+        connect(f"ws://127.0.0.1:{port}") as ros,
+        await ros.advertise_action("/wrong", FIBONACCI, handle),
+    ):
+        goal = await ros.send_goal("/wrong", FIBONACCI, {"order": 1})
+        with pytest.raises(GoalError) as caught:
+            await goal.result(PATIENCE)
+    assert "sequence" in caught.value.reason
+
+
 async def test_a_handler_that_fails_and_a_server_that_goes_away_end_the_goal():
     async with serving(2) as (server, ros):
         failed = await ros.send_goal("/count", FIBONACCI, {"order": 3})
