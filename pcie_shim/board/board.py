@@ -13,9 +13,9 @@ class Board(Protocol):
     done: int
     """The number of the last start or resume that has stopped (register DONE)."""
     running: bool
-    """Whether the machine is running and `step` must be called."""
+    """True while the machine is running and `step` must be called."""
     stuck: bool
-    """Whether the machine runs forever without a cycle, by misbehaviour."""
+    """True if the machine runs forever without a cycle, by misbehaviour."""
 
     @property
     def image_hash(self) -> str:
@@ -23,7 +23,7 @@ class Board(Protocol):
 
     @property
     def interrupt_enabled(self) -> bool:
-        """Whether the host has enabled interrupts."""
+        """True if the host has enabled interrupts."""
 
     def load(self, content: bytes) -> None:
         """Program the board with the bytes of a programming file, or raise a RefusedError."""

@@ -78,7 +78,7 @@ class RtlBoard:
 
     @property
     def interrupt_enabled(self) -> bool:
-        """Whether the host has enabled interrupts."""
+        """True if the host has enabled interrupts."""
         return bool(self._word(rm.CONTROL) & rm.CONTROL_INTERRUPT_ENABLE_MASK)
 
     # ---- programming ----------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ MODEL = """
 
 
 def facts(status):
-    """What a report says of the machines, without times."""
+    """Return the parts of a report that concern the machines, without times."""
     return {
         pair["key"]: pair["value"] for pair in status["values"] if not pair["key"].endswith(("_ns", "_us"))
     }
