@@ -41,7 +41,7 @@ class RtlBoard:
         turned: Monotonic time at which its server last looked for requests; 0 before the first time.
         programmed: Number of images loaded so far.
         done: The number of the last start or resume that has stopped (register DONE).
-        running: Whether the machine is running and `step` must be called.
+        running: True while the machine is running and `step` must be called.
         stuck: False, because simulated hardware does not misbehave.
     """
 

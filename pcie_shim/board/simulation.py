@@ -13,7 +13,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, NamedTuple, NoReturn, Self
+from typing import IO, Final, NamedTuple, NoReturn, Self, cast
 
 from pcie_shim.errors import SimulationError
 
@@ -74,6 +74,9 @@ class Simulation:
             raise SimulationError(
                 f"the simulation of the hardware cannot be started: {command[0]}: {error.strerror}"
             ) from None
+        # both are pipes
+        self._requests = cast("IO[bytes]", self._child.stdin)
+        self._answers = cast("IO[bytes]", self._child.stdout)
 
     def __enter__(self) -> Self:
         return self
@@ -88,16 +91,14 @@ class Simulation:
 
     def close(self) -> None:
         """End the child, by force if it does not end at once."""
-        assert self._child.stdin is not None  # noqa: S101 - it is a pipe
-        assert self._child.stdout is not None  # noqa: S101 - it is a pipe
         with contextlib.suppress(OSError):
-            self._child.stdin.close()
+            self._requests.close()
         try:
             self._child.wait(_CLOSE_S)
         except subprocess.TimeoutExpired:
             self._child.kill()
             self._child.wait()
-        self._child.stdout.close()
+        self._answers.close()
         self._errors.close()
 
     def power_up(self) -> None:
@@ -123,10 +124,9 @@ class Simulation:
 
     def _execute(self, operation: str, first: int, second: int, clocks: int, limit: float = 0.0) -> Answer:
         """Send a request that takes about this number of clocks, and return its answer."""
-        assert self._child.stdin is not None  # noqa: S101 - it is a pipe
         limit = limit or ANSWER_S + (10 * clocks / self.speed if self.speed else 0)
         try:
-            self._child.stdin.write(f"{operation} {first:08x} {second:08x}\n".encode())
+            self._requests.write(f"{operation} {first:08x} {second:08x}\n".encode())
         except OSError:
             self._ended()
         line = self._next_line(time.monotonic() + limit, limit)
@@ -139,8 +139,7 @@ class Simulation:
         return Answer(int(response, 16), int(ran, 16), words)
 
     def _next_line(self, deadline: float, limit: float) -> bytes:
-        assert self._child.stdout is not None  # noqa: S101 - it is a pipe
-        output = self._child.stdout.fileno()
+        output = self._answers.fileno()
         while (end := self._received.find(b"\n")) < 0:
             if len(self._received) > _LONGEST_ANSWER:
                 self._fail(f"answered {bytes(self._received[:80])!r}, which is not an answer")

@@ -5,6 +5,7 @@ RtlBoard and EmulatedBoard: the same accesses
 """
 
 import contextlib
+import errno
 import os
 import select
 import shutil
@@ -33,6 +34,7 @@ from services.boards.hardware import Engine, SimulatedHardware
 from services.commands.board import app
 from tests.command_runner import invoke
 from tests.pcie_shim.boards import expected, image, images, machine, never_stopping
+from toolchain.hardware import simulation
 
 needs_ghdl = pytest.mark.skipif(
     shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
@@ -291,3 +293,15 @@ def test_a_cache_of_others_is_not_used(tmp_path, monkeypatch):
     (tmp_path / "rosbayes" / "hardware").chmod(0o777)
     with pytest.raises(SimulationError):
         SimulatedHardware(Engine.GHDL, {0: image(machine(1))})
+
+
+@needs_ghdl
+def test_a_full_disk_is_an_error_of_the_board(tmp_path, monkeypatch):
+    def write(*_):
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(simulation, "write_board_files", write)
+    with pytest.raises(SimulationError) as raised:
+        SimulatedHardware(Engine.GHDL, {0: image(machine(1))})
+    assert str(tmp_path) in str(raised.value)

@@ -89,21 +89,35 @@ def compiled(image: Image, simulator: Simulator, on_compile: Callable[[str], Non
         )
     cache = _cache()
     kept = cache / _key(image, simulator)
-    if not kept.is_dir():
-        on_compile(f"{simulator} compiles the hardware of image {image.image_hash[:12]} (once) ...")
-        with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=cache, ignore_cleanup_errors=True) as where:
-            finished = Path(where) / "finished"
-            finished.mkdir()
-            (_compile_ghdl if simulator is Simulator.GHDL else _compile_verilator)(image, finished)
-            if not kept.is_dir():  # otherwise another board with this image was faster
-                finished.rename(kept)
-        _prune(cache)
-    os.utime(kept)
+    try:
+        if not kept.is_dir():
+            on_compile(f"{simulator} compiles the hardware of image {image.image_hash[:12]} (once) ...")
+            _compile(image, simulator, kept)
+            _prune(cache)
+        os.utime(kept)
+    except OSError as error:
+        raise HardwareToolError(
+            f"{cache} cannot hold the compiled hardware ({error.strerror}): free space, "
+            "or name a folder for caches with XDG_CACHE_HOME"
+        ) from None
     if simulator is Simulator.VERILATOR:
         return Compiled((str(kept / _EXECUTABLE),), kept)
     # memories are larger than GHDL's default limit of an object, and its warnings would be among the answers
     options = (f"-gBOARD={image.partition.index}", "--max-stack-alloc=0", "--ieee-asserts=disable")
     return Compiled(("ghdl", "-r", "--std=08", "bm1_simulated", *options), kept)
+
+
+def _compile(image: Image, simulator: Simulator, kept: Path) -> None:
+    """Compile a simulation beside its folder in the cache, so that the folder is complete from the beginning."""
+    with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=kept.parent, ignore_cleanup_errors=True) as where:
+        finished = Path(where) / "finished"
+        finished.mkdir()
+        (_compile_ghdl if simulator is Simulator.GHDL else _compile_verilator)(image, finished)
+        try:
+            finished.rename(kept)
+        except OSError:
+            if not kept.is_dir():  # otherwise another board with this image was faster
+                raise
 
 
 def _compile_ghdl(image: Image, folder: Path) -> None:
