@@ -1,11 +1,24 @@
-"""Fixtures and rules for all tests."""
+"""Fixtures and rules for all tests: their kinds, their limits, and what they may leave behind."""
 
+import asyncio
 import contextlib
+import gc
 import os
 import signal
+import sys
+import threading
+import time
+from asyncio import runners
+from pathlib import Path
 
 import psutil
+import pytest
 from hypothesis import HealthCheck, settings
+
+from tests.patience import PATIENCE, PROCESS_TEST_LIMIT, TEST_LIMIT
+
+# pytest-timeout reads it when pytest has loaded this file
+os.environ["PYTEST_TIMEOUT"] = str(TEST_LIMIT)
 
 # A shell that starts the tests in the background has Ctrl-C ignored for them, and so for every process that they start
 # and interrupt.
@@ -28,3 +41,100 @@ def _end_with_children(number: int, _frame: object) -> None:
 
 
 signal.signal(signal.SIGTERM, _end_with_children)
+
+
+# Kinds: a test that starts a process is marked `process` (run one at a time) or `thorough` (only by scripts/test --all).
+
+_STARTS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system"}
+_PID = os.getpid()
+_unmarked: str | None = None
+"""The test that runs now, if it may not start a process."""
+_started: list[str] = []
+"""What it has started all the same."""
+
+
+def _refuse_processes(event: str, arguments: tuple) -> None:
+    if event in _STARTS and _unmarked is not None and os.getpid() == _PID:
+        what = f"{event}{arguments[:2]!r:.200}"
+        _started.append(what)
+        raise RuntimeError(f"{_unmarked} is not marked process or thorough, and starts a process: {what}")
+
+
+sys.addaudithook(_refuse_processes)
+
+
+def _may_start_processes(item: pytest.Item) -> bool:
+    return any(item.get_closest_marker(kind) for kind in ("process", "thorough"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if _may_start_processes(item) and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(PROCESS_TEST_LIMIT))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item):
+    global _unmarked  # noqa: PLW0603  # an audit hook cannot be removed, so it reads what holds now
+    _started.clear()
+    _unmarked = None if _may_start_processes(item) else item.nodeid
+    try:
+        return (yield)
+    finally:
+        _unmarked = None
+
+
+# Leaks: after each test and its fixtures, this process has no more children, threads, sockets and tasks than before.
+
+_pending: set[str] = set()
+"""Tasks that still ran when the event loop of a test was closed."""
+_cancel_all_tasks = runners._cancel_all_tasks
+
+
+def _note_pending_tasks(loop: asyncio.AbstractEventLoop) -> None:
+    """Note the tasks that a test leaves, where asyncio cancels them; those that are about to end may do so."""
+    deadline = time.monotonic() + PATIENCE
+    left = asyncio.all_tasks(loop)
+    while left and all(task.cancelling() for task in left) and time.monotonic() < deadline:
+        loop.run_until_complete(asyncio.sleep(0))
+        left = asyncio.all_tasks(loop)
+    _pending.update(f"task {task.get_coro()}" for task in left)
+    _cancel_all_tasks(loop)
+
+
+runners._cancel_all_tasks = _note_pending_tasks
+
+
+def _held() -> set[str]:
+    """Children, threads and sockets of this process, from /proc: a walk of all processes would cost a minute."""
+    held = {f"thread {thread.name} ({thread.ident})" for thread in threading.enumerate()}
+    for task in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(OSError):
+            held.update(f"process {pid}" for pid in (task / "children").read_text().split())
+    for descriptor in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            target = os.readlink(f"/proc/self/fd/{descriptor}")
+            if target.startswith("socket:"):
+                held.add(target)
+    return held
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left(request: pytest.FixtureRequest):
+    """Fail a test that leaves a process, a thread, a socket or a task.
+
+    Fixtures of a wider scope are made before this one, so what they hold is not held against a test.
+    """
+    before = _held()
+    _pending.clear()
+    yield
+    left = _held() - before
+    if left:
+        gc.collect()  # what nobody refers to is closed by the collector, and warns there
+    # a thread that has been asked to end, and a socket that its peer has closed, may take a moment
+    deadline = time.monotonic() + PATIENCE / 5
+    while (left := _held() - before) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    left |= _pending
+    assert not left, f"{request.node.name} leaves {', '.join(sorted(left))}"
+    assert not _started, f"{request.node.name} is not marked process or thorough, and starts {_started}"
