@@ -1,4 +1,4 @@
-"""Machines, images and board processes for the tests of the boards."""
+"""Machines, images and served boards for the tests of the boards."""
 
 import contextlib
 import dataclasses
@@ -9,6 +9,7 @@ import signal
 import socket
 import struct
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
@@ -19,9 +20,11 @@ from machines.kernel import make_kernel
 from machines.parameters import BM1Parameters, RngKind, SensorMode
 from pcie_shim.board.misbehaviour import Misbehaviour
 from pcie_shim.board.server import StopSignal, serve_board
+from pcie_shim.endpoint import Endpoint
 from pcie_shim.host.frame import FrameInput
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, Partition, interface_words
+from tests.patience import PATIENCE
 
 _FORK = multiprocessing.get_context("fork")
 _PLACES: list[socket.socket] = []
@@ -86,8 +89,41 @@ def images(seed: int, lines: Sequence[int], **parameters) -> list[Image]:
     ]
 
 
+class ServedBoard:
+    """An emulated board in a thread of the test's process."""
+
+    def __init__(self, endpoint: Endpoint | str, *, index: int = 0, misbehave: str = "") -> None:
+        self.endpoint = endpoint
+        self._stop = StopSignal()
+        self._listens = threading.Event()
+        self._thread = threading.Thread(target=self._run, args=(index, misbehave), name="board", daemon=True)
+        self._thread.start()
+        assert self._listens.wait(PATIENCE), f"the board at {endpoint} did not start"
+
+    def _run(self, index: int, misbehave: str) -> None:
+        try:
+            serve_board(
+                self.endpoint,
+                index=index,
+                stop=self._stop,
+                misbehave=Misbehaviour.parse(misbehave) if misbehave else None,
+                pin=False,
+                on_ready=lambda _board: self._listens.set(),
+            )
+        finally:
+            self._stop.close()
+            self._listens.set()
+
+    def stop(self) -> None:
+        """End it, and wait until its connections are closed."""
+        if self._thread.is_alive():
+            self._stop.set()
+        self._thread.join(PATIENCE)
+        assert not self._thread.is_alive()
+
+
 class BoardProcess:
-    """An emulated board in a process of its own."""
+    """An emulated board in a process of its own, which can be killed."""
 
     def __init__(self, endpoint: str, *, index: int = 0, misbehave: str = "") -> None:
         self.endpoint = endpoint
@@ -95,7 +131,7 @@ class BoardProcess:
         self.process = _FORK.Process(target=self._run, args=(index, misbehave), daemon=True)
         self.process.start()
         os.close(self._tell)
-        readable, _, _ = select.select([ready], [], [], 60)
+        readable, _, _ = select.select([ready], [], [], PATIENCE)
         said = os.read(ready, 1) if readable else b""
         os.close(ready)
         assert said, f"the board at {endpoint} did not start"
@@ -114,15 +150,15 @@ class BoardProcess:
     def stop(self) -> int | None:
         """End it in order; its exit code."""
         self.process.terminate()
-        self.process.join(60)
+        self.process.join(PATIENCE)
         return self.process.exitcode
 
     def kill(self) -> None:
         self.process.kill()
-        self.process.join(60)
+        self.process.join(PATIENCE)
 
 
-def endpoints_of(boards: Sequence[BoardProcess]) -> list[str]:
+def endpoints_of(boards: Sequence[ServedBoard | BoardProcess]) -> list[str]:
     return [board.endpoint for board in boards]
 
 
@@ -131,7 +167,7 @@ def opened(parts: Sequence[Image], *, tcp: bool = False) -> Iterator[MiniCluster
     """A mini-cluster of well-behaved boards that hold these parts; they end in order."""
     with tempfile.TemporaryDirectory(prefix="bm") as base:
         boards = [
-            BoardProcess(tcp_endpoint() if tcp else f"unix:{base}/board{at}.sock", index=at)
+            ServedBoard(tcp_endpoint() if tcp else f"unix:{base}/board{at}.sock", index=at)
             for at in range(len(parts))
         ]
         try:
@@ -139,7 +175,7 @@ def opened(parts: Sequence[Image], *, tcp: bool = False) -> Iterator[MiniCluster
                 yield cluster
         finally:
             for board in boards:
-                assert board.stop() == 0
+                board.stop()
 
 
 Outcomes: TypeAlias = list[tuple[list[int], int, StopReason]]

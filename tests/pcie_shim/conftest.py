@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 from machines.kernel import warm_up
-from tests.pcie_shim.boards import BoardProcess
+from tests.pcie_shim.boards import ServedBoard
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _kernels() -> None:
-    """Loaded once, before boards are forked from this process."""
+    """Loaded once, before boards are forked from this process, and before a board's thread would compile them."""
     warm_up()
 
 
@@ -22,15 +22,15 @@ def folder() -> Iterator[Path]:
 
 
 @pytest.fixture
-def start_board(folder: Path) -> Iterator[Callable[..., BoardProcess]]:
-    """Starts board processes; those that still run are ended."""
-    started: list[BoardProcess] = []
+def start_board(folder: Path) -> Iterator[Callable[..., ServedBoard]]:
+    """Serves boards in threads of this process, and ends them after the test."""
+    started: list[ServedBoard] = []
 
-    def start(endpoint: str = "", *, index: int = 0, misbehave: str = "") -> BoardProcess:
-        board = BoardProcess(endpoint or f"unix:{folder}/board{index}.sock", index=index, misbehave=misbehave)
+    def start(endpoint: str = "", *, index: int = 0, misbehave: str = "") -> ServedBoard:
+        board = ServedBoard(endpoint or f"unix:{folder}/board{index}.sock", index=index, misbehave=misbehave)
         started.append(board)
         return board
 
     yield start
     for board in started:
-        board.kill()
+        board.stop()

@@ -14,11 +14,11 @@ from pcie_shim.errors import CredentialsError, KeyRefusedError, LinkClosedError,
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import SocketLink
 from tests.certificates import issue
+from tests.patience import PATIENCE
 from tests.pcie_shim.boards import image, machine, tcp_endpoint
 
 KEY = Credentials(key=b"sixteen-letters-at-least")
 OTHER = Credentials(key=b"sixteen-letters-and-others")
-PATIENCE = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +81,7 @@ def test_a_proof_does_not_fit_another_challenge(start_board):
             assert b"ROSBAYES" not in received  # the greeting
 
 
+@pytest.mark.thorough
 def test_a_link_over_tls(start_board, certificate):
     endpoint = with_credentials(tcp_endpoint().replace("tcp", "tls"), KEY)
     start_board(replace(endpoint, credentials=replace(KEY, tls=board_tls(*certificate))))

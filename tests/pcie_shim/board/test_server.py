@@ -1,16 +1,16 @@
 """The board's server: one host, a second one, one that disconnects, one that breaks the protocol, and loaders.
 
-this process ──socket── board process (registers, machine)
-     └─────────socket── its programming port
+the test ──socket── a board's thread (registers, machine)
+     └─────socket── its programming port
 """
 
 import hashlib
 import socket
 import struct
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -28,24 +28,25 @@ from pcie_shim.errors import (
     ImageMismatchError,
     LinkClosedError,
 )
+from pcie_shim.host import socket_link
 from pcie_shim.host.link import Done
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import image_bytes
 from pcie_shim.register_map import BoardState, ErrorCode
-from tests.pcie_shim.boards import BoardProcess, image, machine, never_stopping, tcp_endpoint, words
+from tests.patience import PATIENCE
+from tests.pcie_shim.boards import ServedBoard, image, machine, never_stopping, tcp_endpoint, words
 
 ENABLE = rm.CONTROL_INTERRUPT_ENABLE_MASK
-StartBoard = Callable[..., BoardProcess]
+StartBoard = Callable[..., ServedBoard]
 MACHINE = machine(1)
-PATIENCE = 60.0
 
 
-def open_link(board: BoardProcess) -> SocketLink:
+def open_link(board: ServedBoard) -> SocketLink:
     return SocketLink.open(parse_endpoint(board.endpoint), timeout=PATIENCE)
 
 
-def programmed(start_board: StartBoard, of: BM1Machine) -> BoardProcess:
+def programmed(start_board: StartBoard, of: BM1Machine) -> ServedBoard:
     board = start_board()
     program(board.endpoint, image(of))
     return board
@@ -67,7 +68,7 @@ def run_for_minutes(link: SocketLink) -> None:
 def wait_done(link: SocketLink, number: int) -> Done:
     deadline = time.monotonic() + PATIENCE
     while (done := link.take_done() or link.receive_done()) is None:
-        assert time.monotonic() < deadline
+        assert time.monotonic() < deadline, f"the board does not finish start {number}"
     assert done.number == number
     return done
 
@@ -138,10 +139,8 @@ def test_a_running_board_answers_and_can_be_reset(start_board: StartBoard) -> No
         with refused(ErrorCode.BUSY):
             link.write32(rm.TARGET_COUNT, 1)
         first = link.read_block(rm.CYCLES, 2)
-        deadline = time.monotonic() + PATIENCE
         while link.read_block(rm.CYCLES, 2) == first:
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
+            pass
         link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK | ENABLE)
         assert link.read32(rm.STATUS) == BoardState.IDLE | ErrorCode.NONE << 8
         link.write32(rm.TARGET_COUNT, 10)
@@ -268,7 +267,7 @@ def test_sockets_are_private_and_go_away_though_the_machine_runs(
     assert all(path.stat().st_mode & 0o777 == 0o600 for path in folder.iterdir())
     with open_link(board) as link:
         run_for_minutes(link)
-        assert board.stop() == 0
+        board.stop()
         with pytest.raises(LinkClosedError):
             link.read32(rm.ID)
     assert list(folder.iterdir()) == []
@@ -308,16 +307,20 @@ def test_a_blank_board_is_programmed_and_programmed_again(start_board: StartBoar
         assert link.read32(rm.PROGRAMMED) == 2
 
 
-def test_a_link_over_tcp_waits_for_the_end_of_the_one_before(start_board: StartBoard) -> None:
+def test_a_link_over_tcp_waits_for_the_end_of_the_one_before(
+    start_board: StartBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # two connections have no order on a network: the former one's end may come after the next one's beginning
     board = start_board(tcp_endpoint())
     former = open_link(board)
     assert former.read32(rm.ID) == rm.ID_VALUE
-    ending = threading.Timer(0.2, former.close)
-    ending.start()
+    # the former one ends when the next one has been refused and is about to try again
+    monkeypatch.setattr(socket_link, "_ENDS_S", PATIENCE)
+    clock = SimpleNamespace(monotonic=time.monotonic, sleep=lambda _: former.close())
+    monkeypatch.setattr(socket_link, "time", clock)
     with open_link(board) as link:
+        assert not former.is_open
         assert link.read32(rm.ID) == rm.ID_VALUE
-    ending.join()
 
 
 def test_the_loader_is_refused_while_a_host_holds_the_board(start_board: StartBoard) -> None:
@@ -343,11 +346,17 @@ def test_one_loader_at_a_time(start_board: StartBoard) -> None:
 def test_a_loader_that_says_nothing_loses_its_turn(
     start_board: StartBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # long enough for a loader that does speak, however busy the machine
-    monkeypatch.setattr(board_module, "PROGRAMMING_SILENCE_S", 3.0)
+    now = [100.0]
+    monkeypatch.setattr(board_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
     board = start_board()
     silent = open_programming(board)
-    silent.read32(rm.ID)
+    for _ in range(2):
+        silent.read32(rm.ID)
+        now[0] += board_module.PROGRAMMING_SILENCE_S
+        with pytest.raises(HeldError):
+            program(board.endpoint, image(MACHINE))
+    now[0] += 1
+    open_link(board).close()  # the board looks at its clock when something happens
     with pytest.raises(LinkClosedError):
         wait_done(silent, 1)
     program(board.endpoint, image(MACHINE))
@@ -358,7 +367,7 @@ def begin(link: SocketLink, size: int, digest: bytes) -> None:
     link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
 
 
-def open_programming(board: BoardProcess) -> SocketLink:
+def open_programming(board: ServedBoard) -> SocketLink:
     return SocketLink.open(parse_endpoint(board.endpoint).programming, timeout=PATIENCE)
 
 

@@ -50,6 +50,7 @@ def compare_every_flip(built: BM1Machine) -> Reach:
     return found
 
 
+@pytest.mark.thorough
 @settings(max_examples=12, deadline=None, phases=(Phase.explicit, Phase.generate))
 @given(
     st.integers(0, 2**16),
@@ -71,6 +72,7 @@ def test_a_walk_finds_the_predicted_flips(seed: int, options: dict) -> None:
     compare_every_flip(machine(seed, **options))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "options",
     [
@@ -118,6 +120,7 @@ def run_with_canaries(cluster: MiniCluster, walk: CanaryWalk, frames: list[Frame
     return outputs
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "options",
     [

@@ -17,9 +17,9 @@ from pcie_shim.host import loader
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import image_bytes
-from tests.pcie_shim.boards import BoardProcess, image, machine
+from tests.pcie_shim.boards import ServedBoard, image, machine
 
-StartBoard = Callable[..., BoardProcess]
+StartBoard = Callable[..., ServedBoard]
 
 
 def test_a_damaged_or_missing_file_is_refused_before_the_board_is_touched(folder: Path) -> None:

@@ -20,8 +20,9 @@ from pcie_shim.host.frame import FrameInput, FrameOutput
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, image_bytes
 from pcie_shim.register_map import ErrorCode
+from tests.patience import PATIENCE
 from tests.pcie_shim.boards import (
-    BoardProcess,
+    ServedBoard,
     expected_of_replicas,
     image,
     images,
@@ -93,7 +94,7 @@ def case(request: pytest.FixtureRequest) -> Iterator[Case]:
         yield Case(parts, cluster)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     st.integers(0, 2**31),
     st.integers(1, 255) | st.just(255),
@@ -151,15 +152,15 @@ def test_a_frame_that_does_not_fit_is_refused(name: str, change: dict) -> None:
         case.cluster.post(dataclasses.replace(case.frame(1), **change))
 
 
-def test_a_replaced_board_gets_the_prior_selects_again(start_board: Callable[..., BoardProcess]) -> None:
+def test_a_replaced_board_gets_the_prior_selects_again(start_board: Callable[..., ServedBoard]) -> None:
     parts = images(8, (4,), replicas=2, prior_bits=1, zeros=0)
     board = start_board()
-    with MiniCluster.open([board.endpoint], parts, timeout=60) as cluster:
+    with MiniCluster.open([board.endpoint], parts, timeout=PATIENCE) as cluster:
         case = Case(parts, cluster)
         frame = case.frame(1, prior_address=(1, 0), target_count=255, max_cycles=2**17)
         # no other board decides about the replicas of the only one
         assert case.check(frame).slices == 1
-        board.kill()
+        board.stop()
         with pytest.raises(BoardGoneError):
             cluster.run(frame)
         start_board(board.endpoint)
@@ -217,7 +218,7 @@ def test_a_replica_that_is_not_there_is_not_halted() -> None:
     [(2, 4), (3, 5000)],
 )
 def test_a_board_of_other_capabilities_is_refused(
-    start_board: Callable[..., BoardProcess], monkeypatch: pytest.MonkeyPatch, replicas: int, inputs: int
+    start_board: Callable[..., ServedBoard], monkeypatch: pytest.MonkeyPatch, replicas: int, inputs: int
 ) -> None:
     """A board that shows the right image hash and has fewer machines or words all the same."""
     (part,) = CASES["three replicas on one board"]
