@@ -104,17 +104,7 @@ def listen(endpoint: Endpoint) -> socket.socket:
         if not endpoint.path:
             family = socket.AF_INET6 if ":" in endpoint.host else socket.AF_INET
             return socket.create_server((endpoint.host, endpoint.port), family=family)
-        server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        # Linux creates the file with the mode of the socket, so another user can never connect
-        os.fchmod(server.fileno(), 0o600)
-        try:
-            server.bind(endpoint.path)
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE or _is_served(endpoint.path):
-                raise
-            Path(endpoint.path).unlink()
-            server.bind(endpoint.path)
-        server.listen()
+        return _listen_privately(endpoint.path)
     except OSError as error:
         reasons = {
             errno.EADDRINUSE: "another process listens there",
@@ -122,6 +112,24 @@ def listen(endpoint: Endpoint) -> socket.socket:
         }
         reason = reasons.get(error.errno or 0, error.strerror or str(error))
         raise EndpointError(f"Nothing can be served at {endpoint}: {reason}") from error
+
+
+def _listen_privately(path: str) -> socket.socket:
+    server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        # Linux creates the file with the mode of the socket, so another user can never connect
+        os.fchmod(server.fileno(), 0o600)
+        try:
+            server.bind(path)
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE or _is_served(path):
+                raise
+            Path(path).unlink()
+            server.bind(path)
+        server.listen()
+    except BaseException:
+        server.close()
+        raise
     return server
 
 

@@ -28,7 +28,7 @@ from tests.patience import PATIENCE
 
 _FORK = multiprocessing.get_context("fork")
 _PLACES: list[socket.socket] = []
-"""Bound and never listening, until the tests end."""
+"""Bound and never listening, until `free_places`."""
 
 
 def machine(
@@ -171,7 +171,7 @@ def opened(parts: Sequence[Image], *, tcp: bool = False) -> Iterator[MiniCluster
             for at in range(len(parts))
         ]
         try:
-            with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+            with MiniCluster.open(endpoints_of(boards), parts, timeout=PATIENCE, slack=PATIENCE) as cluster:
                 yield cluster
         finally:
             for board in boards:
@@ -251,7 +251,7 @@ def _inputs(parameters: BM1Parameters, given: object, lines: slice) -> tuple[int
 
 
 def tcp_endpoint() -> str:
-    """An endpoint whose port is free, and so is the next one, for programming; nobody else is given them."""
+    """An endpoint whose port is free, and so is the next one, for programming; until `free_places`, nobody else is given them."""
     while True:
         first, second = socket.socket(), socket.socket()
         _PLACES.extend((first, second))
@@ -262,6 +262,12 @@ def tcp_endpoint() -> str:
         with contextlib.suppress(OSError, OverflowError):
             second.bind(("127.0.0.1", port + 1))
             return f"tcp://127.0.0.1:{port}"
+
+
+def free_places() -> None:
+    """Close what holds the ports of `tcp_endpoint`; those of boards that listen stay theirs."""
+    while _PLACES:
+        _PLACES.pop().close()
 
 
 def words(*values: int) -> bytes:

@@ -5,13 +5,19 @@ from pathlib import Path
 import pytest
 
 from machines.kernel import warm_up
-from tests.pcie_shim.boards import ServedBoard
+from tests.pcie_shim.boards import ServedBoard, free_places
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _kernels() -> None:
     """Loaded once, before boards are forked from this process, and before a board's thread would compile them."""
     warm_up()
+
+
+@pytest.fixture(autouse=True)
+def _places() -> Iterator[None]:
+    yield
+    free_places()
 
 
 @pytest.fixture

@@ -129,6 +129,7 @@ def test_a_key_is_private(tmp_path: Path):
     assert "letters" not in repr(with_credentials("tcp://localhost:7", KEY))
 
 
+@pytest.mark.thorough
 def test_files_that_are_not_certificates(tmp_path: Path, certificate):
     nothing = tmp_path / "nothing"
     for make in (

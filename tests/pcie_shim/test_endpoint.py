@@ -8,6 +8,7 @@ import pytest
 
 from pcie_shim.endpoint import Endpoint, connect, listen, parse_endpoint
 from pcie_shim.errors import EndpointError, UnreachableError
+from tests.patience import PATIENCE
 
 
 @pytest.mark.parametrize(
@@ -49,7 +50,7 @@ def test_a_dead_processs_socket_is_replaced_and_a_served_one_is_not(folder: Path
     server = listen(endpoint)
     with pytest.raises(EndpointError):
         listen(endpoint)
-    connect(endpoint, timeout=240).close()
+    connect(endpoint, timeout=PATIENCE).close()
     server.close()
 
 
@@ -59,7 +60,7 @@ def test_a_socket_whose_queue_is_full_is_served_and_not_waited_for(folder: Path)
         server = stack.enter_context(socket.socket(socket.AF_UNIX))
         server.bind(endpoint.path)
         server.listen(0)
-        stack.enter_context(connect(endpoint, timeout=240))
+        stack.enter_context(connect(endpoint, timeout=PATIENCE))
         with pytest.raises(EndpointError):
             listen(endpoint)
 
@@ -85,5 +86,5 @@ def test_an_unused_endpoint_is_reported_in_time(folder: Path) -> None:
 def test_small_frames_are_sent_at_once_over_tcp() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         endpoint = Endpoint(host="127.0.0.1", port=server.getsockname()[1])
-        with connect(endpoint, timeout=240) as connection:
+        with connect(endpoint, timeout=PATIENCE) as connection:
             assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)

@@ -177,6 +177,7 @@ def test_silent_connections_are_bounded_and_keep_nobody_out(start_board: StartBo
     for each in silent[2:]:
         assert each.read32(rm.ID) == rm.ID_VALUE
         each.close()
+    silent[1].close()
 
 
 def test_a_host_that_vanishes_leaves_the_board_well(start_board: StartBoard) -> None:
@@ -208,6 +209,10 @@ def test_a_host_that_has_just_left_does_not_hold_the_board(folder: Path) -> None
             decoder = framing.FrameDecoder()
             decoder.received(second.recv_into(decoder.room()))
             assert decoder.next_frame().operation == framing.GREET
+    stop.set()
+    server.run()
+    for listening in (server._registers, server._programming):
+        listening.close()
     stop.close()
 
 

@@ -19,6 +19,7 @@ def child(code):
     return [sys.executable, "-c", code]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "answer",
     [
@@ -41,6 +42,7 @@ def test_garbage_is_an_error(tmp_path, answer):
         assert not psutil.pid_exists(simulation.process)
 
 
+@pytest.mark.thorough
 def test_words_are_little_endian_and_end_with_the_refused_one(tmp_path):
     with Simulation(child(ECHO.format(answer="2 0000000A 01020304A0B0C0D0")), tmp_path) as simulation:
         assert simulation.read(0, 3) == (2, 10, bytes.fromhex("04030201d0c0b0a0"))
@@ -49,6 +51,7 @@ def test_words_are_little_endian_and_end_with_the_refused_one(tmp_path):
         assert simulation.write(0, 1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("code", ["", "import os; os.kill(os.getpid(), 9)", "raise SystemExit('no MIF')"])
 def test_a_child_that_ends_is_an_error(tmp_path, code):
     with Simulation(child(code), tmp_path) as simulation:
@@ -59,6 +62,7 @@ def test_a_child_that_ends_is_an_error(tmp_path, code):
             simulation.write(0, 1)
 
 
+@pytest.mark.process
 def test_a_child_that_hangs_is_killed(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "ANSWER_S", 0.2)
     with Simulation(child("import time; time.sleep(1000)"), tmp_path) as simulation:
@@ -67,12 +71,14 @@ def test_a_child_that_hangs_is_killed(tmp_path, monkeypatch):
         assert not psutil.pid_exists(simulation.process)
 
 
+@pytest.mark.thorough
 def test_a_child_that_ignores_its_end_is_killed(tmp_path):
     with Simulation(child("import time; time.sleep(1000)"), tmp_path) as simulation:
         process = simulation.process
     assert not psutil.pid_exists(process)
 
 
+@pytest.mark.thorough
 def test_a_simulator_that_cannot_be_started(tmp_path):
     with pytest.raises(SimulationError):
         Simulation([str(tmp_path / "nothing")], tmp_path)

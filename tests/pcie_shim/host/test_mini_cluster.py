@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 
 from machines.bm1 import StopReason
 from machines.parameters import PriorMode
+from pcie_shim import endpoint
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.board.misbehaviour import Misbehaviour, MisbehaviourKind, UnknownMisbehaviourError
@@ -293,10 +294,18 @@ def test_a_held_board_is_refused(boards: list[ServedBoard]) -> None:
         assert outcome(cluster.run(frame())) == expected(parts, frame())
 
 
-def test_a_board_that_is_not_there_is_named(start_board: StartBoard, folder: Path) -> None:
+def test_a_board_that_is_not_there_is_named(
+    start_board: StartBoard, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+
+    def sleep(_: float) -> None:
+        now[0] += PATIENCE
+
+    monkeypatch.setattr(endpoint, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
     endpoints = [start_board().endpoint, f"unix:{folder}/nobody.sock"]
     with pytest.raises(BoardUnreachableError) as caught:
-        MiniCluster.open(endpoints, images(60, (3, 2)), timeout=0.1)
+        MiniCluster.open(endpoints, images(60, (3, 2)), timeout=PATIENCE)
     assert caught.value.board == 1
 
 
