@@ -18,11 +18,16 @@ from machines.fast import FastBM1
 from machines.parameters import BM1Parameters, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
 from tests.machines.random_machines import codes, play, seen, sessions
+from tests.patience import PATIENCE
 
 
-@settings(max_examples=200, deadline=None, suppress_health_check=list(HealthCheck))
+@pytest.mark.parametrize("examples", [50, pytest.param(200, marks=pytest.mark.thorough)])
+def test_equals_the_reference(examples):
+    settings(max_examples=examples, suppress_health_check=list(HealthCheck))(equals_the_reference)()
+
+
 @given(sessions(replicas=st.sampled_from([1, 1, 1, 2, 3, 5, 16])))
-def test_equals_the_reference(session):
+def equals_the_reference(session):
     """With kept words of every size: the reference, which is the slow one, runs once for all of them."""
     expected = list(play(ReferenceBM1(session.machine), session.frames))
     for kept_bytes in (0, *(1 << kept for kept in (14, 16, 18, 20, 22, 26))):
@@ -182,6 +187,7 @@ def _in_a_child(machine, start, answers):
     answers.put((compiled, kernel.cycles, kernel.counts.tolist()))
 
 
+@pytest.mark.process
 def test_a_forked_process_has_the_kernel_loaded():
     fast.warm_up()
     compiled = sum(fast_code.begin.stats.cache_misses.values())
@@ -192,8 +198,8 @@ def test_a_forked_process_has_the_kernel_loaded():
     answers = context.Queue()
     child = context.Process(target=_in_a_child, args=(machine, start, answers))
     child.start()
-    assert answers.get(timeout=30) == (compiled, kernel.cycles, kernel.counts.tolist())
-    child.join(10)
+    assert answers.get(timeout=PATIENCE) == (compiled, kernel.cycles, kernel.counts.tolist())
+    child.join(PATIENCE)
 
 
 def test_code_is_compiled_without_a_cache_where_none_can_be_written(monkeypatch):

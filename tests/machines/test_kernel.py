@@ -11,6 +11,7 @@ from machines.fast import FastBM1
 from machines.kernel import make_kernel
 from machines.parameters import BM1Parameters, RngKind
 from machines.reference import ReferenceBM1
+from tests.patience import PROCESS_PATIENCE
 
 
 @pytest.mark.parametrize("kind", RngKind)
@@ -35,6 +36,7 @@ def test_a_machine_with_too_many_codes_for_the_fast_kernel_gets_the_reference():
     assert type(make_kernel(BM1Machine(parameters, np.full((1, 1), 100), ()))) is ReferenceBM1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("module", "late"),
     [
@@ -44,4 +46,4 @@ def test_a_machine_with_too_many_codes_for_the_fast_kernel_gets_the_reference():
 )
 def test_a_library_is_not_loaded_before_it_is_needed(module, late):
     code = f"import sys, machines.{module}; sys.exit('{late}' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=240).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=PROCESS_PATIENCE).returncode == 0

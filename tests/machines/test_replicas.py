@@ -19,12 +19,16 @@ from machines.reference import ReferenceBM1
 from tests.machines.random_machines import codes, sessions
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=list(HealthCheck))
+@pytest.mark.parametrize("examples", [20, pytest.param(50, marks=pytest.mark.thorough)])
+def test_equals_machines_that_run_alone(examples):
+    settings(max_examples=examples, suppress_health_check=list(HealthCheck))(equals_machines_that_run_alone)()
+
+
 @given(
     sessions(kinds=tuple(RngKind), shared=(True, False), replicas=st.sampled_from([2, 3, 5, 16])),
     st.booleans(),
 )
-def test_equals_machines_that_run_alone(session, reference):
+def equals_machines_that_run_alone(session, reference):
     """With every kind of generators, in either kernel, and whether or not each cell has a generator."""
     machine = session.machine
     parameters = machine.parameters
