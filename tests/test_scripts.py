@@ -1,15 +1,18 @@
 """Every script prints its usage, and none is silent for long."""
 
 import asyncio
+import contextlib
 import os
 import re
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from scripts.running import processes
+from tests.patience import PROCESS_PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
 SCRIPTS = sorted(path for path in (ROOT / "scripts").iterdir() if path.is_file() and os.access(path, os.X_OK))
@@ -22,10 +25,13 @@ PARTS = {
 PAGES = [(path, part) for path in SCRIPTS for part in ("", *PARTS.get(path.name, ()))]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("script", "part"), PAGES, ids=lambda each: getattr(each, "name", each))
 def test_a_script_prints_its_usage(script, part, tmp_path):
     command = [script, part, "--help"] if part else [script, "--help"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=PROCESS_PATIENCE, check=False
+    )
     assert done.returncode == 0
     assert script.name in done.stdout
     prose = re.sub(r"\[default: [^]]+\]", "", " ".join(done.stdout.split()))
@@ -34,55 +40,73 @@ def test_a_script_prints_its_usage(script, part, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.thorough
 def test_mutants_of_a_module_that_does_not_exist_are_a_mistake():
     command = [ROOT / "scripts" / "mutants", "--only", "publsher"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PROCESS_PATIENCE, check=False)
     assert done.returncode == 2
     assert "services/pipeline/publisher.py" in done.stderr
 
 
 @pytest.mark.parametrize("terminal", [False, True])
 async def test_a_screen_says_what_it_waits_for_when_nothing_else_comes(terminal, capsys, monkeypatch):
-    monkeypatch.setattr(processes, "SILENCE", 0.2)
+    now = [0.0]
+
+    async def sleep(seconds):
+        until = now[0] + seconds
+        while now[0] < until:
+            await asyncio.sleep(0)
+
+    async def wait(seconds):
+        now[0] += seconds
+        for _ in range(3):  # the screen notices, speaks, and sleeps again
+            await asyncio.sleep(0)
+
+    monkeypatch.setattr(processes, "SILENCE", 2.0)
+    monkeypatch.setattr(processes, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(processes, "asyncio", SimpleNamespace(sleep=sleep))
     monkeypatch.setattr("sys.stdout.isatty", lambda: terminal)
     screen = processes.Screen()
     saying = asyncio.create_task(screen.say_what_it_waits_for())
-    said = ""
     for work in ("building", "drawing"):
         screen.waits_for = work
         for _ in range(4):
             screen.show("frame")
-            await asyncio.sleep(0.1)
+            await wait(1.0)
         assert capsys.readouterr().out == "frame\n" * 4
-        await asyncio.sleep(1.0)
+        for _ in range(5):
+            await wait(2.0)
         screen.show("done")
         said = capsys.readouterr().out
-        assert work in said
         if terminal:
-            assert said.count(work) >= 2
+            assert said.count(work) == 5
             assert said.count("\n") == 1
         else:
-            assert said.splitlines()[0].endswith("....")
-            assert (said.count(work), said.splitlines()[1:]) == (1, ["done"])
+            assert said.splitlines() == [f"... {work} .......", "done"]
     saying.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await saying
 
 
+@pytest.mark.thorough
 def test_setting_up_an_environment_shows_that_it_goes_on(tmp_path):
     (tmp_path / "scripts").mkdir()
     shutil.copy(ROOT / "scripts" / "environment", tmp_path / "scripts")
     for name in ("pyproject.toml", "requirements.lock"):
         shutil.copy(ROOT / name, tmp_path)
     slow = tmp_path / "python"
-    slow.write_text('#!/bin/sh\ncase "$*" in *"-m venv"*) sleep 2.5; exit 1 ;; esac\n')
+    said = tmp_path / "said"
+    # it ends when something was said meanwhile
+    waits = f"until grep -q '^\\.\\.' {said}; do sleep 0.1; done"
+    slow.write_text(f'#!/bin/sh\ncase "$*" in *"-m venv"*) {waits}; exit 1 ;; esac\n')
     slow.chmod(0o755)
-    done = subprocess.run(
-        ["bash", "-c", ". scripts/environment run"],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHON": str(slow)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    with said.open("w") as stderr:
+        done = subprocess.run(
+            ["bash", "-c", ". scripts/environment run"],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHON": str(slow)},
+            stderr=stderr,
+            timeout=PROCESS_PATIENCE,
+            check=False,
+        )
     assert done.returncode == 2
-    assert any(line.startswith("..") for line in done.stderr.splitlines())

@@ -11,11 +11,12 @@ from pathlib import Path
 import pytest
 
 from scripts.supply_chain.bill_of_materials import LicenceError, Package, check, licence_of, locked
+from tests.patience import PROCESS_PATIENCE
 
 ROOT = Path(__file__).resolve().parent.parent
-PATIENCE = 300
 
 
+@pytest.mark.thorough
 def test_the_bill_has_every_locked_package_with_its_hashes_and_licence(tmp_path):
     bills = []
     for name in ("first", "second"):
@@ -23,7 +24,7 @@ def test_the_bill_has_every_locked_package_with_its_hashes_and_licence(tmp_path)
         subprocess.run(
             [ROOT / "scripts" / "bill-of-materials", "--json", file],
             check=True,
-            timeout=PATIENCE,
+            timeout=PROCESS_PATIENCE,
             capture_output=True,
         )
         bills.append(json.loads(file.read_text()))
@@ -72,6 +73,7 @@ def test_a_licence_is_stated_or_read_but_not_both():
             licence_of(packages[name], known)
 
 
+@pytest.mark.thorough
 def test_a_wheel_built_twice_is_the_same_bytes(tmp_path):
     wheels = []
     for umask, zone in (("022", "UTC"), ("077", "Asia/Tokyo")):
@@ -79,7 +81,7 @@ def test_a_wheel_built_twice_is_the_same_bytes(tmp_path):
         subprocess.run(
             ["bash", "-c", f"umask {umask}; {ROOT}/scripts/wheel '{built}'"],
             check=True,
-            timeout=PATIENCE,
+            timeout=PROCESS_PATIENCE,
             capture_output=True,
             env=os.environ | {"TZ": zone, "PYTHONHASHSEED": umask},
         )

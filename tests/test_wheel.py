@@ -9,8 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PROCESS_PATIENCE
+
+pytestmark = pytest.mark.thorough
+
 ROOT = Path(__file__).resolve().parent.parent
-PATIENCE = 300
 
 
 def run(*command, cwd):
@@ -22,7 +25,7 @@ def run(*command, cwd):
         cwd=cwd,
         env=environment,
         check=True,
-        timeout=PATIENCE,
+        timeout=PROCESS_PATIENCE,
         capture_output=True,
         text=True,
     ).stdout

@@ -2,12 +2,12 @@
 
 import asyncio
 import contextlib
+import io
 import json
-import os
 import re
 import ssl
-import sys
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from bridge.codecs import fragments, json_codec
 from bridge.hub.access import AccessPolicy
 from tests.bridge.hub.sockets import running_hub
 from tests.certificates import issue
+from tests.patience import PATIENCE
 
 FOLDER = Path(__file__).parents[2] / "docs/how-to"
 GUIDE = "\n".join(path.read_text() for path in sorted(FOLDER.glob("bridge*.md")))
@@ -35,34 +36,29 @@ STARTS = re.findall(r"(?:^    |with\s`)hub(?: --ros-version (\d))?(?:`|$)", GUID
 """ROS versions of the hubs that the pages start for their examples."""
 (ROS_VERSION,) = {int(number) for number in STARTS}
 TOKEN = "guide-test-token-0123456789"
-PATIENCE = 60.0
 
 Company = Callable[[str], Awaitable[None]]
 
 
-async def run(example: str, uri: str, company: Company | None = None, **environment: str) -> str:
-    """Return the output of an example while `company` acts as the robot."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-c",
-        example.replace("ws://127.0.0.1:9090", uri),
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-        cwd=FOLDER.parent,
-        env={**os.environ, **environment},
-    )
+async def run(example: str, uri: str, company: Company | None = None) -> str:
+    """Return the output of an example, run in a thread while `company` acts as the robot."""
+    program = compile(example.replace("ws://127.0.0.1:9090", uri), "example.py", "exec")
+    said = io.StringIO()
+
+    def play() -> None:
+        with contextlib.redirect_stdout(said):
+            exec(program, {"__name__": "__main__"})  # noqa: S102  # the pages of this repository
+
     robot = asyncio.create_task(company(uri)) if company is not None else None
-    try:
-        out, errors = await asyncio.wait_for(process.communicate(), PATIENCE)
-    finally:
-        if process.returncode is None:
-            process.kill()
-        if robot is not None:
-            robot.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await robot
-    assert process.returncode == 0, errors.decode()
-    return out.decode()
+    with ThreadPoolExecutor(1) as thread:
+        try:
+            await asyncio.get_running_loop().run_in_executor(thread, play)
+        finally:
+            if robot is not None:
+                robot.cancel()
+                with contextlib.suppress(asyncio.CancelledError):
+                    await robot
+    return said.getvalue()
 
 
 def publishes(topic: str, type_name: str, *messages: dict[str, Any]) -> Company:
@@ -164,17 +160,21 @@ async def test_the_goal_of_the_guide(served):
                     await asyncio.sleep(0.05)
             out = await run(EXAMPLES["Actions"], uri)
             worker.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await worker
         assert "so far: {'sequence': [0, 1]}" in out
         assert "SUCCEEDED {'sequence': [0, 1, 1]}" in out
 
 
-async def test_the_door_of_the_guide(tmp_path):
+@pytest.mark.thorough
+async def test_the_door_of_the_guide(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROBOT_TOKEN", TOKEN)
     certificate, key = issue(tmp_path, "server")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificate, key)
     example = EXAMPLES["TLS, tokens, proxies"].replace('"ca.pem"', repr(str(certificate)))
     async with running_hub(access=AccessPolicy(tokens=(TOKEN,), tls=context)) as port:
-        out = await run(example.replace("localhost:9443", f"localhost:{port}"), "-", ROBOT_TOKEN=TOKEN)
+        out = await run(example.replace("localhost:9443", f"localhost:{port}"), "-")
     assert f"wss://localhost:{port} " in out
     assert TOKEN not in out
 
