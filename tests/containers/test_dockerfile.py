@@ -5,11 +5,16 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
+
+from tests.patience import PROCESS_PATIENCE
+
 ROOT = Path(__file__).resolve().parents[2]
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
 IGNORED = (ROOT / ".dockerignore").read_text().splitlines()
 
 
+@pytest.mark.thorough
 def test_linter_finds_nothing():
     hadolint = Path(sys.executable).with_name("hadolint")
     done = subprocess.run(
@@ -17,7 +22,7 @@ def test_linter_finds_nothing():
         capture_output=True,
         check=False,
         text=True,
-        timeout=60,
+        timeout=PROCESS_PATIENCE,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert not done.stdout

@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PROCESS_PATIENCE
+
+pytestmark = pytest.mark.thorough
+
 ROOT = Path(__file__).resolve().parents[2]
 ENGINE = ROOT / "scripts" / "container-engine"
 
@@ -27,7 +31,7 @@ def run(*command, **variables):
         capture_output=True,
         check=False,
         text=True,
-        timeout=240,
+        timeout=PROCESS_PATIENCE,
         cwd=ROOT,
     )
 
@@ -52,6 +56,8 @@ def test_not_verified_is_loud_and_fails_in_ci(ci, code, last):
 
 @pytest.mark.parametrize("arguments", [(), ("run",), ("fly",)])
 def test_usage(arguments):
-    done = subprocess.run([ENGINE, *arguments], capture_output=True, check=False, text=True, timeout=30)
+    done = subprocess.run(
+        [ENGINE, *arguments], capture_output=True, check=False, text=True, timeout=PROCESS_PATIENCE
+    )
     assert done.returncode == 2
     assert done.stderr.startswith("usage: scripts/container-engine")

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PROCESS_PATIENCE
+
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "with-kernels"
 SHOW = ["sh", "-c", 'echo "$NUMBA_CPU_NAME|$NUMBA_CPU_FEATURES|$NUMBA_CACHE_DIR|$*"', "sh", "two words"]
 
@@ -29,12 +31,18 @@ def machine(tmp_path):
             "TMPDIR": str(temporary),
         }
         return subprocess.run(
-            [SCRIPT, *command], env=environment, capture_output=True, check=False, text=True, timeout=30
+            [SCRIPT, *command],
+            env=environment,
+            capture_output=True,
+            check=False,
+            text=True,
+            timeout=PROCESS_PATIENCE,
         )
 
     return run
 
 
+@pytest.mark.process
 def test_generic_code_for_aarch64(machine, tmp_path):
     done = machine("aarch64", ["generic"])
     assert done.stdout == f"generic||{tmp_path}/scratch/kernels|two words\n"
@@ -42,20 +50,24 @@ def test_generic_code_for_aarch64(machine, tmp_path):
     assert not done.stderr
 
 
+@pytest.mark.thorough
 def test_the_best_baseline_that_this_processor_runs(machine):
     flags = Path("/proc/cpuinfo").read_text()
     best = "x86-64-v3" if " avx2 " in flags and " fma " in flags else "x86-64-v2"
     assert machine("x86_64", ["x86-64-v2", "x86-64-v3"]).stdout.split("|")[0] == best
 
 
+@pytest.mark.thorough
 def test_an_image_that_was_built_on_a_lesser_processor(machine):
     assert machine("x86_64", ["x86-64-v2"]).stdout.split("|")[0] == "x86-64-v2"
 
 
+@pytest.mark.thorough
 def test_exit_code_is_the_commands_own(machine):
     assert machine("aarch64", ["generic"], ["sh", "-c", "exit 143"]).returncode == 143
 
 
+@pytest.mark.thorough
 def test_runs_without_a_place_for_kernels(machine):
     done = machine("aarch64", ["generic"], temporary=Path("/proc/nowhere"))
     assert done.stdout.startswith("generic|")

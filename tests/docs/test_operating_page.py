@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PROCESS_PATIENCE
+
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs/how-to"
 PAGE = "".join((FOLDER / name).read_text() for name in ("containers.md", "hosts.md", "operating.md"))
@@ -94,6 +96,7 @@ def test_a_unit_starts_one_of_our_commands_and_settings_are_known(name, text):
     assert "SuccessExitStatus=143" in text
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not installed here")
 @pytest.mark.parametrize(("name", "text"), units())
 def test_systemd_takes_the_unit(name, text, tmp_path):
@@ -104,7 +107,7 @@ def test_systemd_takes_the_unit(name, text, tmp_path):
         ["systemd-analyze", "verify", "--man=no", str(unit)],
         capture_output=True,
         text=True,
-        timeout=240,
+        timeout=PROCESS_PATIENCE,
         check=False,
     )
     about_it = [line for line in checked.stderr.splitlines() if name in line or str(tmp_path) in line]

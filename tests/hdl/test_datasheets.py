@@ -9,6 +9,7 @@ import pytest
 
 from hdl.test.datasheets import PAGES, THEORY, main, units
 from hdl.test.project import HDL
+from tests.patience import PROCESS_PATIENCE
 
 
 @pytest.mark.parametrize("unit", units(), ids=lambda unit: unit.name)
@@ -34,6 +35,7 @@ def test_every_page_is_in_the_overview():
     }
 
 
+@pytest.mark.thorough
 def test_the_vhdl_keeps_to_its_style():
     files = [*HDL.glob("*.vhd"), *HDL.glob("s*/*.vhd"), *HDL.glob("test/formal/*.vhd")]
     assert len(files) > 20
@@ -42,6 +44,6 @@ def test_the_vhdl_keeps_to_its_style():
         check=False,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=PROCESS_PATIENCE,
     )
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stdout + done.stderr

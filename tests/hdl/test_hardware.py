@@ -8,6 +8,7 @@ from hdl.test.mutants import MUTANTS
 from hdl.test.project import HDL, SOURCES
 from hdl.test.random_machines import MOST_CELLS, random_case
 from hdl.test.verification import Check, formal, units
+from tests.patience import FACTOR
 
 needs_ghdl = pytest.mark.skipif(
     shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
@@ -19,12 +20,19 @@ SESSIONS = (15, 25)
 
 @needs_ghdl
 @pytest.mark.parametrize(
-    "check", [Check("session", str(seed)) for seed in SESSIONS], ids=lambda check: check.name
+    "check",
+    [
+        pytest.param(Check("session", str(seed)), marks=kind)
+        for seed, kind in zip(SESSIONS, (pytest.mark.process, pytest.mark.thorough), strict=True)
+    ],
+    ids=lambda check: check.name,
 )
 def test_the_hardware_answers_as_the_emulated_board(check):
     assert check.failure(frames=3) is None
 
 
+@pytest.mark.thorough
+@pytest.mark.timeout(1200 * FACTOR)
 @needs_ghdl
 @pytest.mark.parametrize(
     "check", [*units(), *(each for each in formal() if each.what == "guard")], ids=lambda check: check.name
@@ -33,6 +41,7 @@ def test_units_keep_their_promises(check):
     assert check.failure() is None
 
 
+@pytest.mark.thorough
 @needs_ghdl
 def test_a_broken_machine_is_found(tmp_path):
     shutil.copytree(HDL, tmp_path / "hdl")

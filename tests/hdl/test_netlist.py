@@ -8,6 +8,7 @@ from hdl.test.netlist import synthesised
 from hdl.test.project import HDL, BM1Parameters, RngKind, SensorMode, image_of_parameters, run_tool
 from toolchain.analysis.resources.logic import WORST_ERROR, logic_of
 
+pytestmark = pytest.mark.thorough
 needs_ghdl = pytest.mark.skipif(
     shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
 )

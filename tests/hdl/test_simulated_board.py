@@ -33,13 +33,13 @@ from pcie_shim.register_map import ErrorCode
 from services.boards.hardware import Engine, SimulatedHardware
 from services.commands.board import app
 from tests.command_runner import invoke
+from tests.patience import PROCESS_PATIENCE
 from tests.pcie_shim.boards import expected, image, images, machine, never_stopping
 from toolchain.hardware import simulation
 
 needs_ghdl = pytest.mark.skipif(
     shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
 )
-PATIENCE = 120
 NOT_COMPARED = {
     *range(rm.CAP_SPEED, rm.CAP_SPEED + 4),
     *range(rm.COMPUTE_NS, rm.COMPUTE_NS + 8),
@@ -72,15 +72,16 @@ def serving(folder, count=1):
                 )
             )
         for board in boards:
-            assert select.select([board.stderr], [], [], PATIENCE)[0]
+            assert select.select([board.stderr], [], [], PROCESS_PATIENCE)[0]
             assert "listens" in board.stderr.readline()
         yield boards, endpoints
     finally:
         for board in boards:
             board.terminate()
-            board.communicate(timeout=PATIENCE)
+            board.communicate(timeout=PROCESS_PATIENCE)
 
 
+@pytest.mark.thorough
 @needs_ghdl
 def test_frames_over_the_link_are_the_same(tmp_path):
     parts = images(3, [5, 3], sensor_bits=(3, 4), prior_bits=1)
@@ -113,6 +114,7 @@ def test_frames_over_the_link_are_the_same(tmp_path):
     assert not any(psutil.pid_exists(pid) for pid in hardware)
 
 
+@pytest.mark.thorough
 @needs_ghdl
 def test_a_killed_simulation_is_an_error_of_the_board(tmp_path):
     part = image(never_stopping())
@@ -123,13 +125,14 @@ def test_a_killed_simulation_is_an_error_of_the_board(tmp_path):
             cluster.post(FrameInput(addresses=(1,), target_count=2**32 - 1, max_cycles=1 << 40))
             hardware.kill()
             with pytest.raises(BoardError):
-                cluster.collect(PATIENCE)
-        assert board.wait(PATIENCE) == 5
+                cluster.collect(PROCESS_PATIENCE)
+        assert board.wait(PROCESS_PATIENCE) == 5
         errors = [line for line in board.stderr.read().splitlines() if "error: " in line]
         assert len(errors) == 1
         assert f"signal {int(signal.SIGKILL)}" in errors[0]
 
 
+@pytest.mark.thorough
 @needs_ghdl
 def test_the_simulation_ends_with_a_killed_board(tmp_path):
     part = image(never_stopping())
@@ -138,8 +141,8 @@ def test_the_simulation_ends_with_a_killed_board(tmp_path):
         (hardware,) = psutil.Process(board.pid).children()
         cluster.post(FrameInput(addresses=(1,), target_count=2**32 - 1, max_cycles=1 << 40))
         board.kill()
-        board.wait(PATIENCE)
-        hardware.wait(PATIENCE)
+        board.wait(PROCESS_PATIENCE)
+        hardware.wait(PROCESS_PATIENCE)
 
 
 def both_boards(of):
@@ -148,7 +151,7 @@ def both_boards(of):
     simulated = SimulatedHardware(Engine.GHDL, {}).board(0)
     emulated = EmulatedBoard()
     for board in (emulated, simulated):
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + PROCESS_PATIENCE
         while True:
             try:
                 board.load(content)
@@ -172,6 +175,7 @@ def answered(board, access, *arguments):
         return error.code
 
 
+@pytest.mark.thorough
 @needs_ghdl
 @pytest.mark.parametrize(
     "parameters",
@@ -229,6 +233,7 @@ def test_accesses_are_answered_and_refused_alike(parameters):
     assert {ErrorCode.OUTSIDE, ErrorCode.TOO_LONG, ErrorCode.READ_ONLY, ErrorCode.MISALIGNED} <= refused
 
 
+@pytest.mark.thorough
 @needs_ghdl
 def test_a_running_board_is_busy_until_it_is_released():
     emulated, simulated = both_boards(never_stopping())
@@ -246,6 +251,7 @@ def test_a_running_board_is_busy_until_it_is_released():
             assert board.done == 0
 
 
+@pytest.mark.thorough
 @needs_ghdl
 def test_an_image_that_is_loaded_again_replaces_the_hardware():
     first, second = image(machine(1)), image(machine(2))
@@ -260,6 +266,7 @@ def test_an_image_that_is_loaded_again_replaces_the_hardware():
             assert int.from_bytes(board.read(rm.PROGRAMMED, 1), "little") == board.programmed == number
 
 
+@pytest.mark.thorough
 @needs_ghdl
 def test_a_machine_that_exists_only_emulated_is_refused(tmp_path):
     ideal = image(machine(1, rng=RngKind.IDEAL))
@@ -295,6 +302,7 @@ def test_a_cache_of_others_is_not_used(tmp_path, monkeypatch):
         SimulatedHardware(Engine.GHDL, {0: image(machine(1))})
 
 
+@pytest.mark.thorough
 @needs_ghdl
 def test_a_full_disk_is_an_error_of_the_board(tmp_path, monkeypatch):
     def write(*_):

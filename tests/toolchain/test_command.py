@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from pcie_shim.programming_file import read_image
+from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.running import TARGET, assert_refused, done, toolchain
 from toolchain.deployment import load_deployment
 from toolchain.outputs.mif import read_mif
@@ -145,28 +146,35 @@ def test_a_target_with_a_part_missing(case, missing):
     assert_refused(build(case, target=TARGET[:at] + TARGET[at + 2 :]), f"{missing} is missing")
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [
+        pytest.param(signal.SIGINT, 130, marks=pytest.mark.process),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.thorough),
+    ],
+)
 def test_signals_end_it_with_their_code(case, number, code):
     (case / "model.py").write_text(
-        "import time\n\ndef model():\n    print('here', flush=True)\n    time.sleep(60)\n"
+        "import time\n\ndef model():\n    print('here', flush=True)\n    time.sleep(6000)\n"
     )
     command = [Path(sys.executable).parent / "toolchain", "build", case, "-o", case.parent / "out", *TARGET]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stdout.readline() == "here\n"
         process.send_signal(number)
-        _, sentences = process.communicate(timeout=120)
+        _, sentences = process.communicate(timeout=PROCESS_PATIENCE)
     finally:
         process.kill()
     assert process.returncode == code
     assert "Traceback" not in sentences
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("module", ["toolchain.commands.main", "toolchain.deployment.address"])
 def test_help_and_a_subscriber_load_no_numpy(module):
     code = f"import sys, {module}; print('numpy' in sys.modules)"
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=240
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=PROCESS_PATIENCE
     )
     assert done.stdout == "False\n"
 

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from machines.parameters import RngKind, SensorMode
+from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.corridor import corridor
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis.exploration.pictures import check_pictures_possible
@@ -271,6 +272,7 @@ def test_mistakes(case, arguments, named):
     assert_refused(toolchain("explore"), "--claims DIR")
 
 
+@pytest.mark.thorough
 def test_ctrl_c_keeps_what_is_done(case):
     results = case.parent / "r.jsonl"
     command = [Path(sys.executable).parent / "toolchain", "explore", case, "-o", results]
@@ -279,7 +281,7 @@ def test_ctrl_c_keeps_what_is_done(case):
     child = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
     )
-    limit = time.monotonic() + 200
+    limit = time.monotonic() + PROCESS_PATIENCE
     while (
         child.poll() is None
         and time.monotonic() < limit
@@ -287,7 +289,7 @@ def test_ctrl_c_keeps_what_is_done(case):
     ):
         time.sleep(0.05)
     child.send_signal(signal.SIGINT)
-    out, err = child.communicate(timeout=240)
+    out, err = child.communicate(timeout=PROCESS_PATIENCE)
     assert child.returncode == 130, err
     assert "Traceback" not in err
     done = int(re.search(r"(\d+) of 16 machines are in", err)[1])

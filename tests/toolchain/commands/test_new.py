@@ -10,6 +10,7 @@ import sys
 import numpy as np
 import pytest
 
+from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.running import assert_refused
 from tests.toolchain.running import toolchain as run
 from toolchain.deployment import load_deployment
@@ -76,6 +77,7 @@ def test_the_robot_says_what_the_model_reads(here):
     assert model.searched[0].value(int(np.argmax(posterior))) == pytest.approx(6.5, abs=0.2)
 
 
+@pytest.mark.thorough
 def test_the_robot_ends_quietly_at_ctrl_c(here):
     run("new", "mymodel")
     robot = subprocess.Popen(
@@ -86,7 +88,7 @@ def test_the_robot_ends_quietly_at_ctrl_c(here):
     try:
         assert robot.stdout.readline() == b"connecting\n"
         robot.send_signal(signal.SIGINT)
-        _, said = robot.communicate(timeout=120)
+        _, said = robot.communicate(timeout=PROCESS_PATIENCE)
     finally:
         robot.kill()
     assert (robot.returncode, said) == (0, b"")

@@ -13,6 +13,7 @@ import pytest
 from machines.parameters import PriorMode, RngKind, RngReset
 from machines.rng import random_numbers
 from pcie_shim.programming_file import read_image
+from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.running import OPTIONS, contents
 from toolchain.building.build import build_deployment
 from toolchain.deployment import load_deployment
@@ -83,7 +84,7 @@ def read_by_srec_cat(path, folder):
         )
         (folder / "slice.mif").write_text(narrow, "ascii")
         command = ["srec_cat", folder / "slice.mif", "-mif", "-o", folder / "words.bin", "-binary"]
-        subprocess.run(command, check=True, timeout=240, capture_output=True)
+        subprocess.run(command, check=True, timeout=PROCESS_PATIENCE, capture_output=True)
         data, size = (folder / "words.bin").read_bytes(), -(-bits // 8)
         found = [int.from_bytes(data[place : place + size], "little") for place in range(0, len(data), size)]
         words = [word | part << 4 * low for word, part in zip(words or [0] * len(found), found, strict=True)]
@@ -101,9 +102,16 @@ def words_of(machine, codes):
     return [sum(code << bits * line for line, code in enumerate(row)) for row in codes.tolist()]
 
 
-@pytest.mark.parametrize("reader", [read_by_srec_cat, read_by_toolchain])
+CHANGES = [*KINDS, {"lines": 400}, {"lines": 131, "prob_bits": 11, "partitions": 2}]
+
+
 @pytest.mark.parametrize(
-    "changes", [*KINDS, {"lines": 400}, {"lines": 131, "prob_bits": 11, "partitions": 2}]
+    ("changes", "reader"),
+    [
+        *((changes, read_by_toolchain) for changes in CHANGES),
+        pytest.param(CHANGES[0], read_by_srec_cat, marks=pytest.mark.process),
+        *(pytest.param(changes, read_by_srec_cat, marks=pytest.mark.thorough) for changes in CHANGES[1:]),
+    ],
 )
 def test_the_memories_hold_what_the_images_hold(tmp_path, changes, reader):
     """Every word of every memory, also of those that are thousands of bits wide."""
@@ -168,12 +176,18 @@ SEEDS = """for b in RNG_SEEDS'range(1) loop for c in RNG_SEEDS'range(2) loop
 
 def ghdl(folder, *arguments):
     done = subprocess.run(
-        ["ghdl", *arguments], check=False, cwd=folder, capture_output=True, text=True, timeout=100
+        ["ghdl", *arguments],
+        check=False,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=PROCESS_PATIENCE,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "changes",
     [KINDS[1], KINDS[2], KINDS[4], {"rng": RngKind.IDEAL}],
@@ -219,8 +233,16 @@ def test_no_sensors_and_many_seeds(tmp_path):
     assert "SENSOR_BITS       : natural_array_t(1 to 0) := (others => 0);" in text
     assert "The seeds are in Memory_MIFs alone" in text
     assert len(read_mif(tmp_path / "bm_arch" / "Memory_MIFs" / "rng_seeds.mif").words) == 5000
-    if shutil.which("ghdl"):
-        ghdl(tmp_path, "-a", "--std=08", "bm_arch/bm1_parameters.vhd")
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(
+    shutil.which("ghdl") is None, reason="ghdl is not there; Debian has it in a package of this name"
+)
+def test_ghdl_takes_an_empty_array_of_widths(tmp_path):
+    place = interval("x", 0, 10, cells=2)
+    build_deployment(Model(name="p", searched=(place,), known=()), tmp_path, replace(OPTIONS, rng_banks=5000))
+    ghdl(tmp_path, "-a", "--std=08", "bm_arch/bm1_parameters.vhd")
 
 
 def test_the_project_has_a_revision_for_every_board_and_names_harm_no_file(tmp_path):
@@ -262,6 +284,7 @@ source bm1.tcl
 """
 
 
+@pytest.mark.thorough
 def test_the_script_names_the_sources_and_compiles_every_board(tmp_path):
     if shutil.which("tclsh") is None:
         pytest.skip("tclsh is not there; Debian has it in the package tcl")
@@ -277,7 +300,13 @@ def test_the_script_names_the_sources_and_compiles_every_board(tmp_path):
     for folder, lines in (("hdl", expected), ("boards", [])):
         script = f"set folder {folder}\n{TCL}"
         done = subprocess.run(
-            ["tclsh"], check=False, input=script, cwd=tmp_path, capture_output=True, text=True, timeout=240
+            ["tclsh"],
+            check=False,
+            input=script,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=PROCESS_PATIENCE,
         )
         assert done.stdout.splitlines() == lines
     assert "error: no .vhd file in 'boards'" in done.stderr
@@ -305,13 +334,17 @@ build_deployment(model(), Path(sys.argv[1]), replace(OPTIONS, partitions=2, buil
 """
 
 
+@pytest.mark.thorough
 def test_the_same_bytes_in_another_folder_locale_and_hash_seed(tmp_path):
     found = []
     for number, language in enumerate(["C", "C.UTF-8"]):
         folder = tmp_path / f"number {number}"
         place = {"PYTHONHASHSEED": str(number), "LC_ALL": language, "TZ": ["UTC", "Asia/Tokyo"][number]}
         subprocess.run(
-            [sys.executable, "-c", ELSEWHERE, folder], check=True, timeout=100, env=os.environ | place
+            [sys.executable, "-c", ELSEWHERE, folder],
+            check=True,
+            timeout=PROCESS_PATIENCE,
+            env=os.environ | place,
         )
         found.append(contents(folder))
     assert found[0] == found[1]
