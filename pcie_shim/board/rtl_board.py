@@ -85,6 +85,8 @@ class RtlBoard:
 
     def prepare(self, image: Image) -> None:
         """Compile and start the hardware of an image that will be loaded, or raise a SimulationError."""
+        if self._preparation is not None:
+            self._preparation.close()
         self._preparation = _Preparation(self._simulate, image)
         self._preparation.run()
         if self._preparation.error is not None:

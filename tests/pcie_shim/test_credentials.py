@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pcie_shim import framing
+from pcie_shim import framing, tunnel
 from pcie_shim import register_map as rm
 from pcie_shim.credentials import Credentials, board_tls, host_tls, read_key
 from pcie_shim.endpoint import Endpoint, parse_endpoint
@@ -23,6 +23,7 @@ OTHER = Credentials(key=b"sixteen-letters-and-others")
 
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory):
+    tunnel._loop()  # the thread of all tunnels, which stays
     return issue(tmp_path_factory.mktemp("tls"), "board")
 
 
