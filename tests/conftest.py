@@ -111,9 +111,9 @@ def _held() -> set[str]:
     for task in Path("/proc/self/task").iterdir():
         with contextlib.suppress(OSError):
             held.update(f"process {pid}" for pid in (task / "children").read_text().split())
-    for descriptor in os.listdir("/proc/self/fd"):
+    for descriptor in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(OSError):
-            target = os.readlink(f"/proc/self/fd/{descriptor}")
+            target = str(descriptor.readlink())
             if target.startswith("socket:"):
                 held.add(target)
     return held
