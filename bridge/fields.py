@@ -10,6 +10,7 @@ in JSON.
 
 import base64
 import re
+from collections.abc import Sequence
 from typing import Any, Final
 
 from bridge.errors import FieldAmbiguousError, FieldMissingError, PathError
@@ -86,9 +87,12 @@ class Field:
 
     def missing(self, message: dict[str, Any]) -> FieldMissingError:
         """Return the error for a message without the variable, which lists its fields."""
+        return FieldMissingError(f"the message has no field {self.name!r}{self._reason(message)}")
+
+    def _reason(self, message: dict[str, Any]) -> str:
+        """Return why a message does not have the variable, as a clause after its name."""
         if self.place is None:
-            listed = _list_fields(message)
-            return FieldMissingError(f"the message has no field {self.name!r}; it has {listed}")
+            return f"; it has {_list_fields(message)}"
         value: Any = message
         for depth, step in enumerate(self.place):
             before = _show(self.place[:depth])
@@ -109,8 +113,20 @@ class Field:
             else:
                 value = value[step]
                 continue
-            return FieldMissingError(f"the message has no field {self.name!r}: {reason}")
-        return FieldMissingError(f"the field {self.name!r} is there")
+            return f": {reason}"
+        return ""
+
+
+def all_missing(fields: Sequence[Field], message: dict[str, Any]) -> FieldMissingError:
+    """Return the error for a message without these variables, which names all of them and lists its fields."""
+    first, *others = fields
+    if not others:
+        return first.missing(message)
+    names = [repr(field.name) for field in fields[:MAX_LISTED]]
+    more = f" and {len(fields) - MAX_LISTED} more" if len(fields) > MAX_LISTED else ""
+    return FieldMissingError(
+        f"the message has no fields {', '.join(names)}{more}; it has {_list_fields(message)}"
+    )
 
 
 def parse_path(path: str) -> Place:

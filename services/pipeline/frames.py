@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from bridge.errors import BridgeError
-from bridge.fields import Field
+from bridge.fields import Field, all_missing
 from bridge.stamps import header_stamp_ns
 from services.errors import OverflowedQueueError, VariableError
 from services.pipeline.synchroniser import Synchroniser
@@ -54,13 +54,20 @@ class _SourceReader:
     def _address(self, variable: Variable, field: Field, message: dict[str, Any]) -> int | list[int] | None:
         present, value = field.value(message)
         if not present and variable.on_missing == "error":
-            raise field.missing(message)
+            raise all_missing(self._missing(message), message)
         if variable.name not in self._arrays:
             return to_address(variable, value)
         # imported here, because a subscriber of single numbers does not need NumPy
         from toolchain.deployment.address_array import to_addresses
 
         return to_addresses(self._deployment, variable, value)
+
+    def _missing(self, message: dict[str, Any]) -> list[Field]:
+        return [
+            field
+            for variable, field in self._fields
+            if variable.on_missing == "error" and not field.value(message)[0]
+        ]
 
     def _prior_codes(self, message: dict[str, Any]) -> bytes:
         if self._prior is None:

@@ -3,10 +3,9 @@
 import asyncio
 import contextlib
 from collections.abc import Callable
-from typing import Any
 
 from bridge.client import State, connect
-from bridge.fields import Field
+from bridge.fields import Field, all_missing
 from services.pipeline.connections import OnState, connect_all
 from services.pipeline.subscriber import RECEIVED_QUEUE
 from services.pipeline.timed_frames import TimedFrames
@@ -59,12 +58,10 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
         while count is None or printed < count:
             message = await subscription.next(timeout=settings.first_data_timeout)
             hint.cancel()
-            values: dict[str, Any] = {}
-            for field in fields:
-                present, value = field.value(message.msg)
-                if not present:
-                    raise field.missing(message.msg)
-                values[field.name] = value
+            found = [(field, *field.value(message.msg)) for field in fields]
+            if missing := [field for field, present, _ in found if not present]:
+                raise all_missing(missing, message.msg)
+            values = {field.name: value for field, _, value in found}
             print_json_line(values or message.msg)
             printed += 1
     return 0

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.errors import FieldAmbiguousError, FieldMissingError, PathError
-from bridge.fields import MAX_LISTED, Field, format_place, parse_path
+from bridge.fields import MAX_LISTED, Field, all_missing, format_place, parse_path
 
 POSE = {
     "header": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"},
@@ -201,3 +201,14 @@ def test_a_text_that_is_not_base64_has_no_bytes(text):
         assert not present or value is None or type(value) is int
     for data in ("abc", 5, np.zeros((2, 2))):
         assert Field("a[0]").value({"a": data}) == (False, None)
+
+
+def test_all_missing_names_are_in_one_error():
+    error = all_missing([Field("D7"), Field("pose.position.q")], POSE)
+    assert (error.exit_code, type(error)) == (4, FieldMissingError)
+    for name in ("'D7'", "'pose.position.q'", "pose.position.x"):
+        assert name in str(error)
+    many = str(all_missing([Field(f"n{at}") for at in range(MAX_LISTED + 3)], {}))
+    assert f"'n{MAX_LISTED - 1}'" in many
+    assert f"'n{MAX_LISTED}'" not in many
+    assert str(all_missing([Field("ranges[9]")], POSE)) == str(Field("ranges[9]").missing(POSE))

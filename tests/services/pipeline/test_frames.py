@@ -54,6 +54,16 @@ def test_one_topic_every_message_is_a_frame_with_its_stamp():
     assert reading.stamp_ns == 77  # without a stamp, the receipt
 
 
+def test_all_missing_variables_are_named():
+    frames = FrameAssembler(
+        deployment(*map(variable, ("D1", "D2", "D3")), variable("D4", on_missing="missing"))
+    )
+    with pytest.raises(VariableError) as caught:
+        frames.take(0, {"D2": 1}, 0, 0)
+    assert ["D1" in str(caught.value), "'D3'" in str(caught.value)] == [True, True]
+    assert "'D4'" not in str(caught.value)
+
+
 @pytest.mark.parametrize("message", [{}, {"D1": None}, {"D1": float("nan")}, {"D1": []}])
 def test_missing_is_an_error_or_a_missing_address(message):
     with pytest.raises(VariableError, match=r"/t0: .*D1"):
