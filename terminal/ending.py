@@ -52,6 +52,7 @@ def report(error: BaseException) -> int:
     if isinstance(error, ReaderGoneError | BrokenPipeError):
         discard_output()
         return ExitCode.DONE
+    error = _signal_behind(error) or error
     if isinstance(error, KeyboardInterrupt):
         error = StoppedError(ExitCode.INTERRUPTED, "interrupted (Ctrl-C)")
     if isinstance(error, StoppedError):
@@ -67,6 +68,14 @@ def report(error: BaseException) -> int:
         return ExitCode.BUG
     say(f"error: {error}")
     return exit_code_of(error)
+
+
+def _signal_behind(error: BaseException) -> StoppedError | None:
+    """Return the StoppedError that caused an error, if any: Python 3.11 wraps one that arrives in `__set_name__`."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, StoppedError):
+        cause = cause.__cause__
+    return cause
 
 
 def _system_sentence(error: OSError) -> str | None:

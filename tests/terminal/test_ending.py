@@ -92,6 +92,21 @@ def test_a_signal_that_arrives_when_a_command_has_ended(monkeypatch, ending):
     assert len(calls) == 2
 
 
+def test_a_signal_that_arrives_while_a_class_is_made(monkeypatch, capsys):
+    """Python 3.11 wraps it in a RuntimeError."""
+
+    class Named:
+        def __set_name__(self, *_):
+            raise StoppedError(ExitCode.TERMINATED, "asked to end (SIGTERM)")
+
+    def command():
+        type("Made", (), {"name": Named()})
+
+    monkeypatch.setattr("terminal.ending.ignore_signals", lambda: None)
+    assert outcome(command) == ExitCode.TERMINATED
+    assert capsys.readouterr().err == "asked to end (SIGTERM)\n"
+
+
 def test_a_dropped_signal_counts_at_the_end_of_a_command():
     body = "import ctypes\nctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()"
     assert end_of(body)[0] == ExitCode.INTERRUPTED
