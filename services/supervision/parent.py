@@ -57,11 +57,12 @@ def leave_private_directory() -> None:
     deadline = time.monotonic() + _DYING_TIME
     while _has_dying_threads(os.environ.get(PARENT_VARIABLE, "")) and time.monotonic() < deadline:
         time.sleep(0.001)
-    remove_stale_sockets(directory)
-    if not has_master(directory):
-        for copy in directory.glob(f"{COPY_PREFIX}*"):
-            shutil.rmtree(copy, ignore_errors=True)
+    # such as the directory's absence: another child may remove it meanwhile
     with contextlib.suppress(OSError):
+        remove_stale_sockets(directory)
+        if not has_master(directory):
+            for copy in directory.glob(f"{COPY_PREFIX}*"):
+                shutil.rmtree(copy, ignore_errors=True)
         directory.rmdir()
 
 

@@ -11,6 +11,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from services.supervision.parent import DIRECTORY_VARIABLE, leave_private_directory
+
 PATIENCE = 50.0
 
 
@@ -96,3 +98,19 @@ def test_a_parent_with_a_dying_thread_is_awaited(place):
             assert time.monotonic() < deadline
             time.sleep(0.01)
     assert list(place.iterdir()) == []
+
+
+def test_a_directory_that_another_child_removes_meanwhile_is_left(tmp_path, monkeypatch):
+    directory = tmp_path / "rosbayes-run"
+    directory.mkdir()
+    listed = os.scandir
+
+    def vanish(path):
+        directory.rmdir()
+        return listed(path)
+
+    monkeypatch.setenv(DIRECTORY_VARIABLE, str(directory))
+    monkeypatch.setattr(os, "scandir", vanish)
+    leave_private_directory()
+    monkeypatch.undo()
+    assert not directory.exists()
