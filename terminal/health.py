@@ -66,16 +66,23 @@ def read_status(path: str, timeout: float) -> bytes:
     """
     deadline = time.monotonic() + timeout
     data = bytearray()
+    with silence_explained(path, timeout), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        asking.settimeout(timeout)
+        asking.connect(path)
+        while len(data) <= ANSWER_LIMIT:
+            asking.settimeout(max(0.001, deadline - time.monotonic()))
+            part = asking.recv(1 << 16)
+            if not part:
+                return bytes(data)
+            data += part
+    raise foreign_socket_error(path)
+
+
+@contextlib.contextmanager
+def silence_explained(path: str, timeout: float) -> Iterator[None]:
+    """Raise a NoHealthError for an OSError or a TimeoutError while the process at a status socket is asked."""
     try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
-            asking.settimeout(timeout)
-            asking.connect(path)
-            while len(data) <= ANSWER_LIMIT:
-                asking.settimeout(max(0.001, deadline - time.monotonic()))
-                part = asking.recv(1 << 16)
-                if not part:
-                    return bytes(data)
-                data += part
+        yield
     except TimeoutError:
         raise NoHealthError(Silence.TIMEOUT, f"does not answer at {path} within {timeout:g} s") from None
     except ConnectionRefusedError:
@@ -84,7 +91,6 @@ def read_status(path: str, timeout: float) -> bytes:
     except OSError as error:
         sentence = f"is not running, or does not report its status at {path} ({error.strerror or error})"
         raise NoHealthError(Silence.NO_SOCKET, sentence) from None
-    raise foreign_socket_error(path)
 
 
 def foreign_socket_error(path: str) -> NoHealthError:

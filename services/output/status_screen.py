@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from services.errors import SettingsError
-from services.sockets.stack import StackStatus, ask_stack, no_run_error
+from services.sockets.stack import SilentProcess, StackStatus, ask_stack, no_run_error
 from services.sockets.status import BoardStatus, FrameCounts, ProcessStatus
 from terminal.errors import ExitCode
 
@@ -23,6 +23,10 @@ _WATCH_INTERVAL = 1.0
 _PLAIN_WIDTH = 140
 _SHOWN = 200
 """Maximum number of characters shown of a sentence or name, because another process may answer anything."""
+_SILENT_SHOWN = 20
+"""Maximum number of silent processes shown, because a folder may contain thousands of abandoned sockets."""
+_SENTENCES = 3
+"""Maximum number of silent processes in an error."""
 
 
 def plain(text: str) -> str:
@@ -57,7 +61,10 @@ def _verdict(stack: StackStatus) -> Iterator[RenderableType]:
         yield Text(f"{stack.directory}: all {len(stack.processes)} processes are ready", "green")
     else:
         yield Text(f"{stack.directory}: not ready", "bold red")
-        yield from (Text(f"  {plain(sentence)}", "red") for sentence in stack.why)
+        more = max(0, len(stack.silent) - _SILENT_SHOWN)  # the sentences about them are the last ones
+        yield from (Text(f"  {plain(sentence)}", "red") for sentence in stack.why[: len(stack.why) - more])
+        if more:
+            yield Text(f"  and {more} more", "red")
     for process in stack.processes:
         if process.folder:
             model = f"deployment {plain(process.deployment[:12])} of {plain(process.folder)}"
@@ -88,8 +95,10 @@ def _processes(stack: StackStatus) -> Table:
             f"{process.memory_bytes / 1e6:.0f}" if process.memory_bytes else "",
             *map(Text, _counts(process.frames)),
         )
-    for silent in stack.silent:
+    for silent in stack.silent[:_SILENT_SHOWN]:
         table.add_row(Text(plain(silent.name)), Text("no answer", "red"))
+    if (more := len(stack.silent) - _SILENT_SHOWN) > 0:
+        table.add_row(f"{more} more", Text("no answer", "red"))
     return table
 
 
@@ -226,8 +235,14 @@ async def show(directory: Path | None, others: Sequence[Path], *, watch: bool, j
     finally:
         if live is not None:
             live.stop()
-    names = ", ".join(plain(each.name) for each in stack.silent)
-    killed = f" (sockets of killed processes: {names})" if names else ""
     raise SettingsError(
-        f"no rosbayes process answers in {directory}{killed}; is the stack running, with this BM_RUN_DIRECTORY?"
+        f"no rosbayes process answers in {directory}{_silence(stack.silent)}; is the stack running, with this BM_RUN_DIRECTORY?"
     )
+
+
+def _silence(silent: Sequence[SilentProcess]) -> str:
+    """Return the reasons of the first silent processes in parentheses, and the number of the others."""
+    reasons = [f"{plain(each.name)}: {plain(each.why)}" for each in silent[:_SENTENCES]]
+    if more := len(silent) - len(reasons):
+        reasons.append(f"and {more} more")
+    return f" ({'; '.join(reasons)})" if reasons else ""

@@ -4,7 +4,6 @@ import asyncio
 import os
 import tempfile
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +18,8 @@ from terminal.private_directory import DIRECTORY_PREFIX
 
 ANSWER_TIME = 1.0
 """Seconds in which all processes must answer."""
+_AT_ONCE = 256
+"""Maximum number of processes asked at the same time."""
 _ORDER = ("hub", "master", "subscriber", "publisher", "pcie-app")
 
 
@@ -75,10 +76,11 @@ def _status_sockets(directory: Path) -> list[Path]:
     return list(directory.glob(f"*{SUFFIX}"))
 
 
-def _ask(path: Path) -> ProcessStatus | SilentProcess:
+async def _ask(path: Path, turns: asyncio.Semaphore) -> ProcessStatus | SilentProcess:
     name = path.name.removesuffix(SUFFIX)
     try:
-        return msgspec.structs.replace(read_process_status(str(path), ANSWER_TIME), name=name)
+        async with turns:
+            return msgspec.structs.replace(await read_process_status(str(path), ANSWER_TIME), name=name)
     except NoHealthError as error:
         return SilentProcess(name, f"it {error}")
 
@@ -92,15 +94,16 @@ def _sort_key(name: str) -> tuple[int, int, str]:
 
 
 async def ask_stack(directory: Path | None, others: Iterable[Path] = ()) -> StackStatus:
-    """Return the status of the processes in a run directory, queried in parallel, within about a second.
+    """Return the status of the processes in a run directory, queried in parallel.
+
+    Up to 256 processes take at most about a second.
 
     Of the `others`, only those that answer are included.
     """
     paths = _status_sockets(directory) if directory is not None else []
     more = [path for other in others for path in _status_sockets(other)]
-    loop = asyncio.get_running_loop()
-    with ThreadPoolExecutor(max(1, len(paths) + len(more))) as pool:
-        asked = await asyncio.gather(*(loop.run_in_executor(pool, _ask, path) for path in [*paths, *more]))
+    turns = asyncio.Semaphore(_AT_ONCE)
+    asked = await asyncio.gather(*(_ask(path, turns) for path in [*paths, *more]))
     answers = asked[: len(paths)] + [each for each in asked[len(paths) :] if isinstance(each, ProcessStatus)]
     processes = [each for each in answers if isinstance(each, ProcessStatus)]
     silent = [each for each in answers if isinstance(each, SilentProcess)]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+import socket
 import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 
-from terminal.health import foreign_socket_error, read_status
+from terminal.health import ANSWER_LIMIT, foreign_socket_error, silence_explained
 
 if TYPE_CHECKING:
     # boards and pcie-app start without importing the bridge
@@ -173,9 +175,37 @@ def reasons(counts: Mapping[Reason, int]) -> dict[str, int]:
     return {reason: count for reason, count in dict(counts).items() if count}
 
 
-def read_process_status(path: str, timeout: float) -> ProcessStatus:
-    """Return the status of the process at a status socket, or raise a NoHealthError."""
+_decoder = msgspec.json.Decoder(ProcessStatus)
+_BACKLOG_EVERY = 0.01
+"""Seconds between two attempts to connect to a process that answers nobody at the moment."""
+
+
+async def read_process_status(path: str, timeout: float) -> ProcessStatus:
+    """Return the status of the process at a status socket, or raise a NoHealthError after `timeout` seconds.
+
+    No thread reads it, because Python waits for ever for a thread that has no memory to start.
+    """
+    data = bytearray()
+    loop = asyncio.get_running_loop()
+    with silence_explained(path, timeout), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        asking.setblocking(False)
+        async with asyncio.timeout(timeout):
+            while not _connected(asking, path):
+                await asyncio.sleep(_BACKLOG_EVERY)
+            while part := await loop.sock_recv(asking, 1 << 16):
+                data += part
+                if len(data) > ANSWER_LIMIT:
+                    raise foreign_socket_error(path)
     try:
-        return msgspec.json.decode(read_status(path, timeout), type=ProcessStatus)
+        return _decoder.decode(data)
     except (msgspec.MsgspecError, RecursionError):
         raise foreign_socket_error(path) from None
+
+
+def _connected(asking: socket.socket, path: str) -> bool:
+    """Try to connect; False if the backlog is full, for which no event loop can wait."""
+    try:
+        asking.connect(path)
+    except BlockingIOError:
+        return False
+    return True

@@ -5,7 +5,6 @@ import contextlib
 import io
 import socket
 import sys
-import threading
 from pathlib import Path
 
 import msgspec
@@ -13,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from services.errors import SettingsError
-from services.output.status_screen import screen
+from services.output.status_screen import screen, show
 from services.sockets import stack as status
 from services.sockets.reporting import serve_status
 from services.sockets.status import (
@@ -86,24 +85,43 @@ async def test_everyone_is_asked_and_says_what_it_waits_for(tmp_path):
     assert "publisher: waiting for ws://robot:9090" in shown(stack)
 
 
-async def test_silent_processes_share_one_timeout(tmp_path, monkeypatch):
-    together = threading.Barrier(5)
-    ask = status._ask
-
-    def ask_together(path):
-        together.wait(30)  # all of them are asked before the first has answered
-        return ask(path)
-
-    monkeypatch.setattr(status, "_ask", ask_together)
-    monkeypatch.setattr(status, "ANSWER_TIME", 3.0)
+async def test_silent_processes_are_asked_at_the_same_time(tmp_path):
     silent = ("subscriber", "publisher", "pcie-app", "board0")
-    with contextlib.ExitStack() as sockets:
+    together = asyncio.Barrier(len(silent))
+
+    async def end_together(_reader, writer):
+        await together.wait()  # otherwise the first one would not end within its time
+        writer.close()
+
+    async with contextlib.AsyncExitStack() as sockets:
         for name in silent:
-            sockets.enter_context(listener(tmp_path, name)).listen()
+            path = tmp_path / f"{name}.status.sock"
+            await sockets.enter_async_context(await asyncio.start_unix_server(end_together, path))
         async with served(tmp_path, master=process()):
             stack = await status.ask_stack(tmp_path)
     assert [each.name for each in stack.processes] == ["master"]
     assert tuple(each.name for each in stack.silent) == silent
+    assert [each.why for each in stack.silent if "within" in each.why] == []
+
+
+async def test_thousands_of_silent_sockets_are_counted(tmp_path, monkeypatch):
+    monkeypatch.setattr(status, "ANSWER_TIME", 0.2)
+    with contextlib.ExitStack() as sockets:
+        sockets.enter_context(listener(tmp_path, "board0")).listen()  # it lives, and does not answer
+        for number in range(1, 1000):
+            listener(tmp_path, f"board{number}").close()
+        with pytest.raises(SettingsError) as caught:
+            await show(tmp_path, [], watch=False, json=False)
+    monkeypatch.setattr(status, "ANSWER_TIME", 30.0)  # now all have been killed, and the master answers
+    async with served(tmp_path, master=process()):
+        text = shown(await status.ask_stack(tmp_path))
+    sentence = str(caught.value)
+    assert "board0: it does not answer" in sentence
+    assert "board1: it was killed" in sentence
+    assert "997 more" in sentence
+    assert len(sentence) < 1000
+    assert text.count("980 more") == 2
+    assert text.count("\n") < 80
 
 
 async def test_one_screen_has_services_boards_rates_and_losses(tmp_path):

@@ -34,21 +34,32 @@ def get_status():
     return ProcessStatus(ready=True, why="all is well", frames=counts(7))
 
 
-def test_a_process_identifies_itself(tmp_path):
+async def test_a_process_identifies_itself(tmp_path):
     with serve_status_in_thread(tmp_path, "pcie-app", get_status):
-        found = read_process_status(status_socket(tmp_path, "pcie-app"), PATIENCE)
+        found = await read_process_status(status_socket(tmp_path, "pcie-app"), PATIENCE)
     assert (found.name, found.pid, found.version) == ("pcie-app", os.getpid(), VERSION)
     assert (found.ready, found.why, found.frames) == (True, "all is well", counts(7))
     assert not list(tmp_path.iterdir())
 
 
-def test_a_status_of_another_version_is_refused(tmp_path):
+async def test_a_status_of_another_version_is_refused(tmp_path):
     with (
         in_thread(lambda: serve_health(tmp_path, "hub", lambda: b'{"ready":true,"why":3}')),
         pytest.raises(NoHealthError) as silent,
     ):
-        read_process_status(status_socket(tmp_path, "hub"), PATIENCE)
+        await read_process_status(status_socket(tmp_path, "hub"), PATIENCE)
     assert silent.value.reason is Silence.NOT_OURS
+
+
+async def test_a_process_that_accepts_nobody_is_silent(tmp_path):
+    path = status_socket(tmp_path, "hub")
+    with socket.socket(socket.AF_UNIX) as stuck, socket.socket(socket.AF_UNIX) as queued:
+        stuck.bind(path)
+        stuck.listen(0)
+        queued.connect(path)  # the backlog is full
+        with pytest.raises(NoHealthError) as silent:
+            await read_process_status(path, 0.1)
+    assert silent.value.reason is Silence.TIMEOUT
 
 
 async def test_a_directory_that_is_not_there_is_the_users_mistake(tmp_path):
@@ -97,9 +108,9 @@ def test_a_rate_does_not_count_the_time_before_the_first_result(monkeypatch):
     assert report.status().frames.rate == 10
 
 
-def test_a_process_says_what_it_uses(tmp_path):
+async def test_a_process_says_what_it_uses(tmp_path):
     with serve_status_in_thread(tmp_path, "pcie-app", get_status):
-        found = read_process_status(status_socket(tmp_path, "pcie-app"), PATIENCE)
+        found = await read_process_status(status_socket(tmp_path, "pcie-app"), PATIENCE)
     assert found.cpu_s > 0
     assert 10e6 < found.memory_bytes < 10e9
 
