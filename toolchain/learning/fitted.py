@@ -173,7 +173,7 @@ def write_fit(path: Path, fit: Fit) -> None:
             content = fit.file.model_dump(mode="json", by_alias=True)
             partial.write_text(_HEADER + tomli_w.dumps(content), encoding="utf-8")
         else:
-            _write_tables(partial, fit.file.model_dump(mode="json"), fit.tables)
+            _write_tables(partial, fit.file.model_dump(mode="json", by_alias=True), fit.tables)
 
 
 def read_fit(path: Path) -> Fit:
@@ -191,7 +191,7 @@ def _write_tables(path: Path, content: dict[str, Any], tables: Mapping[str, NDAr
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         entry = zipfile.ZipInfo(_META, _EPOCH)
         archive.writestr(entry, json.dumps(content, indent=1, sort_keys=True), zipfile.ZIP_DEFLATED)
-        for number, variable in enumerate(content["variables"]):
+        for number, variable in enumerate(content["variable"]):
             entry = zipfile.ZipInfo(f"table{number}.npy", _EPOCH)
             entry.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(entry, "w", force_zip64=True) as file:
@@ -205,7 +205,8 @@ def _read_tables(path: Path) -> Fit:
             if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
                 raise ModelError(f"{path} is larger than {MAX_BYTES} bytes, unpacked; this is the maximum")
             content = json.loads(_member(archive, _META, _MAX_META_BYTES))
-            file = FitFile.model_validate(content, by_alias=False, by_name=True)
+            # files of earlier versions have the names of the fields, in the plural
+            file = FitFile.model_validate(content, by_alias=True, by_name=True)
             counted = file.variables if file.method == "counts" else ()
             tables = {
                 variable.name: _array(archive, f"table{number}.npy")

@@ -184,6 +184,10 @@ def test_counted_tables_and_their_file_survive_a_round_trip(tmp_path):
     for name in ("a.npz", "b.npz"):
         write_fit(tmp_path / name, fit)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.npz") as packed:
+        assert set(json.loads(packed.read("fit.json"))) == {
+            *("format", "method", "model", "floor", "recording", "variable"),
+        }
     again = read_fit(tmp_path / "a.npz")
     assert again.file == fit.file
     assert np.array_equal(again.tables["door"], fit.tables["door"])
@@ -208,6 +212,13 @@ META = json.dumps(
     | {"variables": [{"name": "k", "rows": 1}]}
 )
 HEADER = "{{'descr': '{}', 'fortran_order': False, 'shape': {}, }}"
+
+
+def test_a_file_of_an_earlier_version_is_read(tmp_path):
+    table = array_bytes(HEADER.format("<f8", (1, 1)), np.array([1.0]).tobytes())
+    fit = read_fit(archive(tmp_path / "x.npz", {"fit.json": META, "table0.npy": table}))
+    assert [variable.name for variable in fit.file.variables] == ["k"]
+    assert fit.tables["k"].tolist() == [[1.0]]
 
 
 @pytest.mark.parametrize(
