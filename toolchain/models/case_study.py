@@ -5,7 +5,7 @@ import inspect
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from enum import Enum
 from pathlib import Path
 from types import ModuleType, UnionType
@@ -44,7 +44,8 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
             f"{case} {what}; expected a folder with a {FILE_NAME} that defines model(), or a network file (.bif, "
             ".xmlbif, .uai or .net)"
         )
-    with _importing_from(path.parent.resolve()):
+    # standard output belongs to the command, which may print JSON
+    with _importing_from(path.parent.resolve()), redirect_stdout(sys.stderr):
         function = _model_function(path)
         arguments = _arguments(path, function, settings)
         model = _guarded(path, "model()", lambda: function(**arguments))

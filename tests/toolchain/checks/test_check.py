@@ -381,6 +381,15 @@ def test_the_command_as_words_or_json(case):
     assert list(finding.values())[:3] == ["error", "cannot-be-built", "the machine"]
 
 
+def test_json_stays_json_when_a_model_prints(case):
+    file = case / "model.py"
+    text = file.read_text().replace("):\n    return", "):\n    print('a call')\n    return")
+    file.write_text("print('an import')\n" + text)
+    result = toolchain("check", case, "--json")
+    assert [json.loads(line)["about"] for line in result.stdout.splitlines()] == ["K"]
+    assert result.stderr == "an import\na call\n"
+
+
 def test_a_deployment_by_the_command(deployment, tmp_path):
     result = toolchain("check", deployment)
     assert (result.exit_code, result.stdout) == (0, "")
