@@ -27,6 +27,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import coverage
+import msgspec
 import psutil
 
 from scripts.mutation import contexts, warm
@@ -332,11 +333,28 @@ class Warm:
 
 
 def known_results() -> dict[tuple[str, str], Result]:
-    """Return the results of earlier runs; a later line replaces an earlier one."""
+    """Return the results of earlier runs; a later line replaces an earlier one, and others are left out."""
     if not RESULTS.exists():
         return {}
-    found = (Result(**json.loads(line)) for line in RESULTS.read_text(encoding="utf-8").splitlines())
+    found = []
+    for number, line in enumerate(RESULTS.read_bytes().split(b"\n"), start=1):
+        if not line:
+            continue
+        try:
+            found.append(msgspec.json.decode(line, type=Result))
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            print(f"{RESULTS}:{number} is not a result; its mutant is tried again", file=sys.stderr)
     return {result.key: result for result in found}
+
+
+def end_last_line() -> None:
+    """Complete the last line of the results, so that the next one is not appended to a truncated one."""
+    RESULTS.parent.mkdir(parents=True, exist_ok=True)
+    with RESULTS.open("ab+") as file:
+        if size := file.tell():
+            file.seek(size - 1)
+            if file.read() != b"\n":
+                file.write(b"\n")
 
 
 def equivalents() -> dict[tuple[str, str, str], str]:
@@ -371,7 +389,7 @@ class Campaign:
         waiting: queue.SimpleQueue[tuple[str, Mutant]] = queue.SimpleQueue()
         for task in self._tasks():
             waiting.put(task)
-        RESULTS.parent.mkdir(parents=True, exist_ok=True)
+        end_last_line()
         with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
             workers = [
                 threading.Thread(target=self._work, args=(Path(folder, str(number)), waiting))
