@@ -122,7 +122,7 @@ def _listen_privately(path: str) -> socket.socket:
         try:
             server.bind(path)
         except OSError as error:
-            if error.errno != errno.EADDRINUSE or _is_served(path):
+            if error.errno != errno.EADDRINUSE or is_served(path):
                 raise
             Path(path).unlink()
             server.bind(path)
@@ -133,15 +133,16 @@ def _listen_privately(path: str) -> socket.socket:
     return server
 
 
-def _is_served(path: str) -> bool:
+def is_served(path: str) -> bool:
+    """Return whether a process listens at the path of a unix socket, even if it does not answer."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
             probe.connect(path)
-        except ConnectionRefusedError:
+        except (BlockingIOError, PermissionError):
+            pass  # the backlog is full, for which a blocking connect would wait, or it is another user's
+        except OSError:
             return False
-        except BlockingIOError:
-            pass  # the backlog is full: a blocking connect would wait
         return True
 
 

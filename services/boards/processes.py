@@ -4,7 +4,6 @@ import contextlib
 import os
 import select
 import signal
-import socket
 import sys
 import time
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from pcie_shim.board.board import Board
 from pcie_shim.board.misbehaviour import Misbehaviour
 from pcie_shim.board.rtl_board import RtlBoard
 from pcie_shim.board.server import StopSignal, serve_board
-from pcie_shim.endpoint import Endpoint
+from pcie_shim.endpoint import Endpoint, is_served
 from services.boards.hardware import SimulatedHardware
 from services.errors import BoardFailedError, SettingsError
 from services.settings import endpoint_in
@@ -30,6 +29,8 @@ from terminal.output import say
 from terminal.private_directory import remove_stale_sockets
 from terminal.signals import check_signals
 
+_ENDING_TIME: Final = 5.0
+"""Seconds in which boards of a killed process of the same master end, even if they are stopped for a moment."""
 _LISTENS: Final = 128
 """Added to the number of a board whose sign says that it listens; otherwise it only lives."""
 
@@ -94,13 +95,17 @@ def serve_one(
     return ended_by[0] if ended_by else 0
 
 
-def _check_free(endpoint: Endpoint) -> None:
-    """Raise an error if another process listens at an endpoint; later, a socket there counts as ours."""
+def _await_free(endpoint: Endpoint, limit: float) -> None:
+    """Wait until no other process listens at an endpoint, or raise an error; later, a socket there counts as ours."""
+    deadline = time.monotonic() + limit
     for each in (endpoint, endpoint.programming):
-        with socket.socket(socket.AF_UNIX) as probe, contextlib.suppress(OSError):
-            probe.settimeout(1)
-            probe.connect(each.path)
-            raise SettingsError(f"another process listens at {each}; stop it, or give another --directory")
+        while is_served(each.path):
+            if time.monotonic() >= deadline:
+                raise SettingsError(
+                    f"another process listens at {each}; stop it, or give another --directory"
+                )
+            check_signals()
+            time.sleep(0.01)
 
 
 class BoardProcesses:
@@ -137,7 +142,7 @@ class BoardProcesses:
         # children share these pages, because four imports of numba would take 1.6 s
         warm_up()
         for endpoint in self._endpoints:
-            _check_free(endpoint)
+            _await_free(endpoint, 0.0 if self._reports else _ENDING_TIME)
         try:
             for at in range(len(self._endpoints)):
                 self._fork(at)

@@ -13,7 +13,10 @@ from pathlib import Path
 import psutil
 import pytest
 
+from pcie_shim.endpoint import Endpoint
+from services.boards import processes
 from services.boards.processes import BoardProcesses
+from services.errors import SettingsError
 from services.sockets.reporting import STUCK_S
 
 BOARD = str(Path(sys.executable).parent / "board")
@@ -127,3 +130,38 @@ def test_a_stuck_board_is_no_sign_of_life_of_its_parent(tmp_path, monkeypatch):
     boards._hear(1, listens=False)
     boards._report()
     assert reports == [(True, True), (True, False), (True, True)]
+
+
+def test_boards_of_a_killed_process_have_time_to_end(tmp_path, monkeypatch):
+    endpoint = Endpoint(path=str(tmp_path / "board0.sock"))
+    now = [0.0]
+    with socket.socket(socket.AF_UNIX) as former, socket.socket(socket.AF_UNIX) as queued:
+        former.bind(endpoint.path)
+        former.listen(0)
+        queued.connect(endpoint.path)  # a second one would wait
+
+        def ends_later(seconds):
+            now[0] += seconds
+            if now[0] > 1:
+                former.close()
+
+        monkeypatch.setattr(processes.time, "monotonic", lambda: now[0])
+        monkeypatch.setattr(processes.time, "sleep", ends_later)
+        with pytest.raises(SettingsError, match="another process listens"):
+            processes._await_free(endpoint, 0.0)
+        assert now == [0.0]
+        processes._await_free(endpoint, 5.0)
+    assert now[0] > 1
+
+
+def test_boards_that_do_not_end_are_named(tmp_path, monkeypatch):
+    endpoint = Endpoint(path=str(tmp_path / "board0.sock"))
+    now = [0.0]
+    monkeypatch.setattr(processes.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(processes.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
+    with socket.socket(socket.AF_UNIX) as former:
+        former.bind(endpoint.path)
+        former.listen(0)
+        with pytest.raises(SettingsError, match="board0"):
+            processes._await_free(endpoint, 5.0)
+    assert now[0] >= 5
