@@ -64,6 +64,9 @@ class Settings(BaseSettings):
         default=5, description="seconds a board may take beyond max_cycles at its speed"
     )
     stop_timeout: Seconds = Field(default=5, description="grace period in seconds for processes to exit")
+    restart_window: Seconds = Field(
+        default=60, description="seconds within which three restarts of a process are allowed"
+    )
     seen_timeout: Seconds = Field(default=2, description="seconds until a result is seen on the wire")
 
     message_bytes: int = Field(

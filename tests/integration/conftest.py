@@ -11,6 +11,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -19,21 +20,26 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import pytest
 import websockets
 
+from machines.posterior import joint_posterior
+from pcie_shim.host.frame import FrameInput
+from pcie_shim.programming_file import read_image
 from tests.command_runner import invoke
-from tests.pcie_shim.boards import tcp_endpoint
+from tests.patience import PROCESS_PATIENCE, PRODUCT_LIMITS
+from tests.pcie_shim.boards import expected
 from toolchain.commands import main
+from toolchain.deployment import load_deployment
+from toolchain.deployment.address import to_address
 
 ROOT = Path(__file__).resolve().parents[2]
 BIN = Path(sys.executable).parent
 MARK = "ROSBAYES_TEST_RUN"
-PATIENCE = 180.0
-"""Seconds for what happens within one where nothing else runs."""
 PID_MAX = int(Path("/proc/sys/kernel/pid_max").read_text())
-LOOP = ("master", "--loop", "--connect-timeout", "30")
+LOOP = ("master", "--loop")
 PROGRAMMED = "pcie-app: 4 boards"
 """Part of the line that is printed once the boards are ready."""
 READING = {"D1": 71, "D2": 50, "D3": 50, "B1": 45, "B2": 0, "B3": 90}
@@ -42,7 +48,8 @@ READING = {"D1": 71, "D2": 50, "D3": 50, "B1": 45, "B2": 0, "B3": 90}
 
 async def until(true: Callable[[], Any], why: Callable[[], str] = str) -> Any:
     """Wait until a function, or what it returns awaited, returns something that is true; return that."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + PROCESS_PATIENCE
+    pause = 0.02
     while True:
         found = true()
         if inspect.isawaitable(found):
@@ -50,7 +57,14 @@ async def until(true: Callable[[], Any], why: Callable[[], str] = str) -> Any:
         if found:
             return found
         assert time.monotonic() < deadline, why()
-        await asyncio.sleep(0.02)
+        await asyncio.sleep(pause)
+        pause = min(1.2 * pause, 0.25)  # looking costs what a slow machine needs for the processes
+
+
+def environment_of(where: Path, run: str) -> dict[str, str]:
+    """The environment of a test's processes."""
+    limits = {name: str(seconds) for name, seconds in PRODUCT_LIMITS.items()}
+    return dict(os.environ) | limits | {MARK: run, "TMPDIR": str(where)}
 
 
 class Running:
@@ -68,7 +82,7 @@ class Running:
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=err,
-                env=dict(os.environ) | {MARK: run, "TMPDIR": str(where)} | (environment or {}),
+                env=environment_of(where, run) | (environment or {}),
                 start_new_session=True,
             )
 
@@ -109,17 +123,34 @@ class Stage:
         self.where = where
         self.run = uuid.uuid4().hex
         self.running: list[Running] = []
+        self.robots: list[Robot] = []
         self.runs = where / "runs"
         self.runs.mkdir()
+        self._places: list[socket.socket] = []
 
     def start(self, *command: str, environment: dict[str, str] | None = None) -> Running:
         running = Running(self.where, self.run, *command, environment=environment)
         self.running.append(running)
         return running
 
+    @property
+    def environment(self) -> dict[str, str]:
+        """The environment of the processes."""
+        return environment_of(self.where, self.run)
+
     def place(self) -> int:
-        """A port that is free, and the next one; nobody else is given them."""
-        return int(tcp_endpoint().rsplit(":", 1)[1])
+        """A port that is free, and the next one; nobody else is given them before the test's end."""
+        while True:
+            # bound and never listening
+            pair = socket.socket(), socket.socket()
+            self._places.extend(pair)
+            for each in pair:
+                each.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            pair[0].bind(("127.0.0.1", 0))
+            port = pair[0].getsockname()[1]
+            with contextlib.suppress(OSError, OverflowError):
+                pair[1].bind(("127.0.0.1", port + 1))
+                return port
 
     async def hub(self, port: int = 0) -> tuple[Running, str]:
         """A hub and its address; another one may follow it at its port."""
@@ -164,6 +195,7 @@ class Stage:
         """Start a hub, a robot that publishes and a master in --loop, and wait for the first results."""
         hub, uri = await self.hub()
         publishing = (robot or Robot)(uri)
+        self.robots.append(publishing)
         await publishing.connect()
         await publishing.keep_publishing(rate=rate, **reading)
         command = (*LOOP, "-d", str(boat), "--uri", uri, *options)
@@ -219,13 +251,17 @@ class Stage:
         await until(lambda: not left(), lambda: f"left: {left()}")
         assert not [path for path in self.where.glob("rosbayes-*") if not list(path.iterdir())]
 
-    def end_all(self) -> None:
+    async def end_all(self) -> None:
+        for robot in self.robots:
+            await robot.close()
         for all_ in self.processes().values():
             for process in all_:
                 with contextlib.suppress(psutil.Error):
                     process.kill()
         for running in self.running:
-            running.process.wait(PATIENCE)
+            running.process.wait(PROCESS_PATIENCE)
+        for place in self._places:
+            place.close()
 
 
 class Robot:
@@ -240,6 +276,7 @@ class Robot:
         """Each result with its report, which comes just before it; the first result may have come without."""
         self._report: dict | None = None
         self._tasks: list[asyncio.Task] = []
+        self._collecting: asyncio.Task | None = None
         self._publishing: asyncio.Task | None = None
         self._values: dict = {}
         self._socket = None
@@ -249,8 +286,10 @@ class Robot:
         return self
 
     async def connect(self) -> None:
+        if self._socket is not None:
+            await self._socket.close()
         self._socket = await websockets.connect(
-            self.uri, max_size=1 << 22, open_timeout=PATIENCE, ping_interval=None
+            self.uri, max_size=1 << 22, open_timeout=PROCESS_PATIENCE, ping_interval=None
         )
         for topic, type_ in (
             ("/BMresults", "std_msgs/Float64MultiArray"),
@@ -260,11 +299,21 @@ class Robot:
         await self._socket.send(
             json.dumps({"op": "advertise", "topic": "/boat/sensors", "type": "boat_msgs/Sensors"})
         )
-        self._tasks.append(asyncio.ensure_future(self._collect(self._socket)))
+        self._collecting = asyncio.ensure_future(self._collect(self._socket))
+        self._tasks.append(self._collecting)
+
+    async def lost(self) -> None:
+        """Wait until the server is gone, and all that it sent is here."""
+        async with asyncio.timeout(PROCESS_PATIENCE):
+            await asyncio.wait([self._collecting])
 
     async def __aexit__(self, *_):
+        await self.close()
+
+    async def close(self) -> None:
         for task in self._tasks:
             task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
         if self._socket is not None:
             await self._socket.close()
 
@@ -346,6 +395,24 @@ def endpoints_in(folder: Path) -> str:
     return ",".join(f"unix:{folder}/board{at}.sock" for at in range(4))
 
 
+def right_posteriors(folder):
+    """The posteriors of READING, by bank."""
+    deployment = load_deployment(folder)
+    parts = [read_image(deployment.image_path(at)) for at in range(len(deployment.boards))]
+    addresses = tuple(to_address(each, READING[each.name]) for each in deployment.variables)
+    machine = deployment.machine
+    posteriors = []
+    for bank in range(machine.rng_banks):
+        given = FrameInput(
+            addresses=addresses, target_count=machine.target_count, max_cycles=machine.max_cycles, bank=bank
+        )
+        outcome = expected(parts, given)
+        posteriors.append(
+            joint_posterior([np.array(each[0], np.uint32) for each in outcome], [each[1] for each in outcome])
+        )
+    return posteriors
+
+
 def only_error(running: Running) -> str:
     """The last line of standard error, which has the only error."""
     assert "Traceback" not in running.err
@@ -355,7 +422,7 @@ def only_error(running: Running) -> str:
 
 async def until_subscribed(uri: str, topic: str) -> None:
     """Wait until somebody hears a topic at a hub."""
-    async with asyncio.timeout(PATIENCE), websockets.connect(uri, open_timeout=None) as asking:
+    async with asyncio.timeout(PROCESS_PATIENCE), websockets.connect(uri, open_timeout=None) as asking:
         while True:
             call = {"op": "call_service", "service": "/rosapi/subscribers", "args": {"topic": topic}}
             await asking.send(json.dumps(call))
@@ -374,11 +441,11 @@ async def status_of(runs: Path, name: str) -> dict:
 
 
 @pytest.fixture
-def stage(tmp_path_factory):
+async def stage(tmp_path_factory):
     # short: a socket's path has 99 bytes
     made = Stage(tmp_path_factory.mktemp("run"))
     yield made
-    made.end_all()
+    await made.end_all()
 
 
 def toolchain(*arguments: str | Path) -> None:
@@ -393,10 +460,10 @@ def build(model: Path, directory: Path, *options: str) -> Path:
     return directory
 
 
-def build_boat(directory: Path, *options: str, cells: int = 8) -> Path:
-    """The boat on a square map of few cells, for four boards."""
+def build_boat(directory: Path, *options: str, cells: int = 8, partitions: int = 4) -> Path:
+    """The boat on a square map of few cells, for four boards or another number of them."""
     size = ("--set", f"width={cells}", "--set", f"height={cells}")
-    return build(ROOT / "casestudies/boat", directory, "--partitions", "4", *size, *options)
+    return build(ROOT / "casestudies/boat", directory, "--partitions", str(partitions), *size, *options)
 
 
 def made_once(tmp_path_factory, name: str, make: Callable[[Path], object]) -> Path:

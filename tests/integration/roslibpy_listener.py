@@ -1,12 +1,14 @@
-"""A listener with roslibpy, an independent client.
+"""A robot with roslibpy, an independent client.
 
-    python roslibpy_listener.py URI FILE COUNT
+    python roslibpy_listener.py URI FILE COUNT [READING]
 
-Writes one JSON line per message heard and ends after COUNT results, or 240 s.
+Publishes a reading, given as JSON, again and again. Writes one JSON line per message heard, and ends after COUNT
+results.
 """
 
 import json
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -20,17 +22,25 @@ TOPICS = {
 }
 
 
-def main(uri: str, file: str, count: int) -> int:
+PATIENCE = 86_400.0
+"""Seconds; a test that no longer waits for it kills it."""
+
+
+def main(uri: str, file: str, count: int, reading: str = "") -> int:
     host, port = uri.removeprefix("ws://").rsplit(":", 1)
     ros = roslibpy.Ros(host=host, port=int(port))
-    ros.run(timeout=240)
+    ros.run(timeout=PATIENCE)
     heard = []
-    results = [0]
+    results = 0
+    enough = threading.Event()
 
     def keep(topic: str):
         def take(msg) -> None:
+            nonlocal results
             heard.append((topic, msg))
-            results[0] += topic == "/BMresults"
+            results += topic == "/BMresults"
+            if results >= count:
+                enough.set()
 
         return take
 
@@ -38,15 +48,18 @@ def main(uri: str, file: str, count: int) -> int:
     for topic in topics:
         topic.subscribe(keep(topic.name))
     print("listening", file=sys.stderr, flush=True)
-    deadline = time.monotonic() + 240
-    while results[0] < count and time.monotonic() < deadline:
-        time.sleep(0.05)
+    sensors = topics[-1]
+    while not enough.wait(0.05):
+        if reading:
+            sec, nanosec = divmod(time.time_ns(), 10**9)
+            header = {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": "map"}
+            sensors.publish(roslibpy.Message({"header": header, **json.loads(reading)}))
     ros.terminate()
     with Path(file).open("w") as out:
         for topic, msg in heard:
             out.write(json.dumps({"topic": topic, "msg": dict(msg)}) + "\n")
-    return 0 if results[0] >= count else 1
+    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1], sys.argv[2], int(sys.argv[3])))
+    sys.exit(main(sys.argv[1], sys.argv[2], int(sys.argv[3]), *sys.argv[4:]))

@@ -14,7 +14,7 @@ from casestudies.boat.correctness import correctness
 from casestudies.boat.geometry import map_grid
 from casestudies.boat.messages import SENSOR_NAMES
 from casestudies.boat.model import model as boat_model
-from tests.integration.conftest import PROGRAMMED, build_boat, stamp_of
+from tests.integration.conftest import PROGRAMMED, READING, build_boat, stamp_of
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.models.fusion import exact_posterior
@@ -37,6 +37,7 @@ def heard(file: Path) -> dict[str, list[dict]]:
     return messages
 
 
+@pytest.mark.thorough
 async def test_frames_are_as_good_as_float64_fusion(stage, whole_boat, tmp_path):
     _, uri = await stage.hub()
     listener = stage.start(sys.executable, LISTENER, uri, str(tmp_path / "heard"), str(FRAMES))
@@ -73,3 +74,15 @@ async def test_frames_are_as_good_as_float64_fusion(stage, whole_boat, tmp_path)
     assert abs(figures.coverage - figures.exact_coverage) <= 0.03, figures
     assert figures.mean_within_one_cell >= 0.99, figures
     assert figures.total_variation_mean <= 0.06, figures
+
+
+@pytest.mark.process
+async def test_roslibpy_as_the_robot(stage, boat, tmp_path):
+    _, uri = await stage.hub()
+    reading = json.dumps(READING)
+    robot = stage.start(sys.executable, LISTENER, uri, str(tmp_path / "heard"), "1", reading)
+    master = stage.start("master", "--once", "--fused", "-d", str(boat), "--uri", uri)
+    assert await master.end() == 0, master.err
+    assert await robot.end() == 0, robot.err
+    (result,) = heard(tmp_path / "heard")["/BMresults"]
+    assert abs(sum(result["data"]) - 1) < 1e-9

@@ -9,41 +9,24 @@ import subprocess
 import numpy as np
 import pytest
 
-from machines.posterior import joint_posterior
-from pcie_shim.host.frame import FrameInput
-from pcie_shim.programming_file import read_image
-from tests.integration.conftest import BIN, READING, build_boat, only_error, until
-from tests.pcie_shim.boards import expected, tcp_endpoint
+from tests.integration.conftest import BIN, READING, build_boat, only_error, right_posteriors, until
+from tests.patience import PROCESS_PATIENCE
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
+
+pytestmark = pytest.mark.thorough
 
 FRAMES = 2000
 LATE = "300"
 """Starts of the damaged board before its damage: canaries and some frames."""
 
 
-def right_posteriors(folder):
-    """The posteriors of READING, by bank."""
-    deployment = load_deployment(folder)
-    parts = [read_image(deployment.image_path(at)) for at in range(len(deployment.boards))]
-    addresses = tuple(to_address(each, READING[each.name]) for each in deployment.variables)
-    machine = deployment.machine
-    posteriors = []
-    for bank in range(machine.rng_banks):
-        given = FrameInput(
-            addresses=addresses, target_count=machine.target_count, max_cycles=machine.max_cycles, bank=bank
-        )
-        outcome = expected(parts, given)
-        posteriors.append(
-            joint_posterior([np.array(each[0], np.uint32) for each in outcome], [each[1] for each in outcome])
-        )
-    return posteriors
-
-
 def start_boards(stage, misbehave, tcp=False):
     sockets = stage.where / "s"
     sockets.mkdir(mode=0o700)
-    endpoints = [tcp_endpoint() if tcp else f"unix:{sockets}/board{at}.sock" for at in range(4)]
+    endpoints = [
+        f"tcp://127.0.0.1:{stage.place()}" if tcp else f"unix:{sockets}/board{at}.sock" for at in range(4)
+    ]
     for at, endpoint in enumerate(endpoints):
         wrong = ["--misbehave", misbehave] if at == 1 else []
         stage.start("board", "--listen", endpoint, "--index", str(at), *wrong)
@@ -116,11 +99,13 @@ async def test_the_pipe_reprograms_a_damaged_board_and_goes_on(stage, boat):
     command = [BIN / "pcie-app", "-d", boat, "--boards", boards]
     rule = ["--integrity", "canary", "--integrity-frames", "400"]
     ended = subprocess.run(
-        [*command, *rule], input=lines, capture_output=True, text=True, timeout=180, check=False
+        [*command, *rule], input=lines, capture_output=True, text=True, timeout=PROCESS_PATIENCE, check=False
     )
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr.count("board 1 gave wrong counts") == 1
-    plain = subprocess.run(command, input=lines, capture_output=True, text=True, timeout=180, check=False)
+    plain = subprocess.run(
+        command, input=lines, capture_output=True, text=True, timeout=PROCESS_PATIENCE, check=False
+    )
     counts = [
         [[board["counts"] for board in json.loads(line)["boards"]] for line in each.stdout.splitlines()]
         for each in (ended, plain)

@@ -14,7 +14,8 @@ import pytest
 from bridge.client import connect
 from bridge.stamps import header
 from posteriors.listening import posteriors
-from tests.integration.conftest import PATIENCE, toolchain
+from tests.integration.conftest import toolchain
+from tests.patience import PROCESS_PATIENCE
 
 MODEL = """
 import numpy as np
@@ -71,10 +72,18 @@ async def robot(uri):
 @pytest.mark.parametrize(
     ("key", "flags", "environment", "said"),
     [
-        ("topic_bytes = 100000", (), {}, ""),
-        ("", ("--topic-bytes", "100000"), {}, ""),
-        ("topic_bytes = 3000000", (), {"BM_TOPIC_BYTES": "100000"}, ""),
-        ("", ("--message-bytes", "1000000"), {}, r"warning: .*/camera is left out"),
+        pytest.param("topic_bytes = 100000", ("--fused",), {}, "", marks=pytest.mark.process),
+        pytest.param("", ("--topic-bytes", "100000"), {}, "", marks=pytest.mark.thorough),
+        pytest.param(
+            "topic_bytes = 3000000", (), {"BM_TOPIC_BYTES": "100000"}, "", marks=pytest.mark.thorough
+        ),
+        pytest.param(
+            "",
+            ("--message-bytes", "1000000"),
+            {},
+            r"warning: .*/camera is left out",
+            marks=pytest.mark.thorough,
+        ),
     ],
 )
 async def test_results_go_on_beside_a_camera_with_large_pictures(stage, key, flags, environment, said):
@@ -91,8 +100,8 @@ async def test_results_go_on_beside_a_camera_with_large_pictures(stage, key, fla
         master = stage.start(*command, environment=environment | {"BM_RUN_DIRECTORY": str(stage.runs)})
         if said:
             await master.says(said)
-        for _ in range(20):
-            assert (await heard.next(PATIENCE)).best() == {"s": 2}
+        for _ in range(5):
+            assert (await heard.next(PROCESS_PATIENCE)).best() == {"s": 2}
         if not said:
             await stage.status("subscriber", lambda status: status["frames"]["lost"].get("too large"))
         master.send(signal.SIGINT)

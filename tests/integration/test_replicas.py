@@ -17,6 +17,7 @@ from pcie_shim.programming_file import read_image
 from posteriors.frame_report import read_frame_report
 from posteriors.posterior import read_posterior
 from tests.integration.conftest import BIN, Robot, build, only_error
+from tests.patience import PROCESS_PATIENCE
 from tests.pcie_shim.boards import expected_of_replicas
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address_array import to_addresses
@@ -115,11 +116,20 @@ def wanted(deployment, message, number):
 @pytest.mark.parametrize(
     ("options", "flags"),
     [
-        (("--replicas", "3", "--stop", "own", "--partitions", "2"), ()),
-        (("--sensor-mode", "cell", "--replicas", "3", "--partitions", "2"), ("--fused",)),
-        (("--sensor-mode", "threshold"), ()),
+        pytest.param(
+            ("--replicas", "3", "--stop", "own", "--partitions", "2"),
+            (),
+            id="three replicas, each board by itself",
+            marks=pytest.mark.thorough,
+        ),
+        pytest.param(
+            ("--sensor-mode", "cell", "--replicas", "3", "--partitions", "2"),
+            ("--fused",),
+            id="replicas of cells on two boards",
+            marks=pytest.mark.process,
+        ),
+        pytest.param(("--sensor-mode", "threshold"), (), id="thresholds", marks=pytest.mark.thorough),
     ],
-    ids=["three replicas, each board by itself", "replicas of cells on two boards", "thresholds"],
 )
 async def test_what_is_published_is_what_the_machines_count(stage, tmp_path, options, flags):
     deployment = load_deployment(built(tmp_path / "disparity", *options))
@@ -156,6 +166,7 @@ async def test_what_is_published_is_what_the_machines_count(stage, tmp_path, opt
     assert "unusable" not in master.err
 
 
+@pytest.mark.thorough
 async def test_an_array_that_does_not_fit_ends_a_run_of_one_frame(stage, tmp_path):
     cells = built(tmp_path / "disparity", "--sensor-mode", "cell")
     _, uri = await stage.hub()
@@ -166,6 +177,7 @@ async def test_an_array_that_does_not_fit_ends_a_run_of_one_frame(stage, tmp_pat
         assert re.search(r"\bleft: .*\b9\b", only_error(master))
 
 
+@pytest.mark.thorough
 async def test_alone_the_commands_are_a_pipe(stage, tmp_path):
     """`subscriber | pcie-app | publisher`: the same lines as in a run."""
     deployment = load_deployment(built(tmp_path / "disparity", "--replicas", "3"))
@@ -177,7 +189,7 @@ async def test_alone_the_commands_are_a_pipe(stage, tmp_path):
         input=line + "\n" + line.replace("[1, 2, 3]", "[1, 2]"),
         capture_output=True,
         text=True,
-        timeout=240,
+        timeout=PROCESS_PATIENCE,
         check=False,
     )
     first = json.loads(ran.stdout.splitlines()[0])

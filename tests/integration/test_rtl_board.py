@@ -30,6 +30,7 @@ def facts(status):
     }
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(
     shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
 )

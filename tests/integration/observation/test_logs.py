@@ -4,9 +4,12 @@ import json
 import os
 import signal
 
+import pytest
+
 from tests.integration.conftest import Robot, until
 
 
+@pytest.mark.process
 async def test_every_line_of_a_run_is_an_object(stage, boat):
     _, uri = await stage.hub()
     async with Robot(uri) as robot:
@@ -17,7 +20,7 @@ async def test_every_line_of_a_run_is_an_object(stage, boat):
         (publisher,) = stage.processes()["publisher"]
         os.kill(publisher.pid, signal.SIGKILL)
         await until(lambda: "restarting it" in master.err)
-        await robot.have(len(robot.results) + 3)
+        await robot.have(len(robot.results) + 3)  # a service that is killed comes back
         master.send(signal.SIGTERM)
         assert await master.end() == 143
     found = [json.loads(line) for line in master.err.splitlines()]

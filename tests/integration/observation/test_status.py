@@ -1,19 +1,19 @@
 """The status of a real stack: readiness, deaths, and numbers of results."""
 
-import asyncio
 import json
 import os
 import re
 import signal
 from pathlib import Path
 
+import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from services.sockets.http_client import get
 from services.sockets.reporting import http_socket
 from tests.integration.conftest import Robot, until
+from tests.patience import PROCESS_PATIENCE
 
-PATIENCE = 60.0
 SERVICES = {"master", "subscriber", "publisher", "pcie-app", "board0", "board1", "board2", "board3"}
 
 
@@ -29,7 +29,6 @@ async def ask_until(stage, wanted):
     async def asked():
         code, printed = await ask(stage, "--json")
         stack = json.loads(printed) if code in {0, 6} else None
-        await asyncio.sleep(0.3)
         return (code, stack) if stack is not None and wanted(stack) else None
 
     return await until(asked)
@@ -44,6 +43,18 @@ async def ready_exit(stage, name, directory):
     return await asked.end(), asked.out.strip()
 
 
+@pytest.mark.process
+async def test_the_status_of_a_run(stage, boat):
+    _, _, master = await stage.loop(boat, "--fused", environment={"BM_RUN_DIRECTORY": ""})
+    code, stack = await ask_until(stage, lambda stack: stack["ready"])
+    assert code == 0
+    assert set(by_name(stack)) == SERVICES | {"hub"}
+    master.send(signal.SIGKILL)
+    await stage.nothing_left("hub")
+    assert (await ask(stage))[0] == 2
+
+
+@pytest.mark.thorough
 async def test_the_status_of_a_stack(stage, boat):
     """Ready, waiting for readings, with a process that does not answer, after deaths, and ended."""
     _, uri = await stage.hub()
@@ -75,7 +86,7 @@ async def is_measured(stage):
     _, stack = await ask_until(stage, lambda stack: by_name(stack)["master"]["stages"])
     directory = Path(stack["directory"])
     for name in SERVICES:
-        status, text = await get(http_socket(directory, name), "/metrics", timeout=PATIENCE)
+        status, text = await get(http_socket(directory, name), "/metrics", timeout=PROCESS_PATIENCE)
         assert status == 200
         assert {family.name for family in text_string_to_metric_families(text.decode())} > {"rosbayes_ready"}
         assert by_name(stack)[name]["cpu_s"] > 0

@@ -17,7 +17,6 @@ from services.sockets.control_socket import ReloadOrder, control_socket, give_or
 from services.sockets.records import LossReason
 from tests.integration.conftest import (
     LOOP,
-    PATIENCE,
     READING,
     ROOT,
     Robot,
@@ -30,9 +29,12 @@ from tests.integration.conftest import (
     toolchain,
     until,
 )
+from tests.patience import PROCESS_PATIENCE
 from toolchain.analysis.accuracy.emulation import EmulatedBoards
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
+
+pytestmark = pytest.mark.thorough
 
 
 @cache
@@ -109,7 +111,7 @@ def start_reload(stage, *options, runs=None):
 
 async def order(stage, folder):
     """Send the order of `master reload`, without a separate process."""
-    return await give_order(control_socket(stage.runs), ReloadOrder(str(folder)), timeout=PATIENCE)
+    return await give_order(control_socket(stage.runs), ReloadOrder(str(folder)), timeout=PROCESS_PATIENCE)
 
 
 def pids(stage):
@@ -306,7 +308,7 @@ async def test_there_must_be_a_run(stage, boat, tmp_path):
     assert await reloading.end() == 2
     _, uri = await stage.hub()
     # the run waits for missing boards, and has not begun
-    options = ("--boards", endpoints_in(tmp_path), "--peer-timeout", "60")
+    options = ("--boards", endpoints_in(tmp_path), "--peer-timeout", str(PROCESS_PATIENCE))
     master = stage.start("master", "--loop", "-d", str(boat), "--uri", uri, *options, environment=environment)
     control = orders / "master.control.sock"
     await until(control.exists)

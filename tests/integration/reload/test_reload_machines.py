@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 import websockets
 
-from tests.integration.conftest import LOOP, PATIENCE, READING, build, status_of, toolchain, until
+from tests.integration.conftest import LOOP, READING, build, status_of, toolchain, until
 from tests.integration.reload.test_reload import looping, order, reload_, start_reload
+from tests.patience import PROCESS_PATIENCE
 from toolchain.deployment import load_deployment
+
+pytestmark = pytest.mark.thorough
 
 
 def by_generation(robot):
@@ -71,7 +74,7 @@ async def test_several_outputs(stage, boat, other_boat, tmp_path):
         toolchain("regenerate", "deployment", folder)
     _, robot, _ = await looping(stage, folders[0], witness=folders)
     second = []
-    async with websockets.connect(robot.uri, open_timeout=PATIENCE) as listener:
+    async with websockets.connect(robot.uri, open_timeout=PROCESS_PATIENCE) as listener:
         await listener.send(json.dumps({"op": "subscribe", "topic": "/second"}))
         await order(stage, folders[1])
         refused = await reload_(stage, "-d", str(boat), code=2)
@@ -79,7 +82,7 @@ async def test_several_outputs(stage, boat, other_boat, tmp_path):
         await have_of(robot, 1)
         await robot.stop_publishing()
         while len(second) < 5 or second != robot.results[-len(second) :]:
-            second.append(json.loads(await asyncio.wait_for(listener.recv(), PATIENCE))["msg"])
+            second.append(json.loads(await asyncio.wait_for(listener.recv(), PROCESS_PATIENCE))["msg"])
     assert set(robot.generations()) == {0, 1}
 
 
