@@ -162,8 +162,8 @@ async def test_once_ends_with_a_death(stage, boat, victim, code):
 @pytest.mark.parametrize(
     ("how", "number", "code"),
     [
-        pytest.param((), signal.SIGTERM, 143, id="processes", marks=pytest.mark.process),
-        pytest.param(("--fused",), signal.SIGHUP, 129, id="fused", marks=pytest.mark.thorough),
+        pytest.param((), signal.SIGTERM, 143, id="processes", marks=pytest.mark.thorough),
+        pytest.param(("--fused",), signal.SIGHUP, 129, id="fused", marks=pytest.mark.process),
     ],
 )
 async def test_a_hub_that_restarts_is_waited_for(stage, boat, how, number, code):
