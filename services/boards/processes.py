@@ -21,7 +21,7 @@ from services.settings import endpoint_in
 from services.sockets.reporting import STUCK_S, serve_status_in_thread, shifted
 from services.sockets.status import BoardStatus, ProcessStatus
 from services.supervision.child import RESTARTS_WITHIN, describe_exit
-from services.supervision.parent import end_with_parent
+from services.supervision.parent import end_with_parent, outlive_parent
 from services.supervision.service_manager import ServiceManager
 from terminal.errors import StoppedError, exit_code_of
 from terminal.log_line import PARENT_VARIABLE, name_process
@@ -272,6 +272,7 @@ class BoardProcesses:
         for at in range(len(self._endpoints)):
             self._remove_sockets(self._endpoints[at])
         if self._run_directory is not None:
+            outlive_parent()
             remove_stale_sockets(self._run_directory)
 
     def _remove_sockets(self, endpoint: Endpoint) -> None:

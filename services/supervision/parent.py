@@ -54,9 +54,7 @@ def leave_private_directory() -> None:
     if not name:
         return
     directory = Path(name)
-    deadline = time.monotonic() + _DYING_TIME
-    while _has_dying_threads(os.environ.get(PARENT_VARIABLE, "")) and time.monotonic() < deadline:
-        time.sleep(0.001)
+    outlive_parent()
     # such as the directory's absence: another child may remove it meanwhile
     with contextlib.suppress(OSError):
         remove_stale_sockets(directory)
@@ -64,6 +62,13 @@ def leave_private_directory() -> None:
             for copy in directory.glob(f"{COPY_PREFIX}*"):
                 shutil.rmtree(copy, ignore_errors=True)
         directory.rmdir()
+
+
+def outlive_parent() -> None:
+    """Wait for the last threads of a killed parent: the sockets that they hold still accept connections."""
+    deadline = time.monotonic() + _DYING_TIME
+    while _has_dying_threads(os.environ.get(PARENT_VARIABLE, "")) and time.monotonic() < deadline:
+        time.sleep(0.001)
 
 
 def _has_dying_threads(process: str) -> bool:
