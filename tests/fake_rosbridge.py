@@ -46,6 +46,8 @@ from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
+from tests.patience import PATIENCE
+
 SERVER = "FakeRosbridge, a test double"
 
 
@@ -180,13 +182,13 @@ class FakeRosbridge:
             server.close(close_connections=False)
         await self.cut()
         if server is not None:
-            await asyncio.wait_for(server.wait_closed(), 120)
+            await asyncio.wait_for(server.wait_closed(), PATIENCE)
 
     async def cut(self) -> None:
         """Cut every connection without a closing handshake, but continue listening."""
         for client in list(self._clients):
             client.connection.transport.abort()
-        await self._until(lambda: not self._clients, 30, "all connections to be gone")
+        await self._until(lambda: not self._clients, PATIENCE, "all connections to be gone")
 
     async def hang_up(self, code: int = 1001) -> None:
         """Close every connection with a closing handshake."""
@@ -225,13 +227,13 @@ class FakeRosbridge:
         ]
 
     async def wait_for_op(
-        self, op: str, *, count: int = 1, timeout: float = 30, **fields: Any
+        self, op: str, *, count: int = 1, timeout: float = PATIENCE, **fields: Any
     ) -> dict[str, Any]:
         """Wait for a number of operations of one kind, with the given fields, and return the last."""
         await self._until(lambda: len(self.ops(op, **fields)) >= count, timeout, f"{count} {op} {fields}")
         return self.ops(op, **fields)[count - 1]
 
-    async def wait_for_connections(self, count: int, timeout: float = 30) -> None:
+    async def wait_for_connections(self, count: int, timeout: float = PATIENCE) -> None:
         """Wait until a number of connections has been made."""
         await self._until(lambda: self.connections >= count, timeout, f"{count} connections")
 

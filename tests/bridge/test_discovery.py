@@ -10,10 +10,10 @@ import pytest
 
 from bridge import discovery
 from bridge.discovery import DiscoveryError, Robot, UnknownRobotError, announced, discover, resolve
+from tests.patience import PATIENCE
 
 LOOPBACK = ("127.0.0.1",)
 #: No wait may take longer; answers come within fractions of a second where nothing else runs.
-PATIENCE = 60.0
 
 
 def _name(what: str) -> str:

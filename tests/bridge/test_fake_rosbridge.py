@@ -11,23 +11,24 @@ from websockets.asyncio.client import connect as raw_connect
 
 from bridge.client import connect
 from tests.fake_rosbridge import SERVER, FakeRosbridge
+from tests.patience import PATIENCE
 
 
 def speak_roslibpy(port: int) -> dict[str, object]:
     """All that the fake offers, as roslibpy sees it (which blocks, so: in a thread)."""
     ros = roslibpy.Ros("127.0.0.1", port)
-    ros.run(timeout=240)
+    ros.run(timeout=PATIENCE)
     try:
         got: list[object] = []
         roslibpy.Topic(ros, "/chatter", "std_msgs/String").subscribe(got.append)
         talker = roslibpy.Topic(ros, "/chatter", "std_msgs/String")
         talker.advertise()
-        end = time.monotonic() + 30
+        end = time.monotonic() + PATIENCE
         while not got and time.monotonic() < end:
             talker.publish({"data": "hello"})
             time.sleep(0.05)
         echo = roslibpy.Service(ros, "/echo", "p/Echo")
-        answer = echo.call(roslibpy.ServiceRequest({"n": 1}), timeout=240)
+        answer = echo.call(roslibpy.ServiceRequest({"n": 1}), timeout=PATIENCE)
         return {
             "got": got[0],
             "topics": ros.get_topics(),
@@ -50,11 +51,11 @@ async def test_roslibpy_gets_along_with_the_fake_and_with_our_client():
             "type": "std_msgs/String",
             "answer": {"n": 1},
         }
-        assert (await ours.next(30)).msg == {"data": "hello"}
+        assert (await ours.next(PATIENCE)).msg == {"data": "hello"}
 
 
 async def hear(client: ClientConnection) -> object:
-    return json.loads(await asyncio.wait_for(client.recv(), 120))
+    return json.loads(await asyncio.wait_for(client.recv(), PATIENCE))
 
 
 async def test_errors_are_silent_or_reported():
@@ -77,7 +78,7 @@ async def test_a_zombie_serves_nothing_more(zombies):
         if zombies:
             with pytest.raises(TimeoutError):
                 await asyncio.wait_for(client.recv(), 0.1)
-            await asyncio.wait_for(await client.ping(), 120)
+            await asyncio.wait_for(await client.ping(), PATIENCE)
         else:
             await hear(client)
         assert [received.op is None for received in fake.received] == [True, True, False]

@@ -9,6 +9,7 @@ from casestudies.listening import listen
 from posteriors.errors import BadResultError, NoResultError
 from tests.casestudies.pretend_stack import certain, frame_message, posterior_message
 from tests.fake_rosbridge import FakeRosbridge
+from tests.patience import PATIENCE
 
 TRUTH = "/true"
 
@@ -35,7 +36,7 @@ async def test_frames_come_with_their_posterior_and_truth(heard):
     for number in (1, 2, 3):
         await fake.publish(TRUTH, pose(number))
         await say_frame(fake, number, published=number != 2)
-    instances = [await listener.next(30) for _ in range(3)]
+    instances = [await listener.next(PATIENCE) for _ in range(3)]
     assert [i.report.number for i in instances] == [1, 2, 3]
     assert [i.truth.x for i in instances] == [1, 2, 3]
     assert [i.posterior is None for i in instances] == [False, True, False]
@@ -54,7 +55,7 @@ async def test_a_truth_that_is_a_little_late_is_waited_for(heard, monkeypatch):
         await fake.publish(TRUTH, pose(2))
 
     arriving = asyncio.create_task(late())
-    assert (await listener.next(30)).truth.x == 2
+    assert (await listener.next(PATIENCE)).truth.x == 2
     await arriving
 
 
@@ -62,7 +63,7 @@ async def test_a_truth_that_never_comes_is_not_waited_for_to_the_limit(heard):
     fake, listener = heard
     await fake.publish(TRUTH, pose(1))
     await say_frame(fake, 2)
-    async with asyncio.timeout(30):
+    async with asyncio.timeout(PATIENCE):
         instance = await listener.next(1000)
     assert instance.truth is None
     assert instance.posterior is not None
@@ -71,7 +72,7 @@ async def test_a_truth_that_never_comes_is_not_waited_for_to_the_limit(heard):
 async def test_a_result_without_a_report_is_handed_out_too(heard):
     fake, listener = heard
     await fake.publish("/BMresults", posterior_message(certain(7)))
-    async with asyncio.timeout(30):
+    async with asyncio.timeout(PATIENCE):
         instance = await listener.next(1000)
     assert instance.report is None
     assert instance.posterior.probabilities.index(1.0) == 7
@@ -82,7 +83,7 @@ async def test_silence_is_named(heard):
     with pytest.raises(NoResultError, match=fake.uri):
         await listener.next(0.1)
     await say_frame(fake, 1)
-    assert (await listener.next(30)).report.number == 1
+    assert (await listener.next(PATIENCE)).report.number == 1
 
 
 @pytest.mark.parametrize("topic", ["/bm/frame", "/BMresults", TRUTH])
@@ -90,4 +91,4 @@ async def test_nonsense_is_named(heard, topic):
     fake, listener = heard
     await fake.publish(topic, {"data": "nonsense"})
     with pytest.raises(BadResultError, match=topic):
-        await listener.next(30)
+        await listener.next(PATIENCE)

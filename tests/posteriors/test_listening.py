@@ -17,8 +17,7 @@ from bridge.errors import ConcurrentReadError, DisconnectedError, OptionError, U
 from posteriors import BadResultError, NoResultError, listen, posteriors
 from posteriors.frame_report import FrameReport
 from tests.fake_rosbridge import FakeRosbridge
-
-PATIENCE = 60.0
+from tests.patience import PATIENCE
 
 
 def report(number, *, published=True, deployment="boat"):
@@ -220,7 +219,7 @@ async def test_returning_false_ends_it_and_nothing_or_zero_does_not(calling):
 async def test_the_functions_exceptions_are_raised_and_a_client_may_be_given_instead_of_a_uri(calling):
     with pytest.raises(ZeroDivisionError):
         await calling(lambda posterior: 1 / 0)
-    calling.server = connect(calling.fake.uri, connect_timeout=30)
+    calling.server = connect(calling.fake.uri, connect_timeout=PATIENCE)
     assert await calling(lambda posterior: None, count=1) == 1
 
 

@@ -26,8 +26,7 @@ from bridge.errors import (
 )
 from tests.bridge.hub.sockets import running_hub
 from tests.fake_rosbridge import FakeRosbridge
-
-PATIENCE = 30.0
+from tests.patience import PATIENCE
 
 
 async def against_a_hub(program: Callable[[BlockingRos], Any]) -> Any:
@@ -197,11 +196,11 @@ async def test_on_state_runs_on_a_thread_of_its_own_and_may_close():
         ("ros.advertise('/words', 'std_msgs/String').publish({'data': 'last'})", False, 0),  # without close
         ("ros.subscribe('/s', 'p/T', print); raise SystemExit(5)", False, 5),
         (
-            "ros.advertise_service('/s', 'p/S', lambda args: time.sleep(60)); ros.call('/s', timeout=0.2)",
+            "ros.advertise_service('/s', 'p/S', lambda args: time.sleep(3600)); ros.call('/s', timeout=0.2)",
             False,
             1,
         ),
-        ("print('waiting', flush=True); ros.subscribe('/s', 'p/T').next(60)", True, -signal.SIGINT),
+        ("print('waiting', flush=True); ros.subscribe('/s', 'p/T').next(3600)", True, -signal.SIGINT),
     ],
 )
 async def test_exit_and_ctrl_c_do_not_hang(body, interrupt, code):

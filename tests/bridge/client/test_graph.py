@@ -11,8 +11,8 @@ from bridge.client.graph import NodeDetails
 from bridge.codecs.message_check import FieldType
 from bridge.errors import EncodeError, ParamError, ServiceError
 from tests.bridge.hub.sockets import running_hub
+from tests.patience import PATIENCE
 
-PATIENCE = 30.0
 DOCK = "/dock"
 
 

@@ -14,8 +14,8 @@ from bridge.client import Ros, connect
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import DecodeError, NoAnswerError, NoMessageError, ServiceError
 from tests.bridge.client.doubles import Double
+from tests.patience import PATIENCE
 
-PATIENCE = 60.0
 TYPE = "std_msgs/Float64MultiArray"
 VALUES = [1.5, 2.5, -3.0]
 MSG = {"layout": {"dim": [], "data_offset": 0}, "data": VALUES}

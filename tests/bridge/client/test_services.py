@@ -13,6 +13,7 @@ from bridge.errors import (
     NoAnswerError,
     ServiceError,
 )
+from tests.patience import PATIENCE
 
 
 async def test_calls_and_refusals(fake, ros):
@@ -46,18 +47,18 @@ async def test_no_answer_in_time(fake, ros):
         await ros.call("/s", {"n": 1}, timeout=0.1)
     assert str(caught.value) == f"service /s at {fake.uri} did not answer within 0.1 s"
     assert not ros._session.core.calls
-    assert await ros.call("/s", {"n": 2}, timeout=30) == {"n": 2}
+    assert await ros.call("/s", {"n": 2}, timeout=PATIENCE) == {"n": 2}
     assert ros.unusable == 0
 
 
 @pytest.mark.parametrize("end", ["lost", "closed"])
 async def test_the_end_of_the_connection_fails_what_waits(fake, ros, end):
     fake.serve("/mute", lambda _args: None)
-    call = asyncio.create_task(ros.call("/mute", timeout=30))
+    call = asyncio.create_task(ros.call("/mute", timeout=PATIENCE))
     await fake.wait_for_op("call_service", service="/mute")
     await (fake.cut() if end == "lost" else ros.close())
     with pytest.raises(DisconnectedError, match="/mute"):
-        await asyncio.wait_for(call, 120)
+        await asyncio.wait_for(call, PATIENCE)
     if end == "closed":
         with pytest.raises(DisconnectedError):
             await ros.call("/mute")
@@ -133,7 +134,7 @@ async def test_closing_ends_what_is_being_handled(fake, ros, caller):
     await ros.advertise_service("/s", "p/T", handler)
     await fake.wait_for_op("advertise_service")
     call = asyncio.create_task(caller.call("/s", timeout=0.5))
-    await asyncio.wait_for(began.wait(), 120)
+    await asyncio.wait_for(began.wait(), PATIENCE)
     await ros.close()
     assert ended.is_set()
     with pytest.raises(NoAnswerError):
@@ -148,7 +149,7 @@ async def test_more_requests_than_can_be_handled_are_refused(fake, ros, caller):
 
     await ros.advertise_service("/s", "p/T", handler)
     await fake.wait_for_op("advertise_service")
-    calls = [asyncio.create_task(caller.call("/s", timeout=30)) for _ in range(70)]
+    calls = [asyncio.create_task(caller.call("/s", timeout=PATIENCE)) for _ in range(70)]
     await fake.wait_for_op("service_response", count=6)
     release.set()
     await asyncio.gather(*calls)

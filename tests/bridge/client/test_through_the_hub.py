@@ -23,7 +23,8 @@ from bridge.errors import (
     NoAnswerError,
 )
 from bridge.qos import Qos
-from tests.bridge.hub.sockets import PATIENCE, running_hub
+from tests.bridge.hub.sockets import running_hub
+from tests.patience import PATIENCE
 
 pytestmark = pytest.mark.usefixtures("either_reader")
 

@@ -10,6 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import DecodeError, DefinitionError, NameFormError
+from tests.patience import PATIENCE
 
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.LATEST)
 TYPES = MessageTypes()
@@ -141,4 +142,4 @@ def test_without_rosbags_one_sentence_says_so(monkeypatch):
 )
 def test_nothing_heavy_is_imported_before_it_is_wanted(use):
     code = f"import sys; {use}; assert not {{'rosbags', 'numpy', 'zeroconf'}} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=240)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE)

@@ -16,9 +16,7 @@ from websockets.frames import Frame, Opcode
 from bridge.hub.access import AccessPolicy
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
-
-PATIENCE = 60.0
-"""Maximum of seconds for any wait in these tests; none should take a tenth of it."""
+from tests.patience import PATIENCE
 
 
 class Client:

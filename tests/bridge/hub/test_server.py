@@ -15,7 +15,8 @@ from bridge.hub.access import AccessPolicy
 from bridge.hub.errors import HubError
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
-from tests.bridge.hub.sockets import PATIENCE, RawClient, client, running_hub
+from tests.bridge.hub.sockets import RawClient, client, running_hub
+from tests.patience import PATIENCE
 
 
 @pytest.mark.parametrize("size", [0, 60, 80, 100, 200, 65_400, 65_500, 65_600, 200_000, (1 << 20) - 60])

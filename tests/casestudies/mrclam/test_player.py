@@ -18,6 +18,7 @@ from posteriors.posterior import Posterior
 from tests.casestudies.pretend_stack import PretendStack, certain
 from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge
+from tests.patience import PATIENCE
 
 GRID = area_grid()
 
@@ -143,7 +144,7 @@ async def test_the_command_prints_a_line_a_frame_and_a_sum(tmp_path):
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(PATIENCE):
             out, err = await process.communicate()
     assert process.returncode == 0, err.decode()
     lines = out.decode().splitlines()

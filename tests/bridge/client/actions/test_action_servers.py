@@ -12,8 +12,7 @@ from bridge.client.protocol.events import GoalStatus
 from bridge.errors import GoalError
 from tests.bridge.client.actions.counting import FIBONACCI, count
 from tests.bridge.hub.sockets import running_hub
-
-PATIENCE = 30.0
+from tests.patience import PATIENCE
 
 
 @contextlib.asynccontextmanager

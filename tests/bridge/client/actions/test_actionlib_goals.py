@@ -24,8 +24,8 @@ from bridge.errors import (
 )
 from tests.bridge.client.actions.counting import FIBONACCI, count
 from tests.bridge.hub.sockets import running_hub
+from tests.patience import PATIENCE
 
-PATIENCE = 60.0
 ANY = "p/Count"
 """A type that the hub does not know."""
 ROSLIBPY = Path(__file__).with_name("roslibpy_actionlib.py")

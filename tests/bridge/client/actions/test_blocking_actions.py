@@ -16,8 +16,7 @@ from bridge.errors import BridgeError, DisconnectedError, EncodeError, GoalError
 from tests.bridge.client.actions.counting import FIBONACCI
 from tests.bridge.hub.sockets import running_hub
 from tests.fake_rosbridge import FakeRosbridge
-
-PATIENCE = 60.0
+from tests.patience import PATIENCE
 
 
 async def with_two_clients(version: int, program: Callable[[BlockingRos, BlockingRos], Any]) -> None:

@@ -22,6 +22,7 @@ from bridge.errors import (
     UriError,
 )
 from tests.fake_rosbridge import FakeRosbridge
+from tests.patience import PATIENCE
 
 
 @contextlib.asynccontextmanager
@@ -109,7 +110,9 @@ async def test_a_first_connection_is_tried_until_its_time_is_over(unused_tcp_por
         async with connect(uri, retry=True, connect_timeout=0.6):
             pass
     assert time.monotonic() - began > 0.3
-    ros = connect(uri, retry=True, connect_timeout=120, on_state=lambda state, _reason: states.append(state))
+    ros = connect(
+        uri, retry=True, connect_timeout=PATIENCE, on_state=lambda state, _reason: states.append(state)
+    )
     opening = asyncio.create_task(ros.__aenter__())
     while not states:
         await asyncio.sleep(0.01)
@@ -149,10 +152,10 @@ async def test_a_host_that_is_switched_on_later_is_not_missed(monkeypatch):
             on_state=lambda state, _reason: states.append(state),
         )
         opening = asyncio.create_task(ros.__aenter__())
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(PATIENCE):
             while State.CONNECTING not in states:
                 await asyncio.sleep(0.01)
-    async with FakeRosbridge(port=port), asyncio.timeout(60):
+    async with FakeRosbridge(port=port), asyncio.timeout(PATIENCE):
         await opening
         await ros.__aexit__(None, None, None)
 
@@ -262,7 +265,7 @@ async def test_cancelling_an_attempt_leaves_nothing_behind():
         with pytest.raises(asyncio.CancelledError):
             await attempt
         assert ros.state is State.CLOSED
-        await asyncio.wait_for(gone.wait(), 30)
+        await asyncio.wait_for(gone.wait(), PATIENCE)
 
 
 @pytest.mark.parametrize("fake", [{"silent": True}], indirect=True)
@@ -291,5 +294,5 @@ async def test_a_service_may_close_its_client(fake, ros):
         await fake.wait_for_op("advertise_service")
         with contextlib.suppress(BridgeError):
             await other.call("/bye", timeout=1)
-        await asyncio.wait_for(finished.wait(), 30)
+        await asyncio.wait_for(finished.wait(), PATIENCE)
     assert ros.state is State.CLOSED

@@ -12,6 +12,7 @@ from bridge.client import Ros, State, connect
 from bridge.client.session import FIRST_DELAY, MAX_DELAY
 from bridge.errors import DisconnectedError, NoMessageError, StateTimeoutError
 from tests.fake_rosbridge import FakeRosbridge
+from tests.patience import PATIENCE
 
 
 @pytest.fixture
@@ -31,10 +32,10 @@ def delays(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 async def gone_and_back(fake: FakeRosbridge, ros: Ros) -> None:
     await fake.vanish()
-    await ros.wait_for_state(State.RECONNECTING, 30)
+    await ros.wait_for_state(State.RECONNECTING, PATIENCE)
     fake.received.clear()
     await fake.come_back()
-    await ros.wait_for_state(State.CONNECTED, 30)
+    await ros.wait_for_state(State.CONNECTED, PATIENCE)
 
 
 async def test_everything_is_restored(fake):
@@ -67,7 +68,7 @@ async def test_everything_is_restored(fake):
         assert after == [before[1], before[-1], before[2], before[0]]
         # In both directions, on the same handles.
         await fake.publish("/in", {"n": 2})
-        assert (await asyncio.wait_for(reading, 30)).msg == {"n": 2}
+        assert (await asyncio.wait_for(reading, PATIENCE)).msg == {"n": 2}
         await publication.publish({"n": 3})
         await fake.wait_for_op("publish", msg={"n": 3})
         async with connect(fake.uri) as other:
@@ -81,7 +82,7 @@ async def test_everything_is_restored(fake):
 async def test_nothing_is_published_into_the_void(fake, ros):
     publication = await ros.advertise("/a", "p/T")
     await fake.vanish()
-    await ros.wait_for_state(State.RECONNECTING, 30)
+    await ros.wait_for_state(State.RECONNECTING, PATIENCE)
     with pytest.raises(DisconnectedError, match=fake.uri):
         await publication.publish({"n": 1})
     with pytest.raises(DisconnectedError):
@@ -91,11 +92,11 @@ async def test_nothing_is_published_into_the_void(fake, ros):
     new = await ros.advertise("/new", "p/T")
     await publication.close()
     await fake.come_back()
-    await ros.wait_for_state(State.CONNECTED, 30)
+    await ros.wait_for_state(State.CONNECTED, PATIENCE)
     await fake.wait_for_op("subscribe", topic="/later")
     assert fake.ops("publish") == []
     await fake.publish("/later", {"n": 2})
-    assert (await later.next(30)).msg == {"n": 2}
+    assert (await later.next(PATIENCE)).msg == {"n": 2}
     await new.publish({"n": 3})
     await fake.wait_for_op("publish", topic="/new")
 
@@ -118,7 +119,7 @@ async def test_only_a_steady_connection_resets_the_back_off(fake, ros, delays, m
     for number in range(6):
         await fake.cut()
         await fake.wait_for_connections(number + 2)
-        await ros.wait_for_state(State.CONNECTED, 30)
+        await ros.wait_for_state(State.CONNECTED, PATIENCE)
     assert 0.8 * longest <= max(delays) <= longest
 
 
@@ -127,15 +128,15 @@ async def test_it_comes_back_whatever_was_there_meanwhile(fake, ros, trouble):
     if trouble == "refuses":
         fake.refuses = 503
         await fake.cut()
-        await asyncio.wait_for(_until(lambda: "HTTP 503" in ros.last_error), 120)
+        await asyncio.wait_for(_until(lambda: "HTTP 503" in ros.last_error), PATIENCE)
         fake.refuses = None
     else:
         await fake.vanish()
         greeter = await asyncio.start_server(lambda _r, w: w.write(b"220 mail\r\n"), "127.0.0.1", fake.port)
-        await asyncio.wait_for(_until(lambda: "220 mail" in ros.last_error), 120)
+        await asyncio.wait_for(_until(lambda: "220 mail" in ros.last_error), PATIENCE)
         greeter.close()
         await fake.come_back()
-    await ros.wait_for_state(State.CONNECTED, 30)
+    await ros.wait_for_state(State.CONNECTED, PATIENCE)
 
 
 @pytest.mark.parametrize(
@@ -151,9 +152,9 @@ async def test_a_server_that_ends_the_connection_and_does_not_hang_up(fake, ros,
     fake.freeze()
     (client,) = fake._clients
     client.connection.transport.write(frame)
-    await ros.wait_for_state(State.RECONNECTING, 30)
+    await ros.wait_for_state(State.RECONNECTING, PATIENCE)
     assert str(said) in ros.last_error
-    await ros.wait_for_state(State.CONNECTED, 30)
+    await ros.wait_for_state(State.CONNECTED, PATIENCE)
 
 
 @pytest.mark.parametrize("ros", [{"ping_interval": 0.4, "ping_timeout": 0.3}], indirect=True)
@@ -161,12 +162,12 @@ async def test_a_silent_peer_is_noticed(fake, ros):
     subscription = ros.subscribe("/a", "p/T")
     await fake.wait_for_op("subscribe")
     fake.freeze()
-    await ros.wait_for_state(State.RECONNECTING, 30)
+    await ros.wait_for_state(State.RECONNECTING, PATIENCE)
     assert "server for 0." in ros.last_error
-    await ros.wait_for_state(State.CONNECTED, 30)
+    await ros.wait_for_state(State.CONNECTED, PATIENCE)
     await fake.wait_for_op("subscribe", count=2)
     await fake.publish("/a", {})
-    assert (await subscription.next(30)).blind_seconds >= 0.7, "it counts from the last sign of life"
+    assert (await subscription.next(PATIENCE)).blind_seconds >= 0.7, "it counts from the last sign of life"
 
 
 @pytest.mark.parametrize("fake", [{"silent": True}], indirect=True)
@@ -194,31 +195,31 @@ async def test_a_message_that_is_too_large_ends_the_connection_and_says_so(fake,
     waiting = asyncio.create_task(subscription.next(timeout=1))
     await asyncio.sleep(0)
     await fake.publish("/a", {"n": "x" * 2000})
-    await ros.wait_for_state(State.RECONNECTING, 30)
+    await ros.wait_for_state(State.RECONNECTING, PATIENCE)
     reason = "the server sent a message of more than 1000 bytes (max_size allows larger ones)"
     assert ros.last_error == reason
     with pytest.raises(NoMessageError, match=re.escape(f"the connection was lost: {reason}")):
         await waiting
     await fake.wait_for_op("subscribe", count=2)
     await fake.publish("/a", {"n": 1})
-    assert (await subscription.next(30)).msg == {"n": 1}
+    assert (await subscription.next(PATIENCE)).msg == {"n": 1}
 
 
 async def test_waiting_for_a_state_is_bounded_and_closing_ends_it_and_the_reconnecting(fake, ros):
     subscription = ros.subscribe("/a", "p/T")
     await ros.wait_for_state(State.CONNECTED, 1)
     await fake.vanish()
-    await ros.wait_for_state(State.RECONNECTING, 30)
+    await ros.wait_for_state(State.RECONNECTING, PATIENCE)
     with pytest.raises(StateTimeoutError) as caught:
         await ros.wait_for_state(State.CONNECTED, 0.05)
     assert str(caught.value).startswith(
         f"the connection to {fake.uri} was not connected within 0.05 s, it is reconnecting ("
     )
     assert caught.value.exit_code == 3
-    waiting = asyncio.create_task(ros.wait_for_state(State.CONNECTED, 30))
+    waiting = asyncio.create_task(ros.wait_for_state(State.CONNECTED, PATIENCE))
     await asyncio.sleep(0)
     await ros.close()
-    for late in (waiting, ros.wait_for_state(State.CONNECTED, 30)):
+    for late in (waiting, ros.wait_for_state(State.CONNECTED, PATIENCE)):
         with pytest.raises(DisconnectedError, match="closed"):
             await late
     assert not [task for task in asyncio.all_tasks() if "Session." in repr(task.get_coro())]
@@ -238,14 +239,14 @@ async def test_closing_from_the_callback(fake):
     ros = connect(fake.uri, on_state=on_state)
     async with ros:
         await fake.cut()
-        await ros.wait_for_state(State.CLOSED, 30)
+        await ros.wait_for_state(State.CLOSED, PATIENCE)
     await asyncio.gather(*closing)
 
 
 async def test_a_peer_that_does_not_say_goodbye_is_not_waited_for(fake, ros, monkeypatch):
     monkeypatch.setattr("bridge.client.websocket.CLOSE_TIMEOUT", 0.2)
     fake.freeze()
-    await asyncio.wait_for(ros.close(), 30)
+    await asyncio.wait_for(ros.close(), PATIENCE)
 
 
 async def test_nothing_is_left_open():
@@ -266,22 +267,22 @@ async def test_the_first_message_after_losses_says_how_long_it_was_dark(fake, ro
     subscription = ros.subscribe("/a", "p/T")
     await fake.wait_for_op("subscribe")
     await fake.publish("/a", {})
-    assert (await subscription.next(30)).blind_seconds == 0
+    assert (await subscription.next(PATIENCE)).blind_seconds == 0
     begun = time.monotonic()
     for _ in range(2):
         await fake.vanish()
         await asyncio.sleep(0.3)
         between = ros.subscribe("/c", "p/T")
         await fake.come_back()
-        await ros.wait_for_state(State.CONNECTED, 30)
+        await ros.wait_for_state(State.CONNECTED, PATIENCE)
     late = ros.subscribe("/b", "p/T")
     await fake.wait_for_op("subscribe", topic="/b")
     for topic in ("/a", "/a", "/b"):
         await fake.publish(topic, {})
-    first, second = await subscription.next(30), await subscription.next(30)
+    first, second = await subscription.next(PATIENCE), await subscription.next(PATIENCE)
     assert 0.6 <= first.blind_seconds <= time.monotonic() - begun
     assert subscription.blind_seconds == first.blind_seconds >= between.blind_seconds + 0.6
-    assert second.blind_seconds == (await late.next(30)).blind_seconds == late.blind_seconds == 0
+    assert second.blind_seconds == (await late.next(PATIENCE)).blind_seconds == late.blind_seconds == 0
     await subscription.close()
     await gone_and_back(fake, ros)
     assert subscription.blind_seconds == first.blind_seconds
@@ -294,8 +295,8 @@ async def test_a_gap_is_reported_even_if_the_message_after_it_is_dropped(fake, r
     await fake.wait_for_op("subscribe")
     for n in range(20):
         await fake.publish("/a", {"n": n})
-    await asyncio.wait_for(_until(lambda: subscription.lost == 20 - queue_size), 120)
-    messages = [await subscription.next(30) for _ in range(queue_size)]
+    await asyncio.wait_for(_until(lambda: subscription.lost == 20 - queue_size), PATIENCE)
+    messages = [await subscription.next(PATIENCE) for _ in range(queue_size)]
     assert [message.msg["n"] for message in messages] == list(range(20 - queue_size, 20))
     dark = [message.blind_seconds for message in messages]
     assert dark == [subscription.blind_seconds] + [0.0] * (queue_size - 1)

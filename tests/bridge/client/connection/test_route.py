@@ -23,9 +23,9 @@ from bridge.client import State, connect
 from bridge.client.route import shown
 from bridge.errors import AccessRefusedError, BridgeError, OptionError, UnreachableError, UriError
 from tests.certificates import issue, openssl
+from tests.patience import PATIENCE
 
 TOKEN = "s3cret-token"
-PATIENCE = 60.0
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ import asyncio
 import pytest
 
 from bridge.errors import WrongThreadError
+from tests.patience import PATIENCE
 
 
 @pytest.mark.parametrize(
@@ -42,4 +43,4 @@ async def test_a_call_from_another_thread_is_refused(fake, ros, name):
     await fake.wait_for_op("publish", topic="/a")
     await fake.wait_for_op("subscribe", topic="/b")
     await fake.publish("/b", {"n": 2})
-    assert (await subscription.next(30)).msg == {"n": 2}
+    assert (await subscription.next(PATIENCE)).msg == {"n": 2}

@@ -16,10 +16,10 @@ from bridge.errors import EncodeError, MessageTooLargeError, TopicLeftOutError
 from bridge.hub.limits import HubLimits
 from tests.bridge.hub.sockets import running_hub
 from tests.fake_rosbridge import FakeRosbridge, _Client
+from tests.patience import PATIENCE
 
 LIMIT = 4000
 LARGE = {"data": "x" * 2 * LIMIT}
-PATIENCE = 30.0
 
 
 class Unnamed(FakeRosbridge):

@@ -10,8 +10,7 @@ from bridge.client.blocking import connect as connect_blocking
 from bridge.errors import FrameUnknownError
 from tests.bridge.hub.sockets import running_hub
 from tests.bridge.test_transforms import SECOND, message, turned
-
-PATIENCE = 30.0
+from tests.patience import PATIENCE
 
 
 async def test_the_blocking_form():

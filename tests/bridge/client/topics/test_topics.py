@@ -25,6 +25,7 @@ from bridge.errors import (
     SlowPeerError,
 )
 from tests.fake_rosbridge import FakeRosbridge
+from tests.patience import PATIENCE
 
 
 async def test_a_message_goes_round(fake, ros):
@@ -34,7 +35,7 @@ async def test_a_message_goes_round(fake, ros):
     ):
         before = time.time_ns(), time.monotonic_ns()
         await publication.publish({"data": np.array([0.5, 1.0])})
-        message = await subscription.next(30)
+        message = await subscription.next(PATIENCE)
         assert message == Message(
             "/a", {"data": [0.5, 1.0]}, message.received_ns, message.received_monotonic_ns
         )
@@ -71,7 +72,7 @@ async def test_messages_of_one_moment_leave_in_one_piece(fake, ros):
     assert len(written) == 1
     await two.publish({"n": 3})
     assert len(written) == 2
-    assert [(await subscription.next(30)).msg["n"] for _ in range(2)] == [2, 3]
+    assert [(await subscription.next(PATIENCE)).msg["n"] for _ in range(2)] == [2, 3]
     assert (await fake.wait_for_op("publish", topic="/a"))["msg"] == {"n": 1}
     with ros.together():
         await one.publish({"n": 4})
@@ -126,8 +127,8 @@ async def test_iteration_ends_with_the_subscription_or_the_client():
             with pytest.raises(ServiceError):
                 await ros.call("/answers/after/the/messages")
             await one.close()
-            assert await asyncio.wait_for(readers[0], 120) == [1, 2]
-        assert await asyncio.wait_for(readers[1], 120) == [1, 2]
+            assert await asyncio.wait_for(readers[0], PATIENCE) == [1, 2]
+        assert await asyncio.wait_for(readers[1], PATIENCE) == [1, 2]
         with pytest.raises(DisconnectedError, match="/a is closed"):
             await two.next(1)
 
@@ -157,17 +158,17 @@ async def test_a_slow_reader_loses_its_own_oldest_messages_and_nobody_elses(fake
     await fake.wait_for_op("subscribe")
     for n in range(50):
         await fake.publish("/a", {"n": n})
-    assert [(await fast.next(30)).msg["n"] for _ in range(50)] == list(range(50))
+    assert [(await fast.next(PATIENCE)).msg["n"] for _ in range(50)] == list(range(50))
     assert (slow.lost, fast.lost) == (45, 0)
-    assert [(await slow.next(30)).msg["n"] for _ in range(5)] == [45, 46, 47, 48, 49]
+    assert [(await slow.next(PATIENCE)).msg["n"] for _ in range(5)] == [45, 46, 47, 48, 49]
     await fake.publish("/a", {"n": 50})
-    assert (await slow.next(30)).msg["n"] == 50
+    assert (await slow.next(PATIENCE)).msg["n"] == 50
     assert slow.lost == 45
 
 
 async def test_a_second_reader_of_a_subscription_gets_an_error(fake, ros):
     subscription = ros.subscribe("/a", "p/T")
-    given_up = asyncio.create_task(subscription.next(30))
+    given_up = asyncio.create_task(subscription.next(PATIENCE))
     await asyncio.sleep(0)
     given_up.cancel()
     with pytest.raises(asyncio.CancelledError):
@@ -177,14 +178,14 @@ async def test_a_second_reader_of_a_subscription_gets_an_error(fake, ros):
     with pytest.raises(ConcurrentReadError, match="/a"):
         await subscription.next(600)
     with pytest.raises(NoMessageError):  # at its own time, not at the other's
-        await asyncio.wait_for(first, 30)
+        await asyncio.wait_for(first, PATIENCE)
     await fake.wait_for_op("subscribe")
     await fake.publish("/a", {"n": 1})
-    assert (await subscription.next(30)).msg == {"n": 1}
+    assert (await subscription.next(PATIENCE)).msg == {"n": 1}
 
 
 async def test_each_wait_ends_at_its_own_time():
-    async with FakeRosbridge() as fake, connect(fake.uri) as ros, asyncio.timeout(60):
+    async with FakeRosbridge() as fake, connect(fake.uri) as ros, asyncio.timeout(PATIENCE):
         subscription = ros.subscribe("/a", "p/T")
         await fake.wait_for_op("subscribe")
         await fake.publish("/a", {"n": 1})
@@ -221,7 +222,7 @@ async def test_a_topic_that_nobody_publishes_is_named(fake, ros, prepare, said):
     if prepare:
         fake.know("/quiet", prepare)
     with pytest.raises(NoMessageError) as caught:
-        await asyncio.wait_for(ros.subscribe("/quiet", "p/T").next(0.1), 30)
+        await asyncio.wait_for(ros.subscribe("/quiet", "p/T").next(0.1), PATIENCE)
     what, _, why = str(caught.value).partition("; ")
     assert all(part in what for part in ("/quiet", fake.uri, "0.1 s"))
     assert re.search(said, why)
@@ -247,7 +248,7 @@ async def test_a_topic_of_unknown_type_is_found_when_it_appears(fake, monkeypatc
         fake.know("/late", "p/T")
         await fake.wait_for_op("subscribe", count=4, topic="/late")
         await fake.publish("/late", {"n": 1})
-        assert (await subscription.next(30)).msg == {"n": 1}
+        assert (await subscription.next(PATIENCE)).msg == {"n": 1}
         asked = len(fake.ops("subscribe"))
         await asyncio.sleep(0.3)
         assert len(fake.ops("subscribe")) <= asked + 1, "it is not asked for any more"
@@ -266,7 +267,7 @@ async def test_a_best_effort_publisher_that_starts_late_is_heard(fake, monkeypat
         assert await fake.publish("/late", {"n": 0}) == 0
         await fake.wait_for_op("subscribe", count=2, topic="/late")
         assert await fake.publish("/late", {"n": 1}) == 1
-        assert (await subscription.next(30)).msg == {"n": 1}
+        assert (await subscription.next(PATIENCE)).msg == {"n": 1}
         asked = len(fake.ops("subscribe", topic="/late"))
         await asyncio.sleep(0.4)
         assert len(fake.ops("subscribe", topic="/late")) == asked, "it has a message, so that is enough"
@@ -281,7 +282,7 @@ async def test_a_type_that_a_server_cannot_write_as_cbor_comes_as_json(fake, mon
         subscription = ros.subscribe("/imu", "sensor_msgs/Imu", compression="cbor", arrays="numpy")
         while not await fake.publish("/imu", {"covariance": [1.0, 2.0]}):
             await asyncio.sleep(0.02)
-        message = await subscription.next(30)
+        message = await subscription.next(PATIENCE)
         assert message.msg["covariance"].tolist() == [1.0, 2.0]
         assert [op.get("compression") for op in fake.ops("subscribe", topic="/imu")] == ["cbor", "cbor", None]
     assert sum("/imu" in each.getMessage() for each in caplog.records if each.levelname == "WARNING") == 1
@@ -368,7 +369,7 @@ async def test_a_server_that_takes_nothing_more(fake, ros):
         await flood()
     assert caught.value.exit_code == 3
     assert 0 < sent < 100, "what waits here is bounded"
-    waiting = [asyncio.create_task(publication.publish({"n": n}, timeout=120)) for n in range(4)]
+    waiting = [asyncio.create_task(publication.publish({"n": n}, timeout=PATIENCE)) for n in range(4)]
     await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
     with pytest.raises(SlowPeerError, match="3 messages of /a "):
         await waiting[3]
@@ -380,7 +381,7 @@ async def test_a_server_that_takes_nothing_more(fake, ros):
     with pytest.raises(SlowPeerError, match="/a"):
         await publication.ready(timeout=0.1)
     fake.thaw()
-    await asyncio.wait_for(asyncio.gather(*waiting[:3]), 120)
+    await asyncio.wait_for(asyncio.gather(*waiting[:3]), PATIENCE)
     await fake.wait_for_op("publish", count=sent + 3)
     assert [op["msg"]["n"] for op in fake.ops("publish")[-3:]] == [0, 1, 2], "in their order"
 
@@ -392,7 +393,7 @@ async def test_nonsense_is_counted_and_survived(fake, ros, caplog):
         await fake.say('{"op": "png", "data": ""}')
         await fake.say(b"\xff\x00")
     await fake.publish("/a", {"n": 1})
-    assert (await subscription.next(30)).msg == {"n": 1}
+    assert (await subscription.next(PATIENCE)).msg == {"n": 1}
     assert (ros.unusable, ros.reconnections) == (100, 0)
     assert sum(record.levelname == "WARNING" for record in caplog.records) == 7
 
@@ -411,7 +412,7 @@ async def test_nonsense_is_counted_and_survived(fake, ros, caplog):
 )
 async def test_the_version_that_is_configured_or_that_rosapi_tells(fake, ros, version):
     configured = ros.ros_version
-    async with asyncio.timeout(30):
+    async with asyncio.timeout(PATIENCE):
         assert await ros.detect_ros_version(0.2 if fake.silent else 20) == ros.ros_version == version
     assert bool(fake.received) == (configured is None)
     if version == 1:  # it would log an error
@@ -426,7 +427,7 @@ async def test_stamps_tell_the_version(fake, ros, version):
     subscription = ros.subscribe("/a", "p/T")
     await fake.wait_for_op("subscribe")
     await fake.publish("/a", {"header": stamps.header(1, ros_version=version)})
-    await subscription.next(30)
+    await subscription.next(PATIENCE)
     assert ros.ros_version == version
     assert await ros.detect_ros_version() == version
     assert fake.ops("call_service") == []

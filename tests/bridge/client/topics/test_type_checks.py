@@ -9,6 +9,7 @@ from bridge.client import State, connect, type_checks
 from bridge.codecs.message_check import CLOSELY, SAMPLE
 from bridge.errors import MessageTypeError, ServiceError
 from tests.bridge.hub.sockets import running_hub
+from tests.patience import PATIENCE
 
 TWIST = "geometry_msgs/Twist"
 WRONG = {"lineer": {"x": 1.0}}
@@ -37,7 +38,7 @@ async def test_the_hub_knows_the_standard_types(version, monkeypatch):
             with pytest.raises(MessageTypeError):
                 await send(WRONG)
             await send({"linear": {"x": 1.0}})
-            assert (await heard.next(30)).msg["linear"]["x"] == 1.0
+            assert (await heard.next(PATIENCE)).msg["linear"]["x"] == 1.0
         unknown = await ros.advertise("/boat", "boat_msgs/Sensors")
         await unknown.publish(WRONG)
 
@@ -151,8 +152,8 @@ async def test_a_goal_is_checked_and_the_version_of_the_server_decides(version, 
             for wrong in ({"odrer": 3}, {"order": [3]}):
                 with pytest.raises(MessageTypeError):
                     await ros.send_goal("/count", type_name, wrong)
-            async with await ros.send_goal("/count", type_name, {"order": 3}, timeout=60) as goal:
-                assert (await goal.result(60)).values["sequence"] == [0, 1, 2]
+            async with await ros.send_goal("/count", type_name, {"order": 3}, timeout=PATIENCE) as goal:
+                assert (await goal.result(PATIENCE)).values["sequence"] == [0, 1, 2]
 
 
 async def test_the_type_of_a_service_is_asked_once_for_each_connection(fake, ros):
@@ -170,4 +171,4 @@ async def test_the_type_of_a_service_is_asked_once_for_each_connection(fake, ros
             assert len(fake.ops("call_service", service=f"/rosapi/{question}")) == connection + 1
         await fake.cut()
         await fake.wait_for_connections(connection + 2)
-        await ros.wait_for_state(State.CONNECTED, 60)
+        await ros.wait_for_state(State.CONNECTED, PATIENCE)

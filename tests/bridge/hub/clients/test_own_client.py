@@ -4,7 +4,8 @@ from contextlib import AsyncExitStack
 
 from bridge.client import connect
 from bridge.client.session import State
-from tests.bridge.hub.sockets import PATIENCE, running_hub
+from tests.bridge.hub.sockets import running_hub
+from tests.patience import PATIENCE
 
 
 async def test_a_hub_that_comes_back_on_its_port_finds_its_clients_again() -> None:

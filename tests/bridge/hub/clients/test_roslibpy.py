@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.bridge.hub.sockets import running_hub
+from tests.patience import PATIENCE
 
 _SESSION = Path(__file__).with_name("roslibpy_session.py")
 
@@ -27,7 +28,7 @@ async def test_a_session_of_roslibpy(transport: str) -> None:
             stderr=asyncio.subprocess.PIPE,
         )
         try:
-            output, complaints = await asyncio.wait_for(session.communicate(), 240)
+            output, complaints = await asyncio.wait_for(session.communicate(), PATIENCE)
         finally:
             if session.returncode is None:
                 session.kill()

@@ -26,7 +26,8 @@ from bridge.hub.broker import TURN_WORK
 from bridge.hub.delivery.definitions import Definitions
 from bridge.hub.limits import HubLimits
 from tests.bridge.hub.broker_harness import Harness, Peer, publisher_and_subscriber
-from tests.bridge.hub.sockets import PATIENCE, RawClient, client, running_hub
+from tests.bridge.hub.sockets import RawClient, client, running_hub
+from tests.patience import PATIENCE
 
 MEBIBYTE = 1 << 20
 MARGIN = 64 * MEBIBYTE

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from websockets.frames import Opcode
 
 from bridge.hub.limits import HubLimits
-from tests.bridge.hub.sockets import PATIENCE, Client, RawClient, client, running_hub
+from tests.bridge.hub.sockets import Client, RawClient, client, running_hub
+from tests.patience import PATIENCE
 
 
 @asynccontextmanager
