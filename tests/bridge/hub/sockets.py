@@ -2,13 +2,14 @@
 
 import asyncio
 import base64
+import contextlib
 import json
 import os
 import socket
 import struct
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.frames import Frame, Opcode
@@ -86,6 +87,8 @@ async def running_hub(
     finally:
         stop.set()
         await asyncio.wait_for(served, PATIENCE)
+        while RawClient.connected:
+            await RawClient.connected.pop().close()
 
 
 @asynccontextmanager
@@ -95,11 +98,17 @@ async def client(port: int, **options: Any) -> AsyncIterator[Client]:
 
 
 class RawClient:
-    """A WebSocket client that does nothing by itself: it answers no pings and reads on demand."""
+    """A WebSocket client that does nothing by itself: it answers no pings and reads on demand.
+
+    `running_hub` closes those that have not ended when the hub has.
+    """
+
+    connected: ClassVar[set["RawClient"]] = set()
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader = reader
         self.writer = writer
+        self.connected.add(self)
 
     @classmethod
     async def connect(cls, port: int, *, handshake: bool = True, receive_buffer: int = 0) -> "RawClient":
@@ -155,6 +164,7 @@ class RawClient:
 
     async def ended(self) -> bytes:
         """Wait until the hub ends the connection, and return everything before that."""
+        self.connected.discard(self)
         async with asyncio.timeout(PATIENCE):
             data = b""
             try:
@@ -162,7 +172,13 @@ class RawClient:
                     data += chunk
             except ConnectionResetError:
                 pass
+            await self.close()
             return data
+
+    async def close(self) -> None:
+        self.writer.transport.abort()
+        with contextlib.suppress(OSError):
+            await self.writer.wait_closed()
 
     def cut(self) -> None:
         """Leave without a word: TCP reset."""

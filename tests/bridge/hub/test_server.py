@@ -81,9 +81,10 @@ async def test_the_hub_ends_although_a_client_does_not(quick_sweeps: None) -> No
         port = await stack.enter_async_context(running_hub())
         deaf = await RawClient.connect(port)
         half = await RawClient.connect(port, handshake=False)
+        ends = [asyncio.create_task(raw.ended()) for raw in (deaf, half)]
+        await asyncio.sleep(0)
         await asyncio.wait_for(stack.aclose(), PATIENCE)
-        assert await deaf.ended() == b"\x88\x0e\x03\xe9the hub ends"
-        assert await half.ended() == b""
+        assert await asyncio.gather(*ends) == [b"\x88\x0e\x03\xe9the hub ends", b""]
 
 
 @pytest.mark.parametrize(

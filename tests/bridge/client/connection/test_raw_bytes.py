@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from bridge.client import State, connect
+from tests.bridge.client.tcp_service import tcp_service
 
 pytestmark = pytest.mark.usefixtures("either_reader")
 
@@ -46,26 +47,21 @@ async def says(data: bytes, at_once: bytes = b"") -> AsyncIterator[tuple[int, as
     go = asyncio.Event()
 
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
-            head = await reader.readuntil(b"\r\n\r\n")
-            key = next(line[19:] for line in head.split(b"\r\n") if line.startswith(b"Sec-WebSocket-Key: "))
-            accept = base64.b64encode(hashlib.sha1(key + _GUID, usedforsecurity=False).digest())
-            writer.write(
-                b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-                b"Sec-WebSocket-Accept: " + accept + b"\r\n\r\n" + at_once
-            )
-            await go.wait()
-            writer.write(data)
-            await writer.drain()
-            while await reader.read(65536):
-                pass
-        writer.close()
+        head = await reader.readuntil(b"\r\n\r\n")
+        key = next(line[19:] for line in head.split(b"\r\n") if line.startswith(b"Sec-WebSocket-Key: "))
+        accept = base64.b64encode(hashlib.sha1(key + _GUID, usedforsecurity=False).digest())
+        writer.write(
+            b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Accept: " + accept + b"\r\n\r\n" + at_once
+        )
+        await go.wait()
+        writer.write(data)
+        await writer.drain()
+        while await reader.read(65536):
+            pass
 
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
-    try:
-        yield server.sockets[0].getsockname()[1], go
-    finally:
-        server.close()
+    async with tcp_service(serve) as port:
+        yield port, go
 
 
 async def hears(data: bytes, **options: Any) -> tuple[str, int]:

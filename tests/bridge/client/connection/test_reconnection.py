@@ -4,6 +4,8 @@ import asyncio
 import re
 import socket
 import time
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,6 +13,7 @@ import pytest
 from bridge.client import Ros, State, connect
 from bridge.client.session import FIRST_DELAY, MAX_DELAY
 from bridge.errors import DisconnectedError, NoMessageError, StateTimeoutError
+from tests.bridge.client.tcp_service import tcp_service
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 
@@ -28,6 +31,10 @@ def delays(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
     monkeypatch.setattr("bridge.client.session.asyncio.sleep", no_sleep)
     return waits
+
+
+def clock(now: list[float]) -> SimpleNamespace:
+    return SimpleNamespace(monotonic=lambda: now[0], time_ns=time.time_ns, monotonic_ns=time.monotonic_ns)
 
 
 async def gone_and_back(fake: FakeRosbridge, ros: Ros) -> None:
@@ -128,13 +135,12 @@ async def test_it_comes_back_whatever_was_there_meanwhile(fake, ros, trouble):
     if trouble == "refuses":
         fake.refuses = 503
         await fake.cut()
-        await asyncio.wait_for(_until(lambda: "HTTP 503" in ros.last_error), PATIENCE)
+        await _until(lambda: "HTTP 503" in ros.last_error)
         fake.refuses = None
     else:
         await fake.vanish()
-        greeter = await asyncio.start_server(lambda _r, w: w.write(b"220 mail\r\n"), "127.0.0.1", fake.port)
-        await asyncio.wait_for(_until(lambda: "220 mail" in ros.last_error), PATIENCE)
-        greeter.close()
+        async with tcp_service(lambda _reader, writer: writer.write(b"220 mail\r\n"), fake.port):
+            await _until(lambda: "220 mail" in ros.last_error)
         await fake.come_back()
     await ros.wait_for_state(State.CONNECTED, PATIENCE)
 
@@ -157,34 +163,45 @@ async def test_a_server_that_ends_the_connection_and_does_not_hang_up(fake, ros,
     await ros.wait_for_state(State.CONNECTED, PATIENCE)
 
 
-@pytest.mark.parametrize("ros", [{"ping_interval": 0.4, "ping_timeout": 0.3}], indirect=True)
+@pytest.mark.parametrize("ros", [{"ping_interval": 0.2, "ping_timeout": 0.1}], indirect=True)
 async def test_a_silent_peer_is_noticed(fake, ros):
     subscription = ros.subscribe("/a", "p/T")
     await fake.wait_for_op("subscribe")
+    await fake.publish("/a", {})
+    await subscription.next(PATIENCE)
     fake.freeze()
+    frozen = ros._session._connected()
+    ros._session._limits = replace(ros._session._limits, ping_timeout=PATIENCE)  # of the next connection
     await ros.wait_for_state(State.RECONNECTING, PATIENCE)
-    assert "server for 0." in ros.last_error
+    assert re.search(r"server for \d+(\.\d+)? s", ros.last_error)
     await ros.wait_for_state(State.CONNECTED, PATIENCE)
     await fake.wait_for_op("subscribe", count=2)
     await fake.publish("/a", {})
-    assert (await subscription.next(PATIENCE)).blind_seconds >= 0.7, "it counts from the last sign of life"
+    blind = (await subscription.next(PATIENCE)).blind_seconds
+    assert blind == ros._session._connected_at - frozen.last_heard, "it counts from the last sign of life"
 
 
 @pytest.mark.parametrize("fake", [{"silent": True}], indirect=True)
-@pytest.mark.parametrize("ros", [{"ping_interval": 0.05, "ping_timeout": 1.0}], indirect=True)
+@pytest.mark.parametrize("ros", [{"ping_interval": 0.01, "ping_timeout": 2 * PATIENCE}], indirect=True)
 async def test_a_quiet_server_that_answers_pings_is_kept(fake, ros):
-    await asyncio.sleep(2)
+    websocket = ros._session._connected()
+    await _until(lambda: websocket._pinged_at is not None and websocket._pinged_at <= websocket.last_heard)
+    for _ in range(5):
+        heard = websocket.last_heard
+        websocket._check_liveness(time.monotonic())  # as after `ping_timeout`
+        await _until(lambda heard=heard: websocket.last_heard > heard)
     assert (ros.state, ros.reconnections, fake.connections) == (State.CONNECTED, 0, 1)
 
 
-@pytest.mark.parametrize("ros", [{"ping_interval": 0.1, "ping_timeout": 1.0}], indirect=True)
+@pytest.mark.parametrize("ros", [{"ping_interval": 0.01, "ping_timeout": 2 * PATIENCE}], indirect=True)
 async def test_a_sleep_of_this_process_is_not_the_servers_silence(fake, ros):
     fake.freeze()
-    while ros._session._connected()._pinged_at is None:
-        await asyncio.sleep(0)
+    websocket = ros._session._connected()
+    await _until(lambda: websocket._pinged_at is not None and websocket._pinged_at > websocket.last_heard)
     fake.thaw()
-    time.sleep(2.5)  # noqa: ASYNC251 - the whole process must stop while the answer is in transit
-    await asyncio.sleep(0.3)
+    heard = websocket.last_heard
+    websocket._check_liveness(time.monotonic() - 2.5)  # it is called late, while the answer is in transit
+    await _until(lambda: websocket.last_heard > heard)
     assert (ros.state, ros.reconnections, fake.connections) == (State.CONNECTED, 0, 1)
 
 
@@ -224,8 +241,8 @@ async def test_waiting_for_a_state_is_bounded_and_closing_ends_it_and_the_reconn
             await late
     assert not [task for task in asyncio.all_tasks() if "Session." in repr(task.get_coro())]
     await fake.come_back()
-    await asyncio.sleep(0.4)
-    assert (ros.state, fake.connections) == (State.CLOSED, 1)
+    async with connect(fake.uri):
+        assert (ros.state, fake.connections) == (State.CLOSED, 2)
     assert [message async for message in subscription] == []
 
 
@@ -255,24 +272,33 @@ async def test_nothing_is_left_open():
             async with connect(fake.uri) as ros:
                 ros.subscribe("/a", "p/T")
                 await fake.cut()
-        await asyncio.sleep(0.05)
-        assert not fake._clients
-        assert len(asyncio.all_tasks()) <= 2, "this one, and the fake's accepting one"
+        # this one, and the fake's accepting one
+        await _until(lambda: not fake._clients and len(asyncio.all_tasks()) <= 2)
     with socket.socket() as again:
         again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         again.bind(("127.0.0.1", fake.port))
 
 
-async def test_the_first_message_after_losses_says_how_long_it_was_dark(fake, ros):
+async def test_the_first_message_after_losses_says_how_long_it_was_dark(fake, monkeypatch):
+    now = [1000.0]
+    for module in ("session", "websocket", "handles"):
+        monkeypatch.setattr(f"bridge.client.{module}.time", clock(now))
+    monkeypatch.setattr("bridge.transport.websocket.time", clock(now))
+    async with connect(fake.uri) as ros:
+        await _darkness(fake, ros, now)
+
+
+async def _darkness(fake: FakeRosbridge, ros: Ros, now: list[float]) -> None:
     subscription = ros.subscribe("/a", "p/T")
     await fake.wait_for_op("subscribe")
     await fake.publish("/a", {})
     assert (await subscription.next(PATIENCE)).blind_seconds == 0
-    begun = time.monotonic()
     for _ in range(2):
         await fake.vanish()
-        await asyncio.sleep(0.3)
+        await ros.wait_for_state(State.RECONNECTING, PATIENCE)
+        now[0] += 0.25
         between = ros.subscribe("/c", "p/T")
+        now[0] += 0.5
         await fake.come_back()
         await ros.wait_for_state(State.CONNECTED, PATIENCE)
     late = ros.subscribe("/b", "p/T")
@@ -280,8 +306,8 @@ async def test_the_first_message_after_losses_says_how_long_it_was_dark(fake, ro
     for topic in ("/a", "/a", "/b"):
         await fake.publish(topic, {})
     first, second = await subscription.next(PATIENCE), await subscription.next(PATIENCE)
-    assert 0.6 <= first.blind_seconds <= time.monotonic() - begun
-    assert subscription.blind_seconds == first.blind_seconds >= between.blind_seconds + 0.6
+    assert subscription.blind_seconds == first.blind_seconds == 1.5
+    assert between.blind_seconds == 0.5, "of the second time, since it was made"
     assert second.blind_seconds == (await late.next(PATIENCE)).blind_seconds == late.blind_seconds == 0
     await subscription.close()
     await gone_and_back(fake, ros)
@@ -295,7 +321,7 @@ async def test_a_gap_is_reported_even_if_the_message_after_it_is_dropped(fake, r
     await fake.wait_for_op("subscribe")
     for n in range(20):
         await fake.publish("/a", {"n": n})
-    await asyncio.wait_for(_until(lambda: subscription.lost == 20 - queue_size), PATIENCE)
+    await _until(lambda: subscription.lost == 20 - queue_size)
     messages = [await subscription.next(PATIENCE) for _ in range(queue_size)]
     assert [message.msg["n"] for message in messages] == list(range(20 - queue_size, 20))
     dark = [message.blind_seconds for message in messages]
@@ -304,5 +330,6 @@ async def test_a_gap_is_reported_even_if_the_message_after_it_is_dropped(fake, r
 
 
 async def _until(condition: Any) -> None:
-    while not condition():
-        await asyncio.sleep(0.01)
+    async with asyncio.timeout(PATIENCE):
+        while not condition():
+            await asyncio.sleep(0.01)

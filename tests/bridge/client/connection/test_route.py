@@ -22,7 +22,8 @@ from websockets.http11 import Request, Response
 from bridge.client import State, connect
 from bridge.client.route import shown
 from bridge.errors import AccessRefusedError, BridgeError, OptionError, UnreachableError, UriError
-from tests.certificates import issue, openssl
+from tests.bridge.client.tcp_service import tcp_service
+from tests.certificates import issue
 from tests.patience import PATIENCE
 
 TOKEN = "s3cret-token"
@@ -36,8 +37,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
         issue(folder, name, ca=ca)
     both = (folder / "client.pem").read_text() + (folder / "client.key").read_text()
     (folder / "both.pem").write_text(both)
-    locked = ("-aes256", "-passout", "pass:word", "-out", str(folder / "locked.key"))
-    openssl("ec", "-in", str(folder / "client.key"), *locked)
+    issue(folder, "locked", ca="ca", password=b"word")
     return folder
 
 
@@ -118,7 +118,7 @@ async def test_a_server_that_asks_for_a_certificate(certificates):
 
 
 def test_a_key_with_a_password_is_refused_not_asked_for(certificates):
-    files = (certificates / "client.pem", certificates / "locked.key")
+    files = (certificates / "locked.pem", certificates / "locked.key")
     with pytest.raises(OptionError, match="client_certificate"):
         connect("wss://localhost:1", client_certificate=files)
 
@@ -339,8 +339,8 @@ async def test_a_proxy_that_does_not_let_through(answer, said):
 async def test_a_proxy_that_is_not_there_or_says_nothing(unused_tcp_port, scheme):
     through = f"{scheme}://127.0.0.1:{unused_tcp_port}"
     assert f"proxy {through} fails" in await refused("ws://robot:9090", UnreachableError, proxy=through)
-    async with await asyncio.start_server(lambda _reader, _writer: None, "127.0.0.1", 0) as server:
-        through = f"{scheme}://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    async with tcp_service(lambda _reader, _writer: None) as port:
+        through = f"{scheme}://127.0.0.1:{port}"
         options = {"proxy": through, "connect_timeout": 0.3}
         assert "within 0.3 s" in await refused("ws://robot:9090", UnreachableError, **options)
 
