@@ -36,7 +36,7 @@ def speak_roslibpy(port: int) -> dict[str, object]:
             "answer": dict(answer),
         }
     finally:
-        ros.close()
+        ros.terminate()
 
 
 @pytest.mark.asyncio(loop_factories=["asyncio"])

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any, Self
 
 from tests.fake_rosbridge import FakeRosbridge
-from tests.patience import PATIENCE
+from tests.patience import PROCESS_PATIENCE
 
 Answer = list[float] | None
 """A posterior over 32 x 32 cells; None for a frame without one."""
@@ -90,7 +90,7 @@ class PretendStack:
 
     async def _serve(self) -> None:
         for number in itertools.count(1):
-            await self.fake.wait_for_op("publish", topic=self.topic, count=number, timeout=PATIENCE)
+            await self.fake.wait_for_op("publish", topic=self.topic, count=number, timeout=PROCESS_PATIENCE)
             message = self.fake.ops("publish", topic=self.topic)[number - 1]["msg"]
             answer = self.answer(number, message)
             if isinstance(answer, str):

@@ -45,7 +45,7 @@ async def test_frames_come_with_their_posterior_and_truth(heard):
 
 
 async def test_a_truth_that_is_a_little_late_is_waited_for(heard, monkeypatch):
-    monkeypatch.setattr("casestudies.listening._PATIENCE_S", 30.0)
+    monkeypatch.setattr("casestudies.listening._PATIENCE_S", PATIENCE)
     fake, listener = heard
     await fake.publish(TRUTH, pose(1))
     await say_frame(fake, 2)

@@ -17,7 +17,7 @@ from bridge.errors import ConcurrentReadError, DisconnectedError, OptionError, U
 from posteriors import BadResultError, NoResultError, listen, posteriors
 from posteriors.frame_report import FrameReport
 from tests.fake_rosbridge import FakeRosbridge
-from tests.patience import PATIENCE
+from tests.patience import PATIENCE, PROCESS_PATIENCE
 
 
 def report(number, *, published=True, deployment="boat"):
@@ -246,17 +246,23 @@ print("ended after", listen("{uri}", function), flush=True)
 """
 
 
-@pytest.mark.parametrize("when", ["inside", "waiting"])
+@pytest.mark.parametrize(
+    "when",
+    [
+        pytest.param("inside", marks=pytest.mark.thorough),
+        pytest.param("waiting", marks=pytest.mark.process),
+    ],
+)
 async def test_ctrl_c_is_an_end_like_any_other(when):
     async with FakeRosbridge() as fake:
         process = await asyncio.create_subprocess_exec(
             sys.executable, "-c", CTRL_C.format(when=when, uri=fake.uri), stdout=asyncio.subprocess.PIPE
         )
         try:
-            await fake.wait_for_op("subscribe", topic="/BMresults", timeout=PATIENCE)
+            await fake.wait_for_op("subscribe", topic="/BMresults", timeout=PROCESS_PATIENCE)
             await say(fake, 1, 1, 0, 0, 0)
             assert process.stdout is not None
-            async with asyncio.timeout(PATIENCE):
+            async with asyncio.timeout(PROCESS_PATIENCE):
                 assert await process.stdout.readline() == b"got 1\n"
                 if when == "waiting":
                     process.send_signal(2)
@@ -265,11 +271,13 @@ async def test_ctrl_c_is_an_end_like_any_other(when):
         finally:
             with contextlib.suppress(ProcessLookupError):
                 process.kill()
+            await process.communicate()
 
 
+@pytest.mark.thorough
 def test_numpy_is_not_imported_before_it_is_wanted():
     code = "import sys, posteriors; sys.exit('numpy' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=PROCESS_PATIENCE)
 
 
 def test_a_thread_without_a_loop_raises_in_the_caller(monkeypatch):

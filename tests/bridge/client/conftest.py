@@ -4,8 +4,17 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from bridge.client import Ros, connect
+from bridge.client import Ros, connect, session, type_checks
+from bridge.client.actions import actionlib_goals
 from tests.fake_rosbridge import FakeRosbridge
+from tests.patience import PATIENCE
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a busy machine answers late is an answer all the same."""
+    for module in (type_checks, session, actionlib_goals):
+        monkeypatch.setattr(module, "_ROSAPI_TIMEOUT", PATIENCE / 2)
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 Ros ◀──WebSocket──▶ Double (A, B or R)
 """
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator
 from itertools import product
@@ -14,6 +15,7 @@ from bridge.client import Ros, connect
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import DecodeError, NoAnswerError, NoMessageError, ServiceError
 from tests.bridge.client.doubles import Double
+from tests.bridge.client.waits import give_up, until
 from tests.patience import PATIENCE
 
 TYPE = "std_msgs/Float64MultiArray"
@@ -74,12 +76,16 @@ async def test_serialised_bytes_of_either_ros(double, ros):
 async def test_refusals_of_the_server_are_reported(double, ros):
     double.known.remove("png")
     subscription = ros.subscribe("/a", TYPE, compression="png")
+    waiting = asyncio.create_task(subscription.next(3600))
+    await until(lambda: ros.statuses)
+    give_up(subscription)
     with pytest.raises(NoMessageError, match="unsupported compression png$"):
-        await subscription.next(0.5)
+        await waiting
     assert [status.level for status in ros.statuses] == ["error"]
     goal = await ros.send_goal("/fly", "p/Fly")
+    await until(lambda: len(ros.statuses) == 2)
     with pytest.raises(NoAnswerError, match="unknown operation"):
-        await goal.result(0.3)
+        await goal.result(0.01)
 
 
 @SERVERS

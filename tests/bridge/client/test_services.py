@@ -111,7 +111,7 @@ async def test_a_handler_that_fails(fake, ros, caller, outcome, said, caplog):
             await asyncio.sleep(60)
         return outcome
 
-    await ros.advertise_service("/s", "p/T", handler, handler_timeout=0.1 if outcome is None else 30)
+    await ros.advertise_service("/s", "p/T", handler, handler_timeout=0.1 if outcome is None else PATIENCE)
     await fake.wait_for_op("advertise_service")
     assert await caller.call("/s") == {}  # the reference server passes the answer on, whatever its result
     (answer,) = fake.ops("service_response")
@@ -133,7 +133,7 @@ async def test_closing_ends_what_is_being_handled(fake, ros, caller):
 
     await ros.advertise_service("/s", "p/T", handler)
     await fake.wait_for_op("advertise_service")
-    call = asyncio.create_task(caller.call("/s", timeout=0.5))
+    call = asyncio.create_task(caller.call("/s", timeout=0.2))
     await asyncio.wait_for(began.wait(), PATIENCE)
     await ros.close()
     assert ended.is_set()

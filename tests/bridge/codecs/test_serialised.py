@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import DecodeError, DefinitionError, NameFormError
-from tests.patience import PATIENCE
+from tests.patience import PROCESS_PATIENCE
 
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.LATEST)
 TYPES = MessageTypes()
@@ -132,6 +132,7 @@ def test_without_rosbags_one_sentence_says_so(monkeypatch):
         MessageTypes().read(b"", "std_msgs/String")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "use",
     [
@@ -142,4 +143,4 @@ def test_without_rosbags_one_sentence_says_so(monkeypatch):
 )
 def test_nothing_heavy_is_imported_before_it_is_wanted(use):
     code = f"import sys; {use}; assert not {{'rosbags', 'numpy', 'zeroconf'}} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=PROCESS_PATIENCE)

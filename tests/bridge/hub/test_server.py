@@ -16,7 +16,7 @@ from bridge.hub.errors import HubError
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
 from tests.bridge.hub.sockets import RawClient, client, running_hub
-from tests.patience import PATIENCE
+from tests.patience import PATIENCE, PROCESS_PATIENCE
 
 
 @pytest.mark.parametrize("size", [0, 60, 80, 100, 200, 65_400, 65_500, 65_600, 200_000, (1 << 20) - 60])
@@ -148,6 +148,7 @@ def test_the_loop_is_left_as_it_was() -> None:
         sock.connect(("127.0.0.1", port))
 
 
+@pytest.mark.thorough
 def test_memory_of_large_messages_is_retained() -> None:
     """Without `_retain_memory` each burst costs a page fault for most of its pages."""
     code = """
@@ -162,7 +163,9 @@ for _ in range(100):
     burst()
 print(faults() - before)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, timeout=PATIENCE)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, check=True, timeout=PROCESS_PATIENCE
+    )
     assert int(done.stdout) < 10_000
 
 

@@ -20,8 +20,8 @@ from casestudies.boat.geometry import map_grid
 from tests.casestudies.pretend_stack import PretendStack, certain, frame_message, posterior_message
 from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge
+from tests.patience import PROCESS_PATIENCE
 
-LIMIT = 180
 GRID = map_grid()
 
 
@@ -40,20 +40,20 @@ class Process:
     async def __aexit__(self, *_exception):
         with contextlib.suppress(ProcessLookupError):
             self._process.kill()
-        await self._process.wait()
+        await self._process.communicate()
 
     def signal(self, number):
         self._process.send_signal(number)
 
     async def line(self, beginning):
         """Wait until it prints a line that begins so."""
-        async with asyncio.timeout(LIMIT):
+        async with asyncio.timeout(PROCESS_PATIENCE):
             while not (line := (await self._process.stdout.readline()).decode()).startswith(beginning):
                 assert line, "it ended first"
 
     async def ended(self):
         """(exit code, stdout, stderr)"""
-        async with asyncio.timeout(LIMIT):
+        async with asyncio.timeout(PROCESS_PATIENCE):
             out, err = await self._process.communicate()
         return self._process.returncode, out.decode(), err.decode()
 
@@ -77,6 +77,7 @@ async def say_result(fake, number):
     await fake.publish("/BMresults", posterior_message(certain(500)))
 
 
+@pytest.mark.process
 async def test_from_the_simulator_to_the_pictures(tmp_path):
     async with (
         FakeRosbridge(rosapi=True) as fake,
@@ -87,8 +88,8 @@ async def test_from_the_simulator_to_the_pictures(tmp_path):
             *("--json", str(tmp_path / "numbers.json")),
         )
         async with viewing as viewer, Process("normaliser", "--uri", fake.uri):
-            await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
-            await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=LIMIT)
+            await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=PROCESS_PATIENCE)
+            await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=PROCESS_PATIENCE)
             async with Process("simulator", "--uri", fake.uri, "--rate", "50", "--seed", "4"):
                 code, out, err = await viewer.ended()
         sensors = fake.ops("publish", topic="/boat/sensors")
@@ -124,6 +125,7 @@ async def test_from_the_simulator_to_the_pictures(tmp_path):
     assert first["header"] in [op["msg"]["header"] for op in raws]
 
 
+@pytest.mark.thorough
 async def test_arrays_are_paired_with_the_pose_before_them(tmp_path):
     """Without headers the stack stamps a reading when it arrives, which is a little after the true pose."""
     async with FakeRosbridge() as fake, PretendStack(fake, "/boat/sensors", lambda _n, _m: certain(0)):
@@ -131,8 +133,8 @@ async def test_arrays_are_paired_with_the_pose_before_them(tmp_path):
             "viewer", "--uri", fake.uri, "--count", "3", "--json", str(tmp_path / "numbers.json")
         )
         async with viewing as viewer, Process("normaliser", "--uri", fake.uri, "--array"):
-            await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
-            await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=LIMIT)
+            await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=PROCESS_PATIENCE)
+            await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=PROCESS_PATIENCE)
             async with Process("simulator", "--uri", fake.uri, "--rate", "20", "--array") as simulator:
                 assert (await viewer.ended())[0] == 0
                 simulator.signal(signal.SIGTERM)
@@ -144,12 +146,13 @@ async def test_arrays_are_paired_with_the_pose_before_them(tmp_path):
         assert 0 < frame["true_position_age_ms"] < 10_000
 
 
+@pytest.mark.process
 async def test_ctrl_c_ends_an_endless_viewer_with_its_pictures(tmp_path):
     async with (
         FakeRosbridge() as fake,
         Process("viewer", "--uri", fake.uri, "--out", str(tmp_path)) as viewer,
     ):
-        await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
+        await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=PROCESS_PATIENCE)
         for number in (1, 2):
             await say_result(fake, number)
         await viewer.line("    2 ")
@@ -169,20 +172,22 @@ def test_a_folder_that_cannot_be_written_is_reported_at_the_start(flag, name, tm
 
 
 @pytest.mark.parametrize("module", [simulator, normaliser, viewer])
-def test_an_unreachable_server_is_one_sentence(module):
+def test_an_unreachable_server_is_one_sentence(module, monkeypatch):
+    monkeypatch.setattr("bridge.client.session.FIRST_DELAY", 3600)  # the first attempt is the last
     ended = invoke(module.app, ["--uri", "ws://127.0.0.1:1"])
     assert ended.exit_code == 3
     assert ended.stderr.splitlines()[-1].startswith("error: ")
     assert "Traceback" not in ended.stderr
 
 
+@pytest.mark.thorough
 async def test_results_that_end_early_are_drawn_all_the_same(tmp_path):
     async with FakeRosbridge() as fake:
         viewing = Process(
             *("viewer", "--uri", fake.uri, "--count", "5", "--timeout", "0.5", "--out", str(tmp_path))
         )
         async with viewing as viewer:
-            await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
+            await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=PROCESS_PATIENCE)
             await say_result(fake, 1)
             code, _out, err = await viewer.ended()
     assert code == 3
@@ -190,14 +195,14 @@ async def test_results_that_end_early_are_drawn_all_the_same(tmp_path):
     assert (tmp_path / "figure-4.4.png").exists()
 
 
+@pytest.mark.thorough
 async def test_a_simulator_sails_on_while_the_server_is_away():
     async with FakeRosbridge() as fake, Process("simulator", "--uri", fake.uri, "--rate", "20") as simulator:
-        await fake.wait_for_op("publish", topic="/boat/raw", timeout=LIMIT)
+        await fake.wait_for_op("publish", topic="/boat/raw", timeout=PROCESS_PATIENCE)
         await fake.vanish()
         fake.received.clear()
-        await asyncio.sleep(0.3)
         await fake.come_back()
-        await fake.wait_for_op("publish", topic="/boat/raw", count=2, timeout=LIMIT)
+        await fake.wait_for_op("publish", topic="/boat/raw", count=2, timeout=PROCESS_PATIENCE)
         simulator.signal(signal.SIGINT)
         code, _out, err = await simulator.ended()
     assert code == 130
@@ -205,20 +210,21 @@ async def test_a_simulator_sails_on_while_the_server_is_away():
     assert lost.startswith("warning: ")
 
 
+@pytest.mark.thorough
 async def test_a_normaliser_says_what_went_wrong_once():
     """Each kind of bad reading, and that the server went and came back."""
     good = {"D1": 1.2, "D2": 2, "D3": 3, "B1": 0, "B2": 0, "B3": 0}
     async with FakeRosbridge() as fake, Process("normaliser", "--uri", fake.uri) as normaliser:
-        await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=LIMIT)
+        await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=PROCESS_PATIENCE)
         for _ in range(3):
             await fake.publish("/boat/raw", {**good, "B2": None})
         await fake.publish("/boat/raw", good)
-        await fake.wait_for_op("publish", topic="/boat/sensors", timeout=LIMIT)
+        await fake.wait_for_op("publish", topic="/boat/sensors", timeout=PROCESS_PATIENCE)
         (sent,) = fake.ops("publish", topic="/boat/sensors")
         await fake.vanish()
         fake.received.clear()
         await fake.come_back()
-        await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=LIMIT)
+        await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=PROCESS_PATIENCE)
         normaliser.signal(signal.SIGTERM)
         code, _out, err = await normaliser.ended()
     assert sent["msg"] == {"D1": 1, "D2": 2, "D3": 3, "B1": 0, "B2": 0, "B3": 0}
@@ -229,9 +235,10 @@ async def test_a_normaliser_says_what_went_wrong_once():
     assert code == 143
 
 
+@pytest.mark.thorough
 async def test_a_viewer_reports_missing_results():
     async with FakeRosbridge() as fake, Process("viewer", "--uri", fake.uri, "--count", "1") as viewer:
-        await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=LIMIT)
+        await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=PROCESS_PATIENCE)
         await fake.publish("/bm/frame", frame_message({"sec": 1, "nanosec": 0}, 1, published=True))
         await asyncio.sleep(2)  # a report and a result as near as this do not belong together
         await say_result(fake, 2)

@@ -18,7 +18,7 @@ from posteriors.posterior import Posterior
 from tests.casestudies.pretend_stack import PretendStack, certain
 from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge
-from tests.patience import PATIENCE
+from tests.patience import FACTOR, PROCESS_PATIENCE
 
 GRID = area_grid()
 
@@ -59,10 +59,10 @@ async def test_a_lost_and_an_impossible_frame_have_no_result_and_the_rest_goes_o
 
     heard = []
     async with FakeRosbridge() as fake, PretendStack(fake, SIGHTINGS_TOPIC, answer):
-        played = await play(fake.uri, FRAMES, timeout_s=2, on_frame=heard.append)
+        played = await play(fake.uri, FRAMES, timeout_s=FACTOR, on_frame=heard.append)
     assert heard == played
     assert [one.frame.number for one in played if one.posterior is None] == [3, 5]
-    assert played[2].outcome == "no result within 2 s"
+    assert played[2].outcome == f"no result within {FACTOR:g} s"
     assert played[4].outcome == "impossible on every board"
     assert played[2].distance() == LOST_DISTANCE
     assert played[7].distance() == pytest.approx(0, abs=1e-9)
@@ -109,7 +109,8 @@ async def test_something_else_on_the_result_topic():
             await playing
 
 
-async def test_no_server():
+async def test_no_server(monkeypatch):
+    monkeypatch.setattr("bridge.client.session.FIRST_DELAY", 3600)  # the first attempt is the last
     with pytest.raises(BridgeError):
         await play("ws://127.0.0.1:1", FRAMES)
 
@@ -128,6 +129,7 @@ def test_a_posterior_of_something_else():
         PlayedFrame(frame=FRAMES[0], posterior=result, cycles=1, outcome="").estimate()
 
 
+@pytest.mark.process
 async def test_the_command_prints_a_line_a_frame_and_a_sum(tmp_path):
     path = tmp_path / "robot.csv"
     lines = ["time_s,ref_x_m,ref_y_m,ref_std_m,heading_rad,range_6_m,bearing_6_rad"]
@@ -144,7 +146,7 @@ async def test_the_command_prints_a_line_a_frame_and_a_sum(tmp_path):
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
-        async with asyncio.timeout(PATIENCE):
+        async with asyncio.timeout(PROCESS_PATIENCE):
             out, err = await process.communicate()
     assert process.returncode == 0, err.decode()
     lines = out.decode().splitlines()

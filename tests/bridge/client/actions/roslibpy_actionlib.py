@@ -12,7 +12,8 @@ from typing import Any
 import roslibpy
 from roslibpy.ros1.actionlib import ActionClient, Goal, SimpleActionServer
 
-PATIENCE = 60
+PATIENCE = 3600
+"""The test that runs this has a limit of its own."""
 TYPE = "actionlib_tutorials/FibonacciAction"
 
 

@@ -79,9 +79,10 @@ async def test_a_handler_that_fails_and_a_server_that_goes_away_end_the_goal():
 
 
 async def test_an_action_comes_back_with_its_connection_and_its_goals_do_not(fake, ros):
-    cancelled = asyncio.Event()
+    started, cancelled = asyncio.Event(), asyncio.Event()
 
     async def wait(goal: GoalRequest) -> None:
+        started.set()
         try:
             await goal.wait_canceling()
         except asyncio.CancelledError:
@@ -91,7 +92,7 @@ async def test_an_action_comes_back_with_its_connection_and_its_goals_do_not(fak
     await ros.advertise_action("/wait", "p/action/Wait", wait)
     await fake.wait_for_op("advertise_action", action="/wait", type="p/action/Wait")
     await fake.say({"op": "send_action_goal", "id": "1", "action": "/wait", "args": {}})
-    await asyncio.sleep(0.1)
+    await asyncio.wait_for(started.wait(), PATIENCE)
     await fake.cut()
     await asyncio.wait_for(cancelled.wait(), PATIENCE)
     await ros.wait_for_state(State.CONNECTED, PATIENCE)

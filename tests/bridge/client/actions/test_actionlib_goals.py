@@ -24,7 +24,7 @@ from bridge.errors import (
 )
 from tests.bridge.client.actions.counting import FIBONACCI, count
 from tests.bridge.hub.sockets import running_hub
-from tests.patience import PATIENCE
+from tests.patience import PATIENCE, PROCESS_PATIENCE
 
 ANY = "p/Count"
 """A type that the hub does not know."""
@@ -263,9 +263,10 @@ async def test_the_version_or_else_the_type_decides(fake, version, type_name, op
         assert not fake.ops(other)
 
 
+@pytest.mark.thorough
 async def test_goals_to_the_server_of_roslibpy():
     async with two_clients() as (_server, ros), roslibpy("server", ros.uri) as process:
-        assert await asyncio.wait_for(process.stdout.readline(), PATIENCE) == b"serving\n"
+        assert await asyncio.wait_for(process.stdout.readline(), PROCESS_PATIENCE) == b"serving\n"
         async with asyncio.timeout(PATIENCE):
             while not await ros.subscribers("/count/goal"):
                 await asyncio.sleep(0.05)
@@ -279,13 +280,14 @@ async def test_goals_to_the_server_of_roslibpy():
             assert (await goal.result(PATIENCE)).status is GoalStatus.CANCELED
 
 
+@pytest.mark.thorough
 async def test_goals_of_roslibpy_to_this_server():
     async with (
         two_clients() as (server, _ros),
         await server.advertise_action("/count", FIBONACCI, count),
         roslibpy("client", server.uri) as process,
     ):
-        out, _errors = await asyncio.wait_for(process.communicate(), PATIENCE)
+        out, _errors = await asyncio.wait_for(process.communicate(), PROCESS_PATIENCE)
         found = json.loads(out)
         assert found == {
             "feedback": [{"sequence": [0, 1]}],

@@ -14,6 +14,7 @@ from bridge.client import Ros, State, connect
 from bridge.client.session import FIRST_DELAY, MAX_DELAY
 from bridge.errors import DisconnectedError, NoMessageError, StateTimeoutError
 from tests.bridge.client.tcp_service import tcp_service
+from tests.bridge.client.waits import until
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 
@@ -135,12 +136,12 @@ async def test_it_comes_back_whatever_was_there_meanwhile(fake, ros, trouble):
     if trouble == "refuses":
         fake.refuses = 503
         await fake.cut()
-        await _until(lambda: "HTTP 503" in ros.last_error)
+        await until(lambda: "HTTP 503" in ros.last_error)
         fake.refuses = None
     else:
         await fake.vanish()
         async with tcp_service(lambda _reader, writer: writer.write(b"220 mail\r\n"), fake.port):
-            await _until(lambda: "220 mail" in ros.last_error)
+            await until(lambda: "220 mail" in ros.last_error)
         await fake.come_back()
     await ros.wait_for_state(State.CONNECTED, PATIENCE)
 
@@ -185,11 +186,11 @@ async def test_a_silent_peer_is_noticed(fake, ros):
 @pytest.mark.parametrize("ros", [{"ping_interval": 0.01, "ping_timeout": 2 * PATIENCE}], indirect=True)
 async def test_a_quiet_server_that_answers_pings_is_kept(fake, ros):
     websocket = ros._session._connected()
-    await _until(lambda: websocket._pinged_at is not None and websocket._pinged_at <= websocket.last_heard)
+    await until(lambda: websocket._pinged_at is not None and websocket._pinged_at <= websocket.last_heard)
     for _ in range(5):
         heard = websocket.last_heard
         websocket._check_liveness(time.monotonic())  # as after `ping_timeout`
-        await _until(lambda heard=heard: websocket.last_heard > heard)
+        await until(lambda heard=heard: websocket.last_heard > heard)
     assert (ros.state, ros.reconnections, fake.connections) == (State.CONNECTED, 0, 1)
 
 
@@ -197,11 +198,11 @@ async def test_a_quiet_server_that_answers_pings_is_kept(fake, ros):
 async def test_a_sleep_of_this_process_is_not_the_servers_silence(fake, ros):
     fake.freeze()
     websocket = ros._session._connected()
-    await _until(lambda: websocket._pinged_at is not None and websocket._pinged_at > websocket.last_heard)
+    await until(lambda: websocket._pinged_at is not None and websocket._pinged_at > websocket.last_heard)
     fake.thaw()
     heard = websocket.last_heard
     websocket._check_liveness(time.monotonic() - 2.5)  # it is called late, while the answer is in transit
-    await _until(lambda: websocket.last_heard > heard)
+    await until(lambda: websocket.last_heard > heard)
     assert (ros.state, ros.reconnections, fake.connections) == (State.CONNECTED, 0, 1)
 
 
@@ -273,7 +274,7 @@ async def test_nothing_is_left_open():
                 ros.subscribe("/a", "p/T")
                 await fake.cut()
         # this one, and the fake's accepting one
-        await _until(lambda: not fake._clients and len(asyncio.all_tasks()) <= 2)
+        await until(lambda: not fake._clients and len(asyncio.all_tasks()) <= 2)
     with socket.socket() as again:
         again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         again.bind(("127.0.0.1", fake.port))
@@ -321,15 +322,9 @@ async def test_a_gap_is_reported_even_if_the_message_after_it_is_dropped(fake, r
     await fake.wait_for_op("subscribe")
     for n in range(20):
         await fake.publish("/a", {"n": n})
-    await _until(lambda: subscription.lost == 20 - queue_size)
+    await until(lambda: subscription.lost == 20 - queue_size)
     messages = [await subscription.next(PATIENCE) for _ in range(queue_size)]
     assert [message.msg["n"] for message in messages] == list(range(20 - queue_size, 20))
     dark = [message.blind_seconds for message in messages]
     assert dark == [subscription.blind_seconds] + [0.0] * (queue_size - 1)
     assert dark[0] > 0
-
-
-async def _until(condition: Any) -> None:
-    async with asyncio.timeout(PATIENCE):
-        while not condition():
-            await asyncio.sleep(0.01)

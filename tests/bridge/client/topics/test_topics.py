@@ -8,6 +8,8 @@ import math
 import re
 import socket
 import time
+from collections.abc import Coroutine
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +26,7 @@ from bridge.errors import (
     ServiceError,
     SlowPeerError,
 )
+from tests.bridge.client.waits import give_up, until
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 
@@ -176,7 +179,7 @@ async def test_a_second_reader_of_a_subscription_gets_an_error(fake, ros):
     first = asyncio.create_task(subscription.next(0.3))
     await asyncio.sleep(0)
     with pytest.raises(ConcurrentReadError, match="/a"):
-        await subscription.next(600)
+        await subscription.next(3600)
     with pytest.raises(NoMessageError):  # at its own time, not at the other's
         await asyncio.wait_for(first, PATIENCE)
     await fake.wait_for_op("subscribe")
@@ -184,27 +187,43 @@ async def test_a_second_reader_of_a_subscription_gets_an_error(fake, ros):
     assert (await subscription.next(PATIENCE)).msg == {"n": 1}
 
 
-async def test_each_wait_ends_at_its_own_time():
-    async with FakeRosbridge() as fake, connect(fake.uri) as ros, asyncio.timeout(PATIENCE):
-        subscription = ros.subscribe("/a", "p/T")
-        await fake.wait_for_op("subscribe")
-        await fake.publish("/a", {"n": 1})
-        await subscription.next(0.7)  # its alarm rings in the middle of the next wait
-        begun = time.monotonic()
-        with pytest.raises(NoMessageError, match="within 1 s"):
-            await subscription.next(1)
-        assert time.monotonic() - begun >= 1
-        await fake.publish("/a", {"n": 2})
-        await subscription.next(600)  # its alarm is far away
-        with pytest.raises(NoMessageError, match="within 0.1 s"):
-            await subscription.next(0.1)
-        await fake.publish("/a", {"n": 3})
-        await subscription.next(0.7)  # its alarm rings while nobody has a limit
-        waiting = asyncio.create_task(anext(subscription))
-        await asyncio.sleep(1)
-        assert not waiting.done()
-        await fake.publish("/a", {"n": 4})
-        assert (await waiting).msg == {"n": 4}
+async def test_each_wait_ends_at_its_own_time(fake, ros, monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr("bridge.client.handles.time", SimpleNamespace(monotonic=lambda: now[0]))
+    subscription = ros.subscribe("/a", "p/T")
+    await fake.wait_for_op("subscribe")
+
+    async def begin(wait: Coroutine[Any, Any, Message]) -> asyncio.Task[Message]:
+        waiting = asyncio.create_task(wait)
+        await asyncio.sleep(0)
+        return waiting
+
+    async def hear(waiting: asyncio.Task[Message]) -> None:
+        await fake.publish("/a", {})
+        await waiting
+
+    await hear(await begin(subscription.next(700)))  # its alarm rings in the middle of the next wait
+    waiting = await begin(subscription.next(1000))
+    now[0] += 700
+    subscription._ring()
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    now[0] += 300
+    subscription._ring()
+    with pytest.raises(NoMessageError, match="within 1000 s"):
+        await waiting
+    await hear(await begin(subscription.next(600)))  # its alarm is far away
+    waiting = await begin(subscription.next(0.01))
+    now[0] += 0.01
+    with pytest.raises(NoMessageError, match="within 0.01 s"):
+        await waiting
+    await hear(await begin(subscription.next(700)))  # its alarm rings while nobody has a limit
+    waiting = await begin(anext(subscription))
+    now[0] += 700
+    subscription._ring()
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    await hear(waiting)
 
 
 @pytest.mark.parametrize(
@@ -231,8 +250,12 @@ async def test_a_topic_that_nobody_publishes_is_named(fake, ros, prepare, said):
 
 @pytest.mark.parametrize("fake", [{"statuses": True}], indirect=True)
 async def test_what_the_server_says_about_it_is_passed_on(ros):
+    subscription = ros.subscribe("/a")
+    waiting = asyncio.create_task(subscription.next(3600))
+    await until(lambda: ros.statuses)
+    give_up(subscription)
     with pytest.raises(NoMessageError, match="type is required: /a is not known$"):
-        await ros.subscribe("/a").next(2)
+        await waiting
     assert {status.level for status in ros.statuses} == {"error"}  # it may have been asked again
     # A status message before a wait does not concern that wait.
     with pytest.raises(NoMessageError, match=r"within 0\.1 s$"):
@@ -249,11 +272,10 @@ async def test_a_topic_of_unknown_type_is_found_when_it_appears(fake, monkeypatc
         await fake.wait_for_op("subscribe", count=4, topic="/late")
         await fake.publish("/late", {"n": 1})
         assert (await subscription.next(PATIENCE)).msg == {"n": 1}
-        asked = len(fake.ops("subscribe"))
-        await asyncio.sleep(0.3)
-        assert len(fake.ops("subscribe")) <= asked + 1, "it is not asked for any more"
+        asked = len(fake.ops("subscribe", topic="/late"))
         ros.subscribe("/later")
         await fake.wait_for_op("subscribe", count=3, topic="/later")
+        assert len(fake.ops("subscribe", topic="/late")) <= asked + 1, "it is not asked for any more"
 
 
 @pytest.mark.parametrize("fake", [{"rosapi": True}], indirect=True)
@@ -269,7 +291,10 @@ async def test_a_best_effort_publisher_that_starts_late_is_heard(fake, monkeypat
         assert await fake.publish("/late", {"n": 1}) == 1
         assert (await subscription.next(PATIENCE)).msg == {"n": 1}
         asked = len(fake.ops("subscribe", topic="/late"))
-        await asyncio.sleep(0.4)
+        ros.subscribe("/other", "p/T")
+        await fake.wait_for_op(
+            "call_service", service="/rosapi/publishers", args={"topic": "/other"}, count=2
+        )
         assert len(fake.ops("subscribe", topic="/late")) == asked, "it has a message, so that is enough"
 
 
@@ -320,7 +345,7 @@ async def test_who_waits_comes_first(fake, ros):
     assert [op["msg"]["n"] for op in fake.ops("publish")] == [0, 1, 2, 3]
 
 
-@pytest.mark.parametrize("ros", [{"max_size": 4096}], indirect=True, ids=["small"])
+@pytest.mark.parametrize("ros", [{"max_size": 4096, "ping_interval": PATIENCE}], indirect=True, ids=["small"])
 @pytest.mark.parametrize("kind", ["calls", "pings"])
 async def test_a_server_that_causes_answers_and_reads_none_is_left(fake, ros, kind):
     transport = ros._session._connected()._transport
@@ -352,6 +377,7 @@ async def test_a_server_that_causes_answers_and_reads_none_is_left(fake, ros, ki
     fake.thaw()
 
 
+@pytest.mark.parametrize("ros", [{"ping_interval": PATIENCE}], indirect=True, ids=["no pings"])
 async def test_a_server_that_takes_nothing_more(fake, ros):
     publication = await ros.advertise("/a", "p/T", queue_size=3)
     await fake.wait_for_op("advertise")
@@ -413,7 +439,7 @@ async def test_nonsense_is_counted_and_survived(fake, ros, caplog):
 async def test_the_version_that_is_configured_or_that_rosapi_tells(fake, ros, version):
     configured = ros.ros_version
     async with asyncio.timeout(PATIENCE):
-        assert await ros.detect_ros_version(0.2 if fake.silent else 20) == ros.ros_version == version
+        assert await ros.detect_ros_version(0.2 if fake.silent else PATIENCE) == ros.ros_version == version
     assert bool(fake.received) == (configured is None)
     if version == 1:  # it would log an error
         assert all("get_ros_version" not in str(each) for each in fake.received)

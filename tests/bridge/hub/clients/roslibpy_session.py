@@ -11,7 +11,8 @@ from typing import Any
 
 import roslibpy
 
-PATIENCE = 60
+PATIENCE = 3600
+"""The test that runs this has a limit of its own."""
 
 
 def _topics(ros: roslibpy.Ros, other: roslibpy.Ros) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from websockets.frames import Opcode
 
 from bridge.hub.limits import HubLimits
 from tests.bridge.hub.sockets import Client, RawClient, client, running_hub
-from tests.patience import PATIENCE
+from tests.patience import FACTOR, PATIENCE
 
 
 @asynccontextmanager
@@ -241,7 +241,7 @@ async def test_a_client_that_never_reads_is_closed_and_costs_others_nothing(
 
 
 async def test_a_silent_client_is_pinged_and_then_closed(quick_sweeps: None) -> None:
-    limits = HubLimits(ping_interval=0.1, ping_timeout=2.0)
+    limits = HubLimits(ping_interval=0.1, ping_timeout=FACTOR)
     async with _hub_and_witness(limits) as (port, witness):
         raw = await RawClient.connect(port)
         assert await raw.frame() == (Opcode.PING, b"")
@@ -249,7 +249,7 @@ async def test_a_silent_client_is_pinged_and_then_closed(quick_sweeps: None) -> 
 
 
 async def test_a_client_that_answers_pings_may_be_silent(quick_sweeps: None) -> None:
-    limits = HubLimits(ping_interval=0.02, ping_timeout=10.0)
+    limits = HubLimits(ping_interval=0.02, ping_timeout=PATIENCE)
     async with _hub_and_witness(limits) as (port, _witness):
         raw = await RawClient.connect(port)
         for _ in range(10):
@@ -262,7 +262,7 @@ async def test_a_client_that_answers_pings_may_be_silent(quick_sweeps: None) -> 
 
 
 async def test_a_connection_without_a_handshake_is_closed(quick_sweeps: None) -> None:
-    async with _hub_and_witness(HubLimits(handshake_timeout=0.5)) as (port, _witness):
+    async with _hub_and_witness(HubLimits(handshake_timeout=0.5 * FACTOR)) as (port, _witness):
         silent = await RawClient.connect(port, handshake=False)
         assert await silent.ended() == b""
         slow = await RawClient.connect(port, handshake=False)
