@@ -253,6 +253,7 @@ print("ended after", listen("{uri}", function), flush=True)
         pytest.param("waiting", marks=pytest.mark.process),
     ],
 )
+@pytest.mark.asyncio(loop_factories=["asyncio"])
 async def test_ctrl_c_is_an_end_like_any_other(when):
     async with FakeRosbridge() as fake:
         process = await asyncio.create_subprocess_exec(

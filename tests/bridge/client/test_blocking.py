@@ -211,6 +211,7 @@ async def test_on_state_runs_on_a_thread_of_its_own_and_may_close():
         ),
     ],
 )
+@pytest.mark.asyncio(loop_factories=["asyncio"])
 async def test_exit_and_ctrl_c_do_not_hang(body, interrupt, code):
     async with running_hub(ros_version=2) as port:
         script = f"import time\nfrom bridge.client.blocking import connect\nros = connect('ws://127.0.0.1:{port}')\n{body}\n"

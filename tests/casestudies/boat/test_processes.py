@@ -90,7 +90,7 @@ async def test_from_the_simulator_to_the_pictures(tmp_path):
         async with viewing as viewer, Process("normaliser", "--uri", fake.uri):
             await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=PROCESS_PATIENCE)
             await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=PROCESS_PATIENCE)
-            async with Process("simulator", "--uri", fake.uri, "--rate", "50", "--seed", "4"):
+            async with Process("simulator", "--uri", fake.uri, "--rate", "10", "--seed", "4"):
                 code, out, err = await viewer.ended()
         sensors = fake.ops("publish", topic="/boat/sensors")
         raws = fake.ops("publish", topic="/boat/raw")
