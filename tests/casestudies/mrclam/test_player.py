@@ -70,7 +70,7 @@ async def test_a_lost_and_an_impossible_frame_have_no_result_and_the_rest_goes_o
 
 async def test_a_late_answer_is_not_taken_for_that_of_the_next_frame():
     async with FakeRosbridge() as fake:
-        fake.delay = 0.4
+        fake.delay = 0.2
 
         async def hasten():
             await fake.wait_for_op("publish", topic=SIGHTINGS_TOPIC, count=4)
@@ -78,7 +78,7 @@ async def test_a_late_answer_is_not_taken_for_that_of_the_next_frame():
 
         hastening = asyncio.create_task(hasten())
         async with PretendStack(fake, SIGHTINGS_TOPIC, right):
-            played = await play(fake.uri, FRAMES, timeout_s=0.25)
+            played = await play(fake.uri, FRAMES, timeout_s=0.05)
         await hastening
     assert any(one.posterior is None for one in played)
     assert all(one.distance() < 1e-9 for one in played if one.posterior is not None)

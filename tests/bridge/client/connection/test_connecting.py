@@ -265,7 +265,9 @@ async def test_cancelling_an_attempt_leaves_nothing_behind():
         await asyncio.wait_for(gone.wait(), PATIENCE)
 
 
-@pytest.mark.parametrize("fake", [{"silent": True}], indirect=True)
+@pytest.mark.parametrize(
+    ("fake", "ros"), [({"silent": True}, {"check_types": False})], indirect=True, ids=["silent"]
+)
 async def test_a_client_that_is_cancelled_at_its_farewell_is_closed(fake, ros):
     """Else it would go on for good: heard by nobody, and connecting again whenever it is lost."""
     publication = await ros.advertise("/a", "std_msgs/String")
