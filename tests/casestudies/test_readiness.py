@@ -9,6 +9,7 @@ import pytest
 from casestudies import readiness as module
 from casestudies.readiness import Readiness, serve_readiness
 from terminal.health import is_ready, read_status, status_socket
+from tests.patience import PATIENCE
 
 WORK = "a result was shown"
 
@@ -22,10 +23,11 @@ async def readiness(tmp_path, monkeypatch):
 
 
 async def asked(directory):
-    return await asyncio.to_thread(is_ready, status_socket(directory, "boat-viewer"), 30)
+    return await asyncio.to_thread(is_ready, status_socket(directory, "boat-viewer"), PATIENCE)
 
 
-async def test_ready_once_it_has_worked(tmp_path, readiness):
+async def test_ready_once_it_has_worked(tmp_path, readiness, monkeypatch):
+    monkeypatch.setattr(module, "RECENT_S", PATIENCE)
     ready, why = await asked(tmp_path)
     assert not ready
     assert why.endswith(WORK)
@@ -44,7 +46,7 @@ async def test_not_ready_when_its_work_stopped(tmp_path, readiness, monkeypatch)
 
 async def test_is_a_status_of_the_stack(tmp_path, readiness):
     path = status_socket(tmp_path, "boat-viewer")
-    status = json.loads(await asyncio.to_thread(read_status, path, 30))
+    status = json.loads(await asyncio.to_thread(read_status, path, PATIENCE))
     assert (status["name"], status["ready"]) == ("boat-viewer", False)
     assert status["pid"] > 0
 
