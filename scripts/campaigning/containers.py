@@ -12,13 +12,14 @@ from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
-from scripts.campaigning.stack import BOARDS_PARENT, SERVICES, NotThereError, Stack, Topology
+from scripts.campaigning.stack import BOARD_TIMEOUT, BOARDS_PARENT, SERVICES, NotThereError, Stack, Topology
+from scripts.running.patience import FACTOR
 from scripts.running.processes import ROOT
 
 PROJECT: Final = "campaign"
 VOLUMES: Final = ("status", "sockets", "boards")
 """Volumes of the compose file, each a small tmpfs."""
-BUILD_LIMIT, COMMAND_LIMIT = 1800.0, 180.0
+BUILD_LIMIT, COMMAND_LIMIT = 1800.0 * FACTOR, 180.0 * FACTOR
 _PIECE: Final = bytes(1 << 14)
 
 
@@ -80,7 +81,7 @@ class ContainerStack(Stack):
             "ROSBRIDGE_URI": f"ws://host.docker.internal:{self.proxied_port}",
             "DEPLOYMENT": str(deployment),
             "BM_ROS_VERSION": "1",
-            "BM_BOARD_TIMEOUT": "2",
+            "BM_BOARD_TIMEOUT": f"{BOARD_TIMEOUT:g}",
         }
 
     @property

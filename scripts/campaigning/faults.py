@@ -75,6 +75,19 @@ _ENDS_LINK = {
 _CUTS_ROSBRIDGE = {"gone", "finish", "nonsense", "cut-inside", "files"}
 
 
+SHORT: tuple[Step, ...] = (
+    (Fault(Kind.SIGNALS, "kill", "pcie-app"),),
+    (Fault(Kind.LINKS, "cut", "board0"),),
+    (Fault(Kind.SIGNALS, "stop", "publisher", 0.5),),
+    (Fault(Kind.BOARDS, "misbehave", "board1", 0.5, MISBEHAVIOURS.index("wrong-crc")),),
+    (Fault(Kind.ROSBRIDGE, "gone", "rosbridge", 0.5),),
+    (Fault(Kind.SIGNALS, "kill", "subscriber"),),
+    (Fault(Kind.LINKS, "cut-inside", "publisher", 0.3, 1),),
+    (Fault(Kind.SIGNALS, "kill", "hub"),),
+)
+"""The steps of `--short`, for a stack whose parts the campaign starts."""
+
+
 def ended_roles(fault: Fault) -> tuple[str, ...]:
     """Return the roles whose limit of ends a fault uses up by one; a board's failed frame is such an end."""
     if fault.target == BOARDS_PARENT and fault.what in {"kill", "restart", "full"}:

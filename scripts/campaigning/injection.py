@@ -12,13 +12,14 @@ from pathlib import Path
 from scripts.campaigning.containers import ContainerStack
 from scripts.campaigning.faults import MISBEHAVIOURS, NONSENSE, Fault
 from scripts.campaigning.stack import Stack
+from scripts.running.patience import FACTOR
 
 _FEWEST = 3
 """Limit of descriptors under which a process can open nothing more."""
 _STARTS_BEFORE = 20
-_MISBEHAVING = 20.0
+_MISBEHAVING = 20.0 * FACTOR
 """Seconds in which a board should have misbehaved; one that lies in its greeting is not asked for another."""
-_FINDING = 20.0
+_FINDING = 20.0 * FACTOR
 """Seconds in which a flipped bit should have been found; the observer judges frames, not this time."""
 _FAILED = "failed on a board"
 _CLOCK_FILE = "clock"

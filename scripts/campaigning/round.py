@@ -17,10 +17,11 @@ from scripts.campaigning.faults import Kind, Step, excuses_of
 from scripts.campaigning.injection import Injector, steppable_clock
 from scripts.campaigning.judging.accounts import Counters, Excuses, Overdue, in_transit, judge
 from scripts.campaigning.judging.expected import Addresses, Outcome, UnusableError, addresses_of
-from scripts.campaigning.judging.measures import Recovery, RoundResult, slowness
-from scripts.campaigning.judging.observer import OLDEST, Finding, Flaw, Observer
+from scripts.campaigning.judging.measures import Recovery, RoundResult
+from scripts.campaigning.judging.observer import Finding, Flaw, Observer
 from scripts.campaigning.stack import NotThereError, Stack, Topology
 from scripts.campaigning.wire import REPORTS, Client, now
+from scripts.running.patience import FACTOR
 
 POOL = (
     *((0, 0), (2, 1), (3, 2), (5, 3), (6, 4), (3, None), (None, 2), (None, None)),
@@ -29,12 +30,17 @@ POOL = (
 """Number of different readings in a campaign; few, because the reference kernel is slow."""
 INTEGRITY_FRAMES = 100
 """Frames within which the stack promises to find a flipped bit, in rounds in which one flips."""
-_ANSWER = 0.1
-"""Seconds to wait for a result before the next reading is published."""
-_RECOVERY_LIMIT = 60.0
-_SETTLE_LIMIT = 15.0
+_ANSWER = 0.1 * FACTOR
+"""Seconds to wait for a result during a fault before the next reading is published."""
+_ANSWER_LIMIT = 10.0 * FACTOR
+"""The same without a fault, when only one reading is in flight."""
+_RECOVERY_LIMIT = 180.0 * FACTOR
+"""Seconds within which results must come again; generous, and no measure of the stack."""
+_CALM_LIMIT = 5.0 * FACTOR
+"""Seconds within which a further result must come, on average."""
+_SETTLE_LIMIT = 30.0 * FACTOR
 """Seconds until nothing is in flight, even if a board does not answer or the machine is busy."""
-_QUIET = 0.6
+_QUIET = 0.6 * FACTOR
 """Seconds without a change after which nothing is in flight any more."""
 _stamps = count(time.time_ns() // 10**9 * 10**9, 1_000_000)
 
@@ -108,9 +114,11 @@ class Round:
                 continue
             stamp = next(_stamps)
             await self._publish(self._reading(), stamp)
-            deadline = now() + _ANSWER
-            while not self.observer.seen(stamp) and now() < deadline:
-                await self._some_news(max(0.0, deadline - now()))
+            published = now()
+            while not self.observer.seen(stamp):
+                if now() - published > (_ANSWER if self.observer.in_fault else _ANSWER_LIMIT):
+                    break
+                await self._some_news()
 
     async def _some_news(self, seconds: float = _ANSWER) -> None:
         """Wait some seconds for a message to the observer."""
@@ -155,7 +163,7 @@ class Round:
         """Run all steps, or up to the first one with findings."""
         result, observer = self._result, self.observer
         if any(fault.kind == Kind.CLOCK for step in steps for fault in step):
-            self.stack.environment = steppable_clock(self._folder)
+            self.stack.environment |= steppable_clock(self._folder)
         if any(fault.kind == Kind.INTEGRITY for step in steps for fault in step):
             self.stack.environment |= {
                 "BM_INTEGRITY": "canary",
@@ -166,8 +174,8 @@ class Round:
             await self.stack.start(observer.forwarded)
             await self._client.start()
             driver = asyncio.create_task(self._drive())
-            observer.fault(now())
-            await self._recover("start", judged=False)
+            observer.fault()
+            await self._recover("start", noted=False)
             await self._settle(Excuses(readings=True, results=True, until=now()))
             await self._calm()
             steps = [] if observer.findings else steps
@@ -193,8 +201,8 @@ class Round:
 
     async def _take_step(self, step: Step) -> None:
         name = " + ".join(map(str, step))
-        begun, reloads = now(), self._reloads
-        self.observer.fault(begun)
+        reloads = self._reloads
+        self.observer.fault()
         results = await asyncio.gather(
             *(self._injector.inject(fault) for fault in step), return_exceptions=True
         )
@@ -205,9 +213,9 @@ class Round:
             self._begin_master()
         if [fault.what for fault in step] == ["reload"] and self._reloads == reloads:
             self._find(Flaw.REFUSED, "a reload without another fault")
-        await self._recover(name, judged=True)
-        excuses = replace(excuses_of(step, self.stack.topology), since=begun, until=now())
-        self.observer.calm(now())
+        await self._recover(name, noted=True)
+        excuses = replace(excuses_of(step, self.stack.topology), until=now())
+        self.observer.calm()
         await self._settle(excuses)
         await self._calm()
 
@@ -215,28 +223,21 @@ class Round:
         self._base = Counters()
         self.observer.master_started(self.stack.deployment.name)
 
-    async def _recover(self, name: str, *, judged: bool) -> None:
+    async def _recover(self, name: str, *, noted: bool) -> None:
         """Wait for the result of a reading that is published from now on."""
         begun = now()
         first = self.observer.tally["readings"]
-        slow = [await asyncio.to_thread(slowness)]
         while not self.observer.has_result_since(first):
             if now() - begun > _RECOVERY_LIMIT:
-                self._find(Flaw.SLOW, f"no result {_RECOVERY_LIMIT:.0f} s after: {name}")
+                self._find(Flaw.SILENT, f"no result {_RECOVERY_LIMIT:.0f} s after: {name}")
                 return
             if self.stack.is_over("master"):
                 words = await self.stack.wait("master")
                 self._find(Flaw.ENDED, f"the master ended after: {name}: {words}")
                 return
-            if now() - begun > len(slow):
-                slow.append(await asyncio.to_thread(slowness))
             await self._some_news()
-        seconds, factor = now() - begun, max(1.0, sum(slow) / len(slow))
-        self.observer.slowness = factor
-        if judged:
-            self._result.recoveries.append(Recovery(name, seconds, factor))
-            if seconds > OLDEST * factor:
-                self._find(Flaw.SLOW, f"{seconds:.1f} s (machine slower by {factor:.1f}) after: {name}")
+        if noted:
+            self._result.recoveries.append(Recovery(name, now() - begun))
 
     def _find(self, flaw: Flaw, sentence: str) -> None:
         self.observer.findings.append(Finding(flaw, sentence, now()))
@@ -280,18 +281,18 @@ class Round:
 
     async def _calm(self) -> None:
         """Compute frames without faults, and then settle strictly."""
-        self.observer.calm(now())
+        self.observer.calm()
         wanted = self.observer.tally["results"] + self._calm_frames
-        deadline = now() + _RECOVERY_LIMIT + self._calm_frames * _ANSWER
+        deadline = now() + _RECOVERY_LIMIT + self._calm_frames * _CALM_LIMIT
         while self.observer.tally["results"] < wanted and now() < deadline and not self.observer.findings:
             await self._some_news()
         if self.observer.tally["results"] < wanted and not self.observer.findings:
             done = self._calm_frames - wanted + self.observer.tally["results"]
-            slow, last = await asyncio.to_thread(slowness), now() - self._arrived
+            last = now() - self._arrived
             self._find(
-                Flaw.SLOW,
+                Flaw.SILENT,
                 f"{done} of {self._calm_frames} results without a fault, the last one {last:.1f} s ago; "
-                f"counted: {await self.stack.counters()} (machine slower by {slow:.1f})",
+                f"counted: {await self.stack.counters()}",
             )
         await self._settle(Excuses())
         await self._sample()

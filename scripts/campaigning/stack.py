@@ -19,15 +19,18 @@ from scripts.campaigning.judging.accounts import Counters
 from scripts.campaigning.judging.expected import BOARDS
 from scripts.campaigning.proxy import Proxy
 from scripts.campaigning.wire import process_status
+from scripts.running.patience import FACTOR, PRODUCT_LIMITS
 from scripts.running.processes import Process
 
 SERVICES = ("subscriber", "publisher", "pcie-app")
 BOARD_NAMES = tuple(f"board{at}" for at in range(BOARDS))
 BOARDS_PARENT = "boards"
 """The process from which a master's boards are forked."""
-START_LIMIT = 120.0
+START_LIMIT = 120.0 * FACTOR
 """Seconds until a process must have started, even on a busy machine."""
-END_LIMIT = 30.0
+END_LIMIT = 30.0 * FACTOR
+BOARD_TIMEOUT = 2.0 * FACTOR
+"""Seconds that a board may take; short, because some faults silence boards."""
 
 
 class Topology(StrEnum):
@@ -91,7 +94,7 @@ class Stack:
         self._folder = folder
         self.topology = topology
         self.deployment = deployment
-        self.environment: dict[str, str] = {}
+        self.environment = {name: f"{limit:g}" for name, limit in PRODUCT_LIMITS.items()}
         self._parts: dict[str, Process] = {}
         self._runs = folder / "run"
         self.hub_port, self.proxied_port = free_port(), free_port()
@@ -135,10 +138,10 @@ class Stack:
 
     def _command(self, role: str, misbehave: str) -> list[str]:
         deployment, folder = ["-d", str(self.deployment)], self._folder
-        rosbridge = ["--uri", self._uri, "--connect-timeout", "60", "--ros-version", "1"]
+        rosbridge = ["--uri", self._uri, "--connect-timeout", f"{60 * FACTOR:g}", "--ros-version", "1"]
         outside = [f"tcp://127.0.0.1:{outer}" for outer, _ in self._board_ports.values()]
         boards = ["--boards", ",".join(outside)]
-        limits = ["--peer-timeout", "60", "--board-timeout", "2"]
+        limits = ["--board-timeout", f"{BOARD_TIMEOUT:g}"]
         listen = ["--listen", f"unix:{folder}/real-{role}.sock"]
         if role == "hub":
             return ["hub", "--port", str(self.hub_port)]

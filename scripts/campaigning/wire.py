@@ -12,10 +12,12 @@ from typing import Any
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
+from scripts.running.patience import FACTOR
+
 TOPIC, TYPE = "/campaign/readings", "campaign_msgs/Reading"
 RESULTS, REPORTS = "/BMresults", "/bm/frame"
 QUEUE = 1000
-_ANSWER = 1.0
+_ANSWER = 1.0 * FACTOR
 """Seconds within which a process must answer with its status."""
 _AGAIN = 0.05
 """Seconds between two attempts to connect."""
@@ -65,7 +67,7 @@ class Client:
 
     async def _converse(self) -> None:
         async with connect(
-            self._uri, compression=None, ping_interval=None, open_timeout=5, max_size=1 << 24
+            self._uri, compression=None, ping_interval=None, open_timeout=20 * FACTOR, max_size=1 << 24
         ) as connection:
             for operation in (
                 {"op": "advertise", "topic": TOPIC, "type": TYPE},

@@ -13,7 +13,7 @@ from scripts.campaigning.judging.expected import (
     UnusableError,
     addresses_of,
 )
-from scripts.campaigning.judging.observer import OLDEST, Flaw, Observer, Reading
+from scripts.campaigning.judging.observer import Flaw, Observer, Reading
 from scripts.campaigning.round import Round
 from scripts.campaigning.stack import Topology
 
@@ -100,9 +100,9 @@ class Recording:
                 observer.published(stamp(what), (what, what), now)
                 observer.forwarded(stamp(what))
             elif kind == "fault":
-                observer.fault(now)
+                observer.fault()
             elif kind == "calm":
-                observer.calm(now)
+                observer.calm()
             elif kind == "flip":
                 observer.flip(what)
             elif kind == "reload":
@@ -210,19 +210,6 @@ def forgotten_result(run):
     run.counters = Counters(8, 7, {"failed on a board": 1})
 
 
-def late(run):
-    for at in (22, 23):
-        kind, message, now = run.events[at]
-        run.events[at] = (kind, message, now + OLDEST)
-
-
-def late_after_a_fault(run):
-    run.events[21:21] = [("fault", None, 0.6), ("calm", None, 0.7)]
-    for at in (24, 25):
-        kind, message, now = run.events[at]
-        run.events[at] = (kind, message, now + OLDEST + 0.2)
-
-
 def wrong_layout(run):
     run.message("result", 4)["layout"]["dim"][0]["stride"] = 1
 
@@ -263,9 +250,6 @@ def without_report(run):
 
 def without_result(run):
     run.events[3 * 7 + 1 :] = []
-    for at in range(3 * 4 + 1, len(run.events)):
-        kind, what, now = run.events[at]
-        run.events[at] = (kind, what, now + 20)
     del run.events[3 * 4 + 2]
 
 
@@ -318,8 +302,6 @@ BUGS = {
     lost_on_the_way: Flaw.UNCOUNTED,
     counted_twice: Flaw.MISCOUNTED,
     forgotten_result: Flaw.MISCOUNTED,
-    late: Flaw.LATE,
-    late_after_a_fault: Flaw.LATE,
     wrong_layout: Flaw.MALFORMED,
     wrong_label: Flaw.MALFORMED,
     shorter: Flaw.MALFORMED,
@@ -359,16 +341,16 @@ def test_readings_and_results_that_a_fault_cuts_off_are_excused():
     run = Recording()
     faulty(run, 2)
     run.counters = Counters(7, 7)
-    run.excuses = Excuses(readings=True, results=True, since=0.6, until=0.8)
+    run.excuses = Excuses(readings=True, results=True, until=0.8)
     assert run.play() == set()
 
 
-def test_a_fault_excuses_only_readings_of_its_time():
+def test_a_fault_excuses_only_readings_before_the_recovery():
     run = Recording()
-    del run.events[1:3]
-    run.events = [(kind, what, now - (5 if not at else 0)) for at, (kind, what, now) in enumerate(run.events)]
+    del run.events[-2:]
+    run.events[-1] = ("reading", 7, 0.9)
     run.counters = Counters(7, 7)
-    run.excuses = Excuses(readings=True, results=True, since=0.6, until=0.8)
+    run.excuses = Excuses(readings=True, results=True, until=0.8)
     assert run.play() == {Flaw.UNCOUNTED}
 
 

@@ -67,21 +67,15 @@ class Excuses:
         readings: Readings on their way to the master (a killed subscriber or master, a cut connection).
         results: Results on their way from the publisher.
         most: Maximum number of each; higher only if a process or connection was held before.
-        since: Beginning of the fault (seconds); readings from shortly before it on are excused.
-        until: Time at which the stack had recovered.
+        until: Time at which the stack had recovered; only readings published before it are excused.
         overdue: What was missing when the step before was judged.
     """
 
     readings: bool = False
     results: bool = False
     most: int = MOST_IN_TRANSIT
-    since: float = 0.0
     until: float = 0.0
     overdue: Overdue = Overdue()
-
-
-IN_FLIGHT = 1.0
-"""Maximum number of seconds that a reading is in flight when a fault begins."""
 
 
 def in_transit(added: Counters, readings: Iterable[Reading], overdue: Overdue) -> Overdue:
@@ -104,11 +98,7 @@ def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses, now: f
     given = [each for each in readings if each.forwarded]
     arrived = sum(each.arrived is not None for each in given)
     doubtful = added.lost.get(WITH_PUBLISHER, 0)
-    excusable = [
-        each
-        for each in given
-        if each.arrived is None and excuses.since - IN_FLIGHT <= each.published <= excuses.until
-    ]
+    excusable = [each for each in given if each.arrived is None and each.published <= excuses.until]
     most = min(len(excusable), excuses.most)
     figures = f"{len(given)} readings, {arrived} results; counted: {added}"
     uncounted, astray = _difference(added, readings, excuses.overdue)

@@ -1,11 +1,7 @@
-"""Measures of a round: findings, recovery times, resources, and the machine's slowness."""
+"""Measures of a round: findings, recovery times and resources."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import time
 from dataclasses import dataclass, field
 
 from scripts.campaigning.judging.observer import Finding
@@ -13,11 +9,10 @@ from scripts.campaigning.judging.observer import Finding
 
 @dataclass(slots=True)
 class Recovery:
-    """Time until results arrived again after a step's end, and the machine's slowness then."""
+    """Time until results arrived again after a step's end, which is only reported."""
 
     step: str
     seconds: float
-    slowness: float
 
 
 @dataclass(slots=True)
@@ -35,12 +30,3 @@ class RoundResult:
     """By role and process: frames so far, resident KiB and descriptors."""
     failed_step: int = -1
     words: str = ""
-
-
-def slowness() -> float:
-    """Return the ratio of a small process's duration to its CPU time, which is 1 on an idle machine."""
-    begun = time.monotonic()
-    process = subprocess.Popen([sys.executable, "-S", "-c", "pass"])
-    _, _, usage = os.wait4(process.pid, 0)
-    process.returncode = 0
-    return max(1.0, (time.monotonic() - begun) / max(usage.ru_utime + usage.ru_stime, 0.005))

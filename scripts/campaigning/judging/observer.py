@@ -1,6 +1,6 @@
 """The observer, which judges each result of the stack without code of the services, sockets or clocks.
 
-It is informed of the published readings, of those that reached the stack, of the times of faults, and of
+It is informed of the published readings, of those that reached the stack, of faults, and of
 messages on `/bm/frame` and `/BMresults`. It reports everything wrong; counters are judged when nothing is in
 flight (`accounts.py`).
 """
@@ -16,10 +16,6 @@ from typing import Any
 
 from scripts.campaigning.judging.expected import BANKS, BOARDS, LINES, Addresses, Outcome
 
-OLDEST = 5.0
-"""Seconds after which a result is too late, outside a fault."""
-SETTLING = 5.0
-"""Seconds that a fault may delay results beyond its end."""
 REMEMBERED = 20_000
 """Readings by which a repeated result is recognised."""
 LAYOUT = {"dim": [{"label": "x", "size": LINES, "stride": LINES}], "data_offset": 0}
@@ -36,14 +32,14 @@ class Flaw(StrEnum):
     """The report names a reading that was not published."""
     DUPLICATE = "duplicate"
     OUT_OF_ORDER = "out of order"
-    LATE = "late"
     UNREPORTED = "without a report"
     """A result that no report announced."""
     WITHOUT_RESULT = "announced only"
     """A report that announced a result which did not follow, although nothing cut the connection."""
     UNCOUNTED = "lost without being counted"
     MISCOUNTED = "counted, but not lost"
-    SLOW = "slow recovery"
+    SILENT = "no results"
+    """No result came within a generous limit."""
     ENDED = "ended"
     """A process ended unexpectedly."""
     REFUSED = "refused"
@@ -88,6 +84,7 @@ class Observer:
 
     Attributes:
         findings: Everything wrong so far.
+        in_fault: Whether a fault has begun and not ended.
         tally: Numbers of readings, results and unusable readings.
     """
 
@@ -100,9 +97,8 @@ class Observer:
         self._last_number = 0
         self._last_index = -1
         self._last_generation = 0
-        self._fault_since: float | None = None
-        self._fault_until = -math.inf
-        self.slowness = 1.0
+        self.in_fault = False
+        self._undisturbed = True
         self._flip_frames = 0
         self._first_wrong = 0
         self.findings: list[Finding] = []
@@ -133,18 +129,19 @@ class Observer:
         """Record the deployment of a generation, or several if a fault has hidden which one it is."""
         self._deployments[generation] = set(deployments)
 
-    def fault(self, now: float) -> None:
+    def fault(self) -> None:
         """Record the beginning of a fault."""
-        self._fault_since = now
+        self.in_fault = True
+        self._undisturbed = False
 
     def flip(self, frames: int) -> None:
         """Record that a bit of a board's table flips; results of up to `frames` frames may be wrong until `calm`."""
         self._flip_frames, self._first_wrong = frames, 0
 
-    def calm(self, now: float) -> None:
-        """Record the end of a fault."""
+    def calm(self) -> None:
+        """Record the end of a fault; what it has disturbed may still be in flight until `settle`."""
         self._flip_frames = 0
-        self._fault_since, self._fault_until = None, now
+        self.in_fault = False
 
     def reconnected(self) -> None:
         """Record that messages to the observer itself may have been lost."""
@@ -169,6 +166,7 @@ class Observer:
 
     def settle(self) -> None:
         """Record that nothing is in flight, and remove old readings."""
+        self._undisturbed = not self.in_fault
         for reading in self.pending_readings():
             reading.settled = reading.forwarded
         newest = self.tally["readings"] - REMEMBERED
@@ -178,7 +176,7 @@ class Observer:
 
     def report(self, message: Any, now: float) -> None:
         """Judge a message of `/bm/frame`."""
-        if self._announced is not None and self._fault_since is None and now > self._fault_until + SETTLING:
+        if self._announced is not None and self._undisturbed:
             self._find(Flaw.WITHOUT_RESULT, f"frame {self._announced.number} has no result", now)
         self._announced = None
         try:
@@ -225,9 +223,6 @@ class Observer:
             sentence = f"frame {announced.number}: reading {reading.index} after {self._last_index}"
             self._find(Flaw.OUT_OF_ORDER, sentence, now)
         self._last_index = max(self._last_index, reading.index)
-        age = now - max(reading.published, self._fault_until)
-        if self._fault_since is None and age > OLDEST * self.slowness:
-            self._find(Flaw.LATE, f"frame {announced.number}: {age:.1f} s after its reading", now)
 
     def _data(self, message: Any) -> tuple[float, ...]:
         layout = message["layout"]
