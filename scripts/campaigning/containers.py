@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import random
 import subprocess
+import sys
 import tempfile
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
@@ -15,6 +17,8 @@ from typing import Final
 from scripts.campaigning.stack import BOARD_TIMEOUT, BOARDS_PARENT, SERVICES, NotThereError, Stack, Topology
 from scripts.running.patience import FACTOR
 from scripts.running.processes import ROOT
+from scripts.verifications.checks import DownloadError
+from scripts.verifications.containers.project import copy_project, fetch_wheels, override
 
 PROJECT: Final = "campaign"
 VOLUMES: Final = ("status", "sockets", "boards")
@@ -58,8 +62,6 @@ async def docker(
 
 def build_image() -> None:
     """Build the image from a copy of this project, because builds on this engine have no network."""
-    from scripts.verifications.containers.project import copy_project, fetch_wheels
-
     wheels = Path(os.environ["ROSBAYES_ENGINE_HOME"]) / "wheels"
     fetch_wheels(wheels)
     with tempfile.TemporaryDirectory() as folder:
@@ -74,14 +76,16 @@ class ContainerStack(Stack):
         """Store an empty folder with a short path, and the deployment."""
         super().__init__(folder, Topology.CONTAINERS, deployment, rng)
         self.links["rosbridge"].host = "0.0.0.0"  # noqa: S104 - the engine's own network, which containers share
+        override_file = folder / "compose.override.yaml"
+        override_file.write_text(json.dumps(override(BOARD_TIMEOUT)))
         self._variables = {
+            "COMPOSE_FILE": f"{ROOT / 'compose.yaml'}:{override_file}",
             "COMPOSE_PROJECT_NAME": PROJECT,
             "COMPOSE_PROFILES": "hub,boards",
             "HUB_PORT": str(self.hub_port),
             "ROSBRIDGE_URI": f"ws://host.docker.internal:{self.proxied_port}",
             "DEPLOYMENT": str(deployment),
             "BM_ROS_VERSION": "1",
-            "BM_BOARD_TIMEOUT": f"{BOARD_TIMEOUT:g}",
         }
 
     @property
@@ -205,4 +209,8 @@ class ContainerStack(Stack):
 
 
 if __name__ == "__main__":
-    build_image()
+    try:
+        build_image()
+    except DownloadError as error:
+        print(f"error: a download failed: {error}", file=sys.stderr)
+        sys.exit(3)

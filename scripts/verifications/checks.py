@@ -21,6 +21,10 @@ class CheckError(Exception):
     """A check that failed, with the reason."""
 
 
+class DownloadError(Exception):
+    """A download that failed, so that nothing could be checked."""
+
+
 def expect(condition: bool, otherwise: str) -> None:
     """Raise an error unless a condition holds.
 

@@ -1,18 +1,42 @@
-"""The sources of the image: the project's files, and the wheels of the lock file."""
+"""The sources of the image, with the wheels of the lock file and limits for this machine."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import Final
 
+from scripts.running.patience import FACTOR, PRODUCT_LIMITS
 from scripts.running.processes import ROOT
-from scripts.verifications.checks import expect
+from scripts.verifications.checks import DownloadError
 
-FETCH_LIMIT: Final = 600.0
+FETCH_LIMIT: Final = 600.0 * FACTOR
+STOP_GRACE: Final = 60 * FACTOR
+"""Seconds that a service has to end after SIGTERM; then the engine kills it (exit code 137)."""
+PROBED: Final = (
+    *("master", "subscriber", "publisher", "pcie-app", "boards"),
+    *("hub", "boat-simulator", "boat-normaliser", "boat-viewer"),
+)
+PROBE: Final = {
+    "interval": f"{15 * FACTOR:g}s",
+    "timeout": f"{30 * FACTOR:g}s",
+    "retries": 4,
+    "start_period": f"{240 * FACTOR:g}s",
+}
+"""Health checks on a machine of any speed; a probe takes CPU time, so on a slow one there are fewer."""
+
+
+def home() -> Path:
+    """Return the folder of the engine, as scripts/container-engine determines it."""
+    if given := os.environ.get("ROSBAYES_ENGINE_HOME"):
+        return Path(given)
+    cache = os.environ.get("XDG_CACHE_HOME")
+    return (Path(cache) if cache else Path.home() / ".cache") / "rosbayes" / "engine"
 
 
 def copy_project(folder: Path, wheels: Path) -> None:
@@ -29,14 +53,40 @@ def copy_project(folder: Path, wheels: Path) -> None:
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)
-    shutil.copytree(wheels, folder / "wheelhouse")
+    shutil.copytree(wheels, folder / "wheelhouse", copy_function=_link)
+    (folder / "compose.override.yaml").write_text(json.dumps(override(), indent=1) + "\n")
+
+
+def _link(source: str, target: str) -> None:
+    """Link a file instead of copying it, if both are on the same file system."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
+def override(board_timeout: float = 5 * FACTOR) -> dict[str, object]:
+    """Return a second compose file (JSON is YAML) with limits that a slow machine does not reach."""
+    limits = {name: f"{limit:g}" for name, limit in PRODUCT_LIMITS.items()}
+    limits |= {"BM_BOARD_TIMEOUT": f"{board_timeout:g}", "BM_READY_TIMEOUT": f"{10 * FACTOR:g}"}
+    starts = {each: f"{(1 if each == 'hub' else 3) * FACTOR:g}s" for each in PROBED}
+    return {
+        "services": {
+            each: {
+                "stop_grace_period": f"{STOP_GRACE:g}s",
+                "environment": limits,
+                "healthcheck": PROBE | {"start_interval": starts[each]},
+            }
+            for each in PROBED
+        }
+    }
 
 
 def fetch_wheels(folder: Path) -> None:
     """Download the wheels of the lock file, with hashes checked, for the image's Python.
 
     Raises:
-        CheckError: pip cannot download them.
+        DownloadError: pip cannot download them.
     """
     lock = ROOT / "requirements.lock"
     made = folder / ".made"
@@ -53,5 +103,6 @@ def fetch_wheels(folder: Path) -> None:
         timeout=FETCH_LIMIT,
         check=False,
     )
-    expect(done.returncode == 0, f"pip could not get the wheels of {lock.name}: {done.stderr.strip()[-500:]}")
+    if done.returncode:
+        raise DownloadError(f"pip could not get the wheels of {lock.name}: {done.stderr.strip()[-500:]}")
     made.write_text(stamp)

@@ -16,20 +16,22 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
 
+from scripts.running.patience import FACTOR
 from scripts.running.processes import ROOT
-from scripts.verifications.checks import CheckError, expect
+from scripts.verifications.checks import CheckError, DownloadError, expect
 
 OUT: Final = ROOT / "out" / "verify-containers"
 ENGINE: Final = ROOT / "scripts" / "container-engine"
 CLIENT: Final = Path(__file__).resolve().with_name("client.py")
 
-UP_LIMIT, FLOW_LIMIT = 240.0, 180.0
-"""Seconds until all services are healthy, and until results arrive; ten times those of a quiet machine.
-"""
+UP_LIMIT, FLOW_LIMIT, COMMAND_LIMIT = 300.0 * FACTOR, 180.0 * FACTOR, 120.0 * FACTOR
+"""Seconds until all services are healthy, until results arrive, and for a docker command; generous, not judged."""
 MEAN_TV, LARGEST_TV = 0.06, 0.25
 """Limits of results' total variation to float64 fusion: 0.04 is the mean at a target count of 255."""
 MAX_CYCLES: Final = 1 << 17
 """Cycle limit; a frame that ends there has too few counts for a bound, because its readings are unlikely."""
+DOWNLOAD_FAILED: Final = 3
+"""Exit code of scripts/container-engine, and of a verification, after a failed download."""
 KILLED: Final = 137
 """Exit code after SIGKILL."""
 RESULTS_AGAIN: Final = 5
@@ -70,7 +72,9 @@ class Engine:
             if name in {"DOCKER_HOST", "DOCKER_CONFIG", "PATH", "ROSBAYES_ENGINE_HOME"}:
                 self.environment[name] = value
         else:
-            code = self._process.wait(60)
+            code = self._process.wait(COMMAND_LIMIT)
+            if code == DOWNLOAD_FAILED:
+                raise DownloadError("the container engine could not be downloaded; the reason is above")
             raise CheckError(f"scripts/container-engine ended with exit code {code}; its output is above")
         self.home = Path(self.environment["ROSBAYES_ENGINE_HOME"])
         return self
@@ -81,14 +85,14 @@ class Engine:
         assert self._process.stdin is not None
         self._process.stdin.close()
         try:
-            self._process.wait(60)
+            self._process.wait(COMMAND_LIMIT)
         except subprocess.TimeoutExpired:
             self._process.kill()  # everything that it started dies with it
-            self._process.wait(60)
+            self._process.wait(COMMAND_LIMIT)
 
     def left_behind(self) -> list[str]:
         """Return processes, mounts and control groups that are left after a grace period."""
-        deadline = time.time() + 30
+        deadline = time.time() + 30 * FACTOR
         while (left := self._left()) and time.time() < deadline:
             time.sleep(0.25)
         return left
@@ -153,9 +157,9 @@ class Client:
         if self._process is not None:
             self._process.terminate()  # which docker passes on, even to a container that is only about to start
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(60)
+                self._process.wait(COMMAND_LIMIT)
             self._process.kill()
-            self._process.wait(60)
+            self._process.wait(COMMAND_LIMIT)
         self._stack.docker("rm", "--force", self._name, check=False)
         self._log.close()
 
@@ -250,7 +254,7 @@ class Stack:
         return kept | extra | self.engine.environment | self.variables
 
     def docker(
-        self, *arguments: str, limit: float = 120, check: bool = True, codes: Collection[int] = (0,)
+        self, *arguments: str, limit: float = COMMAND_LIMIT, check: bool = True, codes: Collection[int] = (0,)
     ) -> str:
         """Run docker and return its output.
 
@@ -282,7 +286,7 @@ class Stack:
             )
         return done.stdout
 
-    def compose(self, *arguments: str, limit: float = 120) -> str:
+    def compose(self, *arguments: str, limit: float = COMMAND_LIMIT) -> str:
         """Run docker compose."""
         return self.docker("compose", *arguments, limit=limit)
 
@@ -297,6 +301,8 @@ class Stack:
             *options,
             "--network",
             network,
+            "--env",
+            f"TEST_PATIENCE={FACTOR:g}",
             *safe,
             *volumes,
             "rosbayes",
@@ -319,7 +325,9 @@ class Stack:
                 "BM_DEPLOYMENT=/deployment-given",
             ]
         command = self.client_command("rosbayes_ros", *options)[1:]
-        lines = self.docker(*command, "ws://hub:9090", "--bits", str(count), *flags, limit=300).splitlines()
+        lines = self.docker(
+            *command, "ws://hub:9090", "--bits", str(count), *flags, limit=2 * FLOW_LIMIT
+        ).splitlines()
         results = [Result.of(each) for each in map(json.loads, lines) if "at" in each]
         expect(len(results) == count, f"{len(results)} of {count} results came")
         return results
@@ -393,6 +401,12 @@ class Stack:
             self.docker("inspect", *(self.container(each) for each in services))
         )
         return containers
+
+    def phases(self, began: float) -> tuple[float, float]:
+        """Return the seconds after which all containers were created, and the hub was started."""
+        found = self.inspect(*SERVICES)
+        created = max(seconds(each["Created"]) for each in found)
+        return created - began, seconds(self.inspect("hub")[0]["State"]["StartedAt"]) - began
 
     def states(self) -> dict[str, dict[str, Any]]:
         """Return the states of the project's containers, by service."""
@@ -474,7 +488,7 @@ class Stack:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            timeout=120,
+            timeout=COMMAND_LIMIT,
             check=False,
         )
         return done.stdout

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from scripts.running.patience import FACTOR
 from scripts.verifications.checks import expect
 from scripts.verifications.containers.stack import (
     BOARDS,
@@ -25,8 +26,6 @@ from scripts.verifications.containers.stack import (
 )
 
 ROBOT_PORT, BOARD_PORT = 9191, 7100
-FOLLOWS: Final = 10.0
-"""Seconds in which results must flow after a robot appeared."""
 ALONE_S: Final = 15.0
 """Seconds without a robot: longer than the timeout of a connection on the command line."""
 MINE: Final = "build/mine"
@@ -37,7 +36,12 @@ def toolchain(*arguments: str, folder: Path | None = None) -> None:
     """Run the command `toolchain`."""
     command = [str(Path(sys.executable).with_name("toolchain")), *arguments]
     subprocess.run(
-        command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=True, timeout=300
+        command,
+        cwd=folder,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        check=True,
+        timeout=300 * FACTOR,
     )
 
 
@@ -113,14 +117,16 @@ def check_absent_robot(stack: Stack) -> None:
         states = stack.states()
         ended = [name for name, state in states.items() if state["Status"] != "running"]
         expect(not ended, f"without a robot these do not run: {ended}")
-        why = " ".join(stack.status().get("why", []))
-        expect(uri in why, f"status does not name the robot that is waited for: {why}")
+        deadline = time.time() + FLOW_LIMIT
+        while uri not in (why := " ".join(stack.status().get("why", []))):
+            expect(time.time() < deadline, f"status does not name the robot that is waited for: {why}")
+            time.sleep(0.25)
         before = {service: stack.restarts(service) for service in states}
         with robot(stack):
             appeared = time.time()
             # not necessarily frame 1: the viewer may connect after the first results
             while not re.search(r"^frame \d+:", stack.log("viewer", 0), re.MULTILINE):
-                expect(time.time() < appeared + FOLLOWS, f"no result within {FOLLOWS:g} s of the robot")
+                expect(time.time() < appeared + FLOW_LIMIT, "no result after the robot appeared")
                 time.sleep(0.1)
             took = time.time() - appeared
         after = {service: stack.restarts(service) for service in states}
