@@ -17,10 +17,10 @@ from pcie_shim.board.server import StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint, is_served
 from services.boards.hardware import SimulatedHardware
 from services.errors import BoardFailedError, SettingsError
-from services.settings import endpoint_in
+from services.settings import Settings, endpoint_in
 from services.sockets.reporting import STUCK_S, serve_status_in_thread, shifted
 from services.sockets.status import BoardStatus, ProcessStatus
-from services.supervision.child import RESTARTS_WITHIN, describe_exit
+from services.supervision.child import describe_exit
 from services.supervision.parent import end_with_parent, outlive_parent
 from services.supervision.service_manager import ServiceManager
 from terminal.errors import StoppedError, exit_code_of
@@ -116,14 +116,14 @@ class BoardProcesses:
         directory: Path,
         count: int,
         restarts: int,
-        run_directory: Path | None,
-        metrics: str = "",
+        settings: Settings,
         hardware: SimulatedHardware | None = None,
     ) -> None:
         self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
         self._restarts = restarts
-        self._run_directory = run_directory
-        self._metrics = metrics
+        self._restart_window = settings.restart_window
+        self._run_directory = settings.run_directory
+        self._metrics = settings.metrics
         self._hardware = hardware
         self._reports = PARENT_VARIABLE not in os.environ  # a master monitors its boards itself
         self._manager = ServiceManager()  # here, because a service manager hears only its own child
@@ -241,10 +241,10 @@ class BoardProcesses:
     def _ended(self, at: int, code: int) -> None:
         self._listening.discard(at)
         now = time.monotonic()
-        self._ends = [each for each in self._ends if now - each <= RESTARTS_WITHIN] + [now]
+        self._ends = [each for each in self._ends if now - each <= self._restart_window] + [now]
         if len(self._ends) > self._restarts:
             often = (
-                f", {len(self._ends)} exits of boards within {RESTARTS_WITHIN:.0f} s"
+                f", {len(self._ends)} exits of boards within {self._restart_window:g} s"
                 if self._restarts
                 else ""
             )

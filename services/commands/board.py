@@ -69,7 +69,11 @@ def board(
     ] = None,
     restarts: Annotated[
         int,
-        typer.Option(min=0, help="Maximum number of restarts within 60 s.", rich_help_panel=_SEVERAL),
+        typer.Option(
+            min=0,
+            help="Maximum number of restarts within BM_RESTART_WINDOW (60 s).",
+            rich_help_panel=_SEVERAL,
+        ),
     ] = RESTARTS,
     key_file: options.KeyFile = None,
     tls_cert: Annotated[
@@ -122,7 +126,7 @@ def board(
                 f"--directory {directory} can be entered by other users, who could replace the boards' sockets: run chmod 700 {directory}"
             )
         hardware = _hardware(engine, settings, range(boards))
-        BoardProcesses(directory, boards, restarts, run_directory, settings.metrics, hardware).run()
+        BoardProcesses(directory, boards, restarts, settings, hardware).run()
     if engine is not Engine.EMULATED and misbehave:
         raise SettingsError("--misbehave belongs to an emulated board: leave out --engine")
     name_process(f"board{index}")

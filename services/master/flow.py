@@ -40,7 +40,7 @@ from services.sockets.records import (
     Unusable,
 )
 from services.sockets.status import FrameCounts, reasons, seconds_since
-from services.supervision.child import RESTARTS, RESTARTS_WITHIN
+from services.supervision.child import RESTARTS
 
 MOST_AT_PUBLISHER = 8
 """Maximum number of results that the publisher has not acknowledged; after that, frames wait."""
@@ -357,13 +357,13 @@ class FrameFlow:
         if is_withheld:
             self._log.warning(record.sentence, frame=record.number, _reason=reason)
         elif record.reason is FailureReason.FAILED:
-            now = time.monotonic()
+            now, window = time.monotonic(), self._settings.restart_window
             self._failures.append(now)
-            recent = sum(1 for each in self._failures if now - each <= RESTARTS_WITHIN)
+            recent = sum(1 for each in self._failures if now - each <= window)
             if recent > RESTARTS:
                 self.fail(
                     BoardFailedError(
-                        f"{record.sentence}; {recent} frames failed on boards within {RESTARTS_WITHIN:.0f} s"
+                        f"{record.sentence}; {recent} frames failed on boards within {window:g} s"
                     )
                 )
                 return

@@ -40,7 +40,7 @@ from services.sockets.records import (
 )
 from services.sockets.serving import board_endpoints, endpoint_from
 from services.sockets.status import PeerStatus
-from services.supervision.child import RESTARTS, RESTARTS_WITHIN, Child, end_all
+from services.supervision.child import RESTARTS, Child, end_all
 from terminal.errors import ExitCode
 from terminal.output import say
 from terminal.private_directory import PrivateDirectory
@@ -328,7 +328,7 @@ class Peers:
             failure = boards.failure()
             if boards.exit_code == ExitCode.BOARD:
                 raise failure
-            if self._once or not boards.may_restart():
+            if self._once or not boards.may_restart(self._settings.restart_window):
                 raise BoardFailedError(str(failure))
             self._log.warning(f"{failure}; restarting it")
             await boards.start()
@@ -443,10 +443,9 @@ class Peers:
         failure = child.failure()
         if self._once or failure.exit_code != ExitCode.CHILD:
             raise failure
-        if not child.may_restart():
-            raise ChildDiedError(
-                f"{failure}; it was restarted {RESTARTS} times within {RESTARTS_WITHIN:.0f} s before"
-            )
+        window = self._settings.restart_window
+        if not child.may_restart(window):
+            raise ChildDiedError(f"{failure}; it was restarted {RESTARTS} times within {window:g} s before")
         self._log.warning(f"{failure}; restarting it")
         await child.start()
 

@@ -21,8 +21,7 @@ RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 """Environment variable with the folder of status sockets (the setting `run_directory`)."""
 
 RESTARTS = 3
-RESTARTS_WITHIN = 60.0
-"""A process may be restarted three times in 60 s; then its master gives up."""
+"""A process may be restarted three times within the setting `restart_window`; then its master gives up."""
 
 _KEPT_ERRORS = 20
 
@@ -128,12 +127,12 @@ class Child:
             return ReportedError(code if code and code > 0 else ExitCode.CHILD, self._errors[-1])
         return ReportedError(ExitCode.CHILD, f"{self.name} {describe_exit(code)}")
 
-    def may_restart(self) -> bool:
-        """Count a restart; return whether the limit per minute permits it."""
+    def may_restart(self, window: float) -> bool:
+        """Count a restart; return whether the limit within `window` seconds permits it."""
         now = time.monotonic()
         self.restarts += 1
         self._restarts.append(now)
-        return sum(1 for at in self._restarts if now - at <= RESTARTS_WITHIN) <= RESTARTS
+        return sum(1 for at in self._restarts if now - at <= window) <= RESTARTS
 
     def terminate(self) -> None:
         """Send SIGTERM to the process."""

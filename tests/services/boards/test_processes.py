@@ -17,6 +17,7 @@ from pcie_shim.endpoint import Endpoint
 from services.boards import processes
 from services.boards.processes import BoardProcesses
 from services.errors import SettingsError
+from services.settings import Settings
 from services.sockets.reporting import STUCK_S
 
 BOARD = str(Path(sys.executable).parent / "board")
@@ -118,7 +119,7 @@ def test_the_service_manager_hears_one_process_when_all_boards_listen(start, tmp
 
 def test_a_stuck_board_is_no_sign_of_life_of_its_parent(tmp_path, monkeypatch):
     reports = []
-    boards = BoardProcesses(tmp_path, 2, 0, None)
+    boards = BoardProcesses(tmp_path, 2, 0, Settings())
     monkeypatch.setattr(
         boards._manager, "report", lambda _status, *, ready, alive: reports.append((ready, alive))
     )

@@ -104,9 +104,9 @@ def test_restarts_are_bounded(monkeypatch):
     now = [100.0]
     monkeypatch.setattr("services.supervision.child.time.monotonic", lambda: now[0])
     one = child("")
-    assert [one.may_restart() for _ in range(RESTARTS + 1)] == [True] * RESTARTS + [False]
+    assert [one.may_restart(60.0) for _ in range(RESTARTS + 1)] == [True] * RESTARTS + [False]
     now[0] += 60.1
-    assert one.may_restart()
+    assert one.may_restart(60.0)
     assert one.restarts == RESTARTS + 2
 
 
