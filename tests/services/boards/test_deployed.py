@@ -19,6 +19,7 @@ from tests.pcie_shim.boards import BoardProcess
 from toolchain.deployment import load_deployment
 from toolchain.deployment.sections import Integrity
 
+pytestmark = pytest.mark.thorough
 FRAMES = 1000
 """The setting `integrity_frames`."""
 _numbers = itertools.count()

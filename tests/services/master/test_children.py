@@ -6,37 +6,56 @@ from types import SimpleNamespace
 
 from services.master import children
 from services.master.children import ChildrenWatch
-from services.sockets.reporting import serve_status
+from services.sockets.reporting import STUCK_S, serve_status
 from services.sockets.status import ProcessStatus
+from tests.patience import PATIENCE
+
+
+class Peers(list):
+    """Peers that count how often they are looked through."""
+
+    rounds = 0
+
+    def __iter__(self):
+        self.rounds += 1
+        return super().__iter__()
 
 
 async def test_a_child_that_does_not_answer_is_noticed(tmp_path, monkeypatch):
-    monkeypatch.setattr(children, "ASK_EVERY", 0.01)
-    monkeypatch.setattr(children, "STUCK_S", 1.0)
-    well = [True]
+    now, well = [0.0], [True]
+    monkeypatch.setattr(children, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(children, "ASK_EVERY", 0.0)
+    monkeypatch.setattr(children, "_ANSWER_TIME", PATIENCE)
     process = SimpleNamespace(is_running=True)
-    peers = [SimpleNamespace(role="subscriber", child=process), SimpleNamespace(role="publisher", child=None)]
+    peers = Peers(
+        [SimpleNamespace(role="subscriber", child=process), SimpleNamespace(role="publisher", child=None)]
+    )
     watch = ChildrenWatch(peers, tmp_path)
 
-    async def becomes(expected):
-        async with asyncio.timeout(60):
-            while watch.is_alive() != expected:
-                await asyncio.sleep(0.01)
+    async def is_alive():
+        """Whether the child counts as alive when it has been asked after a long time."""
+        now[0] += STUCK_S
+        begun = peers.rounds
+        async with asyncio.timeout(PATIENCE):
+            while peers.rounds < begun + 2:
+                await asyncio.sleep(0)
+        return watch.is_alive()
 
     status = ProcessStatus(ready=True, why="")
     async with serve_status(tmp_path, "subscriber", lambda: status, is_alive=lambda: well[0]):
         asking = asyncio.ensure_future(watch.run())
-        await asyncio.sleep(1.5)
-        assert watch.is_alive()
+        assert await is_alive()
         well[0] = False
-        await becomes(expected=False)
+        now[0] += STUCK_S - 1
+        assert watch.is_alive()  # not yet
+        assert not await is_alive()
         process.is_running = False  # the master restarts it
-        await becomes(expected=True)
+        assert await is_alive()
         process.is_running = True
-        await becomes(expected=False)
+        assert not await is_alive()
         well[0] = True
-        await becomes(expected=True)
-    await becomes(expected=False)  # nothing listens
+        assert await is_alive()
+    assert not await is_alive()  # nothing listens
     asking.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await asking

@@ -3,8 +3,6 @@
 Run.read ──▶ FrameFlow ──▶ app.frames;  computed(), failed() ──▶ publisher;  published() ──▶ counts
 """
 
-import time
-
 import msgspec
 import pytest
 
@@ -109,16 +107,17 @@ async def test_frames_wait_for_a_publisher_that_does_not_answer(run):
     assert run.flow.in_flight == 1
 
 
-async def test_a_publisher_has_its_time_from_the_first_result_or_its_last_answer_on(run):
+async def test_a_publisher_has_its_time_from_the_first_result_or_its_last_answer_on(run, monkeypatch):
+    now = [1.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
     run.read(3)
-    began = time.monotonic()
     computed(run)
-    first = run.flow.awaited(run.peers.publisher).since
-    assert began <= first <= time.monotonic()
+    now[0] = 2.0
     computed(run)
-    assert run.flow.awaited(run.peers.publisher).since == first
+    assert run.flow.awaited(run.peers.publisher).since == 1.0
+    now[0] = 3.0
     published(run, 1)
-    assert run.flow.awaited(run.peers.publisher).since > first
+    assert run.flow.awaited(run.peers.publisher).since == 3.0
 
 
 async def test_no_frame_is_computed_whose_result_nobody_could_get(run):
@@ -231,6 +230,20 @@ async def test_only_a_board_that_fails_again_and_again_ends_the_run(run, reason)
     failed(run, reason)
     assert isinstance(run.error, BoardFailedError) is (reason is FailureReason.FAILED)
     assert len(run.app.frames) == RESTARTS + (2 if run.error is None else 1)
+
+
+async def test_boards_that_fail_seldom_do_not_end_the_run(boat, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    run = Run(boat, queue="all", restart_window=5)
+    run.read(2 * RESTARTS + 2)
+    for count in (RESTARTS, RESTARTS, 1):
+        for _ in range(count):
+            assert run.error is None
+            failed(run, FailureReason.FAILED)
+        now[0] += 5.1 if count == RESTARTS and now[0] < 105 else 0.0
+    assert isinstance(run.error, BoardFailedError)
+    assert str(run.error).endswith(f"; {RESTARTS + 1} frames failed on boards within 5 s")
 
 
 async def test_a_cause_is_reported_once(run):

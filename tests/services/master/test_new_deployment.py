@@ -18,6 +18,7 @@ from services.sockets.records import Hello, NotReloaded, Prepare, Prepared, Swit
 from services.supervision.parent import DIRECTORY_VARIABLE
 from terminal.errors import ExitCode, StoppedError
 from terminal.private_directory import PrivateDirectory
+from tests.patience import PROCESS_PATIENCE
 from toolchain.building.regenerate import DeploymentEdits, regenerate_deployment
 from toolchain.deployment import load_deployment
 
@@ -152,6 +153,7 @@ def test_a_damaged_image_concerns_the_service_that_reads_images(folder, loaded):
     assert refused.exit_code == ExitCode.USAGE
 
 
+@pytest.mark.thorough
 def test_copies_stay_while_the_master_lives(tmp_path, monkeypatch):
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
@@ -159,7 +161,7 @@ def test_copies_stay_while_the_master_lives(tmp_path, monkeypatch):
     def leave(directory):
         code = "from services.supervision.parent import leave_private_directory; leave_private_directory()"
         environment = os.environ | {DIRECTORY_VARIABLE: str(directory)}
-        subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=60)
+        subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=PROCESS_PATIENCE)
 
     private = PrivateDirectory()
     (private.path / "deployment-0").mkdir()

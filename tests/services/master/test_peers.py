@@ -1,7 +1,6 @@
 """Peers: how long the master waits for its own processes and for others, and which peers it accepts."""
 
 import asyncio
-import sys
 import time
 from contextlib import nullcontext, suppress
 from types import SimpleNamespace
@@ -9,25 +8,23 @@ from unittest.mock import AsyncMock, Mock
 
 import pytest
 
-from services.errors import ChildDiedError, NotReloadedError, OtherPeerError, ReportedError, SettingsError
+from services.errors import (
+    BoardFailedError,
+    ChildDiedError,
+    NotReloadedError,
+    OtherPeerError,
+    ReportedError,
+    SettingsError,
+)
 from services.master.peers import Awaited, Peer, Peers
 from services.pipeline.generations import InForce
 from services.settings import Settings
 from services.sockets.local_socket import own_hello
 from services.sockets.records import Begin, Ready, Trouble
 from services.sockets.serving import endpoint_from
-from services.supervision.child import Child
+from services.supervision.child import RESTARTS, Child
 from terminal.logs import get_logger
-
-LATE = """
-import socket, sys, time
-time.sleep(1)
-with socket.socket(socket.AF_UNIX) as listener:
-    listener.bind(sys.argv[1])
-    listener.listen()
-    listener.accept()
-    time.sleep(60)
-"""
+from tests.patience import PATIENCE, PROCESS_PATIENCE
 
 
 class Events:
@@ -62,21 +59,31 @@ def peers(boat, tmp_path, events):
 
 
 @pytest.mark.parametrize("own", [True, False])
-async def test_a_process_of_its_own_may_start_slowly(peers, events, tmp_path, own):
+async def test_a_process_may_start_slowly_but_not_for_ever(peers, tmp_path, own):
     place = tmp_path / "late.sock"
-    child = Child("subscriber", [sys.executable, "-c", LATE, str(place)])
-    await child.start()
-    peer = Peer("subscriber", endpoint_from(f"unix:{place}", "here"), child if own else None)
-    connecting = asyncio.ensure_future(peers._connect(peer, 50 if own else 0.2))
-    try:
-        await asyncio.wait([connecting], timeout=50)
-        assert isinstance(connecting.exception(), ChildDiedError) is not own
-    finally:
-        if peer.protocol is not None:
-            peer.protocol.close()
-        child.kill()
-        await child.wait()
-        child.close()
+    child = SimpleNamespace(is_running=True) if own else None
+    peer = Peer("subscriber", endpoint_from(f"unix:{place}", "here"), child)
+    with pytest.raises(ChildDiedError, match=r"overloaded\?$" if own else r"running\?$"):
+        await peers._connect(peer, 0.05)  # nothing listens there
+    connecting = asyncio.ensure_future(peers._connect(peer, PATIENCE))
+    await asyncio.sleep(0.05)  # it is refused meanwhile, and may be later
+    accepted = asyncio.Event()
+    async with await asyncio.start_unix_server(lambda _, writer: (writer.close(), accepted.set()), place):
+        await asyncio.wait_for(connecting, PATIENCE)
+        await asyncio.wait_for(accepted.wait(), PATIENCE)
+        await asyncio.wait_for(peer.closed.wait(), PATIENCE)
+
+
+@pytest.mark.process
+async def test_a_process_that_dies_is_restarted_three_times(boat, tmp_path):
+    settings = Settings(restart_window=PROCESS_PATIENCE)
+    peers = Peers(settings, InForce(boat, tmp_path), get_logger("test"), once=False)
+    boards = Child("the boards' process", ["/bin/sh", "-c", f"echo >> {tmp_path}/starts; kill -KILL $$"])
+    await boards.start()
+    with pytest.raises(BoardFailedError, match="SIGKILL"):
+        await asyncio.wait_for(peers._keep_boards(boards), PROCESS_PATIENCE)
+    boards.close()
+    assert (tmp_path / "starts").read_text() == "\n" * (1 + RESTARTS)
 
 
 class Process:
@@ -94,12 +101,12 @@ async def test_a_peer_that_does_not_answer_in_time_is_cut_off(peers, events, own
     peer = Peer("pcie-app", endpoint_from("unix:/x", ""), process if own else None)
     peer.greeted = peer.ready = True
     peer.protocol = SimpleNamespace(close=process.kill)
-    events.pending = Awaited("answer frame 3", time.monotonic(), 0.2)
+    events.pending = Awaited("answer frame 3", time.monotonic(), 0.05)
     watching = asyncio.ensure_future(peers._watch(peer))
-    await asyncio.wait_for(process.killed.wait(), 50)
+    await asyncio.wait_for(process.killed.wait(), PATIENCE)
     assert isinstance(events.error, ChildDiedError) is not own
     peer.closed.set()
-    await asyncio.wait_for(watching, 50)
+    await asyncio.wait_for(watching, PATIENCE)
 
 
 @pytest.mark.parametrize(
@@ -272,7 +279,7 @@ async def test_services_inside_get_a_grace_period_to_end(boat, tmp_path):
     task = asyncio.ensure_future(stubborn())
     peers._inside.append(task)
     await asyncio.sleep(0)
-    await asyncio.wait_for(peers.leave(), 60)
+    await asyncio.wait_for(peers.leave(), PATIENCE)
     assert not task.done()
     stopped.set()
     await task

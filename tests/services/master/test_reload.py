@@ -1,7 +1,7 @@
 """Reloads: requests to the services, readings during the switch, and the return after a failure."""
 
 import asyncio
-import time
+import re
 from pathlib import Path
 from unittest.mock import AsyncMock, Mock, call
 
@@ -22,6 +22,7 @@ from services.sockets.records import (
     Published,
     Switch,
 )
+from tests.patience import PATIENCE
 from tests.services.master.conftest import Run
 
 MEANWHILE = "; 3 readings that came meanwhile found no place to wait and were lost"
@@ -93,10 +94,9 @@ async def test_readings_that_still_wait_after_the_drain_are_lost(begun, order, m
 
 async def test_boards_get_no_frame_while_they_are_programmed(begun, order):
     begun.app.before_switch = begun.read
-    began = time.monotonic()
     sentence = await begun.reloads.order(order)
     assert f"; {describe_frames(0, 1)}, " in sentence
-    assert 0 <= float(sentence.split()[-2]) <= (time.monotonic() - began) * 1000 + 1  # its last words: 12 ms
+    assert re.search(r" \d+(\.\d)? ms$", sentence)
     assert begun.app.frames == []
 
 
@@ -144,11 +144,11 @@ async def test_a_reload_ends_with_its_run(begun, order):
         begun.app.send,
     )
     reloading = asyncio.ensure_future(begun.reloads.order(order))
-    await asyncio.wait_for(asked.wait(), 120)
+    await asyncio.wait_for(asked.wait(), PATIENCE)
     begun.read(generation=1)
     reloading.cancel()
     with pytest.raises(asyncio.CancelledError):
-        await asyncio.wait_for(reloading, 120)
+        await asyncio.wait_for(reloading, PATIENCE)
     assert kinds(begun.subscriber) == [Prepare, Switch]
     assert kinds(begun.publisher) == [Prepare]
     assert begun.lost == {LossReason.IN_RELOAD: 1}
@@ -221,14 +221,14 @@ async def test_children_prepare_a_copy_and_the_user_hears_of_the_original(begun,
 async def test_a_service_that_does_not_answer_is_ended(boat, order, monkeypatch, asked):
     monkeypatch.setattr(reload, "ANSWER_TIME", 0.0)
     monkeypatch.setattr(reload, "_PROGRAM_TIME", 0.0)
-    run = Run(boat, queue="all", peer_timeout=0.2)
+    run = Run(boat, queue="all", peer_timeout=0.05)
     run.peers.begun.set()
     run.app.send, send = (
         (lambda record: True if isinstance(record, asked) else send(record)),
         run.app.send,
     )
     with pytest.raises(NotReloadedError) as caught:
-        await asyncio.wait_for(run.reloads.order(order), 60)
+        await asyncio.wait_for(run.reloads.order(order), PATIENCE)
     assert "pcie-app at this process" in str(caught.value)
     assert ("switch" in str(caught.value)) is (asked is Switch)
     assert run.peers.app.closed.is_set()

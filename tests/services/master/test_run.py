@@ -14,6 +14,7 @@ from pcie_shim.host.frame import BoardResult
 from services.boards.frames import encode_boards
 from services.errors import NoDataError
 from services.sockets.records import FrameResult, LossReason, Outcome, Published
+from tests.patience import PATIENCE
 from tests.services.master.conftest import Run
 
 
@@ -82,15 +83,17 @@ async def test_the_summary_names_losses_only(run):
 
 @pytest.mark.parametrize("has_data", [True, False])
 async def test_a_run_without_data_ends(boat, monkeypatch, has_data):
-    monkeypatch.setattr("services.master.run._GRACE_PERIOD", 0.05)
-    run = Run(boat, first_data_timeout=0.05)
+    monkeypatch.setattr("services.master.run._GRACE_PERIOD", 3)
+    run, slept, sleep = Run(boat, first_data_timeout=40), [], asyncio.sleep
+    monkeypatch.setattr(asyncio, "sleep", AsyncMock(side_effect=slept.append))
     expecting = asyncio.ensure_future(run.master._expect_data())
-    await asyncio.sleep(0.2)
-    assert not expecting.done()  # the time begins with the run
+    await sleep(0)
+    assert slept == []  # the time begins with the run
     run.peers.begun.set()
     if has_data:
         run.read()
-    await asyncio.wait_for(expecting, 60)
+    await expecting
+    assert slept == [43]
     assert isinstance(run.error, NoDataError) is not has_data
 
 
@@ -149,9 +152,11 @@ async def test_a_run_is_open_to_questions_until_its_end(boat, tmp_path, monkeypa
     monkeypatch.setattr("services.master.run.get_logger", log := Mock())
     run = Run(boat, once=once, run_directory=tmp_path, metrics="tcp://127.0.0.1:9999", log_level="debug")
     peers, history = run.peers, run.flow.history
-    peers.prepare, peers.start, peers.leave, peers.end = Mock(), AsyncMock(), AsyncMock(), AsyncMock()
+    peers.prepare, peers.leave, peers.end = Mock(), AsyncMock(), AsyncMock()
+    started = asyncio.Event()
+    peers.start = AsyncMock(side_effect=lambda _: started.set())
     running = asyncio.ensure_future(run.master.run())
-    await asyncio.sleep(0.01)
+    await asyncio.wait_for(started.wait(), PATIENCE)
     assert not running.done()
     assert status.call_args.args == (tmp_path, "master", run.master.status)
     given = status.call_args.kwargs

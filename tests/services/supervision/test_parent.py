@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import select
 import subprocess
 import sys
 import tempfile
@@ -12,14 +13,14 @@ import psutil
 import pytest
 
 from services.supervision.parent import DIRECTORY_VARIABLE, leave_private_directory
+from tests.patience import PROCESS_PATIENCE
 
-PATIENCE = 50.0
 
-
+@pytest.mark.process
 def test_a_child_ends_when_its_parent_is_killed(tmp_path):
     child_code = (
         "import time; from services.supervision.parent import end_with_parent; end_with_parent();"
-        f"open({str(tmp_path / 'up')!r}, 'w').close(); time.sleep(60)"
+        f"open({str(tmp_path / 'up')!r}, 'w').close(); time.sleep(1000)"
     )
     parent_code = f"""
 import asyncio, sys, time
@@ -29,21 +30,21 @@ async def main():
     one = Child("tester", [sys.executable, "-c", {child_code!r}])
     await one.start()
     print(one.pid, flush=True)
-    await asyncio.sleep(60)
+    await asyncio.sleep(1000)
 
 asyncio.run(main())
 """
-    parent = subprocess.Popen([sys.executable, "-c", parent_code], stdout=subprocess.PIPE, text=True)
-    pid = int(parent.stdout.readline())
-    deadline = time.monotonic() + PATIENCE
-    while not (tmp_path / "up").exists():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    parent.kill()
-    parent.wait(PATIENCE)
-    while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
-        assert time.monotonic() < deadline, "the child outlived its parent"
-        time.sleep(0.02)
+    with subprocess.Popen([sys.executable, "-c", parent_code], stdout=subprocess.PIPE, text=True) as parent:
+        child = os.pidfd_open(int(parent.stdout.readline()))
+        deadline = time.monotonic() + PROCESS_PATIENCE
+        while not (tmp_path / "up").exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        parent.kill()
+    try:
+        assert select.select([child], [], [], PROCESS_PATIENCE)[0], "the child outlived its parent"
+    finally:
+        os.close(child)
 
 
 KILLED_IN_PART = '''
@@ -82,17 +83,18 @@ def place():
         yield Path(place)
 
 
+@pytest.mark.thorough
 def test_a_parent_with_a_dying_thread_is_awaited(place):
     done = subprocess.run(
         [sys.executable, "-c", KILLED_IN_PART],
         env=os.environ | {"TMPDIR": str(place), "XDG_RUNTIME_DIR": ""},
         stdout=subprocess.PIPE,
         text=True,
-        timeout=PATIENCE,
+        timeout=PROCESS_PATIENCE,
         check=True,
     )
     child_pid = int(done.stdout.split()[0])
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + PROCESS_PATIENCE
     with contextlib.suppress(psutil.NoSuchProcess):
         while psutil.Process(child_pid).status() != psutil.STATUS_ZOMBIE:
             assert time.monotonic() < deadline

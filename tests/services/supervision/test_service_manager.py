@@ -7,11 +7,11 @@ import socket
 
 import pytest
 
+from services.sockets import reporting
 from services.sockets.reporting import serve_status
 from services.sockets.status import ProcessStatus
 from services.supervision.service_manager import ServiceManager
-
-PATIENCE = 60.0
+from tests.patience import PATIENCE
 
 
 @pytest.fixture(params=["path", "abstract"])
@@ -83,16 +83,28 @@ def test_without_a_service_manager_nothing_is_sent(monkeypatch):
         ServiceManager().report("fine", ready=True, alive=True)
 
 
-async def test_a_process_reports_and_one_that_is_stuck_gives_no_sign_of_life(manager):
-    alive = [True]
-    status = ProcessStatus(ready=True, why="fine")
-    async with serve_status(None, "hub", lambda: status, is_alive=lambda: alive[0]):
-        while not (found := messages_to(manager)):
-            await asyncio.sleep(0.05)
-        assert found == ["READY=1", "STATUS=fine", "WATCHDOG=1"]
+async def test_a_process_reports_and_one_that_is_stuck_gives_no_sign_of_life(manager, monkeypatch):
+    monkeypatch.setattr(reporting, "_SAMPLE_EVERY", 0.0)
+    alive, why = [True], ["fine"]
+
+    async def told():
+        """What it tells until, and with, the state that it has now."""
+        found = []
+        async with asyncio.timeout(PATIENCE):
+            while f"STATUS={why[0]}" not in found:
+                await asyncio.sleep(0)
+                found += messages_to(manager)
+        return found
+
+    async with serve_status(
+        None, "hub", lambda: ProcessStatus(ready=True, why=why[0]), is_alive=lambda: alive[0]
+    ):
+        assert await told() == ["READY=1", "STATUS=fine", "WATCHDOG=1"]
+        alive[0], why[0] = False, "stuck"
+        assert await told() == ["STATUS=stuck"]
+        why[0] = "still stuck"
+        assert await told() == ["STATUS=still stuck"]
+        alive[0], why[0] = True, "fine again"
+        assert await told() == ["STATUS=fine again", "WATCHDOG=1"]
         alive[0] = False
-        await asyncio.sleep(1.5)
-        messages_to(manager)
-        await asyncio.sleep(1.5)
-        assert messages_to(manager) == []
-    assert messages_to(manager) == ["STOPPING=1"]
+    assert messages_to(manager)[-1] == "STOPPING=1"
