@@ -46,25 +46,30 @@ def published(run, number, outcome=Outcome.PUBLISHED, **fields):
     run.take(run.publisher, Published(number, outcome, None, 0, 1.0, 1, 1, **fields))
 
 
-async def test_a_reading_becomes_a_result(run):
+async def test_a_reading_becomes_a_result(run, monkeypatch):
+    now = [1000]
+    monkeypatch.setattr("time.monotonic_ns", lambda: now[0])
     run.read(2, stamp_ns=3, received_ns=4, received_tick=5, sent_tick=6, addresses=[7], prior_codes=b"x")
     (frame,) = run.app.records
     assert (frame.number, frame.addresses, frame.bank, frame.prior_codes) == (1, [7], 1, b"x")
     computed(run, 9)  # of a frame that nobody waits for
     assert run.publisher.records == []
+    now[0] = 1500
     computed(run)
     (publish,) = run.publisher.records
     assert isinstance(publish, Publish)
     assert publish.result.boards is RAW
     stamps = publish.stamp_ns, publish.received_ns, publish.received_tick, publish.reading_sent_tick
     assert stamps == (3, 4, 5, 6)
-    assert 0 < publish.waited_ns < 60e9
+    assert publish.waited_ns == 0
     assert run.app.frames == [1, 2]
     assert run.flow.in_flight == 2
     published(run, 1)
     frames = run.master.status().frames
     assert (frames.received, frames.completed, frames.last_number, frames.lost) == (2, 1, 1, {})
     assert run.flow.in_flight == 1
+    computed(run)
+    assert run.publisher.records[-1].waited_ns == 500
 
 
 async def test_the_newest_reading_wins_unless_all_are_kept(boat):

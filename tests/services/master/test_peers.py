@@ -19,7 +19,7 @@ from services.errors import (
 from services.master.peers import Awaited, Peer, Peers
 from services.pipeline.generations import InForce
 from services.settings import Settings
-from services.sockets.local_socket import own_hello
+from services.sockets.local_socket import open_connection, own_hello
 from services.sockets.records import Begin, Ready, Trouble
 from services.sockets.serving import endpoint_from
 from services.supervision.child import RESTARTS, Child
@@ -59,14 +59,25 @@ def peers(boat, tmp_path, events):
 
 
 @pytest.mark.parametrize("own", [True, False])
-async def test_a_process_may_start_slowly_but_not_for_ever(peers, tmp_path, own):
+async def test_a_process_may_start_slowly_but_not_for_ever(peers, tmp_path, monkeypatch, own):
+    refused = asyncio.Event()
+
+    async def connect(*arguments):
+        try:
+            return await open_connection(*arguments)
+        except OSError:
+            refused.set()
+            raise
+
+    monkeypatch.setattr("services.master.peers.open_connection", connect)
     place = tmp_path / "late.sock"
     child = SimpleNamespace(is_running=True) if own else None
     peer = Peer("subscriber", endpoint_from(f"unix:{place}", "here"), child)
     with pytest.raises(ChildDiedError, match=r"overloaded\?$" if own else r"running\?$"):
         await peers._connect(peer, 0.05)  # nothing listens there
+    refused.clear()
     connecting = asyncio.ensure_future(peers._connect(peer, PATIENCE))
-    await asyncio.sleep(0.05)  # it is refused meanwhile, and may be later
+    await asyncio.wait_for(refused.wait(), PATIENCE)
     accepted = asyncio.Event()
     async with await asyncio.start_unix_server(lambda _, writer: (writer.close(), accepted.set()), place):
         await asyncio.wait_for(connecting, PATIENCE)

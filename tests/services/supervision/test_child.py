@@ -14,7 +14,12 @@ from terminal.errors import ExitCode
 from tests.patience import PATIENCE
 
 
-@pytest.fixture(params=[asyncio.new_event_loop, uvloop.new_event_loop], ids=["asyncio", "uvloop"])
+@pytest.fixture(
+    params=[
+        pytest.param(asyncio.new_event_loop, id="asyncio"),
+        pytest.param(uvloop.new_event_loop, id="uvloop", marks=pytest.mark.thorough),
+    ]
+)
 def run(request):
     """Run a coroutine on each of the event loops that a parent may have."""
 
@@ -40,17 +45,40 @@ async def failure_of(code: str, number: int = 0) -> ReportedError:
     return one.failure()
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("code", "number", "exit_code", "sentence"),
     [
-        ("print('starting\\nerror: no luck', file=sys.stderr); sys.exit(3)", 0, 3, "no luck"),
-        ("sys.stderr.write('starting\\nerror: half a line'); sys.exit(4)", 0, 4, "half a line"),
-        ("print('starting', file=sys.stderr)", 0, ExitCode.CHILD, "tester ended by itself with exit code 0"),
-        ("time.sleep(60)", signal.SIGKILL, ExitCode.CHILD, "tester was killed by SIGKILL"),
-        ("time.sleep(60)", signal.SIGRTMIN + 1, ExitCode.CHILD, "tester was killed by signal 35"),
+        pytest.param(
+            "print('starting\\nerror: no luck', file=sys.stderr); sys.exit(3)",
+            *(0, 3, "no luck"),
+            marks=pytest.mark.process,
+            id="error",
+        ),
+        pytest.param(
+            "sys.stderr.write('starting\\nerror: half a line'); sys.exit(4)",
+            *(0, 4, "half a line"),
+            marks=pytest.mark.thorough,
+            id="no line end",
+        ),
+        pytest.param(
+            "print('starting', file=sys.stderr)",
+            *(0, ExitCode.CHILD, "tester ended by itself with exit code 0"),
+            marks=pytest.mark.thorough,
+            id="silent",
+        ),
+        pytest.param(
+            "time.sleep(1000)",
+            *(signal.SIGKILL, ExitCode.CHILD, "tester was killed by SIGKILL"),
+            marks=pytest.mark.thorough,
+            id="killed",
+        ),
+        pytest.param(
+            "time.sleep(1000)",
+            *(signal.SIGRTMIN + 1, ExitCode.CHILD, "tester was killed by signal 35"),
+            marks=pytest.mark.thorough,
+            id="nameless signal",
+        ),
     ],
-    ids=["error", "no line end", "silent", "killed", "nameless signal"],
 )
 def test_an_end_is_an_error_with_the_childs_own_sentence_and_code(
     run, capsys, code, number, exit_code, sentence
@@ -63,7 +91,7 @@ def test_an_end_is_an_error_with_the_childs_own_sentence_and_code(
 @pytest.mark.thorough
 def test_a_line_is_passed_on_while_the_child_runs(run, capsys):
     async def until_said():
-        one = child("import sys, time; print('ready', file=sys.stderr, flush=True); time.sleep(60)")
+        one = child("import sys, time; print('ready', file=sys.stderr, flush=True); time.sleep(1000)")
         await one.start()
         while "ready\n" not in capsys.readouterr().err:
             await asyncio.sleep(0.01)
@@ -83,15 +111,20 @@ def test_an_end_is_noticed_though_a_grandchild_holds_standard_error(run, tmp_pat
     os.kill(int(grandchild.read_text()), signal.SIGKILL)
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize(("ignores", "killed"), [(True, ["tester"]), (False, [])])
+@pytest.mark.parametrize(
+    ("ignores", "killed"),
+    [
+        pytest.param(True, ["tester"], marks=pytest.mark.process),
+        pytest.param(False, [], marks=pytest.mark.thorough),
+    ],
+)
 def test_a_stubborn_child_is_killed_and_named(run, tmp_path, ignores, killed):
     up = tmp_path / "up"
 
     async def end():
         one = child(
             f"import signal, time; signal.signal(signal.SIGTERM, signal.{'SIG_IGN' if ignores else 'SIG_DFL'});"
-            f"open({str(up)!r}, 'w').close(); time.sleep(60)"
+            f"open({str(up)!r}, 'w').close(); time.sleep(1000)"
         )
         await one.start()
         while not up.exists():
