@@ -13,6 +13,6 @@ PRODUCT_LIMITS: Final = {
     "BM_PEER_TIMEOUT": 60 * FACTOR,
     "BM_STOP_TIMEOUT": 20 * FACTOR,
     "BM_SEEN_TIMEOUT": 10 * FACTOR,
-    # add BM_RESTART_WINDOW here
+    "BM_RESTART_WINDOW": 60 * FACTOR,
 }
 """The environment in which stacks are checked, so that a slow machine is not taken for a dead peer."""
