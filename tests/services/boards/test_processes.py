@@ -16,7 +16,7 @@ import pytest
 from pcie_shim.endpoint import Endpoint
 from services.boards import processes
 from services.boards.processes import BoardProcesses
-from services.errors import SettingsError
+from services.errors import BoardFailedError, SettingsError
 from services.settings import Settings
 from services.sockets.reporting import STUCK_S
 from tests.patience import PROCESS_PATIENCE, PRODUCT_LIMITS
@@ -147,6 +147,20 @@ def test_a_stuck_board_is_no_sign_of_life_of_its_parent(tmp_path, monkeypatch):
     boards._hear(1, listens=False)
     boards._report()
     assert reports == [(True, True), (True, False), (True, True)]
+
+
+def test_boards_may_end_seldom(tmp_path, monkeypatch):
+    now, forked = [100.0], []
+    monkeypatch.setattr(processes.time, "monotonic", lambda: now[0])
+    boards = BoardProcesses(tmp_path, 2, 1, Settings(restart_window=5))
+    monkeypatch.setattr(boards, "_fork", forked.append)
+    boards._ended(0, 1)
+    now[0] += 5.1
+    boards._ended(1, 1)
+    assert forked == [0, 1]
+    now[0] += 5.0
+    with pytest.raises(BoardFailedError, match="exit code 1, 2 exits of boards within 5 s$"):
+        boards._ended(0, 1)
 
 
 def test_boards_of_a_killed_process_have_time_to_end(tmp_path, monkeypatch):
