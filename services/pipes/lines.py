@@ -1,6 +1,7 @@
 """Lines of standard input, bounded in length (`terminal.output.print_json_line` writes lines of standard output)."""
 
 import asyncio
+import contextlib
 import os
 import stat
 import sys
@@ -43,18 +44,19 @@ async def lines() -> AsyncIterator[tuple[int, bytes]]:
         return
     reader = asyncio.StreamReader(limit=LINE_LIMIT)
     loop = asyncio.get_running_loop()
-    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    transport, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
     number = 0
-    while True:
-        number += 1
-        try:
-            line = await reader.readline()
-        except ValueError as error:
-            raise _too_long(number) from error
-        if not line:
-            return
-        if line.strip():
-            yield number, line
+    with contextlib.closing(transport):
+        while True:
+            number += 1
+            try:
+                line = await reader.readline()
+            except ValueError as error:
+                raise _too_long(number) from error
+            if not line:
+                return
+            if line.strip():
+                yield number, line
 
 
 def _too_long(number: int) -> InputLineError:

@@ -11,6 +11,7 @@ from typer.main import get_command
 
 from rosbayes.__main__ import app
 from tests.command_runner import invoke
+from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -25,7 +26,7 @@ def run_apart(code, **environment):
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=False,
     )
     assert not done.stderr
@@ -44,6 +45,7 @@ def test_its_subcommands_are_the_other_commands():
     ("arguments", "not_imported"),
     [([], HEAVY), (["hub"], {"numba", "numpy"}), (["toolchain", "build"], {"numba", "numpy"})],
 )
+@pytest.mark.thorough
 def test_help_imports_only_the_named_subcommand(arguments, not_imported):
     code = f"""
 import contextlib, io, sys
@@ -68,6 +70,7 @@ def test_a_subcommand_has_the_flags_and_exit_codes_of_the_command():
     ("words", "found"),
     [("rosbayes lis", "listen"), ("rosbayes toolchain reg", "regenerate"), ("rosbayes hub --po", "--port")],
 )
+@pytest.mark.thorough
 def test_one_completion_serves_all_subcommands(words, found):
     shown = run_apart(
         "import sys; sys.argv = ['rosbayes']; from rosbayes.__main__ import app; app()",

@@ -9,6 +9,7 @@ import pytest
 
 from terminal.ending import outcome
 from terminal.errors import ExitCode, StoppedError
+from tests.patience import PROCESS_PATIENCE
 
 PROGRAM = """
 import os, signal, threading, time
@@ -38,13 +39,14 @@ def end_of(body, *arguments, stdout=subprocess.DEVNULL):
         stdout=stdout,
         stderr=subprocess.PIPE,
         text=True,
-        timeout=240,
+        timeout=PROCESS_PATIENCE,
         # Unbuffered, Python reports a full disk without a flush at the end.
         env={name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"},
     )
     return ended.returncode, ended.stderr.splitlines()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "place",
     [
@@ -107,11 +109,13 @@ def test_a_signal_that_arrives_while_a_class_is_made(monkeypatch, capsys):
     assert capsys.readouterr().err == "asked to end (SIGTERM)\n"
 
 
+@pytest.mark.thorough
 def test_a_dropped_signal_counts_at_the_end_of_a_command():
     body = "import ctypes\nctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()"
     assert end_of(body)[0] == ExitCode.INTERRUPTED
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "command",
     [
@@ -128,6 +132,7 @@ def test_a_full_disk_behind_standard_output_is_one_sentence(command):
     assert (code, len(lines)) == (ExitCode.USAGE, 1)
 
 
+@pytest.mark.thorough
 def test_too_few_open_files_are_one_sentence():
     limit = "import resource\nresource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))\n"
     code, lines = end_of(limit + "run_async(work())")
@@ -135,17 +140,20 @@ def test_too_few_open_files_are_one_sentence():
     assert not any("Traceback" in line for line in lines)
 
 
+@pytest.mark.thorough
 def test_a_file_that_the_system_refuses_is_one_sentence():
     code, lines = end_of("open('/nowhere/at/all')")
     assert (code, len(lines)) == (ExitCode.USAGE, 1)
     assert "/nowhere/at/all" in lines[0]
 
 
+@pytest.mark.process
 def test_a_reader_that_has_enough_is_not_an_error():
     code, lines = end_of("raise BrokenPipeError")
     assert (code, lines) == (ExitCode.DONE, [])
 
 
+@pytest.mark.process
 def test_only_a_bug_shows_a_traceback():
     code, lines = end_of("raise ZeroDivisionError")
     assert code == ExitCode.BUG

@@ -28,8 +28,7 @@ from terminal.health import (
     serve_health,
     status_socket,
 )
-
-PATIENCE = 60.0
+from tests.patience import PATIENCE
 
 
 class Server:
@@ -210,7 +209,8 @@ def test_the_health_check_is_never_green_by_mistake(arguments, directory, monkey
     assert ready.main(arguments) == 1
 
 
+@pytest.mark.thorough
 def test_the_health_check_imports_nothing_slow():
     slow = "{'msgspec','asyncio','typer','structlog','orjson','pydantic'}"
     code = f"import sys, services.ready; sys.exit(bool(set(sys.modules) & {slow}))"
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=240).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=PATIENCE).returncode == 0

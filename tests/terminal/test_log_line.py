@@ -11,6 +11,7 @@ import pytest
 
 from terminal.log_line import LogFormat, log_format
 from terminal.output import say, say_if_slow, show_progress
+from tests.patience import PROCESS_PATIENCE
 
 CODE = """
 import logging
@@ -40,11 +41,17 @@ def lines(form, code=CODE, **more):
     }
     environment |= {"BM_LOG_FORMAT": form} | more
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=240, check=True, env=environment
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=PROCESS_PATIENCE,
+        check=True,
+        env=environment,
     )
     return done.stderr.splitlines()
 
 
+@pytest.mark.thorough
 def test_text_is_as_ever():
     first, *rest = lines("")
     assert re.fullmatch(r"\d\d:\d\d:\d\d\.\d{3} master: warning: frame=17 board 2 is gone\\n cycles=3", first)
@@ -59,6 +66,7 @@ def test_text_is_as_ever():
     assert rest[-1] == r"websockets: odd \x1b"
 
 
+@pytest.mark.thorough
 def test_dated_lines_begin_with_date_time_and_offset():
     found = lines("dated")
     assert len(found) == 10
@@ -82,6 +90,7 @@ relay('{"time": "2026-01-01T00:00:00 and so on', "pcie-app")
 """
 
 
+@pytest.mark.thorough
 def test_a_traceback_of_a_library_imitates_no_line():
     dated = lines("dated", code=IMITATING)
     assert all(re.match(STAMP, line) for line in dated)
@@ -93,6 +102,7 @@ def test_a_traceback_of_a_library_imitates_no_line():
     assert "fine" in found[0]["traceback"]
 
 
+@pytest.mark.process
 def test_json_is_one_object_per_line():
     found = [json.loads(line) for line in lines("json")[:7]]
     assert [(each.get("level"), each["message"]) for each in found] == [
@@ -112,6 +122,7 @@ def test_json_is_one_object_per_line():
     assert all(line.isprintable() for line in lines("json"))
 
 
+@pytest.mark.thorough
 def test_the_error_of_a_child_remains_text_for_its_parent():
     assert "error: no robot" in lines("json", ROSBAYES_PARENT="1")
 

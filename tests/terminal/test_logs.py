@@ -12,6 +12,7 @@ import websockets
 
 from terminal.one_line import one_line, shown
 from terminal.output import print_json_line, say, say_lines
+from tests.patience import PROCESS_PATIENCE
 
 HOSTILE = "a\nerror: all is well\r\x1b[2J\x9b31m\x07\x08\x7f\u202eend\ud800"
 HARMLESS = "a\\nerror: all is well\\r\\x1b[2J\\x9b31m\\x07\\x08\\x7f\\u202eend\\ud800"
@@ -45,6 +46,7 @@ def test_a_message_is_one_line(capsys):
     assert capsys.readouterr().err == "one\n\\x1btwo\n"
 
 
+@pytest.mark.thorough
 def test_what_is_logged_is_a_line():
     code = f"""
 import logging
@@ -58,7 +60,7 @@ except ValueError:
     logging.getLogger("bridge").exception("failed")
 """
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=240, check=True
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=PROCESS_PATIENCE, check=True
     )
     ours, theirs, *trace = done.stderr.splitlines()
     assert f"warning: frame=7 {HARMLESS} reason=" in ours
@@ -78,9 +80,10 @@ log.warning("board 2 is gone", frame=17, why='closed "now"')
 
 
 @pytest.mark.parametrize(("level", "count"), [("debug", 4), ("info", 2), ("warning", 1)])
+@pytest.mark.thorough
 def test_a_frame_is_found_by_its_number_and_nothing_is_logged_below_the_level(level, count):
     command = [sys.executable, "-c", LINES.format(level=level)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=240)
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=PROCESS_PATIENCE)
     lines = [line.split(" ", 1)[1] for line in done.stderr.splitlines()]
     assert (
         lines
@@ -94,6 +97,7 @@ def test_a_frame_is_found_by_its_number_and_nothing_is_logged_below_the_level(le
 
 
 @pytest.mark.parametrize("variables", [("--variables", "K"), ()], ids=["without the variable", "all of it"])
+@pytest.mark.thorough
 async def test_a_server_writes_nothing_over_the_terminal(variables):
     said = HOSTILE.removesuffix("\ud800")
     status = {"op": "status", "level": "error", "msg": said, "id": said}

@@ -13,8 +13,8 @@ from services.errors import SettingsError
 from services.settings import load_settings
 from services.supervision.child import own_command
 from tests.command_runner import invoke
+from tests.patience import PATIENCE
 
-PATIENCE = 60
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - the hub must refuse it, or demand tokens
 TOKEN = "correct-horse-battery-staple"
 
@@ -41,6 +41,7 @@ def test_what_the_hub_refuses_is_one_sentence(arguments: tuple[str, ...], said: 
     assert ended.stdout == ""
 
 
+@pytest.mark.process
 async def test_a_hub_with_tokens_on_another_address(tmp_path: Path) -> None:
     """All of it as a user would: a file of tokens, ROS 2, and an address that is not loopback's."""
     tokens = tmp_path / "tokens"

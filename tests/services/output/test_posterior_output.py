@@ -204,7 +204,7 @@ class TestFiles:
         path = tmp_path / "out.csv"
         save(path, A, EMPTY)
         save(path, B)
-        first, last = csv.DictReader(path.open())
+        first, last = csv.DictReader(path.read_text().splitlines())
         assert first["frame"] == "7"
         assert (first["y"], first["x"], first["probability"]) == ("0.5", "-0.5", "0.5")
         assert (first["y=0 x=2"], first["y=1 x=2"]) == ("0.5", "0.375")
@@ -249,7 +249,7 @@ class TestFiles:
         with np.load(tmp_path / "out.npz") as there:
             assert there["frame"].tolist() == [-1]
             assert np.isnan(there["latency_us"]).all()
-        assert next(csv.DictReader((tmp_path / "out.csv").open()))["frame"] == ""
+        assert next(csv.DictReader((tmp_path / "out.csv").read_text().splitlines()))["frame"] == ""
 
     @pytest.mark.parametrize(
         "name", ["out.txt", "out", "out.jsonl.gz", "none/out.jsonl", "none/out.csv", "none/out.npz"]

@@ -12,8 +12,7 @@ from services.settings import Settings
 from services.sockets.status import why_not_connected
 from tests.bridge.hub.sockets import running_hub
 from tests.certificates import issue
-
-PATIENCE = 60
+from tests.patience import PATIENCE
 
 
 async def test_a_certificate_that_only_the_settings_know(tmp_path):
@@ -44,7 +43,9 @@ async def test_a_robot_of_the_deployment_is_looked_up(monkeypatch):
 async def test_a_server_that_is_waited_for_is_named(unused_tcp_port):
     uri, by_uri = f"ws://127.0.0.1:{unused_tcp_port}", {}
     async with contextlib.AsyncExitStack() as stack:
-        connecting = asyncio.create_task(connect_all(stack, Settings(connect_timeout=60), [uri], by_uri))
+        connecting = asyncio.create_task(
+            connect_all(stack, Settings(connect_timeout=PATIENCE), [uri], by_uri)
+        )
         async with asyncio.timeout(PATIENCE):
             while not (by_uri and by_uri[uri].last_error):
                 await asyncio.sleep(0.01)

@@ -14,6 +14,7 @@ from services.settings import Settings
 from services.sockets.records import Begin, LossReason, Notice, Reading, Ready, Rosbridge, Unusable
 from tests.fake_rosbridge import FakeRosbridge
 from tests.integration.conftest import READING
+from tests.patience import PATIENCE
 
 BUSY = 1 << 19
 """Bytes that wait for a master that is too slow."""
@@ -112,7 +113,7 @@ async def test_a_message_above_the_limit_of_its_topic_is_counted(boat, link):
         await fake.wait_for_op("subscribe", topic="/boat/sensors")
         await fake.publish("/boat/sensors", READING | {"image": "x" * (1 << 17)})
         await fake.publish("/boat/sensors", READING)
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(PATIENCE):
             while not any(isinstance(each, Reading) for each in link.sent):
                 await asyncio.sleep(0.01)
         assert subscriber.status().frames.lost == {LossReason.TOO_LARGE: 1}
@@ -155,10 +156,10 @@ async def test_only_a_single_reading_needs_a_server_that_stays(boat, link, tmp_p
         await fake.vanish()
         if once:
             with pytest.raises(RosbridgeLostError):
-                await asyncio.wait_for(running, 60)
+                await asyncio.wait_for(running, PATIENCE)
             return
         await fake.come_back()
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(PATIENCE):
             while Rosbridge(connected=True) not in link.sent:
                 link.take(Rosbridge(connected=True))  # the publisher has reached it
                 await asyncio.sleep(0.01)

@@ -1,5 +1,6 @@
 """Pipe mode: the lines that pcie-app and publisher read, and the limit of a line."""
 
+import asyncio
 import json
 import os
 import sys
@@ -106,3 +107,6 @@ async def test_a_line_has_a_limit_however_it_arrives(monkeypatch, tmp_path):
         assert [await anext(arriving), await anext(arriving)] == [(1, b"[1]\n"), (3, b"[2]\n")]
         with pytest.raises(InputLineError, match="line 4"):
             await anext(arriving)
+        await arriving.aclose()
+        await asyncio.sleep(0)  # in which the loop closes a pipe
+        source.close()

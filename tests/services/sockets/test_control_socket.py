@@ -20,8 +20,7 @@ from services.sockets.control_socket import (
     serve_control,
 )
 from terminal.errors import ExitCode
-
-PATIENCE = 120
+from tests.patience import PATIENCE
 
 
 @pytest.fixture
@@ -128,7 +127,10 @@ async def test_a_client_notices_that_the_master_ends(path):
     ids=["nonsense", "endless", "silent"],
 )
 async def test_a_strange_master_is_refused(path, answer, error):
+    writers = []
+
     async def serve(reader, writer):
+        writers.append(writer)
         await reader.readline()
         if answer is not None:
             writer.write(answer)
@@ -138,3 +140,5 @@ async def test_a_strange_master_is_refused(path, answer, error):
     with pytest.raises(error):
         await give_order(path, ReloadOrder(), timeout=0.3 if answer is None else PATIENCE)
     server.close()
+    for writer in writers:
+        writer.close()

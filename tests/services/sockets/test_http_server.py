@@ -37,8 +37,7 @@ from services.sockets.status import (
     ProcessStatus,
     StageLatency,
 )
-
-PATIENCE = 60.0
+from tests.patience import PATIENCE
 
 STATUS = ProcessStatus(
     ready=True,
@@ -58,6 +57,7 @@ STATUS = ProcessStatus(
     hub=HubStatus(3, 5, 7),
     integrity=IntegrityStatus(kind="canary", frames=100, walk=30, canaries=7, damaged=2, withheld=0),
 )
+
 STAGE = StageLatency(
     stage="frame", p50_ms=1.5, p99_ms=9, frames=3, sum_s=0.5, buckets=[1, *[0] * (len(BUCKETS_S) - 1), 2]
 )

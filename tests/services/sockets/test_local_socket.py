@@ -23,6 +23,7 @@ from services.sockets.local_socket import (
     own_hello,
 )
 from services.sockets.records import VERSION, Frame, FrameResult, Hello, Notice
+from tests.patience import PATIENCE
 
 
 def raw(value) -> msgspec.Raw:
@@ -113,7 +114,8 @@ def test_the_blocking_socket_sends_large_records_whole():
         with BlockingRecordSocket(ours, "them") as sender:
             assert sender.receive() == []
             assert sender.send(record)
-        assert reading.result(60) == [record]
+        assert reading.result(PATIENCE) == [record]
+    theirs.close()
 
 
 def test_the_blocking_socket_notices_a_peer_that_does_not_read_and_one_that_closes():

@@ -11,10 +11,9 @@ from services.sockets import serving
 from services.sockets.local_socket import RecordProtocol, open_connection, own_hello
 from services.sockets.records import Hello, Notice, Trouble
 from services.sockets.serving import MasterLink, outdated
+from tests.patience import PATIENCE
 from toolchain.building.regenerate import DeploymentEdits, regenerate_deployment
 from toolchain.deployment import load_deployment
-
-PATIENCE = 120
 
 
 @pytest.fixture

@@ -23,6 +23,7 @@ from services.sockets.status import (
     PeerStatus,
     ProcessStatus,
 )
+from tests.patience import PROCESS_PATIENCE
 
 
 @pytest.fixture(autouse=True)
@@ -215,6 +216,7 @@ async def test_processes_without_a_run_are_shown_with_it_and_alone(places):
             assert (stack.ready, stack.silent, stack.directory) == (True, [], str(run))
 
 
+@pytest.mark.process
 async def test_watching_prints_a_line_every_second_until_it_is_ended(places):
     run = make_run(places, "it")
     async with served(run, master=process()):
@@ -224,12 +226,12 @@ async def test_watching_prints_a_line_every_second_until_it_is_ended(places):
             stderr=asyncio.subprocess.PIPE,
         )
         found = 0
-        async with asyncio.timeout(120):
+        async with asyncio.timeout(PROCESS_PATIENCE):
             while found < 2:  # on a busy machine an answer may come too late for a line
                 line = await watching.stdout.readline()
                 found += msgspec.json.decode(line, type=status.StackStatus).ready
         watching.terminate()
-        assert await asyncio.wait_for(watching.wait(), 120) == 143
+        assert await asyncio.wait_for(watching.wait(), PROCESS_PATIENCE) == 143
         assert b"Traceback" not in await watching.stderr.read()
 
 
