@@ -67,7 +67,8 @@ def explore(
     model: Annotated[
         Path | None,
         typer.Argument(
-            help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net.", metavar="[MODEL]"
+            help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net, .xdsl (.gz).",
+            metavar="[MODEL]",
         ),
     ] = None,
     frames: Annotated[int, typer.Option(help="Maximum number of frames.")] = 50,

@@ -38,7 +38,8 @@ MaxCycles: TypeAlias = Annotated[
 ModelPath: TypeAlias = Annotated[
     Path,
     typer.Argument(
-        help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net.", metavar="MODEL"
+        help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net, .xdsl (.gz).",
+        metavar="MODEL",
     ),
 ]
 Partitions: TypeAlias = Annotated[int, typer.Option(help="Number of boards.", rich_help_panel=BOARDS)]

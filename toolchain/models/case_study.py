@@ -42,7 +42,7 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
             what = "is not a model"
         raise ModelError(
             f"{case} {what}; expected a folder with a {FILE_NAME} that defines model(), or a network file (.bif, "
-            ".xmlbif, .uai or .net)"
+            ".xmlbif, .uai, .net or .xdsl, with or without .gz)"
         )
     # standard output belongs to the command, which may print JSON
     with _importing_from(path.parent.resolve()), redirect_stdout(sys.stderr):

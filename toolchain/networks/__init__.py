@@ -1,7 +1,10 @@
-"""Readers of network files: BIF, XMLBIF, UAI and NET become joint distributions."""
+"""Readers of network files: BIF, XMLBIF, UAI, NET and XDSL become joint distributions, also compressed (.gz)."""
 
 from __future__ import annotations
 
+import gzip
+import io
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -15,19 +18,19 @@ if TYPE_CHECKING:
     from toolchain.networks.builder import NetworkBuilder
 
 MAX_BYTES: Final = 32 << 20
-"""Maximum size of a file in bytes."""
+"""Maximum size of a file in bytes, compressed or not."""
 
-SUFFIXES: Final = (".bif", ".xmlbif", ".bifxml", ".xml", ".uai", ".net")
-"""Suffixes of network files."""
+SUFFIXES: Final = (".bif", ".xmlbif", ".bifxml", ".xml", ".uai", ".net", ".xdsl")
+"""Suffixes of network files; `.gz` may follow."""
 
 
 def is_network(path: Path) -> bool:
     """Return whether a path has the suffix of a network file."""
-    return Path(path).suffix.lower() in SUFFIXES
+    return _suffix(Path(path)) in SUFFIXES
 
 
 def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error") -> JointDistribution:
-    """Return the joint distribution of a file whose name ends in one of `SUFFIXES`.
+    """Return the joint distribution of a file whose name ends in one of `SUFFIXES`, or one of them and `.gz`.
 
     Raises:
         NetworkFileError: The file is missing, too large, or not a network; the sentence contains file and
@@ -38,6 +41,8 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
     path = Path(path)
     reader = _reader(path)
     data = read_bounded(path, MAX_BYTES, NetworkFileError)
+    if path.suffix.lower() == ".gz":
+        data = _unpacked(path, data)
     builder = NetworkBuilder(path, on_missing=on_missing)
     reader(data, builder)
     try:
@@ -49,7 +54,7 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
 
 
 def _reader(path: Path) -> Callable[[bytes, NetworkBuilder], None]:
-    match path.suffix.lower():
+    match _suffix(path):
         case ".bif":
             from toolchain.networks.bif import read_bif as reader
         case ".xmlbif" | ".bifxml" | ".xml":
@@ -58,6 +63,29 @@ def _reader(path: Path) -> Callable[[bytes, NetworkBuilder], None]:
             from toolchain.networks.uai import read_uai as reader
         case ".net":
             from toolchain.networks.net import read_net as reader
+        case ".xdsl":
+            from toolchain.networks.xdsl import read_xdsl as reader
         case _:
-            raise NetworkFileError(f"expected a name that ends in {', '.join(SUFFIXES)}", path=path)
+            raise NetworkFileError(
+                f"expected a name that ends in {', '.join(SUFFIXES)}, with or without .gz", path=path
+            )
     return reader
+
+
+def _suffix(path: Path) -> str:
+    name = path.name.lower().removesuffix(".gz")
+    return Path(name).suffix
+
+
+def _unpacked(path: Path, data: bytes) -> bytes:
+    """Return the content of a compressed file, of bounded size."""
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+            content = file.read(MAX_BYTES + 1)
+    except (OSError, EOFError, zlib.error) as reason:
+        raise NetworkFileError(f"not a gzip file, or damaged: {reason}", path=path) from None
+    if len(content) > MAX_BYTES:
+        raise NetworkFileError(
+            f"it has more than {MAX_BYTES} bytes, unpacked; this is the maximum", path=path
+        )
+    return content

@@ -25,7 +25,7 @@ MAX_TOTAL: Final = 2 * MAX_ENTRIES
 """Maximum number of entries of all tables together."""
 MAX_NAME: Final = 200
 
-_ROUNDING: Final = 0.02
+ROUNDING: Final = 0.02
 """Maximum difference between the sum of a distribution and 1: published networks are rounded to two or three
 digits.
 """
@@ -54,6 +54,10 @@ class NetworkBuilder:
         """Set the name of the network; the file name replaces `unknown` and similar names."""
         if name.lower() not in {"unknown", "network", "unnamed", "default", ""}:
             self._name = "".join(each for each in name if each.isprintable())[:MAX_NAME]
+
+    def _file_name(self) -> str:
+        path = self.path.with_suffix("") if self.path.suffix.lower() == ".gz" else self.path
+        return path.stem
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -124,7 +128,7 @@ class NetworkBuilder:
         if not np.all(np.isfinite(values)) or np.any(values < 0):
             raise place.error(f"the table of {child} holds a number that is not a probability")
         sums = values.sum(axis=0)
-        wrong = np.argwhere(np.abs(sums - 1) > _ROUNDING)
+        wrong = np.argwhere(np.abs(sums - 1) > ROUNDING)
         if len(wrong):
             at = tuple(wrong[0])
             where = ", ".join(
@@ -155,4 +159,4 @@ class NetworkBuilder:
         for name in self._symbols:
             if name not in used:
                 raise ModelError(f"{name} has no table")
-        return JointDistribution(self._name or self.path.stem, tuple(self._factors))
+        return JointDistribution(self._name or self._file_name(), tuple(self._factors))

@@ -4,8 +4,9 @@ import math
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from toolchain.networks.builder import MAX_PARENTS, MAX_STATES, MAX_VARIABLES, NetworkBuilder
+from toolchain.networks.builder import MAX_PARENTS, MAX_STATES, MAX_VARIABLES, ROUNDING, NetworkBuilder
 from toolchain.networks.scanner import Scanner
 
 _MAX_FACTORS: Final = 4 * MAX_VARIABLES
@@ -41,8 +42,23 @@ def read_uai(data: bytes, builder: NetworkBuilder) -> None:
             raise text.error(f"{what} is to have {given} entries, but its variables make {math.prod(shape)}")
         values = text.next_numbers(given, what).reshape(shape)
         if kind == "BAYES" and scope:
+            _check_order(scope[-1], values, text)
             builder.distribution(scope[-1], scope[:-1], np.moveaxis(values, -1, 0), text)
         else:
             builder.potential(scope, values, text)
     if rest := text.next():
         raise text.error(f"expected the end of the file after the last factor, found {rest[:40]!r}")
+
+
+def _check_order(child: str, values: NDArray[np.float64], text: Scanner) -> None:
+    """Refuse a table that is a distribution only if the child, last in its scope, varies slowest."""
+    flat = values.ravel()
+    fastest, slowest = (
+        flat.reshape(-1, values.shape[-1]).sum(axis=1),
+        flat.reshape(values.shape[-1], -1).sum(axis=0),
+    )
+    if not np.allclose(fastest, 1, atol=ROUNDING) and np.allclose(slowest, 1, atol=ROUNDING):
+        raise text.error(
+            f"the table of {child} sums to 1 only if {child} varies slowest, as pgmpy writes UAI files; in the format it "
+            "varies fastest: save the network as BIF instead"
+        )

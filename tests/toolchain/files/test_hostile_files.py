@@ -21,6 +21,8 @@ from toolchain.outputs.mif import read_mif
 READERS = {
     "x.bif": (read_network, NetworkFileError),
     "x.uai": (read_network, NetworkFileError),
+    "x.xdsl": (read_network, NetworkFileError),
+    "x.bif.gz": (read_network, NetworkFileError),
     "x.mif": (read_mif, MifError),
     "x.npz": (read_fit, ModelError),
     "fit.toml": (read_fit, ModelError),

@@ -3,6 +3,7 @@
 Dog problem (Charniak 1991): family-out -> light-on, family-out and bowel-problem -> dog-out -> hear-bark.
 """
 
+import gzip
 import re
 from pathlib import Path
 
@@ -102,7 +103,25 @@ BAYES
 6  0.7 0.2 0.1 0.01 0.98 0.01
 """
 
-TEXTS = {"dog.bif": BIF, "dog.xmlbif": XMLBIF, "dog.net": NET, "dog.uai": UAI}
+XDSL = """\
+<?xml version="1.0" encoding="UTF-8"?>
+<smile version="1.0" id="Network1" numsamples="10000">
+  <nodes>
+    <cpt id="family_out"><state id="true"/><state id="false"/><probabilities>0.15 0.85</probabilities></cpt>
+    <cpt id="bowel_problem"><state id="true"/><state id="false"/>
+      <probabilities>0.01 0.99</probabilities></cpt>
+    <cpt id="dog_out"><state id="true" /><state id="false" /><parents>bowel_problem family_out</parents>
+      <probabilities>0.99 0.01 0.97 0.03 0.9 0.1 0.3 0.7</probabilities></cpt>
+    <cpt id="light_on"><state id="true"/><state id="false"/><parents>family_out</parents>
+      <probabilities>0.6 0.4 0.05 0.95</probabilities></cpt>
+    <cpt id="hear_bark"><state id="&lt;5"/><state id=">=5"/><state id="n/a"/><parents>dog_out</parents>
+      <probabilities>0.7 2e-1 .1 0.01 0.98 0.01</probabilities></cpt>
+  </nodes>
+  <extensions><genie version="1.0" app="GeNIe"><node id="dog_out"><name>Dog out</name></node></genie></extensions>
+</smile>
+"""
+
+TEXTS = {"dog.bif": BIF, "dog.xmlbif": XMLBIF, "dog.net": NET, "dog.uai": UAI, "dog.xdsl": XDSL}
 NAMES = ("family-out", "bowel-problem", "dog-out", "light-on", "hear-bark")
 
 
@@ -116,7 +135,7 @@ def names_in(file):
     """The variables' names as the format can write them."""
     if file.endswith(".uai"):
         return ("0", "1", "2", "3", "4")
-    return tuple(name.replace("-", "_") for name in NAMES) if file.endswith(".net") else NAMES
+    return tuple(name.replace("-", "_") for name in NAMES) if file.endswith((".net", ".xdsl")) else NAMES
 
 
 @pytest.mark.parametrize("file", TEXTS)
@@ -151,6 +170,9 @@ def test_the_same_network_in_every_format(tmp_path, file):
         ("dog.net", NET, "dog"),
         ("dog.net", "class Dogs {\ninheritance = ();\n" + NET.split("\n", 2)[2] + "}\n", "Dogs"),
         ("dog.bif", BIF.replace('"dog problem"', "unknown"), "dog"),
+        ("dog.bif.gz", gzip.compress(BIF.replace('"dog problem"', "unknown").encode()), "dog"),
+        ("dog.UAI.GZ", gzip.compress(UAI.encode()), "dog"),
+        ("dog.xdsl", XDSL, "Network1"),
         ("dog.bif", BIF.replace("/* no commas", "/* */ /* no commas"), "dog problem"),
         ("dog.bif", BIF.replace("0.15, 0.85", "0.15, 0.849"), "dog problem"),
     ],
@@ -174,6 +196,39 @@ def changed(file, old, new):
     return file, TEXTS[file].replace(old, new, 1)
 
 
+def test_deterministic_nodes_of_xdsl_whose_parents_follow(tmp_path):
+    text = """<smile id="either"><nodes>
+      <deterministic id="either"><state id="yes"/><state id="no"/><parents>a b</parents>
+        <resultingstates>yes no no no</resultingstates></deterministic>
+      <cpt id="a"><state id="yes"/><state id="no"/><probabilities>0.2 0.8</probabilities></cpt>
+      <cpt id="b"><state id="yes"/><state id="no"/><probabilities>0.5 0.5</probabilities></cpt>
+    </nodes></smile>"""
+    joint = read(tmp_path, "either.xdsl", text)
+    assert joint.factors[0].table.tolist() == [[[1, 0], [0, 0]], [[0, 1], [1, 1]]]
+    assert joint.ask(["either"]).model().prior_distribution == pytest.approx([0.1, 0.9])
+
+
+def test_a_uai_file_with_the_child_slowest_says_so(tmp_path):
+    text = UAI.replace("0.99 0.01 0.97 0.03\n0.9 0.1 0.3 0.7", "0.99 0.97 0.9 0.3 0.01 0.03 0.1 0.7")
+    with pytest.raises(NetworkFileError, match="pgmpy"):
+        read(tmp_path, "dog.uai", text)
+    with pytest.raises(NetworkFileError, match="sum to") as caught:
+        read(tmp_path, "dog.uai", UAI.replace("0.15 0.85", "0.15 0.75"))
+    assert "pgmpy" not in str(caught.value)
+
+
+def test_compressed_files_are_bounded(tmp_path):
+    assert is_network(tmp_path / "dog.bif.gz")
+    assert not is_network(tmp_path / "dog.gz")
+    packed = gzip.compress(BIF.encode())
+    assert read(tmp_path, "dog.bif.gz", packed).name == "dog problem"
+    for data in (packed[:-12], b"", b"no gzip", packed[:20] + b"\0" + packed[21:]):
+        with pytest.raises(NetworkFileError):
+            read(tmp_path, "dog.bif.gz", data)
+    with pytest.raises(NetworkFileError, match="unpacked"):
+        read(tmp_path, "dog.bif.gz", gzip.compress(b" " * (MAX_BYTES + 1)))
+
+
 PROBABILITIES = (
     *("0.15, x0.85", "0.15, 1_0", "0.15, 0.84, 0.01", "0.15, 0.8, 0.01, 0.03, 0.01"),
     *("0.15", "0.15, 0.35", "0.15, 0.82", "-0.15, 1.15", "nan, 0.85", "inf, 0.85"),
@@ -183,6 +238,20 @@ ENTITIES = (
     '<!ENTITY % p SYSTEM "http://127.0.0.1/x"> %p;',
 )
 MISTAKES = [
+    (*changed("dog.xdsl", '<cpt id="light_on">', '<noisymax id="light_on">'), 9),
+    (*changed("dog.xdsl", "0.6 0.4 0.05", "0.6 0.4"), 10),
+    (*changed("dog.xdsl", "0.6 0.4 0.05", "0.6 0.4 x"), 10),
+    (*changed("dog.xdsl", "0.6 0.4 0.05", "0.6 0.4 0.0_5"), 10),
+    (*changed("dog.xdsl", "0.6 0.4 0.05", "0.6 0.3 0.05"), 10),
+    (*changed("dog.xdsl", "<parents>family_out", "<parents>family"), 10),
+    (*changed("dog.xdsl", "</nodes>", ""), 14),
+    (*changed("dog.xdsl", "</smile>", ""), 16),
+    (*changed("dog.xdsl", '<cpt id="light_on">', '<cpt dynamic="plate" id="light_on">'), 9),
+    (*changed("dog.xdsl", "0.05 0.95</probabilities>", "0.05 0.95</probabilities><probabilities/>"), 10),
+    (*changed("dog.xdsl", "<parents>family_out", f"<parents>{'p ' * 31}family_out"), 9),
+    ("dog.xdsl", "<smile><cpt id='a'><state id='b'/><parents>c</parents></cpt></smile>", None),
+    (*changed("dog.xdsl", "<smile", "<BIF"), 2),
+    (*changed("dog.xdsl", "<smile", '<!DOCTYPE smile [<!ENTITY a "b">]><smile'), 2),
     *((*changed("dog.bif", "table 0.15, 0.85", f"table {new}"), 8) for new in PROBABILITIES),
     *((*changed("dog.xmlbif", "<!ELEMENT BIF ( NETWORK )*>", new), 3) for new in ENTITIES),
     (*changed("dog.bif", "variable dog-out", "varable dog-out"), 5),
