@@ -1,13 +1,16 @@
 """Variable elimination: names are summed out of a product of tables one by one.
 
-Exact, in float64. The next name is always the one whose table is the smallest; a table above the limit is refused.
+Exact, in float64. The order is planned before anything is computed, by two rules: the next name is the one with the
+smallest table, or the one whose elimination joins the fewest pairs of names (min-fill). The order with the smaller
+tables is taken; if both need a table above the limit, the question is refused.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from heapq import heapify, heappop, heappush
-from itertools import count
+from itertools import combinations
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +18,14 @@ from numpy.typing import NDArray
 from toolchain.errors import ModelError
 from toolchain.models.limits import MAX_ENTRIES
 
-_NAMED = 6
+_NAMED: Final = 6
+_CHEAP: Final = 2**16
+"""Entries of all tables of an order, below which no other order is planned."""
+_MOST_COUNTED: Final = 64
+"""Maximum number of neighbours whose pairs are counted."""
+
+_Graph: TypeAlias = dict[str, set[str]]
+"""The names that share a term with each name."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,42 +59,118 @@ def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, i
     """Return terms whose product is the product of the given terms, summed over some names.
 
     Tables are scaled by their maxima, so that long products don't underflow: the result is exact up to a
-    factor. An intermediate table above the limit raises a ModelError.
+    factor. If every order needs an intermediate table above the limit, a ModelError is raised.
     """
     left = dict(enumerate(terms))
-    fresh = count(len(left))
+    names = set(names)
     holding: dict[str, set[int]] = {name: set() for name in names}
     for number, term in left.items():
-        for name in holding.keys() & set(term.scope):
+        for name in names.intersection(term.scope):
             holding[name].add(number)
-    unions = {name: _union(left[number] for number in sorted(holding[name])) for name in holding}
-    costs = {name: math.prod(sizes[other] for other in unions[name]) for name in holding}
-    # The name breaks ties, so the same question gives the same sums, bit for bit. A changed cost is a new
-    # entry of the heap.
-    cheapest = [(cost, name) for name, cost in costs.items()]
-    heapify(cheapest)
-    while holding:
-        cost, name = heappop(cheapest)
-        if name not in holding or cost != costs[name]:
-            continue
-        touched = [left.pop(number) for number in sorted(holding.pop(name))]
-        scope = unions[name]
+    for number, name in enumerate(_order(left.values(), names, sizes), start=len(left)):
+        touched = [left.pop(each) for each in sorted(holding.pop(name))]
         if not touched:
             continue
-        _check_size(scope, sizes, f"summing over {name}")
+        scope = _union(touched)
         summed = product(touched, scope, sizes).sum(axis=scope.index(name))
         largest = summed.max()
         made = Term(
             tuple(other for other in scope if other != name), summed / largest if largest > 0 else summed
         )
-        number = next(fresh)
         left[number] = made
         for other in holding.keys() & set(made.scope):
             holding[other] = {each for each in holding[other] if each in left} | {number}
-            unions[other] = _union(left[each] for each in sorted(holding[other]))
-            costs[other] = math.prod(sizes[each] for each in unions[other])
-            heappush(cheapest, (costs[other], other))
     return list(left.values())
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """An order of elimination; `largest` is its largest table, which ends the plan if it is above the limit."""
+
+    order: tuple[str, ...]
+    entries: int
+    largest: int
+    scope: tuple[str, ...]
+
+    @property
+    def cost(self) -> tuple[int, int]:
+        return self.largest, self.entries
+
+
+def _order(terms: Iterable[Term], names: set[str], sizes: Mapping[str, int]) -> tuple[str, ...]:
+    """Return the cheaper order of two rules, or raise a ModelError."""
+    graph: _Graph = {name: set() for name in names}
+    for term in terms:
+        for name in term.scope:
+            graph.setdefault(name, set()).update(term.scope)
+    for name, neighbours in graph.items():
+        neighbours.discard(name)
+    plan = _planned(graph, names, sizes, lambda at, name: _entries(at, name, sizes))
+    if plan.entries > _CHEAP:
+        plan = min(plan, _planned(graph, names, sizes, _fill), key=lambda each: each.cost)
+    if plan.largest > MAX_ENTRIES:
+        _check_size(plan.scope, sizes, f"summing over {plan.scope[0]}")
+    return plan.order
+
+
+def _planned(
+    graph: _Graph, names: set[str], sizes: Mapping[str, int], cost: Callable[[_Graph, str], int]
+) -> _Plan:
+    """Return the order in which the name with the lowest cost is always the next one."""
+    graph = {name: set(neighbours) for name, neighbours in graph.items()}
+    costs = {name: cost(graph, name) for name in names}
+    # The name breaks ties, so the same question gives the same sums, bit for bit. A changed cost is a new
+    # entry of the heap.
+    cheapest = [(each, name) for name, each in costs.items()]
+    heapify(cheapest)
+    order: list[str] = []
+    entries = largest = 0
+    widest: tuple[str, ...] = ()
+    while costs:
+        each, name = heappop(cheapest)
+        if each != costs.get(name):
+            continue
+        del costs[name]
+        order.append(name)
+        own = _entries(graph, name, sizes)
+        entries += own
+        neighbours = graph.pop(name)
+        if own > largest:
+            largest, widest = own, (name, *sorted(neighbours))
+        if own > MAX_ENTRIES:
+            break
+        changed_names = set(neighbours)
+        for other in neighbours:
+            graph[other].discard(name)
+        for one, other in combinations(sorted(neighbours), 2):
+            if other not in graph[one]:
+                changed_names |= graph[one] & graph[other]
+                graph[one].add(other)
+                graph[other].add(one)
+        for other in costs.keys() & changed_names:
+            changed = cost(graph, other)
+            if changed != costs[other]:
+                costs[other] = changed
+                heappush(cheapest, (changed, other))
+    return _Plan(tuple(order), entries, largest, widest)
+
+
+def _entries(graph: _Graph, name: str, sizes: Mapping[str, int]) -> int:
+    """Return the size of the table over a name and its neighbours, or the limit + 1 if it is larger."""
+    entries = sizes[name]
+    for other in graph[name]:
+        entries *= sizes[other]
+        if entries > MAX_ENTRIES:  # a name may have thousands of neighbours
+            return MAX_ENTRIES + 1
+    return entries
+
+
+def _fill(graph: _Graph, name: str) -> int:
+    """Return the number of pairs of neighbours that are not neighbours of each other; at most, if there are many."""
+    neighbours = graph[name]
+    if len(neighbours) > _MOST_COUNTED:
+        return len(neighbours) ** 2
+    return sum(other not in graph[one] for one, other in combinations(neighbours, 2))
 
 
 def _union(terms: Iterable[Term]) -> tuple[str, ...]:
