@@ -54,6 +54,9 @@ def fit(
     prior: Annotated[
         FitPrior, typer.Option(help="counts: shape of the prior: the table of the model, or uniform.")
     ] = FitPrior.MODEL,
+    learn_prior: Annotated[
+        bool, typer.Option("--learn-prior", help="counts: also count how often each cell is the true one.")
+    ] = False,
     check: Annotated[
         list[Path] | None,
         typer.Option(
@@ -65,7 +68,7 @@ def fit(
         typer.Option(help="bags: maximum time between a reading and its truth.", metavar="SECONDS"),
     ] = 0.1,
 ) -> None:
-    """Learn the tables of a model from recordings with ground truth, and report the data behind each.
+    """Learn the tables of a model, and its prior, from recordings with ground truth, and report the data behind each.
 
     For example `toolchain fit casestudies/mrclam DATA/ds1_robot3.csv -o fit.toml --set landmarks=DATA/landmarks.csv
     --truth y=ref_y_m --truth x=ref_x_m --reading 'range_*=range_*_m' --reading 'bearing_*=bearing_*_rad'
@@ -82,6 +85,7 @@ def fit(
         floor=floor,
         pseudo_count=pseudo_count,
         prior=prior,
+        learn_prior=learn_prior,
         tolerance_s=tolerance,
     )
     typer.echo(run_fit(case, recordings, output, settings or [], options, check or []), nl=False)

@@ -7,7 +7,8 @@ sigma and bias. Every variable has its own share of outliers, initialised with o
 reading (the mode of a Beta(2, 2) prior).
 
 **Counts.** P(k | s) = (n(k, s) + a q(k | s)) / (n(s) + a): a Dirichlet prior with the weight of `a` readings
-in every cell and the shape q, the table of the model or a uniform one.
+in every cell and the shape q, the table of the model or a uniform one. Likewise P(s) = (n(s) + a M q(s)) / (n + a M)
+for M cells.
 """
 
 import math
@@ -110,14 +111,16 @@ def fit_model(
             tables[name], support = _counted(known[name], truth, values, options)
             supports.append(support)
             variables.append(FittedVariable(name=name, rows=support.readings))
+    prior = _counted_prior(model, truth, options) if options.learn_prior else None
     file = FitFile(
         method=options.method.value,
+        prior_rows=0 if prior is None else len(truth.rows),
         model=model.name,
         floor=options.floor if options.method is FitMethod.NORMALS else 0.0,
         recordings=tuple(recordings),
         variables=tuple(variables),
     )
-    return Fit(file=file, tables=tables), tuple(supports)
+    return Fit(file=file, tables=tables, prior=prior), tuple(supports)
 
 
 def _position(dimension: Dimension, value: object) -> float:
@@ -244,6 +247,21 @@ def _counted(
     worth = options.pseudo_count
     table: NDArray[np.float64] = (counts + worth * base) / (counts.sum(axis=0) + worth)
     return table, _support(known.name, np.array(used, dtype=np.int64), refused)
+
+
+def _counted_prior(model: Model, truth: Truth, options: FitOptions) -> NDArray[np.float64]:
+    """Return P(S), float64[lines], from the number of rows in each cell."""
+    if model.prior_select is not None:
+        raise ModelError(
+            f"--learn-prior: the prior of {model.name} is selected by {model.prior_select.name}; omit the flag"
+        )
+    counts = np.bincount(truth.lines, minlength=model.lines)
+    base = (
+        model.prior_distribution if options.prior is FitPrior.MODEL else np.full(model.lines, 1 / model.lines)
+    )
+    weight = options.pseudo_count * model.lines
+    prior: NDArray[np.float64] = (counts + weight * base) / (len(truth.lines) + weight)
+    return prior
 
 
 def _support(name: str, lines: NDArray[np.int64], refused: int) -> Support:

@@ -42,5 +42,7 @@ class FitOptions:
     """Weight of the Dirichlet prior of a cell, in readings."""
     prior: FitPrior = FitPrior.MODEL
     """Shape of that prior."""
+    learn_prior: bool = False
+    """True to count P(S) too."""
     tolerance_s: float = 0.1
     """Maximum time in seconds between a reading in a bag and its truth."""

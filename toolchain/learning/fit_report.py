@@ -3,17 +3,20 @@
 import hashlib
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from statistics import fmean, median
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from toolchain.analysis.accuracy.readings import reading_columns
 from toolchain.deployment.address import to_address
 from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.flag_values import key_values
-from toolchain.learning.fit import LEAST_READINGS, Support, fit_model, locate
+from toolchain.learning.fit import LEAST_READINGS, Support, Truth, fit_model, locate
 from toolchain.learning.fit_options import FitMethod, FitOptions
 from toolchain.learning.fitted import Fit, FittedRecording, apply_fit, write_fit
 from toolchain.learning.recording import Recording, read_recording
@@ -22,6 +25,10 @@ from toolchain.models.fusion import exact_posterior
 from toolchain.models.model import Model, cell_centres
 
 _CHUNK: Final = 1 << 20
+_MOST_BITS: Final = 60
+"""Surprise at a cell with a probability of 0."""
+_MOST_STATES: Final = 12
+"""Maximum number of states of a confusion matrix."""
 
 
 def run_fit(
@@ -83,6 +90,8 @@ def _check(options: FitOptions, output: Path) -> None:
     suffix = ".toml" if options.method is FitMethod.NORMALS else ".npz"
     if output.suffix != suffix:
         raise BuildError(f"-o {output}: the method {options.method} writes a file that ends in {suffix}")
+    if options.learn_prior and options.method is FitMethod.NORMALS:
+        raise BuildError("--learn-prior counts rows: add --method counts")
     if not (0 < options.pseudo_count < math.inf):
         raise BuildError(
             f"--pseudo-count is {options.pseudo_count:g}, expected a number above 0, because an empty cell needs a prior"
@@ -122,30 +131,90 @@ def _comparison(
     truth_columns: Mapping[str, str],
     reading_columns: Mapping[str, str],
 ) -> str:
-    """Return the distances between the mean of the exact posterior and the truth, before and after the fit."""
+    """Return how well the exact posterior finds the truth, before and after the fit."""
     truth = locate(model, _joined([recording], truth_columns), recording.rows)
     readings = _joined([recording], reading_columns)
     if not len(truth.rows):
         raise ModelError(f"{path}: no row has a true value inside the searched dimensions")
-    centres = cell_centres(*model.searched)
-    lines = [f"{path.name}, {len(truth.rows)} rows that nothing was learnt from, exact inference:"]
+    rows = [f"{path.name}, {len(truth.rows)} rows that nothing was learnt from, exact inference:"]
+    matrices: list[str] = []
     for name, each in (("by hand", model), ("fitted", fitted)):
-        distances, bits = [], []
-        for row, line, within in zip(
-            truth.rows.tolist(), truth.lines.tolist(), truth.within.T.tolist(), strict=True
-        ):
-            posterior = exact_posterior(each, _addresses(each, readings, row))
-            away = [
-                float(posterior @ centre) - (float(centre[line]) + inside * dimension.step)
-                for centre, inside, dimension in zip(centres, within, model.searched, strict=True)
-            ]
-            distances.append(math.hypot(*away))
-            bits.append(-math.log2(max(float(posterior[line]), 2.0**-60)))
-        lines.append(
-            f"  {name:8} distance of the mean: median {median(distances):.3f}, mean {fmean(distances):.3f}; "
-            f"surprise at the true cell {fmean(bits):.2f} bits"
+        found = _posteriors(each, truth, readings)
+        rows.append(f"  {name:8} " + "; ".join(_scores(each, truth, found)))
+        matrices += _confusions(name, each, truth, found)
+    return "\n".join([*rows, *matrices])
+
+
+def _posteriors(
+    model: Model, truth: Truth, readings: Mapping[str, Sequence[object]]
+) -> list[NDArray[np.float64] | None]:
+    """Return the exact posterior of each row with a truth; None if its readings are impossible in the model."""
+    found: list[NDArray[np.float64] | None] = []
+    for row in truth.rows.tolist():
+        try:
+            found.append(exact_posterior(model, _addresses(model, readings, row)))
+        except ModelError:
+            found.append(None)
+    return found
+
+
+def _scores(model: Model, truth: Truth, found: Sequence[NDArray[np.float64] | None]) -> Iterator[str]:
+    """Yield accuracy, distance and surprise; distances only between numbers, not between names of states."""
+    lines = truth.lines.tolist()
+    right = sum(
+        each is not None and int(each.argmax()) == line for each, line in zip(found, lines, strict=True)
+    )
+    yield f"accuracy {right / len(lines):.1%} (most probable cell, {right} of {len(lines)})"
+    numbers = [
+        (centre, dimension, axis)
+        for axis, (centre, dimension) in enumerate(
+            zip(cell_centres(*model.searched), model.searched, strict=True)
         )
-    return "\n".join(lines)
+        if not dimension.states
+    ]
+    there = [(at, each) for at, each in enumerate(found) if each is not None]
+    if numbers and there:
+        distances = [
+            math.hypot(
+                *(
+                    float(each @ centre)
+                    - (float(centre[lines[at]]) + float(truth.within[axis, at]) * dimension.step)
+                    for centre, dimension, axis in numbers
+                )
+            )
+            for at, each in there
+        ]
+        yield f"distance of the mean: median {median(distances):.3f}, mean {fmean(distances):.3f}"
+    bits = [
+        -math.log2(2.0**-_MOST_BITS if each is None else max(float(each[line]), 2.0**-_MOST_BITS))
+        for each, line in zip(found, lines, strict=True)
+    ]
+    yield f"surprise at the true cell {fmean(bits):.2f} bits"
+    if len(there) < len(found):
+        yield f"rows impossible in this model, which count as wrong: {len(found) - len(there)}"
+
+
+def _confusions(
+    name: str, model: Model, truth: Truth, found: Sequence[NDArray[np.float64] | None]
+) -> Iterator[str]:
+    """Yield the confusion matrix of each searched dimension with named states."""
+    sizes = tuple(dimension.size for dimension in model.searched)
+    true = np.unravel_index(truth.lines, sizes)
+    for axis, dimension in enumerate(model.searched):
+        if not dimension.states or dimension.size > _MOST_STATES:
+            continue
+        others = tuple(each for each in range(len(sizes)) if each != axis)
+        counts = np.zeros((dimension.size, dimension.size + 1), dtype=np.int64)
+        for at, each in enumerate(found):
+            best = dimension.size if each is None else int(each.reshape(sizes).sum(axis=others).argmax())
+            counts[int(true[axis][at]), best] += 1
+        headings = [*dimension.states, "none"]
+        shown = len(headings) if counts[:, -1].any() else len(headings) - 1
+        width = max(5, *map(len, headings))
+        yield f"  {name}, {dimension.label}: rows are true states, columns the most probable ones"
+        yield "  " + " ".join(f"{each:>{width}}" for each in ["", *headings[:shown]])
+        for state, row in zip(dimension.states, counts[:, :shown].tolist(), strict=True):
+            yield f"  {state:>{width}} " + " ".join(f"{count:{width}d}" for count in row)
 
 
 def _addresses(model: Model, readings: Mapping[str, Sequence[object]], row: int) -> list[int | None]:
@@ -163,7 +232,8 @@ def _empty_cells(options: FitOptions) -> str:
     if options.method is FitMethod.NORMALS:
         return "the formula of the mean with the numbers below"
     looks = "the model's own table" if options.prior == "model" else "a uniform table"
-    return f"the prior alone: {looks}, worth {options.pseudo_count:g} readings per cell"
+    unit = "reading" if options.pseudo_count == 1 else "readings"
+    return f"the prior alone: {looks}, worth {options.pseudo_count:g} {unit} per cell"
 
 
 def _table(fit: Fit, supports: Sequence[Support], lines: int) -> str:
@@ -184,6 +254,8 @@ def _table(fit: Fit, supports: Sequence[Support], lines: int) -> str:
         rows.append(row)
         if each.refused:
             notes.append(f"  {each.refused} readings of {each.name} are not values of it and were left out")
+    if fit.file.prior_rows:
+        notes.append(f"  The prior was counted too, from {fit.file.prior_rows} rows.")
     heading = "Data behind each table (readings; cells that have some, share that has none, median in those that have):"
     return "\n".join([heading, *rows, *notes])
 

@@ -29,6 +29,7 @@ _MAX_META_BYTES: Final = 4 << 20
 
 _HEADER: Final = "# Written by `toolchain fit`; read by toolchain.learning.fitted.with_fit. docs/how-to/models.md has the keys.\n"
 _META: Final = "fit.json"
+_PRIOR: Final = "prior.npy"
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 
 
@@ -57,6 +58,7 @@ class FitFile(Section):
     method: Literal["normals", "counts"]
     model: str
     floor: float = Field(default=0.0, ge=0, lt=1)
+    prior_rows: int = Field(default=0, ge=0, exclude_if=lambda rows: rows == 0)
     recordings: Sequence[FittedRecording] = Field(
         default=(), validation_alias="recording", serialization_alias="recording"
     )
@@ -73,6 +75,8 @@ class Fit:
     """Method, recordings and the numbers of variables."""
     tables: Mapping[str, NDArray[np.float64]]
     """With the method `counts`, P(K | S) of each variable, float64[values, lines]."""
+    prior: NDArray[np.float64] | None = None
+    """With the method `counts`, P(S), float64[lines], if it was learnt from the `prior_rows` of the file."""
 
 
 def with_fit(model: Model, path: Path | None) -> Model:
@@ -103,7 +107,16 @@ def apply_fit(model: Model, fit: Fit, where: str = "the fit") -> Model:
                     "fit again with this model"
                 )
             known[variable.name] = replace(before, table=table, floor=0.0, normal=None)
-    return replace(model, known=tuple(known.values()))
+    prior = model.prior
+    if fit.prior is not None:
+        if model.prior_select is not None or fit.prior.shape != (model.lines,):
+            raise ModelError(
+                f"{where} has a prior of {fit.prior.size} lines; {model.name} has {model.lines}"
+                + (f", and {model.prior_select.name} selects its prior" if model.prior_select else "")
+                + "; fit again with this model"
+            )
+        prior = fit.prior
+    return replace(model, known=tuple(known.values()), prior=prior)
 
 
 def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
@@ -173,7 +186,7 @@ def write_fit(path: Path, fit: Fit) -> None:
             content = fit.file.model_dump(mode="json", by_alias=True)
             partial.write_text(_HEADER + tomli_w.dumps(content), encoding="utf-8")
         else:
-            _write_tables(partial, fit.file.model_dump(mode="json", by_alias=True), fit.tables)
+            _write_tables(partial, fit.file.model_dump(mode="json", by_alias=True), fit)
 
 
 def read_fit(path: Path) -> Fit:
@@ -183,20 +196,28 @@ def read_fit(path: Path) -> Fit:
     file = TomlFile.read(path, ModelError).validated(FitFile)
     if file.method != "normals":
         raise ModelError(f"{path} has method = {file.method!r}, whose tables `toolchain fit` writes as .npz")
+    if file.prior_rows:
+        raise ModelError(f"{path} has prior_rows, but `toolchain fit` only learns a prior into .npz files")
     return Fit(file=file, tables={})
 
 
-def _write_tables(path: Path, content: dict[str, Any], tables: Mapping[str, NDArray[np.float64]]) -> None:
+def _write_tables(path: Path, content: dict[str, Any], fit: Fit) -> None:
     """Write an NPZ file without the time of day, which np.savez would include."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         entry = zipfile.ZipInfo(_META, _EPOCH)
         archive.writestr(entry, json.dumps(content, indent=1, sort_keys=True), zipfile.ZIP_DEFLATED)
-        for number, variable in enumerate(content["variable"]):
-            entry = zipfile.ZipInfo(f"table{number}.npy", _EPOCH)
+        arrays = {
+            f"table{number}.npy": fit.tables[variable["name"]]
+            for number, variable in enumerate(content["variable"])
+        }
+        if fit.prior is not None:
+            arrays[_PRIOR] = fit.prior[np.newaxis]
+        for name, array in arrays.items():
+            entry = zipfile.ZipInfo(name, _EPOCH)
             entry.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(entry, "w", force_zip64=True) as file:
-                table = np.ascontiguousarray(tables[variable["name"]], dtype="<f8")
-                np.lib.format.write_array(file, table, version=(1, 0), allow_pickle=False)
+                numbers = np.ascontiguousarray(array, dtype="<f8")
+                np.lib.format.write_array(file, numbers, version=(1, 0), allow_pickle=False)
 
 
 def _read_tables(path: Path) -> Fit:
@@ -204,14 +225,15 @@ def _read_tables(path: Path) -> Fit:
         with open_regular(path, ModelError, MAX_BYTES) as packed, zipfile.ZipFile(packed) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
                 raise ModelError(f"{path} is larger than {MAX_BYTES} bytes, unpacked; this is the maximum")
-            content = json.loads(_member(archive, _META, _MAX_META_BYTES))
             # files of earlier versions have the names of the fields, in the plural
+            content = json.loads(_member(archive, _META, _MAX_META_BYTES))
             file = FitFile.model_validate(content, by_alias=True, by_name=True)
             counted = file.variables if file.method == "counts" else ()
             tables = {
                 variable.name: _array(archive, f"table{number}.npy")
                 for number, variable in enumerate(counted)
             }
+            prior = _prior(archive) if file.prior_rows else None
     except OSError as reason:
         raise ModelError(f"{path} cannot be read: {reason.strerror or reason}") from None
     except (
@@ -230,7 +252,7 @@ def _read_tables(path: Path) -> Fit:
         ) from None
     if file.method != "counts":
         raise ModelError(f"{path} contains {file.method}, which `toolchain fit` writes as .toml")
-    return Fit(file=file, tables=tables)
+    return Fit(file=file, tables=tables, prior=prior)
 
 
 def _member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
@@ -239,6 +261,14 @@ def _member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
     if len(data) > most:
         raise ValueError(name)
     return data
+
+
+def _prior(archive: zipfile.ZipFile) -> NDArray[np.float64]:
+    rows = _array(archive, _PRIOR)
+    if len(rows) != 1:
+        raise ValueError(_PRIOR)
+    prior: NDArray[np.float64] = rows[0]
+    return prior
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> NDArray[np.float64]:

@@ -13,11 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.toolchain.running import done, toolchain
+from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.errors import ModelError
 from toolchain.learning.fit import LEAST_READINGS, fit_model, locate, mixture
 from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
-from toolchain.learning.fitted import apply_fit, cell_spread, mean_slopes, read_fit, with_fit, write_fit
+from toolchain.learning.fitted import Fit, apply_fit, cell_spread, mean_slopes, read_fit, with_fit, write_fit
 from toolchain.models.case_study import load_model
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, cell_centres, dimension, interval
@@ -195,6 +195,29 @@ def test_counted_tables_and_their_file_survive_a_round_trip(tmp_path):
         write_fit(tmp_path / "a.toml", fit)
 
 
+def test_a_learnt_prior_is_dirichlets(tmp_path):
+    truth, readings = {"x": ["a", "b", "b", "b"]}, {"door": [1, 0, 0, None]}
+    options = {
+        "method": FitMethod.COUNTS,
+        "learn_prior": True,
+        "pseudo_count": 0.5,
+        "prior": FitPrior.UNIFORM,
+    }
+    fit, _ = learn(door(), truth, readings, **options)
+    cells = door().lines
+    expected = (np.array([1, 3, *[0] * (cells - 2)]) + 0.5) / (4 + 0.5 * cells)
+    assert fit.prior == pytest.approx(expected)
+    write_fit(tmp_path / "fit.npz", fit)
+    model = with_fit(door(), tmp_path / "fit.npz")
+    assert model.prior_distribution == pytest.approx(expected)
+    assert read_fit(tmp_path / "fit.npz").file.prior_rows == 4
+    unlearnt, _ = learn(door(), truth, readings, **options | {"learn_prior": False})
+    assert apply_fit(door(), unlearnt).prior_distribution == pytest.approx(door().prior_distribution)
+    other = Model(name="other", searched=(dimension("x", size=cells + 1),), known=())
+    with pytest.raises(ModelError, match="prior"):
+        apply_fit(other, Fit(file=fit.file.replace(variables=()), tables={}, prior=fit.prior))
+
+
 def archive(path, members):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
         for name, data in members.items():
@@ -235,6 +258,13 @@ def test_a_file_of_an_earlier_version_is_read(tmp_path):
             for kind, shape in (("<f8", (10**6, 10**6)), ("|O", (1, 1)), ("<f8", (2, 1)))
         ),
         {"fit.json": META.replace('"k"', "7")},
+        *(
+            {
+                "fit.json": json.dumps(json.loads(META) | {"prior_rows": 1, "variables": []}),
+                "prior.npy": array_bytes(HEADER.format("<f8", (rows, 1)), b"x" * 8 * rows),
+            }
+            for rows in (0, 2)
+        ),
         {"fit.json": META.replace("counts", "normals")},
     ],
 )
@@ -250,6 +280,7 @@ def test_a_damaged_or_hostile_file_of_tables_is_refused(tmp_path, members):
     ("old", "new"),
     [
         ("sigma = ", "sgima = "),
+        ("format = 1", "format = 1\nprior_rows = 3"),
         ('method = "normals"', 'method = "counts"'),
         ("format = 1", "format = 2"),
         ('name = "range"', 'name = "rnge"'),
@@ -321,6 +352,64 @@ def test_the_command_fits_normals_and_a_model_loads_them(corridor):
     fitted = load_model(corridor / "corridor", {"fit": str(out)})
     assert fitted.known[0].normal.sigma.max() < 0.25
     assert f"--set fit={out}." in result.stdout
+
+
+LABELS = """
+import numpy as np
+from toolchain.models.model import Known, Model, dimension
+
+def model():
+    return Model(name="gas", searched=(dimension("gas", size=3, states=("air", "smoke", "methane")),), known=(
+        Known(name="sensor", table=np.array([[0.8, 0.3, 0.3], [0.1, 0.6, 0.1], [0.1, 0.1, 0.6]])),))
+"""
+
+
+def test_labels_have_a_confusion_matrix_and_no_distances(tmp_path):
+    (tmp_path / "gas").mkdir()
+    (tmp_path / "gas" / "model.py").write_text(LABELS)
+    rows = [("air", 0)] * 4 + [("smoke", 1)] * 3 + [("smoke", 0)] + [("methane", 2)] * 2
+    text = "gas,sensor\n" + "".join(f"{state},{reading}\n" for state, reading in rows)
+    (tmp_path / "learn.csv").write_text(text)
+    (tmp_path / "check.csv").write_text(text)
+    out = ("-o", tmp_path / "fit.npz", "--method", "counts", "--learn-prior")
+    result = done(
+        toolchain(
+            *("fit", tmp_path / "gas", tmp_path / "learn.csv", "--truth", "gas=gas", *out),
+            *("--check", tmp_path / "check.csv"),
+        )
+    )
+    assert "distance" not in result.stdout
+    assert "accuracy 90.0% (most probable cell, 9 of 10)" in result.stdout
+    matrix = result.stdout.split("fitted, gas: ", 1)[1].splitlines()[1:5]
+    assert [line.split() for line in matrix] == [
+        ["air", "smoke", "methane"],
+        ["air", "4", "0", "0"],
+        ["smoke", "1", "3", "0"],
+        ["methane", "0", "0", "2"],
+    ]
+    assert read_fit(tmp_path / "fit.npz").prior == pytest.approx(np.array([5, 5, 3]) / 13)
+
+
+def test_rows_that_a_model_regards_as_impossible_count_as_wrong(tmp_path):
+    (tmp_path / "gas").mkdir()
+    model = LABELS.replace("[0.1, 0.1, 0.6]", "[0.1, 0.1, 0.6], [0, 0, 0]")
+    (tmp_path / "gas" / "model.py").write_text(model)
+    (tmp_path / "learn.csv").write_text("gas,sensor\nair,0\nsmoke,1\n")
+    (tmp_path / "check.csv").write_text("gas,sensor\nair,0\nair,3\n")
+    out = ("-o", tmp_path / "fit.npz", "--method", "counts", "--check", tmp_path / "check.csv")
+    result = done(toolchain("fit", tmp_path / "gas", tmp_path / "learn.csv", "--truth", "gas=gas", *out))
+    assert "accuracy 50.0% (most probable cell, 1 of 2)" in result.stdout
+    assert result.stdout.count("rows impossible in this model, which count as wrong: 1") == 2
+    matrix = result.stdout.split("fitted, gas: ", 1)[1].splitlines()[1:3]
+    assert [line.split() for line in matrix] == [
+        ["air", "smoke", "methane", "none"],
+        ["air", "1", "0", "0", "1"],
+    ]
+
+
+def test_only_counts_learn_a_prior(corridor):
+    ended = fit(corridor, "--learn-prior", "-o", corridor / "fit.toml")
+    assert_refused(ended, "--learn-prior", "--method counts")
 
 
 def test_the_command_counts(corridor):
