@@ -1,4 +1,4 @@
-"""The command `loader`, which programs a board through its programming port (thesis 3.4, SofLoader)."""
+"""The command `loader`, which programs boards through their programming ports (thesis 3.4, SofLoader)."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,32 +7,59 @@ import typer
 
 from pcie_shim.host.loader import program
 from services.commands import flags as options
+from services.errors import SettingsError
 from services.settings import load_settings
-from services.sockets.serving import board_endpoint
+from services.sockets.serving import board_endpoint, board_endpoints, deployment_for
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.output import say, say_if_slow
 
 app = CommandLine(
-    help="Program a board with an image written by `toolchain build`.\n\n"
+    help="Program boards with images written by `toolchain build`.\n\n"
+    "One board, or all boards of a deployment:\n\n"
     "`loader build/boat/boards/board0.bm unix:/tmp/b/board0.sock`\n\n"
-    "It fails while pcie-app holds the board."
+    "`loader -d build/boat --boards unix:/tmp/b/`\n\n"
+    "It fails while pcie-app holds a board."
 )
 
 
 @app.command(help=app.info.help)
 def loader(
-    image: Annotated[Path, typer.Argument(help="Programming file (boards/*.bm of a deployment).")],
-    endpoint: Annotated[str, typer.Argument(help="The board's endpoint.", metavar="ENDPOINT")],
+    image: Annotated[
+        Path | None, typer.Argument(help="Programming file (boards/*.bm of a deployment).")
+    ] = None,
+    endpoint: Annotated[str | None, typer.Argument(help="The board's endpoint.", metavar="ENDPOINT")] = None,
+    deployment: options.Deployment = None,
+    boards: options.Boards = None,
     peer_timeout: options.PeerTimeout = None,
     key_file: options.KeyFile = None,
     board_ca: options.BoardCa = None,
 ) -> int:
-    """Program a board with an image written by `toolchain build`."""
+    """Program one board, or all boards of a deployment."""
     end_with_parent()
-    settings = load_settings(peer_timeout=peer_timeout, key_file=key_file, board_ca=board_ca)
-    board = board_endpoint(endpoint, "ENDPOINT", settings)
-    with say_if_slow(f"waiting for the board at {board}"):
-        image_hash = program(board, image, timeout=settings.peer_timeout)
-    say(f"{endpoint} holds image {image_hash[:16]} now")
+    settings = load_settings(
+        deployment=deployment,
+        boards=boards,
+        peer_timeout=peer_timeout,
+        key_file=key_file,
+        board_ca=board_ca,
+    )
+    if image is None:
+        loaded = deployment_for(settings, images=True)
+        images = [loaded.image_path(index) for index in range(len(loaded.boards))]
+        endpoints = board_endpoints(settings, loaded)
+        if twice := next((each for at, each in enumerate(endpoints) if each in endpoints[:at]), None):
+            raise SettingsError(f"{twice} is named twice, and a board holds one image: name each board once")
+    elif deployment is not None or boards is not None:
+        raise SettingsError("-d and --boards program all boards of a deployment: omit them, or the image")
+    elif endpoint is None:
+        raise SettingsError(
+            f"the endpoint of the board for {image} is missing, such as unix:/tmp/b/board0.sock"
+        )
+    else:
+        images, endpoints = [image], [board_endpoint(endpoint, "ENDPOINT", settings)]
+    for path, board in zip(images, endpoints, strict=True):
+        with say_if_slow(f"waiting for the board at {board}"):
+            image_hash = program(board, path, timeout=settings.peer_timeout)
+        say(f"{board} holds image {image_hash[:16]} now")
     return 0
