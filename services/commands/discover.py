@@ -1,21 +1,27 @@
 """The command `discover`."""
 
 import json
-from typing import Annotated
+import re
+import sys
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bridge.discovery import Robot, UnknownRobotError
+from bridge.discovery import ROBOT, Robot, UnknownRobotError
+from services.errors import SettingsError
 from terminal.command_line import CommandLine
 from terminal.one_line import one_line
-from terminal.signals import run_async
+from terminal.signals import check_signals, run_async
+
+_LONGEST_ANSWER: Final = 80
 
 app = CommandLine(
     help="List the rosbridge servers that announce themselves on this network.\n\n`discover`\n\n"
-    "Use a listed name instead of an address with `--uri robot:NAME`."
+    "Use a listed name instead of an address with `--uri robot:NAME`, or choose one from the list:\n\n"
+    '`master --once -d build/boat --uri "$(discover --pick)"`'
 )
 
 
@@ -28,43 +34,67 @@ def discover(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object per line instead of a table.")
     ] = False,
+    pick: Annotated[
+        bool, typer.Option("--pick", help="Ask for the number of a server, and print its robot:NAME.")
+    ] = False,
 ) -> int:
     """List the rosbridge servers that announce themselves on this network."""
+    if pick and as_json:
+        raise SettingsError("--pick and --json cannot be combined: omit one of them")
 
-    async def look() -> int:
+    robots: list[Robot] = []
+
+    async def look() -> None:
         from bridge.discovery import discover
 
-        robots = await discover(timeout)
-        if as_json:
-            for robot in robots:
-                print(
-                    json.dumps(
-                        {
-                            "name": robot.name,
-                            "uri": robot.uri,
-                            "ros_version": robot.ros_version,
-                            "token": robot.token,
-                        }
-                    )
+        robots.extend(await discover(timeout))
+
+    run_async(look())
+    if not robots:
+        raise UnknownRobotError(
+            f"no rosbridge server announced itself on this network within {timeout:g} s; the hub does with --announce NAME"
+        )
+    if pick:
+        Console(stderr=True).print(_table(robots, numbered=True))
+        print(f"{ROBOT}{_picked(robots).name}")
+    elif as_json:
+        for robot in robots:
+            print(
+                json.dumps(
+                    {
+                        "name": robot.name,
+                        "uri": robot.uri,
+                        "ros_version": robot.ros_version,
+                        "token": robot.token,
+                    }
                 )
-        elif robots:
-            Console().print(_table(robots))
-        if not robots:
-            raise UnknownRobotError(
-                f"no rosbridge server announced itself on this network within {timeout:g} s; the hub does with --announce NAME"
             )
-        return 0
+    else:
+        Console().print(_table(robots))
+    return 0
 
-    return run_async(look())
+
+def _picked(robots: list[Robot]) -> Robot:
+    """Return the robot whose number a person enters, or raise a SettingsError."""
+    check_signals()
+    print(f"number of the server (1 to {len(robots)}): ", end="", file=sys.stderr, flush=True)
+    answer = sys.stdin.readline(_LONGEST_ANSWER).strip()
+    if not re.fullmatch(r"[0-9]+", answer, re.ASCII) or not 1 <= int(answer) <= len(robots):
+        raise SettingsError(f"{answer!r} is not a number from 1 to {len(robots)}; run discover again")
+    return robots[int(answer) - 1]
 
 
-def _table(robots: list[Robot]) -> Table:
+def _table(robots: list[Robot], *, numbered: bool = False) -> Table:
     table = Table()
-    for column in ("name", "URI", "ROS", "token"):
+    for column in (*(("",) if numbered else ()), "name", "URI", "ROS", "token"):
         table.add_column(column, overflow="fold")
-    for robot in robots:
+    for number, robot in enumerate(robots, start=1):
         token = "wanted" if robot.token else ""
         table.add_row(
-            escape(one_line(robot.name)), escape(one_line(robot.uri)), str(robot.ros_version or "?"), token
+            *([str(number)] if numbered else []),
+            escape(one_line(robot.name)),
+            escape(one_line(robot.uri)),
+            str(robot.ros_version or "?"),
+            token,
         )
     return table

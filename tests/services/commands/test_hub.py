@@ -1,7 +1,9 @@
 """The commands hub and discover: what they refuse, what they print, and a robot's name in place of an address."""
 
 import asyncio
+import io
 import json
+import signal
 from pathlib import Path
 
 import pytest
@@ -90,6 +92,38 @@ def test_discover_lists_robots(discovered: list[Robot]) -> None:
         assert shown in listed.stdout
     lines = [json.loads(line) for line in invoke(discover.app, ["--json"]).stdout.splitlines()]
     assert lines[1] == {"name": "Zoë", "uri": "wss://zoe.local:9090", "ros_version": None, "token": True}
+
+
+def test_one_of_the_robots_is_picked_by_its_number(
+    discovered: list[Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    discovered.extend([Robot("Adam", "ws://192.0.2.7:9090"), Robot("Zoë", "ws://192.0.2.8:9090")])
+    monkeypatch.setattr("sys.stdin", io.StringIO("2\n"))
+    picked = invoke(discover.app, ["--pick"])
+    assert (picked.exit_code, picked.stdout) == (0, "robot:Zoë\n")
+    assert "192.0.2.8" in picked.stderr
+    for answer in ("3", "0", "two", "", "٢"):
+        monkeypatch.setattr("sys.stdin", io.StringIO(answer))
+        refused = invoke(discover.app, ["--pick"])
+        assert (refused.exit_code, refused.stdout) == (2, "")
+        assert f"{answer!r} is not a number from 1 to 2" in refused.stderr
+    both = invoke(discover.app, ["--pick", "--json"])
+    assert (both.exit_code, both.stdout) == (2, "")
+    assert "--pick and --json" in both.stderr
+
+
+def test_ctrl_c_ends_the_question_for_a_number(
+    discovered: list[Robot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Interrupted(io.StringIO):
+        def readline(self, _size: int | None = -1, /) -> str:
+            signal.raise_signal(signal.SIGINT)
+            return "1\n"
+
+    discovered.append(Robot("Adam", "ws://192.0.2.7:9090"))
+    monkeypatch.setattr("sys.stdin", Interrupted())
+    ended = invoke(discover.app, ["--pick"])
+    assert (ended.exit_code, ended.stdout) == (130, "")
 
 
 @pytest.mark.usefixtures("discovered")
