@@ -1,7 +1,6 @@
 """Lines of standard input, bounded in length (`terminal.output.print_json_line` writes lines of standard output)."""
 
 import asyncio
-import contextlib
 import os
 import stat
 import sys
@@ -44,19 +43,18 @@ async def lines() -> AsyncIterator[tuple[int, bytes]]:
         return
     reader = asyncio.StreamReader(limit=LINE_LIMIT)
     loop = asyncio.get_running_loop()
-    transport, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
     number = 0
-    with contextlib.closing(transport):
-        while True:
-            number += 1
-            try:
-                line = await reader.readline()
-            except ValueError as error:
-                raise _too_long(number) from error
-            if not line:
-                return
-            if line.strip():
-                yield number, line
+    while True:
+        number += 1
+        try:
+            line = await reader.readline()
+        except ValueError as error:
+            raise _too_long(number) from error
+        if not line:
+            return
+        if line.strip():
+            yield number, line
 
 
 def _too_long(number: int) -> InputLineError:

@@ -97,16 +97,26 @@ def test_flags_without_a_meaning_are_refused_at_once(built, command, flags):
 
 async def test_a_line_has_a_limit_however_it_arrives(monkeypatch, tmp_path):
     monkeypatch.setattr(lines, "LINE_LIMIT", 10)
+    loop = asyncio.get_running_loop()
+    connect, transports = loop.connect_read_pipe, []
+
+    async def connected(*arguments):
+        transport, protocol = await connect(*arguments)
+        transports.append(transport)
+        return transport, protocol
+
+    monkeypatch.setattr(loop, "connect_read_pipe", connected)
     (tmp_path / "lines").write_bytes(b"[1]\n\n[2]\n" + b" " * 20)
     read, write = os.pipe()
     os.write(write, (tmp_path / "lines").read_bytes())
     os.close(write)
     for source in (os.fdopen(read), (tmp_path / "lines").open()):
-        monkeypatch.setattr(sys, "stdin", source)
-        arriving = lines.lines()
-        assert [await anext(arriving), await anext(arriving)] == [(1, b"[1]\n"), (3, b"[2]\n")]
-        with pytest.raises(InputLineError, match="line 4"):
-            await anext(arriving)
-        await arriving.aclose()
-        await asyncio.sleep(0)  # in which the loop closes a pipe
-        source.close()
+        with source:
+            monkeypatch.setattr(sys, "stdin", source)
+            arriving = lines.lines()
+            assert [await anext(arriving), await anext(arriving)] == [(1, b"[1]\n"), (3, b"[2]\n")]
+            with pytest.raises(InputLineError, match="line 4"):
+                await anext(arriving)
+            while transports:
+                transports.pop().close()
+                await asyncio.sleep(0)
