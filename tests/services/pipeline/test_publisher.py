@@ -18,6 +18,7 @@ from services.pipeline.result_topics import ResultTopics
 from services.settings import Settings
 from services.sockets.records import Begin, FrameResult, Notice, Outcome, Publish, Published, Ready, Rosbridge
 from tests.fake_rosbridge import FakeRosbridge
+from tests.patience import FACTOR, PATIENCE
 from toolchain.deployment import Output
 
 REASON = 1
@@ -45,7 +46,7 @@ async def gone(topics, fake):
     await fake.vanish()
     ros = topics.rosbridges[fake.uri]
     if ros.state is State.CONNECTED:
-        await ros.wait_for_state(State.RECONNECTING, 30)
+        await ros.wait_for_state(State.RECONNECTING, PATIENCE)
 
 
 class FakeTopics:
@@ -73,24 +74,30 @@ class FakeTopics:
         return self.publish_now(publish)
 
 
+async def settled():
+    """Let every task go on until it waits for something that does not come."""
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
 async def test_results_stay_in_order_while_the_queue_drains(boat, link):
     publisher = Publisher(Settings(), boat, link.make)
     topics = publisher._topics = FakeTopics()
     running = asyncio.create_task(publisher.run())
-    await asyncio.sleep(0.01)
+    await settled()
     for number in (1, 2, 3):
         link.take(result(boat, number))
     topics.must_wait = False
     topics.allowed.release()  # the first is published, and the second waits
     while topics.published != [1]:
         await asyncio.sleep(0.001)
-    await asyncio.sleep(0.01)
+    await settled()
     link.take(result(boat, 4))
     for _ in range(3):
         topics.allowed.release()
     while len(topics.published) < 4:
         await asyncio.sleep(0.001)
-    await asyncio.sleep(0.01)
+    await settled()
     link.take(result(boat, 5))  # at once: nothing waits any more
     assert topics.published == [1, 2, 3, 4, 5]
     assert publisher.status().frames.completed == 5
@@ -111,7 +118,7 @@ async def test_the_master_learns_that_no_server_is_there_and_that_one_is_back(bo
         await fake.come_back()
         assert [each.connected for each in link.sent if isinstance(each, Rosbridge)] == [False]
         link.take(Rosbridge(connected=True))  # the subscriber has reached it
-        await ros.wait_for_state(State.CONNECTED, 30)
+        await ros.wait_for_state(State.CONNECTED, PATIENCE)
         assert [each.connected for each in link.sent if isinstance(each, Rosbridge)] == [False, True]
         assert [each.level for each in link.sent if isinstance(each, Notice)] == ["warning", "info"]
         running.cancel()
@@ -140,7 +147,7 @@ async def test_results_go_on_where_a_server_is(boat):
         await first.wait_for_op("publish", topic="/BMresults", count=3)
         assert len(first.ops("publish", topic="/bm/frame")) == 3
         await second.come_back()
-        await topics.rosbridges[second.uri].wait_for_state(State.CONNECTED, 30)
+        await topics.rosbridges[second.uri].wait_for_state(State.CONNECTED, PATIENCE)
         await gone(topics, first)
         other = await topics.publish(result(boat, 4), look=False)
         assert (other.outcome, other.missed) == (Outcome.PUBLISHED, 1)
@@ -154,7 +161,7 @@ async def test_results_go_on_where_a_server_is(boat):
 
 async def test_a_result_for_a_connection_that_is_about_to_end_is_not_published(boat):
     async with FakeRosbridge() as fake, topics_of(boat, fake, fake) as topics:
-        await topics.rosbridges[fake.uri].wait_for_state(State.CONNECTED, 30)
+        await topics.rosbridges[fake.uri].wait_for_state(State.CONNECTED, PATIENCE)
         assert topics.publish_now(result(boat, 1)).outcome is Outcome.PUBLISHED
         topics.rosbridges[fake.uri]._session._websocket.abort()
         assert topics.must_wait
@@ -187,7 +194,7 @@ async def test_the_largest_posterior_goes_out(boat):
 
 
 async def running_publisher(boat, link, uri):
-    publisher = Publisher(Settings(uri=uri, seen_timeout=0.2), boat, link.make)
+    publisher = Publisher(Settings(uri=uri, seen_timeout=0.2 * FACTOR), boat, link.make)
     running = asyncio.create_task(publisher.run())
     while not running.done() and not any(isinstance(each, Ready) for each in link.sent):
         await asyncio.sleep(0.01)

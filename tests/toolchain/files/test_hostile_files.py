@@ -33,7 +33,6 @@ READERS = {
 }
 
 
-@pytest.mark.timeout(20)
 @pytest.mark.parametrize("name", READERS)
 @pytest.mark.parametrize("kind", ["fifo", "endless", "folder", "absent"])
 def test_nothing_but_a_regular_file_is_read(tmp_path, name, kind):

