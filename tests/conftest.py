@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import gc
 import os
+import resource
 import signal
 import sys
 import threading
@@ -119,13 +120,18 @@ def _held() -> set[str]:
     return held
 
 
+def _ended_children() -> int:
+    """A number that grows with each child that has ended."""
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_minflt
+
+
 @pytest.fixture(autouse=True)
 def nothing_is_left(request: pytest.FixtureRequest):
     """Fail a test that leaves a process, a thread, a socket or a task.
 
     Fixtures of a wider scope are made before this one, so what they hold is not held against a test.
     """
-    before = _held()
+    before, ended = _held(), _ended_children()
     _pending.clear()
     yield
     left = _held() - before
@@ -137,4 +143,6 @@ def nothing_is_left(request: pytest.FixtureRequest):
         time.sleep(0.01)
     left |= _pending
     assert not left, f"{request.node.name} leaves {', '.join(sorted(left))}"
+    if not _may_start_processes(request.node) and _ended_children() != ended:
+        _started.append("one that only the kernel has seen, as uvloop starts them")
     assert not _started, f"{request.node.name} is not marked process or thorough, and starts {_started}"

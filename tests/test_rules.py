@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[1]
 TESTS = """
 import asyncio, socket, subprocess, threading
 import pytest
+import uvloop
 
 held = []
 
@@ -32,6 +33,13 @@ def test_hides_that_it_starts_a_process():
         subprocess.run(["true"])
     except Exception:
         pass
+
+def test_starts_a_process_by_uvloop():
+    async def start():
+        await (await asyncio.create_subprocess_exec("true")).wait()
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        runner.run(start())
 
 @pytest.mark.process
 def test_may_start_a_process():
@@ -58,6 +66,7 @@ async def test_cancels_its_task():
 def test_uses_a_wide_fixture(wide):
     pass
 
+@pytest.mark.thorough
 def test_ends_all():
     for each in held:
         if isinstance(each, subprocess.Popen):
@@ -98,6 +107,7 @@ def test_who_breaks_a_rule_fails_and_is_told_which(tmp_path):
     assert set(told) == {
         "starts_a_process",
         "hides_that_it_starts_a_process",
+        "starts_a_process_by_uvloop",
         "leaves_a_process",
         "leaves_a_thread",
         "leaves_a_socket",
