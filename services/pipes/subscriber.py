@@ -55,15 +55,18 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
         say(f"listening on {source.topic} at {source.uri}")
         hint = asyncio.ensure_future(report_unpublished(ros, source.topic, _warn))
         printed = 0
-        while count is None or printed < count:
-            message = await subscription.next(timeout=settings.first_data_timeout)
+        try:
+            while count is None or printed < count:
+                message = await subscription.next(timeout=settings.first_data_timeout)
+                hint.cancel()
+                found = [(field, *field.value(message.msg)) for field in fields]
+                if missing := [field for field, present, _ in found if not present]:
+                    raise all_missing(missing, message.msg)
+                values = {field.name: value for field, _, value in found}
+                print_json_line(values or message.msg)
+                printed += 1
+        finally:
             hint.cancel()
-            found = [(field, *field.value(message.msg)) for field in fields]
-            if missing := [field for field, present, _ in found if not present]:
-                raise all_missing(missing, message.msg)
-            values = {field.name: value for field, _, value in found}
-            print_json_line(values or message.msg)
-            printed += 1
     return 0
 
 
