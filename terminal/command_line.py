@@ -4,7 +4,6 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from importlib import import_module
 from typing import Any, Final, NoReturn, cast
 
@@ -57,8 +56,12 @@ class CommandLine(typer.Typer):
         """Run the command with `sys.argv`, or with these arguments, and exit."""
         open_standard_streams()
         escape_last_resort()
-        raise_on_signals()
-        sys.exit(outcome(partial(get_command(self).main, arguments, standalone_mode=False)))
+
+        def run() -> object:
+            raise_on_signals()
+            return get_command(self).main(arguments, standalone_mode=False)
+
+        sys.exit(outcome(run))
 
 
 class _Command(TyperCommand):

@@ -13,7 +13,7 @@ from terminal.errors import ExitCode, ReaderGoneError, StoppedError, exit_code_o
 from terminal.help.usage import usage_sentence
 from terminal.log_line import PARENT_VARIABLE
 from terminal.output import discard_output, say, say_lines
-from terminal.signals import check_signals, ignore_signals
+from terminal.signals import check_signals, ignore_signals, received_stop
 
 _NO_SPACE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 _TOO_MANY_FILES: Final = frozenset({errno.EMFILE, errno.ENFILE})
@@ -52,7 +52,7 @@ def report(error: BaseException) -> int:
     if isinstance(error, ReaderGoneError | BrokenPipeError):
         discard_output()
         return ExitCode.DONE
-    error = _signal_behind(error) or error
+    error = _signal_behind(error) or received_stop() or error  # a library may have replaced that of a signal
     if isinstance(error, KeyboardInterrupt):
         error = StoppedError(ExitCode.INTERRUPTED, "interrupted (Ctrl-C)")
     if isinstance(error, StoppedError):

@@ -7,6 +7,7 @@ import contextlib
 import signal
 import sys
 from collections.abc import Coroutine
+from types import TracebackType
 from typing import Any
 
 import uvloop
@@ -32,9 +33,11 @@ def raise_on_signals() -> None:
 
     A second signal is ignored, because the duration of the clean-up is bounded. Python drops an exception
     that is raised while the thread runs a callback from C code, forks, or runs a finaliser, so code calls
-    `check_signals` before it blocks.
+    `check_signals` before it blocks. C code may also print it, and raise another one in its place, as numba does
+    while it is imported.
     """
     sys.unraisablehook = _report_dropped
+    sys.excepthook = _report_printed
     for number in _ENDS:
         signal.signal(number, _stop)
 
@@ -51,10 +54,21 @@ def _report_dropped(dropped: sys.UnraisableHookArgs) -> None:
         sys.__unraisablehook__(dropped)
 
 
+def _report_printed(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
+    """Print an exception at which a program ends, except those of signals, which `terminal.ending` reports."""
+    if not isinstance(error, StoppedError):
+        sys.__excepthook__(kind, error, traceback)
+
+
+def received_stop() -> StoppedError | None:
+    """Return the error for the first signal that interrupted blocking code, or None."""
+    return stopped_error(_received[0]) if _received else None
+
+
 def check_signals() -> None:
     """Raise a StoppedError for a signal whose exception was dropped; call this before blocking."""
-    if _received:
-        raise stopped_error(_received[0])
+    if stop := received_stop():
+        raise stop
 
 
 def ignore_signals() -> None:

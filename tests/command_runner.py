@@ -24,14 +24,14 @@ def invoke(app, arguments):
     """Run a command line and return how it ended, with the process's signals as they were."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True) for _ in range(2))
-    code, hook = 0, sys.unraisablehook
+    code, hooks = 0, (sys.unraisablehook, sys.excepthook)
     try:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             app([str(each) for each in arguments])
     except SystemExit as ended:
         code = ended.code
     finally:
-        sys.unraisablehook = hook
+        sys.unraisablehook, sys.excepthook = hooks
         signals._received.clear()
         for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -1,14 +1,18 @@
 """How a command ends: signals, full disks, too few files."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from services.errors import SettingsError
+from terminal.command_line import CommandLine
 from terminal.ending import outcome
 from terminal.errors import ExitCode, StoppedError
+from tests.command_runner import invoke
 from tests.patience import PROCESS_PATIENCE
 
 PROGRAM = """
@@ -107,6 +111,26 @@ def test_a_signal_that_arrives_while_a_class_is_made(monkeypatch, capsys):
     monkeypatch.setattr("terminal.ending.ignore_signals", lambda: None)
     assert outcome(command) == ExitCode.TERMINATED
     assert capsys.readouterr().err == "asked to end (SIGTERM)\n"
+
+
+@pytest.mark.parametrize(
+    "replaced",
+    [ImportError("numba._devicearray failed to import"), SettingsError("this needs numba")],
+)
+def test_a_signal_is_the_reason_of_what_fails_after_it(replaced):
+    """The C code of numba prints the exception of a signal that interrupts its import, and raises another one."""
+    app = CommandLine(help="a command")
+
+    @app.command()
+    def command():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except StoppedError:
+            sys.excepthook(*sys.exc_info())
+        raise replaced
+
+    ended = invoke(app, [])
+    assert (ended.exit_code, ended.output) == (ExitCode.TERMINATED, "asked to end (SIGTERM)\n")
 
 
 @pytest.mark.thorough
