@@ -31,7 +31,7 @@ from scripts.running.flags import ScriptParser, output_file
 from scripts.running.processes import ROOT, Process, run_script
 
 FRAMES = 100_000
-SHORT_CALM = 30
+SHORT_CALM = 150
 """Number of results between two steps of `--short`."""
 STEPS = 10
 """Number of steps in a round."""
