@@ -23,11 +23,9 @@ needs_setpriv = pytest.mark.skipif(
 )
 
 
-def run(*command, **variables):
-    environment = {name: value for name, value in os.environ.items() if name != "CI"} | variables
+def run(*command):
     return subprocess.run(
         [*POWERLESS, *command],
-        env=environment,
         capture_output=True,
         check=False,
         text=True,
@@ -44,14 +42,10 @@ def test_says_why_it_is_not_able():
 
 
 @needs_setpriv
-@pytest.mark.parametrize(
-    ("ci", "code", "last"), [("", 0, "0 passed, 0 failed"), ("true", 1, "0 passed, 1 failed")]
-)
-def test_not_verified_is_loud_and_fails_in_ci(ci, code, last):
-    done = run(ROOT / ".venv" / "bin" / "python", "-P", "-m", "scripts.verifications.containers", CI=ci)
-    assert done.returncode == code
-    assert "CONTAINERS WERE NOT VERIFIED" in done.stdout
-    assert done.stdout.splitlines()[-1] == last
+def test_not_verified_is_loud():
+    done = run(ROOT / ".venv" / "bin" / "python", "-P", "-m", "scripts.verifications.containers")
+    assert done.returncode == 4
+    assert done.stdout.splitlines()[-1].startswith("CONTAINERS WERE NOT VERIFIED")
 
 
 @pytest.mark.parametrize("arguments", [(), ("run",), ("fly",)])

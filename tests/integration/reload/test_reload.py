@@ -278,6 +278,7 @@ async def test_services_that_the_master_did_not_start_are_used_and_left_running(
     for role in ("subscriber", "publisher"):
         stage.start(role, "-d", str(boat), "--uri", uri, "--listen", f"unix:{sockets}/{role}.sock")
     robot = Witness(uri, boat, other_boat)
+    stage.robots.append(robot)
     await robot.connect()
     await robot.keep_publishing(**READING)
     environment = {"BM_RUN_DIRECTORY": str(sockets)}
