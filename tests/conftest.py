@@ -44,14 +44,14 @@ def _end_with_children(number: int, _frame: object) -> None:
 signal.signal(signal.SIGTERM, _end_with_children)
 
 
-# Kinds: a test that starts a process is marked `process` (run one at a time) or `thorough` (only by scripts/test --all).
+# Kinds: a test that starts a process is marked `process` (run one at a time) or `thorough` (only with --all).
 
 _STARTS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system"}
 _PID = os.getpid()
 _unmarked: str | None = None
-"""The test that runs now, if it may not start a process."""
+"""The running test, if it may not start a process."""
 _started: list[str] = []
-"""What it has started all the same."""
+"""Processes that it tried to start."""
 
 
 def _refuse_processes(event: str, arguments: tuple) -> None:
@@ -136,8 +136,8 @@ def nothing_is_left(request: pytest.FixtureRequest):
     yield
     left = _held() - before
     if left:
-        gc.collect()  # what nobody refers to is closed by the collector, and warns there
-    # a thread that has been asked to end, and a socket that its peer has closed, may take a moment
+        gc.collect()  # the collector closes unreachable sockets, and their warnings fail the test
+    # a stopping thread, or a socket that its peer has closed, may take a moment
     deadline = time.monotonic() + PATIENCE / 5
     while (left := _held() - before) and time.monotonic() < deadline:
         time.sleep(0.01)

@@ -3,9 +3,8 @@
 No test judges how long something takes. A limit only names the test that hangs, so all are generous.
 """
 
-import os
+from scripts.running.patience import FACTOR
 
-FACTOR = float(os.environ.get("TEST_PATIENCE") or 1)
 PATIENCE = 50.0 * FACTOR
 """Seconds that a test waits for an event; less than its own limit, so that the wait says what it waited for."""
 PROCESS_PATIENCE = 200.0 * FACTOR

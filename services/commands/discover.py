@@ -52,7 +52,8 @@ def discover(
     run_async(look())
     if not robots:
         raise UnknownRobotError(
-            f"no rosbridge server announced itself on this network within {timeout:g} s; the hub does with --announce NAME"
+            f"no rosbridge server announced itself on this network within {timeout:g} s; "
+            "the hub does with --announce NAME"
         )
     if pick:
         Console(stderr=True).print(_table(robots, numbered=True))

@@ -236,7 +236,8 @@ async def show(directory: Path | None, others: Sequence[Path], *, watch: bool, j
         if live is not None:
             live.stop()
     raise SettingsError(
-        f"no rosbayes process answers in {directory}{_silence(stack.silent)}; is the stack running, with this BM_RUN_DIRECTORY?"
+        f"no rosbayes process answers in {directory}{_silence(stack.silent)}; "
+        "is the stack running, with this BM_RUN_DIRECTORY?"
     )
 
 

@@ -251,7 +251,7 @@ def _inputs(parameters: BM1Parameters, given: object, lines: slice) -> tuple[int
 
 
 def tcp_endpoint() -> str:
-    """An endpoint whose port is free, and so is the next one, for programming; until `free_places`, nobody else is given them."""
+    """Return an endpoint whose port and next port (for programming) stay reserved until `free_places`."""
     while True:
         first, second = socket.socket(), socket.socket()
         _PLACES.extend((first, second))

@@ -12,7 +12,7 @@ from tests.patience import PATIENCE
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a busy machine answers late is an answer all the same."""
+    """Accept an answer of rosapi however late a busy machine gives it."""
     for module in (type_checks, session, actionlib_goals):
         monkeypatch.setattr(module, "_ROSAPI_TIMEOUT", PATIENCE / 2)
 

@@ -33,7 +33,7 @@ async def test_a_child_that_does_not_answer_is_noticed(tmp_path, monkeypatch):
     watch = ChildrenWatch(peers, tmp_path)
 
     async def is_alive():
-        """Whether the child counts as alive when it has been asked after a long time."""
+        """Return whether the child counts as alive after a long silence."""
         now[0] += STUCK_S
         begun = peers.rounds
         async with asyncio.timeout(PATIENCE):

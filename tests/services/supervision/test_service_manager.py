@@ -88,7 +88,7 @@ async def test_a_process_reports_and_one_that_is_stuck_gives_no_sign_of_life(man
     alive, why = [True], ["fine"]
 
     async def told():
-        """What it tells until, and with, the state that it has now."""
+        """Return the messages up to and including that of its current state."""
         found = []
         async with asyncio.timeout(PATIENCE):
             while f"STATUS={why[0]}" not in found:
