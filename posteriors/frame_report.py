@@ -56,7 +56,6 @@ class FrameReport:
     number: int | None = None
     cycles: int | None = None
     counts_total: int | None = None
-    generation: int | None = None
     received_ns: int | None = None
     """Receipt of the reading by the subscriber."""
     sent_ns: int | None = None
@@ -73,7 +72,6 @@ _FRAME_KEYS: Final = {
     "published": "%s",
     "cycles": "%d",
     "counts_total": "%d",
-    "generation": "%d",
     "received_ns": "%d",
     "sent_ns": "%d",
     **{f"{stage}_us": "%.1f" for stage in _STAGES},
@@ -92,7 +90,7 @@ def _template(level: str, name: str, keys: Mapping[str, str]) -> str:
 _FRAME: Final = _template("%d", "frame", _FRAME_KEYS)
 _BOARD: Final = _template("0", "board %d", _BOARD_KEYS)
 _BOARD_OF_REPLICAS: Final = _template("0", "board %d", _BOARD_KEYS | _REPLICA_KEYS)
-_numbers: Final = attrgetter("cycles", "counts_total", "generation", "received_ns", "sent_ns")
+_numbers: Final = attrgetter("cycles", "counts_total", "received_ns", "sent_ns")
 _times: Final = attrgetter(*_STAGES)
 
 

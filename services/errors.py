@@ -64,24 +64,6 @@ class OverflowedQueueError(StackError):
     exit_code = ExitCode.CHILD
 
 
-class NotPreparedError(StackError):
-    """A service was asked to switch to a deployment that it has not prepared."""
-
-
-class ShapeError(StackError):
-    """A deployment cannot replace the one in force: its boards or topics differ."""
-
-
-class NotReloadedError(StackError):
-    """A reload could not be finished now; the run keeps the deployment that it had."""
-
-    exit_code = ExitCode.CHILD
-
-
-class ControlError(StackError):
-    """A control socket received a malformed order or answer, or does not exist."""
-
-
 class OutdatedError(StackError):
     """The folder of a service has changed since its start, and the master requires the new deployment."""
 

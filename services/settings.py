@@ -82,9 +82,6 @@ class Settings(BaseSettings):
         default=False, description="subscriber, publisher and pcie-app inside the master's process"
     )
     run_directory: Path | None = Field(default=None, description="folder of the processes' status sockets")
-    control_directory: Path | None = Field(
-        default=None, description="folder of the master's control socket; the run directory without it"
-    )
     ready_timeout: Seconds = Field(
         default=10, description="seconds without a frame after which a process is not ready"
     )
@@ -97,9 +94,7 @@ class Settings(BaseSettings):
     )
     log_format: LogFormat = Field(default=LogFormat.TEXT, description="lines on standard error")
 
-    @field_validator(
-        "deployment", "ca", "key_file", "board_ca", "run_directory", "control_directory", mode="before"
-    )
+    @field_validator("deployment", "ca", "key_file", "board_ca", "run_directory", mode="before")
     @classmethod
     def _no_directory(cls, value: object) -> object:
         return value or None  # an empty variable means no folder, not the current one

@@ -1,4 +1,4 @@
-"""The private directory of a run: the sockets of its processes, and copies of its deployments.
+"""The private directory of a run: the sockets of its processes.
 
 A process without a master and without BM_RUN_DIRECTORY, such as a hub, has one of its own.
 """
@@ -18,15 +18,11 @@ from terminal.errors import OutputError
 from terminal.health import SUFFIX
 from terminal.output import say
 
-CONTROL_SUFFIX = ".control.sock"
 HTTP_SUFFIX = ".http.sock"
 
 DIRECTORY_PREFIX = "rosbayes-"
-COPY_PREFIX = "deployment-"
-"""Prefix of the folders with copies of deployments (`services.master.new_deployment`)."""
 
 _DIRECTORY_NAME = re.compile(DIRECTORY_PREFIX + "[a-z0-9_]{8}")
-_COPY_NAME = re.compile(COPY_PREFIX + "[0-9]+")
 _MOST_ORPHANS = 100
 
 
@@ -99,7 +95,7 @@ def remove_orphans() -> None:
     """Remove private directories orphaned by killed masters.
 
     An orphan has the right name, belongs only to this user, is not locked by a master, and contains only
-    sockets and copies of deployments. Links are not followed.
+    sockets. Links are not followed.
     """
     with contextlib.suppress(OSError):
         found = [each for each in _parent().iterdir() if _DIRECTORY_NAME.fullmatch(each.name)]
@@ -117,38 +113,18 @@ def _remove_if_orphaned(directory: Path) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with os.scandir(handle) as entries:
             modes = {each.name: each.stat(follow_symlinks=False).st_mode for each in entries}
-        copies = {name for name, mode in modes.items() if stat.S_ISDIR(mode) and _COPY_NAME.fullmatch(name)}
-        sockets = {name for name, mode in modes.items() if stat.S_ISSOCK(mode)}
-        if copies | sockets != set(modes):
+        if not all(stat.S_ISSOCK(mode) for mode in modes.values()):
             return
-        for name in sockets:
+        for name in modes:
             os.unlink(name, dir_fd=handle)
-        for name in copies:
-            shutil.rmtree(name, dir_fd=handle)
         directory.rmdir()
     finally:
         os.close(handle)
 
 
-def has_master(directory: Path) -> bool:
-    """Return whether the master of a private directory is alive, or the directory is gone."""
-    try:
-        handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    except OSError:
-        return True
-    try:
-        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    else:
-        return False
-    finally:
-        os.close(handle)
-
-
 def remove_stale_sockets(directory: Path) -> None:
-    """Remove the status, HTTP and control sockets of killed processes."""
-    for path in [each for end in (SUFFIX, HTTP_SUFFIX, CONTROL_SUFFIX) for each in directory.glob(f"*{end}")]:
+    """Remove the status and HTTP sockets of killed processes."""
+    for path in [each for end in (SUFFIX, HTTP_SUFFIX) for each in directory.glob(f"*{end}")]:
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
             probe.settimeout(0.2)
             try:

@@ -145,7 +145,7 @@ class Campaign:
     async def run(self) -> int:
         """Run rounds until enough frames are judged or the time is over, and return the exit code."""
         options = self._options
-        folders = await deployments(self._folder, ("1",) if options.short else ("1", "2"))
+        folders = await deployments(self._folder, ("1",))
         expected = await asyncio.to_thread(expected_of, folders)
         kinds = [Kind(each) for each in options.only] if options.only else list(Kind)
         begun = time.monotonic()

@@ -17,7 +17,6 @@ class Kind(StrEnum):
     """A kind of fault, as named with `--only`."""
 
     SIGNALS = "signals"
-    RELOAD = "reload"
     ROSBRIDGE = "rosbridge"
     LINKS = "links"
     BOARDS = "boards"
@@ -131,7 +130,6 @@ class Schedule:
             (Kind.SIGNALS, self._kill),
             (Kind.SIGNALS, self._stop),
             (Kind.SIGNALS, self._pair),
-            (Kind.RELOAD, self._reload),
             (Kind.ROSBRIDGE, self._rosbridge),
             (Kind.ROSBRIDGE, self._rosbridge),
             (Kind.INPUT, self._input),
@@ -145,9 +143,8 @@ class Schedule:
                 (Kind.INTEGRITY, self._flip),
             ]
         if topology is Topology.CONTAINERS:
-            # processes of containers cannot be limited from outside, and the engine mounts one deployment only
-            without = {Kind.RELOAD, Kind.RESOURCES}
-            self._makers = [(kind, maker) for kind, maker in self._makers if kind not in without]
+            # processes of containers cannot be limited from outside
+            self._makers = [(kind, maker) for kind, maker in self._makers if kind is not Kind.RESOURCES]
             self._makers += 2 * [(Kind.CONTAINERS, self._contain)]
         self._makers = [(kind, maker) for kind, maker in self._makers if kind in kinds]
         if Kind.CLOCK in kinds and topology is not Topology.CONTAINERS:
@@ -184,13 +181,6 @@ class Schedule:
             Fault(Kind.SIGNALS, second()[0].what, other, self._seconds(2)),
         )
 
-    def _reload(self) -> Step:
-        order = Fault(Kind.RELOAD, "reload", "master")
-        others = [self._kill, self._stop, self._rosbridge]
-        if self._topology.apart:
-            others.append(self._link)
-        return (order,) if self._rng.random() < 0.4 else (order, *self._rng.choice(others)())
-
     def _rosbridge(self) -> Step:
         what = self._rng.choice(["gone", "hold", "slow", "delay", "nonsense", "cut-inside", "finish"])
         longest = 4.0 if self._rng.random() < 0.9 else 20.0
@@ -221,10 +211,9 @@ class Schedule:
         return (Fault(Kind.INPUT, what, "readings", 0.0, 10_000 if what == "burst" else 50),)
 
     def _resource(self) -> Step:
-        what = self._rng.choice(["files", "memory", "disk"])
         roles = [role for role in self._roles if role not in {*BOARD_NAMES, BOARDS_PARENT}]
-        target = "master" if what == "disk" else self._rng.choice(roles)
-        return (Fault(Kind.RESOURCES, what, target, self._seconds(2)),)
+        what = self._rng.choice(["files", "memory"])
+        return (Fault(Kind.RESOURCES, what, self._rng.choice(roles), self._seconds(2)),)
 
     def _contain(self) -> Step:
         what = self._rng.choice(["cut-off", "restart", "full"])

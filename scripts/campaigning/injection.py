@@ -34,14 +34,12 @@ class Injector:
         folder: Path,
         *,
         publish: Callable[[str, int], Awaitable[None]],
-        reload: Callable[[], Awaitable[None]],
         flip: Callable[[], None],
     ) -> None:
-        """Store functions that publish special readings (kind, number), order a reload and announce a flip."""
+        """Store functions that publish special readings (kind, number) and announce a flip."""
         self._stack = stack
         self._clock = folder / _CLOCK_FILE
         self._publish = publish
-        self._reload = reload
         self._flip = flip
         self.killed: set[str] = set()
         """Roles whose processes were ended by a fault since the last restart."""
@@ -52,13 +50,11 @@ class Injector:
             await self._signal(fault)
         elif fault.kind == "containers":
             await self._contain(fault)
-        elif fault.what == "reload":
-            await self._reload()
         elif fault.what == "misbehave":
             await self._misbehave(fault)
         elif fault.what == "flip":
             await self._damage(fault)
-        elif fault.what in {"files", "memory", "disk"}:
+        elif fault.what in {"files", "memory"}:
             await self._limit(fault)
         elif fault.what == "clock":
             await self._step_clock(fault)
@@ -177,23 +173,17 @@ class Injector:
                 await link.start()
 
     async def _limit(self, fault: Fault) -> None:
-        """Limit a process's descriptors, memory or disk space, while connections are restored."""
+        """Limit a process's descriptors or memory, while connections are restored."""
         pid = await self._stack.pid(fault.target)
         used = self._stack.resources(pid)
         if not pid or used is None:
             return
-        which = {
-            "files": resource.RLIMIT_NOFILE,
-            "memory": resource.RLIMIT_AS,
-            "disk": resource.RLIMIT_FSIZE,
-        }[fault.what]
-        least = {"files": _FEWEST, "memory": _size(pid) // 2, "disk": 0}[fault.what]
+        which = {"files": resource.RLIMIT_NOFILE, "memory": resource.RLIMIT_AS}[fault.what]
+        least = {"files": _FEWEST, "memory": _size(pid) // 2}[fault.what]
         try:
             former = resource.prlimit(pid, which)
             resource.prlimit(pid, which, (least, former[1]))
-            if fault.what == "disk":
-                await self._reload()
-            elif fault.what == "files":
+            if fault.what == "files":
                 self._stack.links["rosbridge"].cut()
             else:
                 await self._publish("burst", 500)

@@ -62,7 +62,6 @@ class Round:
         rng = random.Random(seed)
         self._rng = rng
         self._folder = folder
-        self._deployments = deployments
         self._calm_frames = calm_frames
         self.stack = (
             ContainerStack(folder, deployments[0], rng)
@@ -70,13 +69,10 @@ class Round:
             else Stack(folder, topology, deployments[0], rng)
         )
         self.observer = Observer(expected, deployments[0].name)
-        self._injector = Injector(
-            self.stack, folder, publish=self._special, reload=self._reload, flip=self._flip
-        )
+        self._injector = Injector(self.stack, folder, publish=self._special, flip=self._flip)
         self._client = Client(self.stack.hub_port, self._take, self.observer.reconnected)
         self._result = RoundResult()
         self._base = Counters()
-        self._reloads = 0
         self._arrived = now()
         self._master = 0
         self._news = asyncio.Event()
@@ -144,16 +140,6 @@ class Round:
             if what != "burst":
                 await asyncio.sleep(0.005)
 
-    async def _reload(self) -> None:
-        others = [each for each in self._deployments if each != self.stack.deployment]
-        new, former = self._rng.choice(others), self.stack.deployment
-        generation = await self.stack.reload(new)
-        if generation >= 0:
-            self.observer.reloaded(generation, new.name)
-            self._reloads += 1
-        else:
-            self.stack.deployment = former
-
     def _flip(self) -> None:
         self.observer.flip(INTEGRITY_FRAMES)
 
@@ -201,7 +187,6 @@ class Round:
 
     async def _take_step(self, step: Step) -> None:
         name = " + ".join(map(str, step))
-        reloads = self._reloads
         self.observer.fault()
         results = await asyncio.gather(
             *(self._injector.inject(fault) for fault in step), return_exceptions=True
@@ -211,8 +196,6 @@ class Round:
                 raise error
         if "master" in await self._injector.restart():
             self._begin_master()
-        if [fault.what for fault in step] == ["reload"] and self._reloads == reloads:
-            self._find(Flaw.REFUSED, "a reload without another fault")
         await self._recover(name, noted=True)
         excuses = replace(excuses_of(step, self.stack.topology), until=now())
         self.observer.calm()

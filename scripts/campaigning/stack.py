@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import os
 import random
 import shutil
@@ -249,28 +248,6 @@ class Stack:
         if not isinstance(frames, dict):
             return None
         return Counters(frames["received"], frames["completed"], frames["lost"])
-
-    async def reload(self, deployment: Path) -> int:
-        """Order the master to load another deployment, and return the new generation, or -1 if it refuses."""
-        answer = await self._order(deployment)
-        if answer != 0:
-            return -1
-        self.deployment = deployment
-        status = await self.status("master")
-        return -1 if status is None else int(str(status["generation"]))
-
-    async def _order(self, deployment: Path) -> int | None:
-        """Send the order to the master's control socket, and return the exit code, or None without an answer."""
-        with contextlib.suppress(OSError, TimeoutError, ValueError):
-            async with asyncio.timeout(END_LIMIT):
-                reader, writer = await asyncio.open_unix_connection(f"{self._runs}/master.control.sock")
-                try:
-                    writer.write(json.dumps({"order": "reload", "folder": str(deployment)}).encode() + b"\n")
-                    answer = json.loads(await reader.read())
-                finally:
-                    writer.close()
-                return int(answer["exit_code"])
-        return None
 
     def resources(self, pid: int) -> tuple[int, int] | None:
         """Return a process's resident memory in KiB and its open descriptors; None if it has ended."""

@@ -74,7 +74,6 @@ MODULES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "services/master/run.py": (_MASTER, _STACK),
     "services/master/flow.py": (_MASTER, _STACK),
     "services/master/peers.py": (_MASTER, _STACK),
-    "services/master/reload.py": (_MASTER, _STACK),
     "bridge/client/session.py": (_CLIENT, ()),
 }
 """Tests of each module: first those of which the ones that execute the mutated line run, then tests of processes."""

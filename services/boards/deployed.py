@@ -1,4 +1,4 @@
-"""The boards of a deployment: programming, opening, frames, recovery after restarts, and reloads."""
+"""The boards of a deployment: programming, opening, frames, and recovery after restarts."""
 
 import time
 from collections.abc import Sequence
@@ -24,12 +24,9 @@ from services.boards.agreement import DisagreementError, compare
 from services.boards.canaries import PAUSE, Canaries, DamagedBoardError
 from services.boards.frames import BoardAwayError, driver_input
 from services.boards.integrity import integrity_rule
-from services.errors import StackError
-from services.pipeline.generations import Generations
 from services.settings import Settings
-from services.sockets.records import Frame, NotReloaded, Switch, Switched
+from services.sockets.records import Frame
 from services.sockets.status import BoardStatus, IntegrityStatus
-from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment
 from toolchain.deployment.sections import Integrity
 
@@ -38,10 +35,10 @@ TICK = 0.2
 
 
 class DeployedBoards:
-    """The boards of the deployment in force; a restarted board is programmed and opened again.
+    """The boards of a deployment; a restarted board is programmed and opened again.
 
     Attributes:
-        generations: The deployments to which the boards can be switched, with their images.
+        deployment: The deployment.
         gone: Reasons why boards are unusable, by board number.
         canaries: The known readings that run between frames; None before opening and without them.
         disagreements: Frames whose two computations disagreed.
@@ -62,7 +59,8 @@ class DeployedBoards:
         """
         self._settings = settings
         self._rule = integrity_rule(settings, deployment)
-        self.generations = Generations(deployment, images_of, images=True)
+        self.deployment = deployment
+        self._images = images_of(deployment)
         self._reprogram = reprogram
         self._endpoints = list(endpoints)
         self._cluster: MiniCluster | None = None
@@ -106,49 +104,6 @@ class DeployedBoards:
             self.canaries = Canaries(self._images, self._rule.frames)
             if former is not None:
                 self.canaries.go_on(former.position)
-
-    @property
-    def _images(self) -> list[Image]:
-        return self.generations.derived
-
-    # --- another deployment --------------------------------------------------------------------
-
-    def switch(self, record: Switch) -> Switched | NotReloaded:
-        """Program all boards with the images of another generation, or restore all of them after a failure.
-
-        No frame may be in progress. Boards that already hold the right image are not touched.
-        """
-        try:
-            deployment, images = self.generations.get(record.generation)
-            rule = integrity_rule(self._settings, deployment)
-            cluster = self._whole_cluster()
-            self._reprogram = True  # from here on, a board may hold either image
-            try:
-                self._cluster = self._programmed(cluster, images)
-            except PcieShimError:
-                self._restore(cluster)
-                raise
-        except (PcieShimError, StackError) as error:
-            return NotReloaded(record.generation, exit_code_of(error), str(error))
-        answer = self.generations.switch(record)
-        self._rule = rule
-        self._prepare_canaries()
-        return answer
-
-    def _programmed(self, cluster: MiniCluster, images: Sequence[Image]) -> MiniCluster:
-        """Return the opened boards with these images."""
-        cluster.close()
-        for board, (held, wanted) in enumerate(zip(self._images, images, strict=True)):
-            if held.image_hash != wanted.image_hash:
-                self._program(board, wanted)
-        return self._opened(images)
-
-    def _restore(self, cluster: MiniCluster) -> None:
-        """Restore the boards; those that do not come back in time remain in `gone`, to be recovered later."""
-        self._cluster = cluster
-        cluster.close()
-        self.gone = dict.fromkeys(range(len(self._endpoints)), "its previous image is being restored")
-        self.recover_in_time()
 
     def _program(self, board: int, image: Image) -> None:
         """Program a board that this process does not have open, or raise a BoardError."""
@@ -229,7 +184,7 @@ class DeployedBoards:
         self._posted_canary, self._first, self._second = None, None, None
         self._whole_cluster().post(given)
         if self._rule.kind is Integrity.TWICE:
-            banks = self.generations.deployment.machine.rng_banks
+            banks = self.deployment.machine.rng_banks
             self._second = replace(given, bank=(given.bank + banks // 2) % banks)
 
     def post_canary(self) -> None:
@@ -310,8 +265,7 @@ class DeployedBoards:
         return self._cluster
 
     def _input(self, frame: Frame) -> FrameInput:
-        deployment = self.generations.deployment
-        return driver_input(deployment, frame, self._settings.stop or deployment.machine.stop)
+        return driver_input(self.deployment, frame, self._settings.stop or self.deployment.machine.stop)
 
     def find_lost_boards(self, error: BoardError) -> None:
         """Find all boards that are gone after a failure, so that several deaths at once fail one frame."""

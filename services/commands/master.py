@@ -1,4 +1,4 @@
-"""The commands `master`, which runs the stack, and `master reload`, which makes a running one reload."""
+"""The command `master`, which runs the stack."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,31 +11,24 @@ from services.commands import flags as options
 from services.errors import SettingsError
 from services.master.run import run_master
 from services.settings import Settings, endpoint_in, load_settings
-from services.sockets.control_socket import ReloadOrder, control_socket, give_order
 from services.sockets.reporting import check_metrics
 from services.sockets.serving import board_endpoints, deployment_for
 from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.errors import ExitCode
-from terminal.one_line import one_line
 from terminal.output import say
 from terminal.signals import run_async
-
-RELOAD_TIME = 600.0
-"""Seconds that `master reload` waits for the answer."""
 
 app = CommandLine(
     help="Move readings to the boards and posteriors back to the robot.\n\n"
     "`master --once -d build/boat --uri ws://robot:9090` computes one frame; `master --loop` runs until Ctrl-C.\n\n"
-    "`master reload -d build/boat2` makes a running one switch to another deployment of the same shape.\n\n"
     "It starts and stops subscriber, publisher, pcie-app and emulated boards that are not running yet. "
     "Exit codes: 0 done, 2 usage or deployment, 3 rosbridge, 4 a variable, 5 a board, 6 a process, 130, 143."
 )
 
 
-@app.callback(help=app.info.help, invoke_without_command=True)
+@app.command(help=app.info.help)
 def master(
-    context: typer.Context,
     once: Annotated[bool, typer.Option("--once", help="Compute the first complete frame and exit.")] = False,
     loop: Annotated[bool, typer.Option("--loop", help="Run until Ctrl-C, or --count.")] = False,
     count: options.Count = None,
@@ -86,8 +79,6 @@ def master(
     ] = False,
 ) -> int:
     """Move readings to the boards and posteriors back to the robot."""
-    if context.invoked_subcommand is not None:
-        return ExitCode.DONE
     end_with_parent()
     connected = {}
     if connect is not None:
@@ -149,39 +140,3 @@ def _check(settings: Settings) -> None:
     say(
         f"{settings.deployment} is deployment {loaded.hash[:12]} for {count} {'board' if count == 1 else 'boards'}"
     )
-
-
-@app.command("reload")
-def reload_(
-    deployment: options.Deployment = None,
-    directory: Annotated[
-        Path | None,
-        options.setting(
-            "control_directory",
-            "Folder of the master's control socket.",
-            "--directory",
-            otherwise="BM_RUN_DIRECTORY, or that of this user's run",
-            metavar="DIR",
-        ),
-    ] = None,
-    run: options.Run = None,
-) -> int:
-    """Make a running `master --loop` switch to another deployment of the same shape, or reload its folder.
-
-    `toolchain regenerate memories build/boat --model casestudies/boat`, then `master reload -d build/boat`:
-    readings and results continue. If the switch fails, the run keeps its deployment, and the sentence gives
-    the reason. Exit codes: 0 done, 2 another shape or damaged, 5 a board, 6 not now.
-    """
-    end_with_parent()
-    settings = load_settings(deployment=deployment)
-    folder = "" if settings.deployment is None else str(settings.deployment.absolute())
-
-    async def order() -> int:
-        from services.sockets.stack import find_run
-
-        given = None if run else directory or settings.control_directory or settings.run_directory
-        where = given or (await find_run(run)).only_run
-        print(one_line(await give_order(control_socket(where), ReloadOrder(folder), timeout=RELOAD_TIME)))
-        return ExitCode.DONE
-
-    return run_async(order())

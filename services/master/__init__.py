@@ -1,1 +1,1 @@
-"""A run of the master: its peers, the flow of frames between them, and reloads of the deployment."""
+"""A run of the master: its peers, and the flow of frames between them."""

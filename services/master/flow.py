@@ -1,8 +1,6 @@
 """Flow of frames through a run: waiting, computing, publishing (thesis 3.3, figure 3.4).
 
-    subscriber ─reading─▶ [waiting] ─frame─▶ pcie-app ─result─▶ publisher ─outcome─▶ counted
-
-During a reload, readings for the next deployment wait separately from those for the one in force.
+subscriber ─reading─▶ [waiting] ─frame─▶ pcie-app ─result─▶ publisher ─outcome─▶ counted
 """
 
 import asyncio
@@ -23,7 +21,6 @@ from services.errors import (
 from services.master.history import FrameHistory
 from services.master.peers import ANSWER_TIME, Awaited, Peer, Peers
 from services.pipeline.frames import WaitingFrames
-from services.pipeline.generations import InForce
 from services.settings import Settings
 from services.sockets.records import (
     AnyRecord,
@@ -41,6 +38,7 @@ from services.sockets.records import (
 )
 from services.sockets.status import FrameCounts, reasons, seconds_since
 from services.supervision.child import RESTARTS
+from toolchain.deployment import Deployment
 
 MOST_AT_PUBLISHER = 8
 """Maximum number of results that the publisher has not acknowledged; after that, frames wait."""
@@ -75,7 +73,7 @@ class FrameFlow:
     def __init__(
         self,
         settings: Settings,
-        in_force: InForce,
+        deployment: Deployment,
         peers: Peers,
         log: FilteringBoundLogger,
         *,
@@ -85,18 +83,14 @@ class FrameFlow:
     ) -> None:
         """Start without frames; `once` ends the run after the first frame, `count` after `count` results."""
         self._settings = settings
-        self._in_force = in_force
+        self._deployment = deployment
         self._peers = peers
         self._log = log
         self._follows = settings.log_level == "debug"
         self._once = once
         self._count = count
         self._show = show
-        self._queue = settings.queue or in_force.deployment.queue
-        self._readings: WaitingFrames[WaitingReading] = WaitingFrames(self._queue)
-        self._next_readings: WaitingFrames[WaitingReading] | None = None
-        self._held = False
-        self._catching_up = 0
+        self._readings: WaitingFrames[WaitingReading] = WaitingFrames(settings.queue or deployment.queue)
         self._computing: _Computing | None = None
         self._at_publisher = 0
         self._published_at = 0.0
@@ -191,55 +185,6 @@ class FrameFlow:
             return Awaited("publish", self._published_at, self._settings.seen_timeout + ANSWER_TIME)
         return None
 
-    # --- a reload ------------------------------------------------------------------------------
-
-    @property
-    def waiting(self) -> int:
-        """Readings that wait for the boards."""
-        return len(self._readings)
-
-    @property
-    def in_flight(self) -> int:
-        """Frames that wait, are computed, or are being published."""
-        return len(self._readings) + (self._computing is not None) + self._at_publisher
-
-    @property
-    def busy_with(self) -> str:
-        """Description of the frames in flight; empty if there are none."""
-        if self._computing is not None:
-            return "a frame on the boards"
-        return "results at the publisher" if self._at_publisher else ""
-
-    def hold(self) -> None:
-        """Stop sending frames to the boards."""
-        self._held = True
-
-    def resume(self) -> None:
-        """Resume sending frames to the boards."""
-        self._held = False
-        self._catching_up = len(self._readings)
-        self._send_next()
-
-    def expect_next_generation(self) -> None:
-        """Let readings for the next deployment wait from now on."""
-        self._next_readings = WaitingFrames(self._queue)
-
-    def drop_next_generation(self) -> None:
-        """Drop the readings for the next deployment."""
-        dropped, self._next_readings = self._next_readings, None
-        self._count_lost(dropped)
-
-    def adopt_next_generation(self) -> None:
-        """Drop the readings for the previous deployment, and use those for the next one."""
-        if self._next_readings is not None:
-            self._count_lost(self._readings)
-            self._readings, self._next_readings = self._next_readings, None
-
-    def _count_lost(self, readings: WaitingFrames[WaitingReading] | None) -> None:
-        if readings is not None:
-            self._losses[LossReason.IN_RELOAD] += len(readings)
-            self._losses[LossReason.PASSED_OVER] += readings.passed_over
-
     # --- from reading to outcome ---------------------------------------------------------------
 
     def _take_reading(self, reading: Reading) -> None:
@@ -254,22 +199,12 @@ class FrameFlow:
         if self._peers.publisher.away and not self._once:
             self._losses[LossReason.ROSBRIDGE_AWAY] += 1  # its result could not be received
             return
-        waiting = WaitingReading(reading, time.monotonic_ns())
-        ahead = reading.generation - self._in_force.generation
-        readings = {0: self._readings, 1: self._next_readings}.get(ahead)
-        if readings is None:
-            self._losses[LossReason.IN_RELOAD] += 1
-            return
         try:
-            readings.put(waiting)
+            self._readings.put(WaitingReading(reading, time.monotonic_ns()))
         except OverflowedQueueError as error:
-            if ahead or self._held or self._catching_up:  # a reload caused the delay, not the boards
-                self._losses[LossReason.IN_RELOAD] += 1
-            else:
-                self.fail(error)
+            self.fail(error)
             return
-        if not ahead:
-            self._send_next()
+        self._send_next()
 
     def _take_unusable(self, record: Unusable) -> None:
         self.has_data = True
@@ -283,7 +218,7 @@ class FrameFlow:
 
     def _send_next(self) -> None:
         app = self._peers.app
-        if self._computing is not None or self._held or not app.ready or app.protocol is None:
+        if self._computing is not None or not app.ready or app.protocol is None:
             return
         if self._at_publisher >= MOST_AT_PUBLISHER or not self._peers.publisher.ready:
             return
@@ -292,13 +227,12 @@ class FrameFlow:
         waiting = self._readings.get()
         if waiting is None:
             return
-        self._catching_up = max(0, self._catching_up - 1)
         self._number += 1
         reading, number = waiting.reading, self._number
-        bank = number % self._in_force.deployment.machine.rng_banks
+        bank = number % self._deployment.machine.rng_banks
         now = time.monotonic_ns()
         self._computing = _Computing(number, waiting, now)
-        self.history.sent(number, self._in_force.generation, bank, reading, (waiting.arrived, now))
+        self.history.sent(number, bank, reading, (waiting.arrived, now))
         app.protocol.send(Frame(number, reading.addresses, bank, reading.prior_codes))
         if self._follows:
             self._follow(number, bank, waiting)

@@ -11,7 +11,6 @@ from concurrent.futures import Future
 from typing import Any, Final, TypeVar, cast
 
 from pcie_shim.errors import BoardError, PcieShimError
-from services.boards.canaries import PAUSE
 from services.boards.deployed import DeployedBoards
 from services.boards.frames import frame_failed, result_record
 from services.master.command_lines import METRICS_PORTS
@@ -22,7 +21,7 @@ from services.pipeline.result_topics import ROLE as PUBLISHER
 from services.pipeline.subscriber import ROLE as SUBSCRIBER
 from services.pipeline.subscriber import Subscriber
 from services.settings import Settings
-from services.sockets.records import AnyRecord, Frame, Notice, Prepare, Ready, Record, Switch, Trouble
+from services.sockets.records import AnyRecord, Frame, Notice, Ready, Record, Trouble
 from services.sockets.reporting import serve_status, shifted
 from services.sockets.serving import Link, MakeLink, board_endpoints
 from terminal.errors import exit_code_of
@@ -56,9 +55,6 @@ class FusedLink(Link):
         self._to_master(cast("AnyRecord", record))
         return True
 
-    def serve(self, deployment: Deployment) -> None:
-        """Do nothing, because there are no later masters."""
-
 
 class FusedEnd:
     """The master's end of a fused link, in place of a socket connection."""
@@ -79,7 +75,7 @@ class FusedEnd:
 class FusedBoards:
     """pcie-app in an event loop: a frame is posted, and collected when the last board has answered.
 
-    Slow work (opening boards, recovering them, reloading) runs in a thread; no frame is posted meanwhile.
+    Slow work (opening boards, recovering them) runs in a thread; no frame is posted meanwhile.
     """
 
     def __init__(self, boards: DeployedBoards, settings: Settings, link: MakeLink) -> None:
@@ -94,7 +90,6 @@ class FusedBoards:
         self._loop = asyncio.get_running_loop()
         self._looking: asyncio.Task[None] | None = None
         self._one_thread = asyncio.Lock()
-        self._reloading: asyncio.Task[None] | None = None
 
     async def run(self) -> int:
         """Serve until cancelled.
@@ -128,30 +123,13 @@ class FusedBoards:
                 raise
             finally:
                 self._unwatch()
-                for task in (self._looking, self._reloading):
-                    if task is not None:
-                        task.cancel()
+                if self._looking is not None:
+                    self._looking.cancel()
                 self._boards.close()
 
     def _take(self, record: AnyRecord) -> None:
         if isinstance(record, Frame):
             self._post(record)
-        elif isinstance(record, Prepare | Switch):
-            self._reloading = self._loop.create_task(self._reload(record))
-
-    async def _reload(self, record: Prepare | Switch) -> None:
-        """Read images, or program boards; the master does not send frames meanwhile."""
-        boards = self._boards
-        answer: Record
-        if isinstance(record, Prepare):
-            answer = await _in_thread(lambda: boards.generations.prepare(record))
-        else:
-            async with self._one_thread:
-                while self._number is not None:  # a canary, which ends by its deadline at the latest
-                    await asyncio.sleep(PAUSE)
-                self._unwatch()  # its link is closed, and the next link may get the same descriptor
-                answer = await _in_thread(lambda: boards.switch(record))
-        self._link.send(answer)
 
     def _post_canary(self) -> None:
         try:

@@ -36,7 +36,6 @@ class FrameTrace:
     """The times of a frame, as they become known; those ending in `_tick` are monotonic, in ns."""
 
     number: int
-    generation: int
     bank: int
     stamp_ns: int
     received_ns: int
@@ -75,7 +74,6 @@ class FrameTrace:
             number=self.number,
             outcome=self.outcome,
             why=self.why,
-            generation=self.generation,
             bank=self.bank,
             stamp_ns=self.stamp_ns,
             received_ns=self.received_ns,
@@ -107,12 +105,11 @@ class FrameHistory:
         self._sums_ns = [0] * len(_STAGES)
         self._timed = 0
 
-    def sent(self, number: int, generation: int, bank: int, reading: Reading, ticks: tuple[int, int]) -> None:
+    def sent(self, number: int, bank: int, reading: Reading, ticks: tuple[int, int]) -> None:
         """Remember a frame that goes to the boards; `ticks` are its arrival and now."""
         self._traces.append(
             FrameTrace(
                 number,
-                generation,
                 bank,
                 reading.stamp_ns,
                 reading.received_ns,

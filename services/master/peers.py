@@ -16,26 +16,20 @@ from pcie_shim.endpoint import Endpoint
 from services.errors import (
     BoardFailedError,
     ChildDiedError,
-    NotReloadedError,
     OtherPeerError,
     ReportedError,
     SettingsError,
     StackError,
 )
 from services.master.command_lines import boards_command, service_command
-from services.pipeline.generations import InForce
 from services.settings import Settings, endpoint_in
 from services.sockets.local_socket import RecordProtocol, check_hello, open_connection, own_hello
 from services.sockets.records import (
     AnyRecord,
     Begin,
-    Hello,
     Notice,
-    NotReloaded,
-    Prepared,
     Ready,
     Rosbridge,
-    Switched,
     Trouble,
 )
 from services.sockets.serving import board_endpoints, endpoint_from
@@ -44,6 +38,7 @@ from services.supervision.child import RESTARTS, Child, end_all
 from terminal.errors import ExitCode
 from terminal.output import say
 from terminal.private_directory import PrivateDirectory
+from toolchain.deployment import Deployment
 
 if TYPE_CHECKING:
     from services.master.fused import FusedEnd  # it imports all three services
@@ -82,9 +77,6 @@ class Peer:
         self.reason: Exception | None = None
         self.since = 0.0
         self.missed = False
-        self.generation = 0
-        self.answer: asyncio.Future[Prepared | Switched | NotReloaded] | None = None
-        self.outdated = False
 
     def cut(self) -> None:
         """Kill its process if the master started it, otherwise close the connection; either is renewed."""
@@ -92,11 +84,6 @@ class Peer:
             self.child.kill()
         elif self.protocol is not None:
             self.protocol.close()
-
-    def answered(self, record: Prepared | Switched | NotReloaded) -> None:
-        """Pass its answer to the waiting reload."""
-        if self.answer is not None and not self.answer.done():
-            self.answer.set_result(record)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,10 +118,10 @@ class Peers:
     """The three services, and the boards' process if the master starts it."""
 
     def __init__(
-        self, settings: Settings, in_force: InForce, log: FilteringBoundLogger, *, once: bool
+        self, settings: Settings, deployment: Deployment, log: FilteringBoundLogger, *, once: bool
     ) -> None:
         self._settings = settings
-        self._in_force = in_force
+        self._deployment = deployment
         self._log = log
         self._once = once
         self._events: PeerEvents
@@ -189,22 +176,11 @@ class Peers:
             for peer in self
         ]
 
-    def set_flag(self, flag: str, value: str) -> None:
-        """From now on, start the master's own services with another value of a flag."""
-        for peer in self:
-            if peer.child is not None:
-                peer.child.set_flag(flag, value)
-
-    def renew(self, peer: Peer, sentence: str) -> None:
-        """Restart or reconnect a service, after a warning; a restarted one uses the deployment in force."""
-        self._log.warning(sentence)
-        peer.cut()
-
     # --- starting and ending -------------------------------------------------------------------
 
     def prepare(self) -> None:
         """Determine which peers are running, and how to start the others, or raise a SettingsError."""
-        settings, deployment = self._settings, self._in_force.deployment
+        settings, deployment = self._settings, self._deployment
         given = {
             "subscriber": settings.subscriber,
             "publisher": settings.publisher,
@@ -294,7 +270,7 @@ class Peers:
             peer = self._by_role[role]
             return lambda record: self._take(peer, record)
 
-        for role, (end, service) in fused_services(settings, self._in_force.deployment, to_master).items():
+        for role, (end, service) in fused_services(settings, self._deployment, to_master).items():
             peer = self._by_role[role]
             peer.protocol, peer.greeted = end, True
             self._begin_task(service, inside=True)
@@ -341,9 +317,7 @@ class Peers:
             await self._connect(peer, max(limit, self._settings.peer_timeout))
             first = False
             await self._watch(peer)
-            peer.protocol, peer.ready, peer.outdated, peer.away = None, False, False, False
-            if peer.answer is not None and not peer.answer.done():
-                peer.answer.set_exception(NotReloadedError(f"{peer.role} ended meanwhile"))
+            peer.protocol, peer.ready, peer.away = None, False, False
             self._events.lost(peer)
             await self._bring_back(peer)
 
@@ -416,7 +390,7 @@ class Peers:
             opening = self._compiling_time if peer.role == "pcie-app" else 0.0
             return Awaited("greet", peer.since, settings.peer_timeout + opening)
         if not peer.ready:
-            boards = len(self._in_force.deployment.boards)
+            boards = len(self._deployment.boards)
             limit = settings.connect_timeout + boards * settings.peer_timeout + self._compiling_time
             return Awaited("get ready", peer.since, limit)
         return self._events.awaited(peer)
@@ -453,7 +427,7 @@ class Peers:
 
     def _opened(self, peer: Peer, protocol: RecordProtocol) -> None:
         peer.protocol = protocol
-        protocol.send(own_hello(ROLE, self._in_force.deployment.hash, self._in_force.generation))
+        protocol.send(own_hello(ROLE, self._deployment.hash))
 
     def _closed(self, peer: Peer, protocol: RecordProtocol, why: Exception | None) -> None:
         if peer.protocol in (protocol, None):
@@ -469,37 +443,19 @@ class Peers:
             self._events.fail(error)
 
     def _dispatch(self, peer: Peer, record: AnyRecord) -> None:
-        if peer.outdated:
-            return
         if isinstance(record, Trouble):
             self._events.fail(ReportedError(record.exit_code, f"{peer.role}: {record.sentence}"))
         elif not peer.greeted:
-            self._greet(peer, record)
+            check_hello(record, peer.role, self._deployment.hash, f"{peer.role} at {peer.where}")
+            peer.greeted, peer.missed = True, False
         elif isinstance(record, Ready):
             self._ready(peer, record)
         elif isinstance(record, Rosbridge):
             self._rosbridge(peer, record)
         elif isinstance(record, Notice):
             (self._log.warning if record.level == "warning" else self._log.info)(record.sentence)
-        elif isinstance(record, Prepared | Switched | NotReloaded):
-            peer.answered(record)
         else:
             self._events.received(peer, record)
-
-    def _greet(self, peer: Peer, record: AnyRecord) -> None:
-        in_force = self._in_force
-        peer.outdated = (
-            peer.child is not None
-            and isinstance(record, Hello)
-            and record.deployment_hash == in_force.former_hash != in_force.deployment.hash
-        )
-        if peer.outdated:
-            self.renew(peer, f"{peer.role} was started before the reload; restarting it")
-            return
-        check_hello(record, peer.role, in_force.deployment.hash, f"{peer.role} at {peer.where}")
-        peer.greeted = True
-        peer.generation = in_force.generation
-        peer.missed = False
 
     def _ready(self, peer: Peer, record: Ready) -> None:
         peer.ready = True

@@ -1,23 +1,19 @@
-"""A run of the master: its peers, the flow of frames between them, reloads, and the end."""
+"""A run of the master: its peers, the flow of frames between them, and the end."""
 
 import asyncio
 import contextlib
 import sys
 import time
 from collections.abc import Coroutine
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from services.errors import NoDataError
 from services.master.children import ChildrenWatch
 from services.master.flow import FrameFlow
 from services.master.peers import ROLE, Peers
-from services.master.reload import Reloads
 from services.output.axes import deployment_axes
 from services.output.master_output import print_json, sentence
-from services.pipeline.generations import InForce
 from services.settings import Settings
-from services.sockets.control_socket import serve_control
 from services.sockets.records import LossReason, Publish, Published
 from services.sockets.reporting import serve_status
 from services.sockets.status import ProcessStatus
@@ -57,12 +53,11 @@ class Master:
         self._newest: Published | None = None
         self._drawn: Publish | None = None
         self._log = get_logger(ROLE, settings.log_level)
-        self._in_force = InForce(deployment, Path(settings.deployment or deployment.directory).absolute())
-        self._peers = Peers(settings, self._in_force, self._log, once=once)
+        self._deployment = deployment
+        self._peers = Peers(settings, deployment, self._log, once=once)
         self._flow = FrameFlow(
-            settings, self._in_force, self._peers, self._log, once=once, count=self._count, show=self._show
+            settings, deployment, self._peers, self._log, once=once, count=self._count, show=self._show
         )
-        self._reloads = Reloads(settings, self._in_force, self._peers, self._flow, self._log)
         self._tasks: list[asyncio.Task[None]] = []
 
     async def run(self) -> int:
@@ -92,13 +87,10 @@ class Master:
                 **more,
             )
             await sockets.enter_async_context(report)
-            if not self._once:
-                control = settings.control_directory or run_directory
-                await sockets.enter_async_context(serve_control(control, self._reloads.order))
-                self._begin_task(self._reloads.keep_first())
-                # results on the terminal show the progress themselves
-                if sys.stderr.isatty() and not ((self._json or self._plot) and sys.stdout.isatty()):
-                    self._begin_task(self._show_progress())
+            # results on the terminal show the progress themselves
+            shown = (self._json or self._plot) and sys.stdout.isatty()
+            if not self._once and sys.stderr.isatty() and not shown:
+                self._begin_task(self._show_progress())
             self._begin_task(self._expect_data())
             if not self._plot:
                 await peers.start(self._flow)
@@ -139,9 +131,8 @@ class Master:
         return ProcessStatus(
             ready=not why,
             why=why or "results flow",
-            deployment=self._in_force.deployment.hash,
-            generation=self._in_force.generation,
-            folder=str(self._in_force.folder),
+            deployment=self._deployment.hash,
+            folder=str((self._settings.deployment or self._deployment.directory).absolute()),
             peers=self._peers.status(),
             frames=frames,
         )
@@ -162,9 +153,9 @@ class Master:
         """Print a published result if requested."""
         self._newest = record
         if self._json:
-            print_json(record, self._in_force)
+            print_json(record, self._deployment)
         elif self._once and not self._plot:
-            print(sentence(record, self._in_force), flush=True)
+            print(sentence(record, self._deployment), flush=True)
         if record.seen is False:
             say(
                 f"the result was published, but not seen on the wire within {self._settings.seen_timeout:g} s"
@@ -176,7 +167,7 @@ class Master:
         limit = self._settings.first_data_timeout
         await asyncio.sleep(limit + _GRACE_PERIOD)
         if not self._flow.has_data:
-            topics = ", ".join(source.topic for source in self._in_force.deployment.sources)
+            topics = ", ".join(source.topic for source in self._deployment.sources)
             self._flow.fail(NoDataError(f"no reading came from {topics} within {limit:g} s"))
 
     async def _show_progress(self) -> None:
@@ -188,7 +179,7 @@ class Master:
                 began = max(before, self._flow.first_reading_at or before)
                 rate = (published - count) / (now - began) if now > began else 0.0
                 of = f" of {self._count}" if self._count else ""
-                newest = "" if self._newest is None else f"; {sentence(self._newest, self._in_force)}"
+                newest = "" if self._newest is None else f"; {sentence(self._newest, self._deployment)}"
                 show_progress(f"{ROLE}: {published}{of} results, {rate:.0f} a second{newest}")
             before, count = now, published
 
@@ -205,9 +196,9 @@ class Master:
         if newest is None or newest is self._drawn:
             return
         self._drawn = newest
-        posterior = posterior_of(newest, self._in_force)
+        posterior = posterior_of(newest, self._deployment)
         if posterior is not None:
-            show(posterior, deployment_axes(self._in_force.deployment))
+            show(posterior, deployment_axes(self._deployment))
 
 
 async def run_master(

@@ -48,7 +48,7 @@ def lines(timeline: FrameTimeline) -> list[str]:
     received, stamp = _time(timeline.received_ns), _time(timeline.stamp_ns)
     found = [
         f"frame {timeline.number}: {timeline.outcome}{after}{why}",
-        f"reading received {received}, stamp {stamp}; generation {timeline.generation}, bank {timeline.bank}",
+        f"reading received {received}, stamp {stamp}; bank {timeline.bank}",
         "",
         f"{'stage':<17}{'began ms':>10}{'took ms':>10}  process",
     ]

@@ -4,19 +4,19 @@ from collections.abc import Sequence
 
 from services.errors import StackError
 from services.output.axes import Axis, deployment_axes, in_words
-from services.pipeline.generations import InForce
 from services.sockets.records import Published
 from terminal.output import print_json_line
+from toolchain.deployment import Deployment
 
 
-def print_json(record: Published, in_force: InForce) -> None:
+def print_json(record: Published, deployment: Deployment) -> None:
     """Print a result as a line of JSON.
 
     Raises:
         BrokenPipeError: The reader has closed the pipe.
         StackError: Standard output cannot be written.
     """
-    axes = deployment_axes(in_force.deployment)
+    axes = deployment_axes(deployment)
     best = _cell(axes, record.best_line)
     result = {
         "frame": record.number,
@@ -26,7 +26,6 @@ def print_json(record: Published, in_force: InForce) -> None:
         "cycles": record.cycles,
         "ms": round(record.total_ns / 1e6, 3),
         "seen": record.seen,
-        "generation": in_force.generation,
     }
     try:
         print_json_line(result)
@@ -36,9 +35,9 @@ def print_json(record: Published, in_force: InForce) -> None:
         raise StackError(f"standard output cannot be written: {error.strerror or error}") from error
 
 
-def sentence(record: Published, in_force: InForce) -> str:
+def sentence(record: Published, deployment: Deployment) -> str:
     """Return a result as a line, with the words of `listen`."""
-    axes = deployment_axes(in_force.deployment)
+    axes = deployment_axes(deployment)
     return (
         f"frame {record.number}: {in_words(axes, _cell(axes, record.best_line))} with {record.best_probability:.3g}; "
         f"{record.cycles} cycles; {record.total_ns / 1e6:.2f} ms"

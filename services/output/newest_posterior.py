@@ -3,24 +3,22 @@
 import time
 
 from posteriors.posterior import Posterior
-from services.pipeline.generations import InForce
 from services.pipeline.inference import Inference, report_of
 from services.sockets.records import Publish
+from toolchain.deployment import Deployment
 
 
-def posterior_of(publish: Publish, in_force: InForce) -> Posterior | None:
+def posterior_of(publish: Publish, deployment: Deployment) -> Posterior | None:
     """Return the posterior of a computed frame with its report, or None if all counts were 0."""
     inference = Inference(publish.result)
     if inference.posterior is None:
         return None
-    dimensions = in_force.deployment.result_dimensions
+    dimensions = deployment.result_dimensions
     now = time.time_ns(), time.monotonic_ns()
     return Posterior(
         probabilities=tuple(inference.posterior.tolist()),
         labels=tuple(dimension.label for dimension in dimensions),
         sizes=tuple(dimension.size for dimension in dimensions),
         heard_ns=now[0],
-        report=report_of(
-            publish, inference, in_force.deployment, in_force.generation, now=now, previous_out_ns=0
-        ),
+        report=report_of(publish, inference, deployment, now=now, previous_out_ns=0),
     )

@@ -67,8 +67,7 @@ def _verdict(stack: StackStatus) -> Iterator[RenderableType]:
             yield Text(f"  and {more} more", "red")
     for process in stack.processes:
         if process.folder:
-            model = f"deployment {plain(process.deployment[:12])} of {plain(process.folder)}"
-            yield Text(f"{model}, generation {process.generation}")
+            yield Text(f"deployment {plain(process.deployment[:12])} of {plain(process.folder)}")
 
 
 def _processes(stack: StackStatus) -> Table:

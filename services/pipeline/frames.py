@@ -189,10 +189,6 @@ class FrameAssembler:
             prior_codes=prior_codes,
         )
 
-    def forget(self) -> None:
-        """Drop the waiting messages, and count them as unpaired."""
-        self._synchroniser.forget()
-
     def needs(self, source: int) -> bool:
         """Return whether a frame needs a message of this source."""
         return self._readers[source].needed

@@ -69,7 +69,6 @@ def report_of(
     publish: Publish,
     inference: Inference,
     deployment: Deployment,
-    generation: int,
     *,
     now: tuple[int, int],
     previous_out_ns: int,
@@ -97,7 +96,6 @@ def report_of(
         number=result.number,
         cycles=max((board.cycles for board in inference.boards), default=0),
         counts_total=sum(inference.totals),
-        generation=generation,
         received_ns=publish.received_ns,
         sent_ns=sent_ns,
         stages=StageTimes(

@@ -19,13 +19,10 @@ from services.sockets.local_socket import BlockingRecordSocket, check_hello, own
 from services.sockets.records import (
     AnyRecord,
     Frame,
-    Hello,
     LossReason,
     Notice,
-    Prepare,
     Ready,
     Record,
-    Switch,
     Trouble,
 )
 from services.sockets.reporting import STUCK_S
@@ -34,7 +31,6 @@ from services.sockets.status import FrameCounts, ProcessStatus, reasons, seconds
 from terminal.errors import ExitCode, exit_code_of
 from terminal.logs import get_logger
 from terminal.signals import check_signals
-from toolchain.deployment import Deployment
 
 ROLE = "pcie-app"
 
@@ -81,8 +77,7 @@ class Progress:
         return ProcessStatus(
             ready=self.ready is not None and gone is None,
             why=why,
-            deployment=self._boards.generations.deployment.hash,
-            generation=self._boards.generations.number,
+            deployment=self._boards.deployment.hash,
             boards=self._boards.status(output),
             integrity=self._boards.integrity_status(),
             frames=FrameCounts(
@@ -102,6 +97,7 @@ class PcieApp:
 
     def __init__(self, boards: DeployedBoards, endpoint: Endpoint, log_level: str = "info") -> None:
         self._boards = boards
+        self._deployment = boards.deployment
         self._endpoint = endpoint
         self._where = f"{ROLE} at {endpoint}"
         self._master: BlockingRecordSocket | None = None
@@ -109,10 +105,6 @@ class PcieApp:
         self._progress = Progress(boards, log_level)
         self._selector = selectors.DefaultSelector()
         self._turned = 0.0
-
-    @property
-    def _deployment(self) -> Deployment:
-        return self._boards.generations.deployment
 
     def serve(self) -> int:
         """Serve until a signal raises in this thread.
@@ -190,10 +182,10 @@ class PcieApp:
                 self._drop()
                 return
             for record in records:
-                if self._greeted:
-                    self._take(record)
-                else:
+                if not self._greeted:
                     self._greet(record)
+                elif isinstance(record, Frame):  # other records do not concern boards
+                    self._compute(record)
         except (LocalSocketError, OtherPeerError) as error:
             master.send(Trouble(error.exit_code, str(error)))
             self._drop()
@@ -208,22 +200,8 @@ class PcieApp:
                 self._master.send(Trouble(error.exit_code, str(error)))
             raise reason from error
         self._greeted = True
-        self._take(record)
         if self._progress.ready is not None:
             self._send(self._progress.ready)
-
-    def _take(self, record: AnyRecord) -> None:
-        match record:
-            case Frame():
-                self._compute(record)
-            case Hello():
-                self._boards.generations.adopt(record)
-            case Prepare():
-                self._send(self._boards.generations.prepare(record))
-            case Switch():
-                self._send(self._boards.switch(record))
-            case _:
-                pass  # other records do not concern boards
 
     def status(self) -> ProcessStatus:
         """Return the status of this process; called from the thread of the status socket."""

@@ -9,23 +9,18 @@ import msgspec
 
 from bridge.client import State
 from bridge.errors import BridgeError
-from posteriors.posterior import posterior_layout
 from services.pipeline.connections import reconnect_now, report_failure
 from services.pipeline.delivery import CHECK_INTERVAL, SETTLED_TIME, NotReceivableError, refusals
-from services.pipeline.generations import Generations
 from services.pipeline.result_topics import RESULTS_DEPTH, ROLE, ResultTopics
 from services.settings import Settings
 from services.sockets.records import (
     AnyRecord,
     Begin,
-    Hello,
     Outcome,
-    Prepare,
     Publish,
     Published,
     Ready,
     Rosbridge,
-    Switch,
 )
 from services.sockets.reporting import serve_status
 from services.sockets.serving import MakeLink
@@ -50,7 +45,7 @@ class Publisher:
         self._once = False
         self._draining = True  # set until the topics are advertised, and then until the queue is empty
         self._link = link(self._take)
-        self._generations = Generations(deployment, posterior_layout)
+        self._deployment = deployment
         self._logs_frames = settings.log_level == "debug"
         self._log = get_logger(ROLE, settings.log_level)
         self._settings = settings
@@ -69,8 +64,7 @@ class Publisher:
         return ProcessStatus(
             ready=not why,
             why=why or self._where,
-            deployment=self._generations.deployment.hash,
-            generation=self._generations.number,
+            deployment=self._deployment.hash,
             connections=connections(self._topics.rosbridges),
             frames=FrameCounts(
                 received=outcomes.total() + self._waiting.qsize(),
@@ -101,17 +95,6 @@ class Publisher:
                 self._link.send(Published(record.result.number, Outcome.ROSBRIDGE_AWAY, None, -1, 0.0, 0, 0))
         elif isinstance(record, Rosbridge):
             reconnect_now(self._topics.rosbridges)
-        elif isinstance(record, Hello):
-            self._generations.adopt(record)
-            self._topics.use(self._generations.deployment, record.generation)
-        elif isinstance(record, Prepare):
-            self._link.send(self._generations.prepare(record))
-        elif isinstance(record, Switch):
-            # no result is in flight, because the master has waited for them
-            answer = self._generations.switch(record)
-            self._topics.use(self._generations.deployment, self._generations.number)
-            self._link.serve(self._generations.deployment)
-            self._link.send(answer)
 
     def _report(self, published: Published) -> None:
         """Count and log the outcome of a result, and send it to the master."""

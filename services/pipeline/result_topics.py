@@ -49,7 +49,8 @@ class ResultTopics:
     def __init__(self, settings: Settings, deployment: Deployment) -> None:
         self._settings = settings
         self._ros_version: Literal[1, 2] = 2
-        self.use(deployment, 0)
+        self._deployment = deployment
+        self._layout = posterior_layout(deployment)
         self._outputs: list[tuple[Ros, Publication]] = []
         self._frames: Publication | None = None
         self._watched: Subscription | None = None
@@ -57,12 +58,6 @@ class ResultTopics:
         self.rosbridges: dict[str, Ros] = {}
         self.advertised: list[AdvertisedTopic] = []
         self.reports: AdvertisedTopic | None = None
-
-    def use(self, deployment: Deployment, generation: int) -> None:
-        """From now on, publish results of another deployment on the same topics."""
-        self._deployment = deployment
-        self._generation = generation
-        self._layout = posterior_layout(deployment)
 
     @contextlib.asynccontextmanager
     async def opened(self, on_state: OnState | None = None) -> AsyncIterator[str]:
@@ -159,7 +154,6 @@ class ResultTopics:
             publish,
             inference,
             self._deployment,
-            self._generation,
             now=(time.time_ns(), started),
             previous_out_ns=self._previous_out_ns,
         )

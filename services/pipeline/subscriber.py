@@ -11,7 +11,6 @@ from bridge.client import Message, Ros, State, Subscription
 from bridge.errors import BridgeError, NoMessageError, TopicLeftOutError
 from services.errors import RosbridgeLostError, VariableError
 from services.pipeline.connections import connect_all, reconnect_now, report_failure
-from services.pipeline.generations import Generations
 from services.pipeline.timed_frames import TimedFrames
 from services.pipeline.unpublished import report_unpublished
 from services.settings import Settings
@@ -19,16 +18,11 @@ from services.sockets.local_socket import MAX_RECORD
 from services.sockets.records import (
     AnyRecord,
     Begin,
-    Hello,
     LossReason,
     Notice,
-    NotReloaded,
-    Prepare,
     Reading,
     Ready,
     Rosbridge,
-    Switch,
-    Switched,
     Unusable,
 )
 from services.sockets.reporting import serve_status
@@ -75,7 +69,8 @@ class Subscriber:
 
     def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
         self._settings = settings
-        self._generations = Generations(deployment, self._frames_of)
+        self._deployment = deployment
+        self._assembler = TimedFrames(deployment, self._forward)
         self._queue_all = (settings.queue or deployment.queue) == "all"
         self._begun = asyncio.Event()
         self._once = False
@@ -87,25 +82,10 @@ class Subscriber:
         self._subscriptions: list[Subscription] = []
         self._received = self._completed = self._unusable = 0
         self._passed_over = self._passed_over_sent = 0
-        self._unpaired_before_reload = self._unpaired_sent = 0
+        self._unpaired_sent = 0
         self._last_tick = 0
         self._gap_reported = False
         self._absent_reported: set[str] = set()
-
-    @property
-    def _deployment(self) -> Deployment:
-        return self._generations.deployment
-
-    def _frames_of(self, deployment: Deployment) -> TimedFrames:
-        return TimedFrames(deployment, self._forward)
-
-    @property
-    def _assembler(self) -> TimedFrames:
-        return self._generations.derived
-
-    @property
-    def _unpaired(self) -> int:
-        return self._unpaired_before_reload + self._assembler.unpaired
 
     def _take(self, record: AnyRecord) -> None:
         if isinstance(record, Begin):
@@ -116,20 +96,6 @@ class Subscriber:
             self._log.debug(record.sentence)
         elif isinstance(record, Rosbridge):
             reconnect_now(self._rosbridges)
-        elif isinstance(record, Hello):
-            self._generations.adopt(record)
-        elif isinstance(record, Prepare):
-            self._link.send(self._generations.prepare(record))
-        elif isinstance(record, Switch):
-            self._link.send(self._switch(record))
-
-    def _switch(self, record: Switch) -> Switched | NotReloaded:
-        self._assembler.forget()  # waiting messages were read according to the previous deployment
-        unpaired = self._unpaired
-        answer = self._generations.switch(record)
-        self._unpaired_before_reload = unpaired - self._assembler.unpaired
-        self._link.serve(self._deployment)
-        return answer
 
     def status(self) -> ProcessStatus:
         """Return the status of this process."""
@@ -145,7 +111,6 @@ class Subscriber:
             ready=not why,
             why=why or f"connected to {', '.join(self._rosbridges)}",
             deployment=self._deployment.hash,
-            generation=self._generations.number,
             connections=connections(self._rosbridges),
             frames=FrameCounts(
                 received=self._received,
@@ -155,7 +120,7 @@ class Subscriber:
                         LossReason.PASSED_OVER: self._passed_over,
                         LossReason.TOO_LARGE: sum(each.discarded for each in self._subscriptions),
                         LossReason.UNUSABLE: self._unusable,
-                        LossReason.UNPAIRED: self._unpaired,
+                        LossReason.UNPAIRED: self._assembler.unpaired,
                     }
                 ),
                 without=dict(self._assembler.absent),
@@ -302,13 +267,12 @@ class Subscriber:
         if self._link.backlog > _BACKLOG_LIMIT and not self._queue_all:
             self._passed_over += 1
             return
-        passed_over, unpaired = self._passed_over, self._unpaired
+        passed_over, unpaired = self._passed_over, self._assembler.unpaired
         record = msgspec.structs.replace(
             reading,
             sent_tick=time.monotonic_ns(),
             passed_over=passed_over - self._passed_over_sent,
             unpaired=unpaired - self._unpaired_sent,
-            generation=self._generations.number,
         )
         if self._link.send(record):
             self._completed += 1

@@ -28,11 +28,6 @@ class TimedFrames(FrameAssembler):
         """
         self._deliver_all(self.take(source, message.msg, message.received_ns, message.received_monotonic_ns))
 
-    def forget(self) -> None:
-        """Drop the waiting messages, and count them as unpaired."""
-        super().forget()
-        self._set_timer()
-
     def _wake(self) -> None:
         self._timer = self._timer_deadline = None
         self._deliver_all(self.due(time.monotonic_ns()))

@@ -31,7 +31,6 @@ class FrameTimeline(msgspec.Struct, frozen=True, kw_only=True):
     number: int
     outcome: str
     why: str
-    generation: int
     bank: int
     stamp_ns: int
     received_ns: int

@@ -71,9 +71,9 @@ class RecordSplitter:
         return records
 
 
-def own_hello(role: str, deployment_hash: str, generation: int = 0) -> Hello:
-    """Return the hello of this process; that of a master contains the generation of its deployment."""
-    return Hello(role=role, version=VERSION, deployment_hash=deployment_hash, generation=generation)
+def own_hello(role: str, deployment_hash: str) -> Hello:
+    """Return the hello of this process."""
+    return Hello(role=role, version=VERSION, deployment_hash=deployment_hash)
 
 
 def check_hello(record: AnyRecord, expected_role: str, deployment_hash: str, where: str) -> None:

@@ -28,7 +28,6 @@ class LossReason(StrEnum):
     """Its two computations disagreed (`integrity = twice`)."""
     WITH_APP = "lost with pcie-app"
     WITH_PUBLISHER = "lost with the publisher"
-    IN_RELOAD = "lost in a reload"
     NO_POSTERIOR = "no posterior"
     ROSBRIDGE_AWAY = "rosbridge away"
     REFUSED = "refused by rosbridge"
@@ -63,16 +62,11 @@ class Record(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Hello(Record, tag="hello", frozen=True):
-    """First record in each direction: the sender's role, version and deployment.
-
-    `generation` comes from the master: the number of deployment changes in the run, from which the service
-    continues.
-    """
+    """First record in each direction: the sender's role, version and deployment."""
 
     role: str
     version: str
     deployment_hash: str
-    generation: int = 0
 
 
 class Begin(Record, tag="begin", frozen=True):
@@ -125,8 +119,7 @@ class Reading(Record, tag="reading", frozen=True):
 
     `prior_codes` is a written prior, two bytes per line (and replica); empty for the prior of the machine.
     `passed_over` is the number of readings that the subscriber dropped since the last one it sent, `unpaired`
-    the number of unpaired messages. `generation` is that of the deployment for which the addresses were
-    computed; the boards must have the same.
+    the number of unpaired messages.
     """
 
     stamp_ns: int
@@ -137,7 +130,6 @@ class Reading(Record, tag="reading", frozen=True):
     passed_over: int = 0
     unpaired: int = 0
     prior_codes: bytes = b""
-    generation: int = 0
 
 
 class Unusable(Record, tag="unusable", frozen=True):
@@ -214,40 +206,6 @@ class Published(Record, tag="published", frozen=True):
     boards: list[tuple[int, int]] = []
 
 
-class Prepare(Record, tag="prepare", frozen=True):
-    """Master to a service: read and check this deployment without using it yet."""
-
-    generation: int
-    folder: str
-    deployment_hash: str
-
-
-class Prepared(Record, tag="prepared", frozen=True):
-    """A service to the master: it has the deployment of this generation."""
-
-    generation: int
-
-
-class Switch(Record, tag="switch", frozen=True):
-    """Master to a service: use the deployment of this generation from now on (or again)."""
-
-    generation: int
-
-
-class Switched(Record, tag="switched", frozen=True):
-    """A service to the master: everything that it sends from now on belongs to this generation."""
-
-    generation: int
-
-
-class NotReloaded(Record, tag="not reloaded", frozen=True):
-    """A service to the master: it failed to prepare or switch, and keeps its deployment."""
-
-    generation: int
-    exit_code: int
-    sentence: str
-
-
 AnyRecord = (
     Hello
     | Begin
@@ -262,9 +220,4 @@ AnyRecord = (
     | FrameFailed
     | Publish
     | Published
-    | Prepare
-    | Prepared
-    | Switch
-    | Switched
-    | NotReloaded
 )

@@ -47,9 +47,6 @@ class Link(Protocol):
         """Send a message for the user that does not end the run."""
         self.send(Notice(level, sentence))
 
-    def serve(self, deployment: Deployment) -> None:
-        """Greet later masters with another deployment from now on."""
-
     async def __aenter__(self) -> Self:
         """Start to serve."""
         return self
@@ -59,8 +56,7 @@ class Link(Protocol):
 
 
 MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
-"""Function that creates a service's link, given a function for the master's records, its hello first.
-"""
+"""Function that creates a service's link, given a function for the master's records after its hello."""
 
 
 class MasterLink(Link):
@@ -146,7 +142,6 @@ class MasterLink(Link):
                     self._service.cancel()
                 raise
             self._greeted = True
-            self._on_record(record)
             for each in (*self._unsaid, *self._last.values()):
                 protocol.send(each)
             self._unsaid.clear()
@@ -181,10 +176,6 @@ class MasterLink(Link):
         """Send a message for the user now, or later to the next master, because a service may wait before it has one."""
         if not self.send(record := Notice(level, sentence)):
             self._unsaid.append(record)
-
-    def serve(self, deployment: Deployment) -> None:
-        """Greet later masters with another deployment from now on."""
-        self._deployment = deployment
 
 
 def listening(endpoint: Endpoint, role: str, deployment: Deployment) -> MakeLink:

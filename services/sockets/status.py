@@ -119,8 +119,7 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     `cpu_s` is its user and system time so far, `cpu_percent` that of the last seconds (100 is one core), and
     `memory_bytes` its resident memory.
 
-    `deployment` is the hash of the deployment in force, `generation` the number of changes since the start of
-    the run, and `folder` the folder from which the master has read it.
+    `deployment` is the hash of the deployment, and `folder` the folder from which the master has read it.
     """
 
     ready: bool
@@ -133,7 +132,6 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     cpu_percent: float = 0.0
     memory_bytes: int = 0
     deployment: str = ""
-    generation: int = 0
     folder: str = ""
     connections: list[ConnectionStatus] = msgspec.field(default_factory=list)
     frames: FrameCounts | None = None

@@ -4,13 +4,12 @@ import atexit
 import contextlib
 import ctypes
 import os
-import shutil
 import signal
 import time
 from pathlib import Path
 
 from terminal.log_line import PARENT_VARIABLE
-from terminal.private_directory import COPY_PREFIX, has_master, remove_stale_sockets
+from terminal.private_directory import remove_stale_sockets
 from terminal.signals import stopped_error
 
 DIRECTORY_VARIABLE = "ROSBAYES_DIRECTORY"
@@ -58,9 +57,6 @@ def leave_private_directory() -> None:
     # such as the directory's absence: another child may remove it meanwhile
     with contextlib.suppress(OSError):
         remove_stale_sockets(directory)
-        if not has_master(directory):
-            for copy in directory.glob(f"{COPY_PREFIX}*"):
-                shutil.rmtree(copy, ignore_errors=True)
         directory.rmdir()
 
 

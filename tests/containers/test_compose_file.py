@@ -137,16 +137,6 @@ def test_sockets_are_the_users_own():
         assert "mode=0700" in volume["driver_opts"]["o"]
 
 
-def test_only_the_master_has_the_folder_that_takes_orders():
-    directory = SERVICES["master"]["environment"]["BM_CONTROL_DIRECTORY"]
-    (mount,) = [each for each in SERVICES["master"]["tmpfs"] if each.startswith(f"{directory}:")]
-    assert {"mode=0700", "uid=10001", "gid=10001"} <= set(mount.split(":")[1].split(","))
-    for name, service in SERVICES.items():
-        assert ("BM_CONTROL_DIRECTORY" in service["environment"]) is (name == "master")
-        volumes = [each if isinstance(each, str) else each["target"] for each in service["volumes"]]
-        assert not any(each.endswith(directory) for each in volumes)
-
-
 def test_boards_of_this_stack_alone_are_programmed_again():
     command = SERVICES["pcie-app"]["command"]
     assert filled(command).endswith(" --reprogram")

@@ -50,7 +50,7 @@ def test_a_path_too_long_for_a_socket_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "value"),
     [
-        *((name, "", None) for name in ("deployment", "run_directory", "control_directory")),
+        *((name, "", None) for name in ("deployment", "run_directory")),
         ("boards", "unix:/tmp/a.sock, tcp://10.0.0.2:7000", ("unix:/tmp/a.sock", "tcp://10.0.0.2:7000")),
     ],
 )

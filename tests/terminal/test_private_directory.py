@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from terminal.private_directory import COPY_PREFIX, PrivateDirectory, make_private_directory
+from terminal.private_directory import PrivateDirectory, make_private_directory
 
 
 @pytest.mark.parametrize("runtime", ["", ".", "relative", "/nonexistent", sys.executable, "/" + "x" * 60])
@@ -28,13 +28,11 @@ def place(tmp_path, monkeypatch):
 
 
 def left_by_a_killed_master(place, name, *, mode=0o700):
-    """Create a directory as left after a SIGKILL, with a dead socket and a copy of a deployment."""
+    """Create a directory as left after a SIGKILL, with a dead socket."""
     directory = place / name
     directory.mkdir()
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(directory / "b.sock"))
-    (directory / f"{COPY_PREFIX}0" / "boards").mkdir(parents=True)
-    (directory / f"{COPY_PREFIX}0" / "boards" / "board0.bm").write_bytes(b"x")
     directory.chmod(mode)
     return directory
 
@@ -60,7 +58,7 @@ def test_what_no_killed_master_left_stays(place):
     work = left_by_a_killed_master(place, "rosbayes-mywork00")
     (work / "thesis.md").write_text("three years")
     linked = left_by_a_killed_master(place, "rosbayes-linking0")
-    (linked / f"{COPY_PREFIX}7").symlink_to(others[2])
+    (linked / "b7.sock").symlink_to(others[2])
     (place / "rosbayes-alink000").symlink_to(others[2])
     (place / "rosbayes-file0000").write_text("no folder")
     before = {each: sorted(each.rglob("*")) for each in place.iterdir()}

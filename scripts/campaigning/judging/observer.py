@@ -42,8 +42,6 @@ class Flaw(StrEnum):
     """No result came within a generous limit."""
     ENDED = "ended"
     """A process ended unexpectedly."""
-    REFUSED = "refused"
-    """A reload was refused that nothing disturbed."""
     GROWTH = "growth"
     """A process uses an increasing amount of memory or descriptors."""
 
@@ -91,12 +89,11 @@ class Observer:
     def __init__(self, expected: Callable[[str, Addresses, int], Outcome], deployment: str) -> None:
         """Store the function from deployment, addresses and bank to the correct outcome, and the deployment."""
         self._expected = expected
-        self._deployments = {0: {deployment}}
+        self._deployment = deployment
         self._readings: dict[int, Reading] = {}
         self._announced: _Announced | None = None
         self._last_number = 0
         self._last_index = -1
-        self._last_generation = 0
         self.in_fault = False
         self._undisturbed = True
         self._flip_frames = 0
@@ -118,16 +115,12 @@ class Observer:
             reading.forwarded = True
 
     def master_started(self, deployment: str) -> None:
-        """Record a new master, whose frame numbers and generations begin again."""
-        self._deployments = {0: {deployment}}
-        self._last_number = self._last_generation = 0
+        """Record a new master, whose frame numbers begin again."""
+        self._deployment = deployment
+        self._last_number = 0
         self._announced = None
         for reading in self.pending_readings():  # the former master counted them, and its counters are gone
             reading.settled = reading.arrived is not None
-
-    def reloaded(self, generation: int, *deployments: str) -> None:
-        """Record the deployment of a generation, or several if a fault has hidden which one it is."""
-        self._deployments[generation] = set(deployments)
 
     def fault(self) -> None:
         """Record the beginning of a fault."""
@@ -241,7 +234,7 @@ class Observer:
         stamp_ns += stamp.get("nsecs", 0) or stamp.get("nanosec", 0)
         first, *others = message["status"]
         values = {pair["key"]: pair["value"] for pair in first["values"]}
-        number, generation = int(values["number"]), int(values["generation"])
+        number = int(values["number"])
         if number <= self._last_number:
             flaw = Flaw.DUPLICATE if number == self._last_number else Flaw.OUT_OF_ORDER
             self._find(flaw, f"frame {number} after frame {self._last_number}", now)
@@ -250,34 +243,20 @@ class Observer:
         if reading is None or reading.addresses is None:
             self._find(Flaw.UNKNOWN, f"frame {number} names a reading of {stamp_ns} ns", now)
             return _Announced(stamp_ns, number, None, None)
-        deployment = self._deployment(first["hardware_id"], generation, number, now)
-        outcome = self._expected(deployment, reading.addresses, number % BANKS)
+        if (said := first["hardware_id"]) != self._deployment:
+            self._find(Flaw.WRONG, f"frame {number}: {said}, expected {self._deployment}", now)
+        outcome = self._expected(self._deployment, reading.addresses, number % BANKS)
         if values["published"] != "true" or first["level"] != 0:
             self._find(Flaw.WRONG, f"frame {number} is said to have no posterior", now)
             return None
-        said = [self._board(each) for each in others]
+        boards = [self._board(each) for each in others]
         right = [(f"board{at}", b.cycles, b.total, b.reason) for at, b in enumerate(outcome.boards)]
         whole = (max(b.cycles for b in outcome.boards), sum(b.total for b in outcome.boards))
-        if said != right or len(said) != BOARDS:
-            self._wrong(number, f"frame {number}: boards {said}, expected {right}", now)
+        if boards != right or len(boards) != BOARDS:
+            self._wrong(number, f"frame {number}: boards {boards}, expected {right}", now)
         if (int(values["cycles"]), int(values["counts_total"])) != whole:
             self._wrong(number, f"frame {number}: its sums are not those of its boards", now)
         return _Announced(stamp_ns, number, outcome, reading)
-
-    def _deployment(self, said: str, generation: int, number: int, now: float) -> str:
-        known = self._deployments.get(generation)
-        if generation < self._last_generation:
-            self._find(Flaw.OUT_OF_ORDER, f"frame {number} is of the former generation {generation}", now)
-        self._last_generation = max(generation, self._last_generation)
-        if known is None:
-            self._deployments[generation] = known = {said}
-        if said not in known:
-            self._find(
-                Flaw.WRONG, f"frame {number} of generation {generation}: {said}, expected {known}", now
-            )
-            return min(known)
-        self._deployments[generation] = {said}
-        return said
 
     @staticmethod
     def _board(status: Any) -> tuple[str, int, int, str]:

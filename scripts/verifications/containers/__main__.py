@@ -286,9 +286,7 @@ def check_other_deployments(stack: Stack, tally: Tally, folder: Path) -> None:
     """Check DEPLOYMENT=DIR, and builds into this folder while the stack runs."""
     checks: list[tuple[str, Callable[[Stack, Path], None]]] = [
         ("DEPLOYMENT=another", another_deployment),
-        ("DEPLOYMENT: master reload", reload_deployment),
-        ("DEPLOYMENT: pcie-app and a board killed after a reload", kill_after_reload),
-        ("DEPLOYMENT: changed without a reload, pcie-app killed", kill_instead_of_reload),
+        ("DEPLOYMENT: changed, pcie-app killed", kill_after_change),
     ]
     if stack.only and not any(stack.only in name for name, _ in checks):
         return
@@ -310,33 +308,8 @@ def another_deployment(stack: Stack, folder: Path) -> None:
         stack.notes.append(f"healthy after {took:.1f} s; {check_results(client.results)}")
 
 
-def reload_deployment(stack: Stack, folder: Path) -> None:
-    """Check `master reload` after a build of other tables: results are theirs, and no container is restarted."""
-    before = {service: stack.restarts(service) for service in SERVICES}
-    correct_tables(folder, 1.1)
-    output = stack.docker("exec", stack.container("master"), "master", "reload").strip()
-    expect(output.startswith("generation 1 is in force"), f"it says {output}")
-    of_deployment(stack, folder)
-    after = {service: stack.restarts(service) for service in SERVICES}
-    expect(after == before, f"containers were restarted: {before}, {after}")
-    stack.notes.append(output)
-    hidden = stack.docker("exec", stack.container("hub"), "sh", "-c", "ls /run/rosbayes/*").split()
-    expect("hub.status.sock" in hidden, f"the hub sees {hidden}")
-    expect("master.control.sock" not in hidden, "the hub can reach the master's control socket")
-
-
-def kill_after_reload(stack: Stack, folder: Path) -> None:
-    """Check that a restarted service uses the deployment in force, which is the folder's."""
-    killed_at = time.time()
-    for service in ("pcie-app", "boards"):
-        before = stack.restarts(service)
-        stack.signal(service, "KILL")
-        stack.restarted(service, before, killed_at)
-    of_deployment(stack, folder)
-
-
-def kill_instead_of_reload(stack: Stack, folder: Path) -> None:
-    """Check a changed folder without a reload: after the first restart, all others restart once."""
+def kill_after_change(stack: Stack, folder: Path) -> None:
+    """Check a changed folder: after the first restart, all others restart once."""
     before = {service: stack.restarts(service) for service in SERVICES}
     correct_tables(folder, 1.2)
     at = time.time()

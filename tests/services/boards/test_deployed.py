@@ -13,10 +13,8 @@ from pcie_shim.endpoint import parse_endpoint
 from services.boards.canaries import DamagedBoardError
 from services.boards.deployed import DeployedBoards
 from services.settings import Settings
-from services.sockets.records import Frame, Prepare, Prepared, Switch, Switched
-from tests.integration.conftest import build_boat
+from services.sockets.records import Frame
 from tests.pcie_shim.boards import BoardProcess
-from toolchain.deployment import load_deployment
 from toolchain.deployment.sections import Integrity
 
 pytestmark = pytest.mark.thorough
@@ -109,22 +107,3 @@ def test_recovery_tries_again_until_the_board_is_back_or_the_time_is_over(open_b
     canaries_until_damaged(boards)
     boards.recover_in_time()
     assert boards.gone.keys() == {1}
-
-
-def test_a_reload_continues_the_walk(open_boards, boat, built, tmp_path):
-    boards = open_boards({})
-    for _ in range(7):
-        boards.run_canary()
-    counts(boards, 1)
-    former, status = boards.canaries.position, boards.integrity_status()
-    assert (former.next, former.passed) == (7, 7)
-    assert former.debt > 0
-    assert boards.generations.prepare(Prepare(1, str(built), boat.hash)) == Prepared(1)
-    assert boards.switch(Switch(1)) == Switched(1)
-    assert boards.canaries.position == former
-    assert boards.integrity_status() == status
-    other = build_boat(tmp_path / "other", "--counter-bits", "6", cells=4)
-    assert boards.generations.prepare(Prepare(2, str(other), load_deployment(other).hash)) == Prepared(2)
-    assert boards.switch(Switch(2)) == Switched(2)
-    assert boards.canaries.position.shape != former.shape
-    assert (boards.canaries.position.next, boards.canaries.position.debt) == (0, 0)

@@ -8,11 +8,11 @@ import pytest
 from services.master.peers import Peer
 from services.master.run import Master
 from services.settings import Settings
-from services.sockets.records import Frame, Prepare, Prepared, Reading, Switch, Switched
+from services.sockets.records import Frame, Reading
 
 
 class Service:
-    """A service at the other end of a peer's connection: it keeps what it is sent, and answers what a reload asks."""
+    """A service at the other end of a peer's connection: it keeps what it is sent."""
 
     where = "here"
 
@@ -20,8 +20,6 @@ class Service:
         self.peer = peer
         self.records = []
         self.takes = True
-        self.before_switch = self.switched = lambda: None
-        self.answers = True
         peer.protocol, peer.ready, peer.greeted = self, True, True
 
     @property
@@ -32,11 +30,6 @@ class Service:
         if not self.takes:
             return False
         self.records.append(record)
-        if isinstance(record, Switch):
-            self.before_switch()
-        if isinstance(record, Prepare | Switch) and self.answers:
-            answer = Prepared if isinstance(record, Prepare) else Switched
-            self.peer.answered(answer(record.generation))
         return True
 
     def close(self):
@@ -48,7 +41,7 @@ class Run:
 
     def __init__(self, boat, *, once=False, count=None, json=False, plot=False, **settings):
         self.master = Master(Settings(**settings), boat, once=once, count=count, json=json, plot=plot)
-        self.flow, self.reloads = self.master._flow, self.master._reloads
+        self.flow = self.master._flow
         self.peers = self.master._peers
         self.peers._events = self.flow
         self.warnings = []

@@ -22,7 +22,6 @@ from services.sockets.records import (
     LossReason,
     Notice,
     Outcome,
-    Prepared,
     Publish,
     Published,
     Rosbridge,
@@ -63,11 +62,9 @@ async def test_a_reading_becomes_a_result(run, monkeypatch):
     assert stamps == (3, 4, 5, 6)
     assert publish.waited_ns == 0
     assert run.app.frames == [1, 2]
-    assert run.flow.in_flight == 2
     published(run, 1)
     frames = run.master.status().frames
     assert (frames.received, frames.completed, frames.last_number, frames.lost) == (2, 1, 1, {})
-    assert run.flow.in_flight == 1
     computed(run)
     assert run.publisher.records[-1].waited_ns == 500
 
@@ -77,7 +74,8 @@ async def test_the_newest_reading_wins_unless_all_are_kept(boat):
     run.read(5, passed_over=2, unpaired=3)
     assert run.lost == {LossReason.PASSED_OVER: 13, LossReason.UNPAIRED: 15}
     computed(run)
-    assert (run.app.frames, run.flow.in_flight) == ([1, 2], 2)
+    computed(run)
+    assert run.app.frames == [1, 2]  # no other reading was kept
 
 
 async def test_a_publisher_that_takes_nothing_costs_its_results_and_no_more(run):
@@ -87,7 +85,6 @@ async def test_a_publisher_that_takes_nothing_costs_its_results_and_no_more(run)
         computed(run)
     assert run.lost == {LossReason.WITH_PUBLISHER: MOST_AT_PUBLISHER + 3}
     assert run.app.frames[-1] == MOST_AT_PUBLISHER + 4
-    assert run.flow.in_flight == 1
     assert run.flow.awaited(run.peers.publisher) is None
 
 
@@ -98,7 +95,6 @@ async def test_frames_wait_for_a_publisher_that_does_not_answer(run):
     assert len(run.app.frames) == MOST_AT_PUBLISHER
     assert run.flow.awaited(run.peers.publisher) is not None
     assert run.flow.awaited(run.peers.subscriber) is None
-    assert run.flow.busy_with
     published(run, 1)
     assert len(run.app.frames) == MOST_AT_PUBLISHER + 1
     run.flow.lost(run.peers.subscriber)
@@ -109,7 +105,6 @@ async def test_frames_wait_for_a_publisher_that_does_not_answer(run):
     assert run.lost[LossReason.WITH_APP] == 1
     run.flow.ready(run.peers.app)
     assert len(run.app.frames) == MOST_AT_PUBLISHER + 2
-    assert run.flow.in_flight == 1
 
 
 async def test_a_publisher_has_its_time_from_the_first_result_or_its_last_answer_on(run, monkeypatch):
@@ -129,7 +124,7 @@ async def test_no_frame_is_computed_whose_result_nobody_could_get(run):
     for service in (run.publisher, run.subscriber):
         run.take(service, Rosbridge(connected=False))
     run.read(3)
-    assert (run.app.frames, run.flow.in_flight) == ([], 0)
+    assert run.app.frames == []
     assert run.lost == {LossReason.ROSBRIDGE_AWAY: 3}
     run.take(run.subscriber, Rosbridge(connected=True))
     assert run.publisher.records == [Rosbridge(connected=True)]  # so that it tries at once
@@ -150,45 +145,11 @@ async def test_frames_wait_for_peers_that_are_not_ready(run):
     assert run.app.frames == [1]
 
 
-@pytest.mark.parametrize("held", [True, False])
-async def test_too_many_readings_end_the_run_unless_a_reload_holds_them(run, held):
-    if held:
-        run.flow.hold()
-    run.read(QUEUE_ALL_DEPTH + (not held))
+async def test_too_many_readings_end_the_run(run):
+    run.read(1 + QUEUE_ALL_DEPTH)  # one is on the boards
     assert run.error is None
-    run.read(7)
-    assert run.lost == ({LossReason.IN_RELOAD: 7} if held else {})
-    assert isinstance(run.error, OverflowedQueueError) is not held
-
-
-async def test_boards_may_catch_up_after_a_reload(run):
-    run.flow.hold()
-    run.flow.expect_next_generation()
-    run.read(QUEUE_ALL_DEPTH, generation=1)
-    run.flow._in_force.generation = 1
-    run.flow.adopt_next_generation()
-    run.flow.resume()
-    run.read(3, generation=1)
-    assert run.lost == {LossReason.IN_RELOAD: 2}  # one is on the boards, so one more could wait
-    for _ in range(QUEUE_ALL_DEPTH - 1):
-        failed(run)
-        run.read(generation=1)
-    assert run.error is None
-    # the readings of the reload are done, and still as many wait: now it is the boards
-    run.read(generation=1)
+    run.read()
     assert isinstance(run.error, OverflowedQueueError)
-
-
-async def test_readings_of_other_generations_are_lost_or_wait_for_theirs(run):
-    run.read(generation=1)
-    run.flow.expect_next_generation()
-    run.read(4)
-    run.read(2, generation=2)
-    run.read(2, generation=1)
-    assert (run.flow.waiting, run.lost) == (3, {LossReason.IN_RELOAD: 3})
-    run.flow.drop_next_generation()
-    run.flow.adopt_next_generation()  # there is none
-    assert (run.flow.waiting, run.lost) == (3, {LossReason.IN_RELOAD: 5})
 
 
 async def test_a_run_publishes_the_requested_number_of_results(boat):
@@ -279,8 +240,6 @@ async def test_a_single_frame_that_has_no_result_ends_the_run(boat, end, error, 
 
 
 async def test_a_record_of_another_service_is_reported(run):
-    run.take(run.subscriber, Prepared(1))  # nobody waits for it
-    assert not run.warnings
     run.take(run.subscriber, Publish(None, 0, 0, 0, 0, 0))
     assert len(run.warnings) == 1
     assert run.error is None

@@ -31,7 +31,7 @@ def reading(tick=0, **fields):
 
 
 def publish(history, number, tick=0, total_ms=20):
-    history.sent(number, 0, number % 2, reading(tick), (tick + 2 * MS, tick + 3 * MS))
+    history.sent(number, number % 2, reading(tick), (tick + 2 * MS, tick + 3 * MS))
     history.computed(FrameResult(number, RAW, MS, 5 * MS, 2 * MS, 4 * MS, began_tick=tick + 4 * MS))
     record = Published(
         number,

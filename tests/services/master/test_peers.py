@@ -11,13 +11,10 @@ import pytest
 from services.errors import (
     BoardFailedError,
     ChildDiedError,
-    NotReloadedError,
-    OtherPeerError,
     ReportedError,
     SettingsError,
 )
 from services.master.peers import Awaited, Peer, Peers
-from services.pipeline.generations import InForce
 from services.settings import Settings
 from services.sockets.local_socket import open_connection, own_hello
 from services.sockets.records import Begin, Ready, Trouble
@@ -53,7 +50,7 @@ def events():
 
 @pytest.fixture
 def peers(boat, tmp_path, events):
-    peers = Peers(Settings(peer_timeout=0.2), InForce(boat, tmp_path), get_logger("test"), once=True)
+    peers = Peers(Settings(peer_timeout=0.2), boat, get_logger("test"), once=True)
     peers._events = events
     return peers
 
@@ -88,7 +85,7 @@ async def test_a_process_may_start_slowly_but_not_for_ever(peers, tmp_path, monk
 @pytest.mark.process
 async def test_a_process_that_dies_is_restarted_three_times(boat, tmp_path):
     settings = Settings(restart_window=PROCESS_PATIENCE)
-    peers = Peers(settings, InForce(boat, tmp_path), get_logger("test"), once=False)
+    peers = Peers(settings, boat, get_logger("test"), once=False)
     boards = Child("the boards' process", ["/bin/sh", "-c", f"echo >> {tmp_path}/starts; kill -KILL $$"])
     await boards.start()
     with pytest.raises(BoardFailedError, match="SIGKILL"):
@@ -142,7 +139,7 @@ ROLES = ("subscriber", "publisher", "pcie-app")
 @pytest.mark.parametrize("given", [(), ("publisher",), ("pcie-app",), ROLES])
 def test_peers_that_are_not_given_are_started(boat, tmp_path, given):
     settings = Settings(**{role.replace("-", "_"): f"unix:/tmp/{role}.sock" for role in given})
-    peers = Peers(settings, InForce(boat, tmp_path), get_logger("test"), once=True)
+    peers = Peers(settings, boat, get_logger("test"), once=True)
     peers.prepare()
     try:
         assert [peer.role for peer in peers] == list(ROLES)
@@ -159,7 +156,7 @@ def test_peers_that_are_not_given_are_started(boat, tmp_path, given):
 @pytest.mark.parametrize("given", [{}, {"publisher": "unix:/tmp/publisher.sock"}])
 def test_a_fused_master_has_all_services_inside(boat, tmp_path, given):
     settings = Settings(fused=True, boards=("unix:/tmp/board.sock",) * 4, **given)
-    peers = Peers(settings, InForce(boat, tmp_path), get_logger("test"), once=True)
+    peers = Peers(settings, boat, get_logger("test"), once=True)
     with pytest.raises(SettingsError) if given else nullcontext():
         peers.prepare()
     peers._private.remove()
@@ -172,37 +169,6 @@ def connected(peers):
     peer = peers._by_role["publisher"] = Peer("publisher", None, None)
     peer.child, peer.since = Process(), time.monotonic()
     return peer
-
-
-async def test_a_child_that_was_started_before_a_reload_is_restarted(peers, events, connected, boat):
-    in_force = peers._in_force
-    in_force.former_hash, in_force.generation = "f" * 64, 1
-    peers._take(connected, own_hello("publisher", in_force.former_hash))
-    assert (connected.outdated, connected.greeted, connected.child.killed.is_set()) == (True, False, True)
-    peers._take(connected, Ready("publishing"))
-    assert not connected.ready
-    # and its successor is taken
-    connected.outdated = False
-    connected.child.killed.clear()
-    peers._take(connected, own_hello("publisher", boat.hash))
-    assert (connected.greeted, connected.generation, connected.child.killed.is_set()) == (True, 1, False)
-    assert events.error is None
-
-
-@pytest.mark.parametrize("case", ["not a child", "same deployment again", "third deployment"])
-async def test_only_a_child_of_the_former_deployment_is_restarted(peers, connected, boat, case):
-    peers._in_force.former_hash = boat.hash if case == "same deployment again" else "f" * 64
-    hash_ = "e" * 64 if case == "third deployment" else peers._in_force.former_hash
-    child = connected.child
-    if case == "not a child":
-        connected.child = None
-    if case == "same deployment again":
-        peers._take(connected, own_hello("publisher", hash_))
-        assert connected.greeted
-    else:
-        with pytest.raises(OtherPeerError):
-            peers._take(connected, own_hello("publisher", hash_))
-    assert not child.killed.is_set()
 
 
 async def test_the_subscriber_begins_when_all_are_ready(peers, events):
@@ -240,13 +206,6 @@ async def test_only_the_end_of_the_present_connection_counts(peers, connected):
     assert connected.reason is reason
 
 
-async def test_flags_are_for_the_masters_own_processes(peers, connected):
-    peers._by_role["subscriber"] = Peer("subscriber", endpoint_from("unix:/x", ""), None)
-    connected.child = Mock()
-    peers.set_flag("--deployment", "/there")
-    connected.child.set_flag.assert_called_once_with("--deployment", "/there")
-
-
 async def test_a_peer_that_is_gone_is_reported_once(peers, connected, boat):
     connected.child, peers._once, peers._log = None, False, Mock()
     for _ in range(2):
@@ -258,22 +217,15 @@ async def test_a_peer_that_is_gone_is_reported_once(peers, connected, boat):
 
 
 @pytest.mark.parametrize(("own", "limit"), [(True, 60.0), (False, 0.2)])
-async def test_a_lost_peer_answers_no_reload_and_is_brought_back(peers, connected, own, limit):
+async def test_a_lost_peer_is_brought_back(peers, connected, own, limit):
     if not own:
         connected.child = None
     peers._connect, peers._watch = AsyncMock(), AsyncMock()
     peers._bring_back = AsyncMock(side_effect=[None, ChildDiedError("it died")])
-    connected.answer = asyncio.get_running_loop().create_future()
-    connected.protocol, connected.ready, connected.outdated, connected.away = object(), True, True, True
+    connected.protocol, connected.ready, connected.away = object(), True, True
     with pytest.raises(ChildDiedError):
         await peers._keep(connected)
-    assert isinstance(connected.answer.exception(), NotReloadedError)
-    assert (connected.protocol, connected.ready, connected.outdated, connected.away) == (
-        None,
-        False,
-        False,
-        False,
-    )
+    assert (connected.protocol, connected.ready, connected.away) == (None, False, False)
     assert [each.args for each in peers._connect.await_args_list] == [(connected, limit), (connected, 60.0)]
 
 
@@ -286,7 +238,7 @@ async def test_services_inside_get_a_grace_period_to_end(boat, tmp_path):
 
     stopped = asyncio.Event()
     settings = Settings(stop_timeout=0.1)
-    peers = Peers(settings, InForce(boat, tmp_path), get_logger("test"), once=True)
+    peers = Peers(settings, boat, get_logger("test"), once=True)
     task = asyncio.ensure_future(stubborn())
     peers._inside.append(task)
     await asyncio.sleep(0)

@@ -48,7 +48,7 @@ async def test_the_status_gives_the_reason_for_missing_results(boat, monkeypatch
     assert not late.ready
     assert "6 s" in late.why
     assert late.why != flowing.why != ""
-    assert (late.deployment, late.generation) == (boat.hash, 0)
+    assert late.deployment == boat.hash
     assert [peer.name for peer in late.peers] == ["subscriber", "publisher", "pcie-app"]
 
 
@@ -146,9 +146,8 @@ async def test_the_newest_posterior_is_drawn_once(boat):
 
 @pytest.mark.parametrize("once", [True, False])
 async def test_a_run_is_open_to_questions_until_its_end(boat, tmp_path, monkeypatch, capsys, once):
-    status, control = Mock(return_value=nullcontext()), Mock(return_value=nullcontext())
+    status = Mock(return_value=nullcontext())
     monkeypatch.setattr("services.master.run.serve_status", status)
-    monkeypatch.setattr("services.master.run.serve_control", control)
     monkeypatch.setattr("services.master.run.get_logger", log := Mock())
     run = Run(boat, once=once, run_directory=tmp_path, metrics="tcp://127.0.0.1:9999", log_level="debug")
     peers, history = run.peers, run.flow.history
@@ -165,7 +164,6 @@ async def test_a_run_is_open_to_questions_until_its_end(boat, tmp_path, monkeypa
         history.latencies,
         history.timeline,
     )
-    assert control.call_args_list == ([] if once else [((tmp_path, run.reloads.order),)])
     run.flow.end.set_result(None)
     assert await running == 0
     assert (peers.start.await_args.args, peers.leave.await_count, peers.end.await_count) == (

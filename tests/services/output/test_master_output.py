@@ -1,7 +1,6 @@
 """Results as `master` prints them: the words and the keys of `listen`."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -9,7 +8,6 @@ from services.output.axes import axes_of
 from services.output.master_output import print_json, sentence
 from services.output.posterior_file import record
 from services.output.posterior_lines import line
-from services.pipeline.generations import InForce
 from services.sockets.records import Outcome, Published
 from tests.services.output.test_posterior_output import deployment, made
 from toolchain.deployment import Dimension
@@ -32,7 +30,7 @@ def result():
         cycles=812,
         total_ns=3_210_000,
     )
-    return published, InForce(MAP, Path())
+    return published, MAP
 
 
 def test_the_line_of_a_master_begins_with_the_words_of_listen(result):

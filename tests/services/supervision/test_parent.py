@@ -51,9 +51,8 @@ KILLED_IN_PART = '''
 import ctypes, os, platform, socket, subprocess, sys, threading, time
 from services.supervision.parent import DIRECTORY_VARIABLE
 from terminal.log_line import PARENT_VARIABLE
-from terminal.private_directory import COPY_PREFIX, PrivateDirectory
+from terminal.private_directory import PrivateDirectory
 directory = PrivateDirectory().path
-(directory / f"{COPY_PREFIX}3").mkdir()
 listener = socket.socket(socket.AF_UNIX)
 listener.bind(str(directory / "master.status.sock"))
 listener.listen()
