@@ -36,12 +36,6 @@ class Settings(BaseSettings):
         default=None, description="readings that wait while a frame is computed"
     )
     stop: Literal["slices", "own"] | None = Field(default=None, description="when the boards stop")
-    integrity: Literal["off", "canary", "twice"] | None = Field(
-        default=None, description="detection of silently wrong counts"
-    )
-    integrity_frames: int | None = Field(
-        default=None, ge=1, le=2**63 - 1, description="frames within which canaries find a flipped bit"
-    )
     boards: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="endpoints of running boards, comma-separated, or the folder of their sockets"
     )

@@ -5,7 +5,6 @@ machine runs in chunks of about 50 ms (`EmulatedBoard.step`), between which the 
 Chunks do not change results, because a machine that is stopped and resumed gives the same bits.
 """
 
-import copy
 import math
 import struct
 import time
@@ -289,28 +288,6 @@ class EmulatedBoard:
         self._outcomes[:] = np.zeros((), REPLICA_OUTCOME)
         self._publish(BoardState.IDLE, StopReason.NONE, 0)
 
-    def flip_table_bit(self, column: int, address: int, line: int, bit: int) -> None:
-        """Invert one bit of a table's code (column 0: the prior) until the board is programmed again."""
-        if self._kernel is not None:
-            self._kernel = self._make(with_flipped_bit(self._kernel.machine, column, address, line, bit))
-
-    def flip_used_bit(self) -> None:
-        """Invert the highest bit of a code that the last frame used, in the line that counted most."""
-        if self._kernel is None:
-            return
-        parameters = self._kernel.machine.parameters
-        line = int(self._results.reshape(-1, parameters.lines).argmax()) % parameters.lines
-        column = address = 0
-        if parameters.has_tables and parameters.sensors:
-            inputs = np.asarray(self._inputs(parameters)).reshape(
-                -1, parameters.sensors, _lines_of(parameters)
-            )
-            own = inputs[0, :, line if inputs.shape[2] > 1 else 0]
-            given = np.flatnonzero(own < (1 << np.array(parameters.sensor_bits)) - 1)
-            if len(given):
-                column, address = int(given[0]) + 1, int(own[given[0]])
-        self.flip_table_bit(column, address, line, parameters.prob_bits - 1)
-
     def release(self) -> None:
         """Stop a running machine and disable interrupts, because the host has disconnected."""
         if self.running:
@@ -454,20 +431,6 @@ class EmulatedBoard:
         words = self._view[rm.DONE : rm.DONE + DONE_BLOCK.size].tobytes() + self._results.tobytes()
         return words if self._is_plain else words + self._outcomes.tobytes()
 
-    @property
-    def is_sliced(self) -> bool:
-        """True if the machine stopped at the end of a slice, so that its counts are not final."""
-        return self._kernel is not None and self._kernel.reason is StopReason.SLICE
-
-    def with_flipped_counter(self, words: bytes) -> bytes:
-        """Return the payload of an interrupt with the highest bit of the highest count inverted."""
-        if self._kernel is None:
-            return words
-        changed = np.frombuffer(words, "<u4").copy()
-        counter = DONE_BLOCK.size // 4 + int(self._results.argmax())
-        changed[counter] ^= 1 << self._kernel.machine.parameters.counter_bits - 1
-        return changed.tobytes()
-
     # ---- memory ---------------------------------------------------------------------------------------
 
     def _put(self, address: int, value: int) -> None:
@@ -492,17 +455,6 @@ _DATA: Final = (
 def _lines_of(parameters: BM1Parameters) -> int:
     """Return the number of inputs of a sensor column, in each replica."""
     return 1 if parameters.sensor_mode is InputMode.COLUMN else parameters.lines
-
-
-def with_flipped_bit(machine: BM1Machine, column: int, address: int, line: int, bit: int) -> BM1Machine:
-    """Return a machine with one wrong bit, which the checks of a new machine might refuse."""
-    tables = [machine.prior, *machine.tables]
-    tables[column] = tables[column].copy()
-    tables[column][address, line] ^= 1 << bit
-    damaged = copy.copy(machine)
-    object.__setattr__(damaged, "prior", tables[0])
-    object.__setattr__(damaged, "tables", tuple(tables[1:]))
-    return damaged
 
 
 def _measure_speed(kernel: BM1Kernel) -> float:

@@ -41,10 +41,6 @@ class MisbehaviourKind(StrEnum):
     """An interrupt is sent before the machine has run."""
     STALE_RESULT = "stale-result"
     """An interrupt has the doorbell number and the results of the previous one."""
-    FLIP_TABLE = "flip-table"
-    """A bit of a running table is inverted, in the line that counted most in the previous frame."""
-    FLIP_COUNTER = "flip-counter"
-    """The highest bit of the counter that counted most is inverted in the last interrupt of a frame."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -375,8 +375,6 @@ class _Server:
                 board.stuck = rings and self._misbehaves(MisbehaviourKind.NEVER_DONE, ahead=1)
                 if rings and self._misbehaves(MisbehaviourKind.DONE_EARLY, ahead=1):
                     self._interrupt(host)
-                if rings and self._misbehaves(MisbehaviourKind.FLIP_TABLE, ahead=1):
-                    board.flip_used_bit()
             board.write(address, payload)
             # acknowledge before the interrupt that the write may cause
             if not flags & framing.POSTED:
@@ -435,13 +433,6 @@ class _Server:
             last, self._last_results = self._last_results, words
             if last and self._misbehaves(MisbehaviourKind.STALE_RESULT):
                 words = last
-            board = self.board
-            if (
-                isinstance(board, EmulatedBoard)
-                and not board.is_sliced
-                and self._misbehaves(MisbehaviourKind.FLIP_COUNTER)
-            ):
-                words = board.with_flipped_counter(words)
         if words and self._misbehaves(MisbehaviourKind.SHORT_READ):
             words = words[:-4]
         if words and self._misbehaves(MisbehaviourKind.ALL_ONES):

@@ -129,10 +129,6 @@ class MiniCluster:
         """
         self._open(self._boards[board], self._timeout if timeout is None else timeout)
 
-    def give_up(self, board: int, reason: str) -> None:
-        """Close the link to a board, which must then be reopened."""
-        self._close(self._boards[board], reason)
-
     def close(self) -> None:
         """Close all links; running boards stop."""
         self._progress = None

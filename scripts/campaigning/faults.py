@@ -23,7 +23,6 @@ class Kind(StrEnum):
     RESOURCES = "resources"
     CLOCK = "clock"
     INPUT = "input"
-    INTEGRITY = "integrity"
     CONTAINERS = "containers"
     """Faults of containers alone: without network, restarted, or with full run directories."""
 
@@ -39,8 +38,6 @@ class Fault:
     number: int = 0
 
     def __str__(self) -> str:
-        if self.what == "flip":
-            return f"a bit flips in a table of {self.target} after {self.number} starts"
         if self.what == "misbehave":
             return f"{self.target} misbehaves: {MISBEHAVIOURS[self.number]}"
         parts = [self.what, self.target, f"{self.seconds:.2f} s" if self.seconds else ""]
@@ -91,8 +88,6 @@ def ended_roles(fault: Fault) -> tuple[str, ...]:
     """Return the roles whose limit of ends a fault uses up by one; a board's failed frame is such an end."""
     if fault.target == BOARDS_PARENT and fault.what in {"kill", "restart", "full"}:
         return ("boards",)
-    if fault.what == "flip":
-        return ("boards",)  # it has been killed before; the flip itself fails no frame
     if fault.what == "misbehave":
         return ("boards", "boards")  # it has been killed before
     if fault.target in BOARD_NAMES and fault.what in {*_FAILS, "stop", "hold"}:
@@ -140,7 +135,6 @@ class Schedule:
                 (Kind.LINKS, self._link),
                 (Kind.LINKS, self._link),
                 (Kind.BOARDS, self._misbehave),
-                (Kind.INTEGRITY, self._flip),
             ]
         if topology is Topology.CONTAINERS:
             # processes of containers cannot be limited from outside
@@ -201,10 +195,6 @@ class Schedule:
     def _misbehave(self) -> Step:
         kind = self._rng.randrange(len(MISBEHAVIOURS))
         return (Fault(Kind.BOARDS, "misbehave", self._rng.choice(BOARD_NAMES), 0.5, kind),)
-
-    def _flip(self) -> Step:
-        starts = self._rng.randrange(30, 300)
-        return (Fault(Kind.INTEGRITY, "flip", self._rng.choice(BOARD_NAMES), 0.0, starts),)
 
     def _input(self) -> Step:
         what = self._rng.choice(["burst", "nan", "huge", "unusable", "disorder"])

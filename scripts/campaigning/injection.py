@@ -19,8 +19,6 @@ _FEWEST = 3
 _STARTS_BEFORE = 20
 _MISBEHAVING = 20.0 * FACTOR
 """Seconds in which a board should have misbehaved; one that lies in its greeting is not asked for another."""
-_FINDING = 20.0 * FACTOR
-"""Seconds in which a flipped bit should have been found; the observer judges frames, not this time."""
 _FAILED = "failed on a board"
 _CLOCK_FILE = "clock"
 
@@ -34,13 +32,11 @@ class Injector:
         folder: Path,
         *,
         publish: Callable[[str, int], Awaitable[None]],
-        flip: Callable[[], None],
     ) -> None:
-        """Store functions that publish special readings (kind, number) and announce a flip."""
+        """Store a function that publishes special readings (kind, number)."""
         self._stack = stack
         self._clock = folder / _CLOCK_FILE
         self._publish = publish
-        self._flip = flip
         self.killed: set[str] = set()
         """Roles whose processes were ended by a fault since the last restart."""
 
@@ -52,8 +48,6 @@ class Injector:
             await self._contain(fault)
         elif fault.what == "misbehave":
             await self._misbehave(fault)
-        elif fault.what == "flip":
-            await self._damage(fault)
         elif fault.what in {"files", "memory"}:
             await self._limit(fault)
         elif fault.what == "clock":
@@ -116,25 +110,6 @@ class Injector:
                 back, failed = counters.completed, now_failed  # the board is not ready yet
             elif failed != now_failed:
                 return
-
-    async def _damage(self, fault: Fault) -> None:
-        """Restart a board in which a bit of a table flips once, and wait until pcie-app has found it."""
-        os.kill(await self._stack.pid(fault.target), signal.SIGKILL)
-        await self._stack.wait(fault.target)
-        found = await self._damages()
-        self._flip()
-        await self._stack.start_part(fault.target, f"flip-table:{fault.number}:1")
-        deadline = asyncio.get_running_loop().time() + _FINDING
-        while asyncio.get_running_loop().time() < deadline:
-            await asyncio.sleep(0.05)
-            if await self._damages() > found:
-                return
-
-    async def _damages(self) -> int:
-        """Return how many damaged boards pcie-app has found, by its own account."""
-        status = await self._stack.status("pcie-app")
-        integrity = None if status is None else status.get("integrity")
-        return int(integrity["damaged"]) if isinstance(integrity, dict) else 0
 
     async def _weather(self, fault: Fault) -> None:
         link = self._stack.links[fault.target]

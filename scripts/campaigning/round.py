@@ -28,8 +28,6 @@ POOL = (
     *((4, 1), (5, 1), (6, 1), (0, 3)),  # sensors that contradict each other need several slices
 )
 """Number of different readings in a campaign; few, because the reference kernel is slow."""
-INTEGRITY_FRAMES = 100
-"""Frames within which the stack promises to find a flipped bit, in rounds in which one flips."""
 _ANSWER = 0.1 * FACTOR
 """Seconds to wait for a result during a fault before the next reading is published."""
 _ANSWER_LIMIT = 10.0 * FACTOR
@@ -69,7 +67,7 @@ class Round:
             else Stack(folder, topology, deployments[0], rng)
         )
         self.observer = Observer(expected, deployments[0].name)
-        self._injector = Injector(self.stack, folder, publish=self._special, flip=self._flip)
+        self._injector = Injector(self.stack, folder, publish=self._special)
         self._client = Client(self.stack.hub_port, self._take, self.observer.reconnected)
         self._result = RoundResult()
         self._base = Counters()
@@ -140,9 +138,6 @@ class Round:
             if what != "burst":
                 await asyncio.sleep(0.005)
 
-    def _flip(self) -> None:
-        self.observer.flip(INTEGRITY_FRAMES)
-
     # --- a round -------------------------------------------------------------------------------
 
     async def run(self, steps: list[Step]) -> RoundResult:
@@ -150,11 +145,6 @@ class Round:
         result, observer = self._result, self.observer
         if any(fault.kind == Kind.CLOCK for step in steps for fault in step):
             self.stack.environment |= steppable_clock(self._folder)
-        if any(fault.kind == Kind.INTEGRITY for step in steps for fault in step):
-            self.stack.environment |= {
-                "BM_INTEGRITY": "canary",
-                "BM_INTEGRITY_FRAMES": str(INTEGRITY_FRAMES),
-            }
         driver = None
         try:
             await self.stack.start(observer.forwarded)

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import (
@@ -20,15 +19,11 @@ from pcie_shim.host.link import LONGEST_POLL_S
 from pcie_shim.host.loader import program
 from pcie_shim.host.mini_cluster import PROGRAMMING_S, MiniCluster
 from pcie_shim.programming_file import Image, read_image
-from services.boards.agreement import DisagreementError, compare
-from services.boards.canaries import PAUSE, Canaries, DamagedBoardError
 from services.boards.frames import BoardAwayError, driver_input
-from services.boards.integrity import integrity_rule
 from services.settings import Settings
 from services.sockets.records import Frame
-from services.sockets.status import BoardStatus, IntegrityStatus
+from services.sockets.status import BoardStatus
 from toolchain.deployment import Deployment
-from toolchain.deployment.sections import Integrity
 
 TICK = 0.2
 """Seconds between attempts to reopen a board, and for each of them."""
@@ -40,8 +35,6 @@ class DeployedBoards:
     Attributes:
         deployment: The deployment.
         gone: Reasons why boards are unusable, by board number.
-        canaries: The known readings that run between frames; None before opening and without them.
-        disagreements: Frames whose two computations disagreed.
     """
 
     def __init__(
@@ -52,13 +45,8 @@ class DeployedBoards:
         *,
         reprogram: bool = False,
     ) -> None:
-        """Read the images; with `reprogram`, boards with another image are programmed instead of refused.
-
-        Raises:
-            SettingsError: The rule of integrity is unsound with this machine.
-        """
+        """Read the images; with `reprogram`, boards with another image are programmed instead of refused."""
         self._settings = settings
-        self._rule = integrity_rule(settings, deployment)
         self.deployment = deployment
         self._images = images_of(deployment)
         self._reprogram = reprogram
@@ -66,13 +54,6 @@ class DeployedBoards:
         self._cluster: MiniCluster | None = None
         self.gone: dict[int, str] = {}
         self._times_gone = [0] * len(self._endpoints)
-        self._times_damaged = [0] * len(self._endpoints)
-        self._damaged: set[int] = set()
-        self.canaries: Canaries | None = None
-        self.disagreements = 0
-        self._posted_canary: Canaries | None = None
-        self._second: FrameInput | None = None
-        self._first: FrameOutput | None = None
 
     def open(self) -> str:
         """Open all boards, program blank ones, and return a sentence for the user, or raise a PcieShimError."""
@@ -85,7 +66,6 @@ class DeployedBoards:
                     raise
                 programmed.add(error.board)
                 self._program(error.board, self._images[error.board])
-        self._prepare_canaries()
         count = len(self._endpoints)
         return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
 
@@ -96,14 +76,6 @@ class DeployedBoards:
             timeout=self._settings.peer_timeout,
             slack=self._settings.board_timeout,
         )
-
-    def _prepare_canaries(self) -> None:
-        """Begin a walk of canaries for the deployment in force, or continue one, if the rule asks for it."""
-        former, self.canaries = self.canaries, None
-        if self._rule.kind is Integrity.CANARY:
-            self.canaries = Canaries(self._images, self._rule.frames)
-            if former is not None:
-                self.canaries.go_on(former.position)
 
     def _program(self, board: int, image: Image) -> None:
         """Program a board that this process does not have open, or raise a BoardError."""
@@ -137,24 +109,9 @@ class DeployedBoards:
                 restarts=self._times_gone[at],
                 last_cycles=None if output is None else output.boards[at].cycles,
                 why=gone.get(at, ""),
-                damaged=self._times_damaged[at],
             )
             for at, (endpoint, image) in enumerate(zip(self._endpoints, self._images, strict=True))
         ]
-
-    def integrity_status(self) -> IntegrityStatus | None:
-        """Return the counts of the detection of wrong counts; None if it is off. For use in another thread."""
-        rule, canaries = self._rule, self.canaries
-        if rule.kind is Integrity.OFF:
-            return None
-        return IntegrityStatus(
-            kind=rule.kind,
-            frames=rule.frames,
-            walk=0 if canaries is None else canaries.length,
-            canaries=0 if canaries is None else canaries.passed,
-            damaged=sum(self._times_damaged),
-            withheld=self.disagreements,
-        )
 
     def run(self, frame: Frame) -> FrameOutput:
         """Compute one frame; a board that fails (a BoardError) is in `gone` until `recover` has reopened it."""
@@ -168,85 +125,14 @@ class DeployedBoards:
             raise
         return output
 
-    def run_canary(self) -> None:
-        """Run the next canary; a BoardError names the board that failed, or gave wrong counts (DamagedBoardError)."""
-        try:
-            self.post_canary()
-            while self.collect(LONGEST_POLL_S) is None:
-                pass
-        except BoardError as error:
-            self.find_lost_boards(error)
-            raise
-
     def post(self, frame: Frame) -> None:
         """Start a frame, whose result `collect` returns; after a BoardError call `find_lost_boards`."""
         given = self._input(frame)
-        self._posted_canary, self._first, self._second = None, None, None
         self._whole_cluster().post(given)
-        if self._rule.kind is Integrity.TWICE:
-            banks = self.deployment.machine.rng_banks
-            self._second = replace(given, bank=(given.bank + banks // 2) % banks)
-
-    def post_canary(self) -> None:
-        """Start the next canary instead of a frame."""
-        if self.canaries is None:
-            raise ValueError("there are no canaries: the boards are not open, or integrity is not canary")
-        self._whole_cluster().post(self.canaries.next())
-        self._posted_canary, self._first, self._second = self.canaries, None, None
 
     def collect(self, seconds: float = 0) -> FrameOutput | None:
-        """Return the posted frame's result, or None while boards run; after a BoardError, call `find_lost_boards`.
-
-        Raises:
-            DamagedBoardError: The posted canary has shown a damaged board, which is in `gone` now.
-            DisagreementError: The two computations of the frame disagree.
-        """
-        output = self._whole_cluster().collect(seconds)
-        if output is None:
-            return None
-        if self._posted_canary is not None:
-            self._judge(self._posted_canary, output)
-            return output
-        if self._second is not None:
-            self._whole_cluster().post(self._second)
-            self._first, self._second = output, None
-            return None
-        if self._first is not None:
-            try:
-                compare(self._first, output, self._images[0].machine.parameters)
-            except DisagreementError:
-                self.disagreements += 1
-                raise
-            output = self._first
-        if self.canaries is not None:
-            self.canaries.count_frame()
-        return output
-
-    def _judge(self, canaries: Canaries, output: FrameOutput) -> None:
-        """Compare a canary's counts; damaged boards are closed, and programmed again when they are recovered."""
-        cluster = self._whole_cluster()
-        try:
-            canaries.judge(output)
-        except DamagedBoardError as error:
-            self._are_damaged(cluster, error)
-            raise
-
-    def _are_damaged(self, cluster: MiniCluster, error: DamagedBoardError) -> None:
-        for board in error.boards:
-            self._damaged.add(board)
-            self._times_damaged[board] += 1
-            self.gone[board] = str(error)
-            cluster.give_up(board, str(error))
-
-    @property
-    def is_canary_owed(self) -> bool:
-        """True if a canary must run before the next frame."""
-        return self.canaries is not None and not self.gone and self.canaries.is_owed
-
-    @property
-    def pause(self) -> float:
-        """Seconds without a frame after which a canary, or else an attempt to reopen boards, is due."""
-        return PAUSE if self.canaries is not None and not self.gone else TICK
+        """Return the posted frame's result, or None while boards run; after a BoardError, call `find_lost_boards`."""
+        return self._whole_cluster().collect(seconds)
 
     @property
     def awaited(self) -> int | None:
@@ -269,7 +155,7 @@ class DeployedBoards:
 
     def find_lost_boards(self, error: BoardError) -> None:
         """Find all boards that are gone after a failure, so that several deaths at once fail one frame."""
-        if self._cluster is None or isinstance(error, BoardAwayError | DamagedBoardError | DisagreementError):
+        if self._cluster is None or isinstance(error, BoardAwayError):
             return
         if not self._cluster.is_open(error.board):
             self._is_gone(error.board, error)
@@ -287,12 +173,10 @@ class DeployedBoards:
     def recover(self) -> list[int]:
         """Try once to reopen the missing boards, and return the numbers of those that are back.
 
-        Boards that gave wrong counts are programmed first, and must then give the right ones.
-
         Raises:
             BoardMismatchError: A board is back with another image, so waiting would not help.
         """
-        back = []
+        back: list[int] = []
         for board in list(self.gone):
             if self._cluster is None:
                 break
@@ -303,38 +187,11 @@ class DeployedBoards:
             except BoardError as error:
                 self.gone[board] = str(error)
             else:
+                del self.gone[board]
                 back.append(board)
-        if self._damaged and self._cluster is not None and self.gone.keys() == set(back):
-            try:
-                self._check_again(self._cluster)
-            except DamagedBoardError as error:
-                self._are_damaged(self._cluster, error)
-                back = [board for board in back if board not in error.boards]
-            except BoardError as error:
-                self.gone[error.board] = str(error)
-                self._cluster.give_up(error.board, str(error))
-                back = [board for board in back if board != error.board]
-            else:
-                self._damaged.clear()
-        for board in back:
-            del self.gone[board]
         return back
 
-    def recover_in_time(self) -> None:
-        """Try for `peer_timeout` seconds to recover all missing boards; the others remain in `gone`."""
-        deadline = time.monotonic() + self._settings.peer_timeout
-        while self.gone and time.monotonic() < deadline:
-            self.recover()
-            time.sleep(TICK / 4 if self.gone else 0)
-
-    def _check_again(self, cluster: MiniCluster) -> None:
-        """Run the canary that showed damaged boards, now that they are programmed again."""
-        if self.canaries is not None:
-            self.canaries.check(cluster.run(self.canaries.next()), self._damaged)
-
     def _reopen(self, cluster: MiniCluster, board: int) -> None:
-        if board in self._damaged:
-            self._program(board, self._images[board])
         try:
             cluster.reopen(board, timeout=TICK)
         except BoardMismatchError:

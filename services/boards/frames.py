@@ -10,7 +10,6 @@ import numpy.typing as npt
 from machines.parameters import SensorMode
 from pcie_shim.errors import BoardError, FrameInputError
 from pcie_shim.host.frame import BoardResult, FrameInput, FrameOutput
-from services.boards.agreement import DisagreementError
 from services.sockets.records import Addresses, FailureReason, Frame, FrameFailed, FrameResult
 from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment, Variable
@@ -135,9 +134,5 @@ def result_record(number: int, output: FrameOutput, began_tick: int = 0) -> Fram
 
 def frame_failed(number: int, error: BoardError) -> FrameFailed:
     """Return the error of a board as the record of a failed frame."""
-    reason = FailureReason.FAILED
-    if isinstance(error, BoardAwayError):
-        reason = FailureReason.AWAY
-    elif isinstance(error, DisagreementError):
-        reason = FailureReason.WITHHELD
+    reason = FailureReason.AWAY if isinstance(error, BoardAwayError) else FailureReason.FAILED
     return FrameFailed(number, error.board, exit_code_of(error), str(error), reason)

@@ -145,26 +145,6 @@ Stop = Annotated[
         rich_help_panel=BOARDS,
     ),
 ]
-Integrity = Annotated[
-    str | None,
-    setting(
-        "integrity",
-        "Detect wrong counts: canary (known readings between frames) or twice (two banks for each frame).",
-        otherwise=_DEPLOYMENTS,
-        metavar="off|canary|twice",
-        rich_help_panel=BOARDS,
-    ),
-]
-IntegrityFrames = Annotated[
-    int | None,
-    setting(
-        "integrity_frames",
-        "Frames within which canaries find a flipped bit.",
-        otherwise=_DEPLOYMENTS,
-        min=1,
-        rich_help_panel=BOARDS,
-    ),
-]
 Boards = Annotated[
     str | None,
     setting(

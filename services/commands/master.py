@@ -6,7 +6,6 @@ from typing import Annotated
 import orjson
 import typer
 
-from services.boards.integrity import integrity_rule
 from services.commands import flags as options
 from services.errors import SettingsError
 from services.master.run import run_master
@@ -45,8 +44,6 @@ def master(
     boards: options.Boards = None,
     queue: options.Queue = None,
     stop: options.Stop = None,
-    integrity: options.Integrity = None,
-    integrity_frames: options.IntegrityFrames = None,
     ros_version: options.RosVersion = None,
     message_bytes: options.MessageBytes = None,
     topic_bytes: options.TopicBytes = None,
@@ -95,8 +92,6 @@ def master(
         boards=boards,
         queue=queue,
         stop=stop,
-        integrity=integrity,
-        integrity_frames=integrity_frames,
         ros_version=ros_version,
         message_bytes=message_bytes,
         topic_bytes=topic_bytes,
@@ -127,7 +122,6 @@ def master(
         raise SettingsError("--count requires --loop; --once computes one frame")
     check_metrics(settings.metrics, insecure=insecure)
     loaded = deployment_for(settings)
-    integrity_rule(settings, loaded)  # refuse an unsound rule before processes are started
     return run_async(run_master(settings, loaded, once=once, count=count, json=json, plot=plot))
 
 

@@ -29,8 +29,6 @@ def pcie_app(
     boards: options.Boards = None,
     listen: options.Listen = None,
     stop: options.Stop = None,
-    integrity: options.Integrity = None,
-    integrity_frames: options.IntegrityFrames = None,
     peer_timeout: options.PeerTimeout = None,
     board_timeout: options.BoardTimeout = None,
     reprogram: Annotated[
@@ -53,8 +51,6 @@ def pcie_app(
         deployment=deployment,
         boards=boards,
         stop=stop,
-        integrity=integrity,
-        integrity_frames=integrity_frames,
         peer_timeout=peer_timeout,
         board_timeout=board_timeout,
         key_file=key_file,

@@ -38,9 +38,6 @@ def service_command(
     if role == "pcie-app":
         command += ["--boards", ",".join(settings.boards)] if settings.boards else []
         command += ["--stop", settings.stop] if settings.stop else []
-        command += ["--integrity", settings.integrity] if settings.integrity else []
-        if settings.integrity_frames:
-            command += ["--integrity-frames", str(settings.integrity_frames)]
         command += ["--peer-timeout", str(settings.peer_timeout + compiling_time)]
         command += ["--board-timeout", str(settings.board_timeout)]
         command += ["--key-file", str(settings.key_file)] if settings.key_file else []

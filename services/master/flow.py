@@ -279,18 +279,14 @@ class FrameFlow:
         self._send_next()
 
     def _take_failure(self, record: FrameFailed) -> None:
-        is_withheld = record.reason is FailureReason.WITHHELD
-        reason = LossReason.WITHHELD if is_withheld else LossReason.FAILED
         if self._computing is not None and self._computing.number == record.number:
             self._computing = None
-            self.history.lost(record.number, reason, record.sentence)
+            self.history.lost(record.number, LossReason.FAILED, record.sentence)
         if self._once:
             self.fail(ReportedError(record.exit_code, record.sentence))
             return
-        self._losses[reason] += 1
-        if is_withheld:
-            self._log.warning(record.sentence, frame=record.number, _reason=reason)
-        elif record.reason is FailureReason.FAILED:
+        self._losses[LossReason.FAILED] += 1
+        if record.reason is FailureReason.FAILED:
             now, window = time.monotonic(), self._settings.restart_window
             self._failures.append(now)
             recent = sum(1 for each in self._failures if now - each <= window)

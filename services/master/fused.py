@@ -8,10 +8,10 @@ import threading
 import time
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
-from typing import Any, Final, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from pcie_shim.errors import BoardError, PcieShimError
-from services.boards.deployed import DeployedBoards
+from services.boards.deployed import TICK, DeployedBoards
 from services.boards.frames import frame_failed, result_record
 from services.master.command_lines import METRICS_PORTS
 from services.pipeline.pcie_app import ROLE as PCIE_APP
@@ -27,8 +27,6 @@ from services.sockets.serving import Link, MakeLink, board_endpoints
 from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment
 
-_CANARY: Final = 0
-"""Number of a canary; frames are numbered from 1."""
 Result = TypeVar("Result")
 TakeRecord = Callable[[AnyRecord], None]
 
@@ -83,8 +81,8 @@ class FusedBoards:
         self._settings = settings
         self._progress = Progress(boards, settings.log_level)
         self._link = link(self._take)
-        self._number: int | None = None  # _CANARY: a canary instead of a frame
-        self._next_frame: Frame | None = None  # it waits for a canary
+        self._number: int | None = None  # that of the posted frame
+        self._next_frame: Frame | None = None  # it waits for the search of lost boards
         self._began = 0
         self._watched: int | None = None
         self._loop = asyncio.get_running_loop()
@@ -104,8 +102,7 @@ class FusedBoards:
                 self._progress.ready = Ready(await _in_thread(self._boards.open))
                 self._link.keep(self._progress.ready)
                 while True:
-                    number = self._progress.asked
-                    await asyncio.sleep(self._boards.pause)
+                    await asyncio.sleep(TICK)
                     if self._number is not None:
                         if self._boards.is_late:
                             self._collect()
@@ -116,8 +113,6 @@ class FusedBoards:
                             back = await _in_thread(self._boards.recover)
                         for board in back:
                             self._link.send(Notice("info", f"board {board} is back, programmed"))
-                    elif self._boards.canaries is not None and self._progress.asked == number:
-                        self._post_canary()
             except PcieShimError as error:
                 self._link.send(Trouble(exit_code_of(error), str(error)))
                 raise
@@ -131,28 +126,6 @@ class FusedBoards:
         if isinstance(record, Frame):
             self._post(record)
 
-    def _post_canary(self) -> None:
-        try:
-            self._boards.post_canary()
-        except BoardError as error:
-            self._canary_failed(error)
-        else:
-            self._number = _CANARY
-            self._watch()
-
-    def _canary_failed(self, error: BoardError) -> None:
-        self._unwatch()
-        self._number = None
-        self._link.send(Notice("warning", str(error)))
-        self._looking = self._loop.create_task(self._find_lost_boards(None, error))
-
-    def _take_next(self) -> None:
-        """Continue with a canary that is owed, or else with the frame that waits."""
-        if self._boards.is_canary_owed:
-            self._post_canary()
-        else:
-            self._start_next_frame()
-
     def _start_next_frame(self) -> None:
         if self._next_frame is not None:
             frame, self._next_frame = self._next_frame, None
@@ -161,10 +134,6 @@ class FusedBoards:
     def _post(self, record: Frame) -> None:
         if self._number is not None or self._looking is not None:
             self._next_frame = record
-            return
-        if self._boards.is_canary_owed:
-            self._next_frame = record
-            self._post_canary()
             return
         self._start(record)
 
@@ -203,38 +172,31 @@ class FusedBoards:
         try:
             output = self._boards.collect()
         except BoardError as error:
-            if number == _CANARY:
-                self._canary_failed(error)
-            else:
-                self._failed(number, error)
+            self._failed(number, error)
             return
         if output is None:
             self._watch()
             return
         self._number = None
-        if number != _CANARY:
-            self._progress.computed(number, output)
-            self._link.send(result_record(number, output, self._began))
+        self._progress.computed(number, output)
+        self._link.send(result_record(number, output, self._began))
         if self._number is None:  # sending may have brought the next frame
-            self._take_next()
+            self._start_next_frame()
 
     def _failed(self, number: int, error: BoardError) -> None:
         self._unwatch()
-        self._progress.count_failure(error)
+        self._progress.failed += 1
         self._number = None
         self._looking = self._loop.create_task(self._find_lost_boards(number, error))
 
-    async def _find_lost_boards(self, number: int | None, error: BoardError) -> None:
-        """Find all lost boards, and then report the frame as failed, or compute the one that waits."""
+    async def _find_lost_boards(self, number: int, error: BoardError) -> None:
+        """Find all lost boards, and then report the frame as failed."""
         try:
             async with self._one_thread:
                 await _in_thread(lambda: self._boards.find_lost_boards(error))
         finally:
             self._looking = None
-        if number is None:
-            self._start_next_frame()  # even if a canary is owed, so that a broken link fails a frame
-        else:
-            self._link.send(frame_failed(number, error))
+        self._link.send(frame_failed(number, error))
 
 
 async def _in_thread(work: Callable[[], Result]) -> Result:

@@ -131,10 +131,9 @@ def _boards(boards: list[BoardStatus]) -> Table:
 
     table = _table("board", "state", "image", "restarts", "last cycles", "endpoint")
     for board in boards:
-        state = f"{board.state}, {board.damaged} x damaged" if board.damaged else board.state
         table.add_row(
             str(board.index),
-            Text(plain(state), "green" if board.state in {"programmed", "blank"} else "red"),
+            Text(plain(board.state), "green" if board.state in {"programmed", "blank"} else "red"),
             Text(plain(board.image[:12])),
             str(board.restarts),
             "" if board.last_cycles is None else str(board.last_cycles),
@@ -163,8 +162,7 @@ def _boards_by_number(stack: StackStatus) -> list[BoardStatus]:
                 continue
             seen, own = (known, board) if known.image else (board, known)
             restarts = max(seen.restarts, own.restarts)
-            damaged = max(seen.damaged, own.damaged)
-            boards[board.index] = msgspec.structs.replace(seen, restarts=restarts, damaged=damaged)
+            boards[board.index] = msgspec.structs.replace(seen, restarts=restarts)
     return [boards[index] for index in sorted(boards)]
 
 

@@ -11,8 +11,7 @@ import time
 from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import BoardError, PcieShimError
 from pcie_shim.host.frame import FrameOutput
-from services.boards.agreement import DisagreementError
-from services.boards.deployed import DeployedBoards
+from services.boards.deployed import TICK, DeployedBoards
 from services.boards.frames import frame_failed, result_record
 from services.errors import LocalSocketError, OtherPeerError
 from services.sockets.local_socket import BlockingRecordSocket, check_hello, own_hello
@@ -48,10 +47,6 @@ class Progress:
         self.failed = 0
         self.ready: Ready | None = None
 
-    def count_failure(self, error: BoardError) -> None:
-        """Count a frame without a result; `DeployedBoards` counts those whose computations disagree."""
-        self.failed += not isinstance(error, DisagreementError)
-
     def computed(self, number: int, output: FrameOutput) -> None:
         """Count and log a computed frame."""
         self._computed += 1
@@ -79,13 +74,10 @@ class Progress:
             why=why,
             deployment=self._boards.deployment.hash,
             boards=self._boards.status(output),
-            integrity=self._boards.integrity_status(),
             frames=FrameCounts(
                 received=self.asked,
                 completed=self._computed,
-                lost=reasons(
-                    {LossReason.FAILED: self.failed, LossReason.WITHHELD: self._boards.disagreements}
-                ),
+                lost=reasons({LossReason.FAILED: self.failed}),
                 last_number=number or None,
                 last_age_s=seconds_since(tick),
             ),
@@ -122,8 +114,7 @@ class PcieApp:
                 while True:
                     check_signals()
                     self._turned = time.monotonic()
-                    if not self._poll(listener, self._boards.pause):
-                        self._run_canary()
+                    self._poll(listener, TICK)
                     self._recover_boards()
             except PcieShimError as error:
                 self._report(listener, Trouble(exit_code_of(error), str(error)))
@@ -134,15 +125,13 @@ class PcieApp:
                 self._master.close()
             remove_listener(self._endpoint, listener)
 
-    def _poll(self, listener: socket.socket, timeout: float) -> bool:
-        """Handle what arrives within `timeout` seconds, and return whether anything did."""
-        events = self._selector.select(timeout)
-        for key, _ in events:
+    def _poll(self, listener: socket.socket, timeout: float) -> None:
+        """Handle what arrives within `timeout` seconds."""
+        for key, _ in self._selector.select(timeout):
             if key.fileobj is listener:
                 self._accept(listener)
             else:
                 self._receive()
-        return bool(events)
 
     def _accept(self, listener: socket.socket) -> None:
         connection = BlockingRecordSocket(listener.accept()[0], self._where)
@@ -218,24 +207,11 @@ class PcieApp:
         try:
             output = self._boards.run(frame)
         except BoardError as error:
-            progress.count_failure(error)
+            progress.failed += 1
             self._send(frame_failed(frame.number, error))
         else:
             self._send(result_record(frame.number, output, began))
             progress.computed(frame.number, output)
-            while self._boards.is_canary_owed and self._run_canary():
-                pass
-
-    def _run_canary(self) -> bool:
-        """Run a canary if there are any, and return whether all boards gave the right counts."""
-        if self._boards.canaries is None or self._boards.gone:
-            return False
-        try:
-            self._boards.run_canary()
-        except BoardError as error:
-            self._send(Notice("warning", str(error)))
-            return False
-        return True
 
     def _recover_boards(self) -> None:
         for board in self._boards.recover():

@@ -7,7 +7,6 @@ import numpy as np
 
 from pcie_shim.errors import FrameInputError
 from pcie_shim.host.frame import FrameOutput
-from services.boards.canaries import DamagedBoardError
 from services.boards.deployed import DeployedBoards
 from services.errors import InputLineError
 from services.pipeline.inference import REASON_WORDS
@@ -52,22 +51,9 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
             except FrameInputError as error:
                 raise InputLineError(f"line {number} of standard input: {error}") from error
             print_json_line(_line(number, output, reading.stamp_ns))
-            while boards.is_canary_owed:
-                _run_canary(boards)
     finally:
         boards.close()
     return 0
-
-
-def _run_canary(boards: DeployedBoards) -> None:
-    """Run a canary; a damaged board is programmed again before the next line is read."""
-    try:
-        boards.run_canary()
-    except DamagedBoardError as error:
-        say(str(error))
-        boards.recover_in_time()
-        if boards.gone:
-            raise
 
 
 def _line(number: int, output: FrameOutput, stamp_ns: int | None) -> dict[str, Any]:

@@ -84,11 +84,6 @@ def families(status: ProcessStatus) -> Iterator[Metric]:
         yield _gauge("rosbayes_board_usable", "Whether the board answers.", usable, process, "board")
         restarts = [(labels, board.restarts) for labels, board in boards]
         yield _counter("rosbayes_board_restarts", "Restarts of the board.", restarts, process, "board")
-        damaged = [(labels, board.damaged) for labels, board in boards]
-        yield _counter("rosbayes_board_damaged", "Canaries with wrong counts.", damaged, process, "board")
-    if status.integrity is not None:
-        passed = [((), status.integrity.canaries)]
-        yield _counter("rosbayes_integrity_canaries", "Canaries with right counts.", passed, process)
     if status.hub is not None:
         counted = [
             (("clients",), status.hub.clients),

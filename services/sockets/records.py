@@ -24,8 +24,6 @@ class LossReason(StrEnum):
     """Above the limit of its topic (`topic_bytes`)."""
     UNUSABLE = "with an unusable variable"
     FAILED = "failed on a board"
-    WITHHELD = "withheld"
-    """Its two computations disagreed (`integrity = twice`)."""
     WITH_APP = "lost with pcie-app"
     WITH_PUBLISHER = "lost with the publisher"
     NO_POSTERIOR = "no posterior"
@@ -53,8 +51,6 @@ class FailureReason(StrEnum):
     """A board failed while it computed the frame."""
     AWAY = "away"
     """A board that failed an earlier frame is not back yet."""
-    WITHHELD = "withheld"
-    """The two computations of the frame disagree, so its result is not used."""
 
 
 class Record(msgspec.Struct, array_like=True, frozen=True):

@@ -46,10 +46,7 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A board: `state` is starting, blank, programmed, or gone (as seen by pcie-app).
-
-    `damaged` counts how often it gave wrong counts for a canary (pcie-app).
-    """
+    """A board: `state` is starting, blank, programmed, or gone (as seen by pcie-app)."""
 
     index: int
     endpoint: str
@@ -58,22 +55,6 @@ class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
     restarts: int = 0
     last_cycles: int | None = None
     why: str = ""
-    damaged: int = 0
-
-
-class IntegrityStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """Detection of wrong counts: `kind` is canary or twice, `frames` the setting `integrity_frames`.
-
-    `walk` is the number of canaries that select every address, `canaries` the number of right ones so far,
-    `damaged` the number of wrong ones, and `withheld` the frames whose two computations disagreed.
-    """
-
-    kind: str
-    frames: int
-    walk: int
-    canaries: int
-    damaged: int
-    withheld: int
 
 
 class PeerStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -139,7 +120,6 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     peers: list[PeerStatus] = msgspec.field(default_factory=list)
     hub: HubStatus | None = None
     stages: list[StageLatency] = msgspec.field(default_factory=list)
-    integrity: IntegrityStatus | None = None
 
 
 Reason = TypeVar("Reason", bound=str)

@@ -102,8 +102,6 @@ class Recording:
                 observer.fault()
             elif kind == "calm":
                 observer.calm()
-            elif kind == "flip":
-                observer.flip(what)
             else:
                 getattr(observer, kind)(copy.deepcopy(what), now)
         observer.findings += judge(self.counters, observer.pending_readings(), self.excuses, 1.0)
@@ -416,24 +414,3 @@ def test_addresses_are_those_of_the_deployment(values, addresses):
 def test_a_word_is_not_a_reading():
     with pytest.raises(UnusableError):
         addresses_of({"near": "three", "far": 1})
-
-
-@pytest.mark.parametrize(
-    ("wrong", "calm_before", "flaws"),
-    [
-        ((), None, set()),
-        ((2, 3, 4), None, set()),
-        ((2, 5), None, {Flaw.WRONG}),
-        ((2, 4), 4, {Flaw.WRONG}),
-    ],
-    ids=["hidden", "within the frames", "a frame later", "after it was found"],
-)
-def test_wrong_results_are_accepted_only_within_the_stated_frames_of_a_flip(wrong, calm_before, flaws):
-    run = Recording()
-    for index in wrong:
-        data = run.message("result", index)["data"]
-        data[0], data[1] = data[1], data[0]
-    if calm_before is not None:
-        run.events.insert(3 * calm_before, ("calm", None, calm_before * 0.1))
-    run.events.insert(0, ("flip", 3, 0.0))
-    assert run.play() == flaws

@@ -251,8 +251,6 @@ def _with_places(new: Deployment, old: Deployment) -> Deployment:
         outputs=old.outputs,
         queue=old.queue,
         tolerance_s=old.tolerance_s,
-        integrity=old.integrity,
-        integrity_frames=old.integrity_frames,
         prior=old.prior,
         variables=tuple(
             variable.replace(source=before[variable.name].source, path=before[variable.name].path)

@@ -12,7 +12,6 @@ from toolchain.deployment.fields import Choice, Name, Sequence, names_differ
 from toolchain.deployment.sections import (
     Board,
     Dimension,
-    Integrity,
     MachineSection,
     Output,
     Queue,
@@ -24,9 +23,6 @@ from toolchain.deployment.sections import (
 
 FORMAT: Final = 1
 FILE_NAME: Final = "deployment.toml"
-CANARY_FRAMES: Final = 100_000
-"""Default number of frames within which canaries find a flipped bit."""
-FRAMES_MAX: Final = 2**63 - 1
 REPLICA: Final = "replica"
 """Label of the dimension of replicas, the first dimension of a published result."""
 
@@ -39,10 +35,6 @@ class DeploymentFile(Section):
     hash: str = ""
     queue: Choice[Queue] = Queue.LATEST
     tolerance_s: float = Field(default=0.05, ge=0, le=86_400)
-    integrity: Choice[Integrity] = Field(default=Integrity.OFF, exclude_if=lambda kind: kind == Integrity.OFF)
-    integrity_frames: int = Field(
-        default=CANARY_FRAMES, ge=1, le=FRAMES_MAX, exclude_if=lambda frames: frames == CANARY_FRAMES
-    )
     sources: Sequence[Source] = Field(validation_alias="source", min_length=1)
     variables: Sequence[Variable] = Field(default=(), validation_alias="variable")
     searched: Sequence[Dimension] = Field(min_length=1)

@@ -16,8 +16,6 @@ def deployment_hash(deployment: DeploymentFile) -> str:
         mode="json",
         exclude={
             "hash": True,
-            "integrity": True,
-            "integrity_frames": True,
             "sources": {"__all__": {"uri", "compression", "topic_bytes"}},
             "boards": {"__all__": {"endpoint"}},
             "outputs": {"__all__": {"uri"}},

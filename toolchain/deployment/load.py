@@ -1,11 +1,15 @@
 """Reading of deployments: `deployment.toml`, its hash and its images; errors give file and line."""
 
 from pathlib import Path
+from typing import Final
 
 from toolchain.deployment.deployment import FILE_NAME, FORMAT, Deployment, DeploymentFile
 from toolchain.deployment.deployment_hash import deployment_hash
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 from toolchain.files.toml_file import TomlFile
+
+_FORMER_KEYS: Final = ("integrity", "integrity_frames")
+"""Keys that earlier versions wrote or read, and that did not enter the hash."""
 
 
 def load_deployment(directory: Path, *, images: bool = True, edited: bool = False) -> Deployment:
@@ -40,12 +44,17 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
         raise DeploymentVersionError(
             f"{path} {found}, and this version reads format {FORMAT}: build it again with 'toolchain build'"
         )
+    for key in _FORMER_KEYS:
+        if key in toml.tables:
+            raise toml.mistake(
+                (key,), f"'{key}' belonged to a check of the boards that was removed; delete this line"
+            )
     file = toml.validated(DeploymentFile)
     computed = deployment_hash(file)
     if computed != file.hash and not edited:
         raise DamagedDeploymentError(
             f"{path} is not as it was built: its hash is {computed[:16]}, "
-            f"but it names {file.hash[:16] or 'none'}; only URIs, endpoints, compression, topic_bytes and integrity may be edited: "
+            f"but it names {file.hash[:16] or 'none'}; only URIs, endpoints, compression and topic_bytes may be edited: "
             "build it again with 'toolchain build', or keep the edit with 'toolchain regenerate deployment'"
         )
     deployment = Deployment(**dict(file), directory=directory)

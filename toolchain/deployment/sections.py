@@ -54,16 +54,6 @@ class Queue(StrEnum):
     """All wait, in order."""
 
 
-class Integrity(StrEnum):
-    """The detection of silently wrong counts."""
-
-    OFF = "off"
-    CANARY = "canary"
-    """Known readings walk through all addresses of all tables between the frames."""
-    TWICE = "twice"
-    """Every frame is computed with two banks, whose counts must agree."""
-
-
 class Scale(StrEnum):
     """The part of a table that is divided by its maximum before quantising."""
 

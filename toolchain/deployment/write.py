@@ -11,7 +11,7 @@ from toolchain.errors import DeploymentError
 from toolchain.files.whole_file import whole_file
 
 _HEADER: Final = """\
-# Written by `toolchain build`. URIs, endpoints and integrity may be changed here; the rest belongs to the boards' images
+# Written by `toolchain build`. URIs and endpoints may be changed here; the rest belongs to the boards' images
 # and is guarded by the hash: change the model and build again.
 """
 

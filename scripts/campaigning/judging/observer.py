@@ -96,8 +96,6 @@ class Observer:
         self._last_index = -1
         self.in_fault = False
         self._undisturbed = True
-        self._flip_frames = 0
-        self._first_wrong = 0
         self.findings: list[Finding] = []
         self.tally: Counter[str] = Counter()
 
@@ -127,13 +125,8 @@ class Observer:
         self.in_fault = True
         self._undisturbed = False
 
-    def flip(self, frames: int) -> None:
-        """Record that a bit of a board's table flips; results of up to `frames` frames may be wrong until `calm`."""
-        self._flip_frames, self._first_wrong = frames, 0
-
     def calm(self) -> None:
         """Record the end of a fault; what it has disturbed may still be in flight until `settle`."""
-        self._flip_frames = 0
         self.in_fault = False
 
     def reconnected(self) -> None:
@@ -190,22 +183,12 @@ class Observer:
             self._find(Flaw.MALFORMED, f"/BMresults of frame {announced.number}: {error!r}", now)
             return
         if announced.outcome is not None and data != announced.outcome.posterior:
-            self._wrong(announced.number, f"posterior of frame {announced.number}: {data}", now)
+            self._find(Flaw.WRONG, f"posterior of frame {announced.number}: {data}", now)
         if announced.reading is not None:
             self._arrived(announced, announced.reading, now)
 
     def _find(self, flaw: Flaw, sentence: str, now: float) -> None:
         self.findings.append(Finding(flaw, sentence, now))
-
-    def _wrong(self, number: int, sentence: str, now: float) -> None:
-        """Report a wrong result, unless a table is damaged and its detection is not yet due."""
-        if not self._flip_frames:
-            self._find(Flaw.WRONG, sentence, now)
-            return
-        self._first_wrong = self._first_wrong or number
-        self.tally["wrong until found"] += 1
-        if number >= self._first_wrong + self._flip_frames:
-            self._find(Flaw.WRONG, f"{number - self._first_wrong} frames after the first: {sentence}", now)
 
     def _arrived(self, announced: _Announced, reading: Reading, now: float) -> None:
         if reading.arrived is not None:
@@ -253,9 +236,9 @@ class Observer:
         right = [(f"board{at}", b.cycles, b.total, b.reason) for at, b in enumerate(outcome.boards)]
         whole = (max(b.cycles for b in outcome.boards), sum(b.total for b in outcome.boards))
         if boards != right or len(boards) != BOARDS:
-            self._wrong(number, f"frame {number}: boards {boards}, expected {right}", now)
+            self._find(Flaw.WRONG, f"frame {number}: boards {boards}, expected {right}", now)
         if (int(values["cycles"]), int(values["counts_total"])) != whole:
-            self._wrong(number, f"frame {number}: its sums are not those of its boards", now)
+            self._find(Flaw.WRONG, f"frame {number}: its sums are not those of its boards", now)
         return _Announced(stamp_ns, number, outcome, reading)
 
     @staticmethod

@@ -70,21 +70,6 @@ def test_what_only_replicas_have_is_not_there_without_them(board: EmulatedBoard)
             board.read(address, 1)
 
 
-def test_a_flipped_counter_is_the_highest_one_of_the_final_counts(board: EmulatedBoard) -> None:
-    start(board, 2, 3, target=200, until=64)
-    assert board.is_sliced
-    board.write(rm.RUN_UNTIL, struct.pack("<QII", 0, 0, next_doorbell(board.done)))
-    finish(board)
-    assert not board.is_sliced
-    good = np.frombuffer(board.interrupt_words(), "<u4")
-    damaged = np.frombuffer(board.with_flipped_counter(good.tobytes()), "<u4")
-    (changed,) = np.flatnonzero(good != damaged)
-    assert good[changed] == good[-MACHINE.parameters.lines :].max()
-    assert good[changed] ^ damaged[changed] == 1 << MACHINE.parameters.counter_bits - 1
-    blank = EmulatedBoard()
-    assert (blank.is_sliced, blank.with_flipped_counter(b"1234")) == (False, b"1234")
-
-
 # ---- identity and capabilities ----
 
 

@@ -190,8 +190,7 @@ async def test_only_a_board_that_fails_again_and_again_ends_the_run(run, reason)
     run.read(RESTARTS + 2)
     for _ in range(RESTARTS):
         failed(run, reason)
-    counted = LossReason.WITHHELD if reason is FailureReason.WITHHELD else LossReason.FAILED
-    assert run.lost == {counted: RESTARTS}
+    assert run.lost == {LossReason.FAILED: RESTARTS}
     assert run.error is None
     failed(run, reason)
     assert isinstance(run.error, BoardFailedError) is (reason is FailureReason.FAILED)

@@ -156,6 +156,16 @@ def test_any_other_edit_is_found(folder, old, new):
     assert deployment_hash(boat())[:16] in refused(folder, DamagedDeploymentError)
 
 
+@pytest.mark.parametrize("key", ["integrity", "integrity_frames"])
+def test_a_key_of_an_earlier_version_is_to_be_deleted(folder, key):
+    edit(folder, "tolerance_s", f'{key} = "off"\ntolerance_s')
+    with pytest.raises(DeploymentError) as caught:
+        load_deployment(folder, images=False)
+    line = (folder / "deployment.toml").read_text().splitlines().index(f'{key} = "off"') + 1
+    assert (caught.value.exit_code, caught.value.line, caught.value.place) == (2, line, (key,))
+    assert "delete this line" in refused(folder)
+
+
 @pytest.mark.parametrize(
     "new", ["format = 2", 'format = "1"', "format = true", "format = 7\nwarp = true", ""]
 )
