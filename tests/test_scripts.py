@@ -40,14 +40,6 @@ def test_a_script_prints_its_usage(script, part, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.thorough
-def test_mutants_of_a_module_that_does_not_exist_are_a_mistake():
-    command = [ROOT / "scripts" / "mutants", "--only", "publsher"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PROCESS_PATIENCE, check=False)
-    assert done.returncode == 2
-    assert "services/pipeline/publisher.py" in done.stderr
-
-
 @pytest.mark.parametrize("terminal", [False, True])
 async def test_a_screen_says_what_it_waits_for_when_nothing_else_comes(terminal, capsys, monkeypatch):
     now = [0.0]
