@@ -1,0 +1,491 @@
+"""Any input to the bridge gives a right message or one error: codecs, fragments, fields, and the client's core.
+
+What client and hub remember of a publisher's messages changes nothing: each is compared with one that parses all.
+"""
+
+import contextlib
+import json
+import math
+from typing import Any
+
+import numpy as np
+import orjson
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from bridge import fields
+from bridge.client.protocol import ClientCore, Delivery
+from bridge.client.protocol.calls import MAX_CALLS
+from bridge.client.protocol.events import MessageDiscarded, MessageReceived, ServiceRequested, Unusable
+from bridge.client.protocol.goals import MAX_GOALS
+from bridge.client.protocol.services import MAX_REQUESTS
+from bridge.codecs import cbor_codec, json_codec, png
+from bridge.codecs.arrays import with_arrays, with_lists
+from bridge.codecs.fragments import Reassembler, split
+from bridge.codecs.serialised import MessageTypes
+from bridge.errors import BridgeError, DecodeError, EncodeError
+from bridge.hub.broker import Broker
+from bridge.hub.limits import HubLimits
+from bridge.qos import Qos
+
+MAX_SIZE, MAX_DEPTH = 4096, 8
+LONGEST_SENTENCE = 700
+"""Maximum number of characters in an error message, which quotes only part of the received data."""
+
+_NUMBERS = ["null", "1", "-1.5e300", "1e999", '"a"', "NaN", "-Infinity", "true", "[]", "{}", str(2**64)]
+json_like = st.recursive(
+    st.sampled_from(_NUMBERS),
+    lambda inner: (
+        st.lists(inner, max_size=3).map(lambda parts: f"[{','.join(parts)}]")
+        | inner.map(lambda part: f'{{"a":{part}}}')
+    ),
+    max_leaves=8,
+).map(str.encode)
+cbor_like = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**70), 2**70) | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=2), inner, max_size=3),
+).map(lambda value: cbor_codec.encode({"a": value}))
+
+
+def check_sentence(error: BridgeError) -> None:
+    said = str(error)
+    assert said
+    assert "\n" not in said
+    assert len(said) <= LONGEST_SENTENCE
+
+
+def check_plain(value: Any, *, finite: bool, depth: int) -> None:
+    """Check that a message has only types of ROS messages."""
+    assert depth >= 0
+    if isinstance(value, dict):
+        for key, part in value.items():
+            assert type(key) is str
+            check_plain(part, finite=finite, depth=depth - 1)
+    elif isinstance(value, list):
+        for part in value:
+            check_plain(part, finite=finite, depth=depth - 1)
+    elif type(value) is float:
+        assert math.isfinite(value) or not finite
+    else:
+        assert value is None or type(value) in {str, int, bool, bytes, np.ndarray}
+
+
+# Codecs
+
+
+@settings(max_examples=200)
+@given(st.binary(max_size=400) | json_like)
+@example(b'{"a":NaN,"b":[1e999,-Infinity,18446744073709551616],"c":"\\ud83d\\ude00"}')
+def test_json_gives_a_plain_message_that_survives_a_round_trip(data):
+    try:
+        message = json_codec.decode(data, max_size=MAX_SIZE, max_depth=MAX_DEPTH)
+    except DecodeError as error:
+        check_sentence(error)
+        return
+    check_plain(message, finite=True, depth=MAX_DEPTH)
+    written = json_codec.encode(message, nonfinite="refuse", max_size=100 * MAX_SIZE, max_depth=MAX_DEPTH)
+    assert json_codec.decode(written, max_size=100 * MAX_SIZE, max_depth=MAX_DEPTH) == message
+    assert json_codec.decode(data.decode(), max_size=MAX_SIZE, max_depth=MAX_DEPTH) == message
+
+
+@settings(max_examples=200)
+@given(st.binary(max_size=100) | cbor_like)
+@example(cbor_codec.encode({"a": b"\x01\x02", "b": np.arange(3, dtype=np.int16)}))
+@example(  # typed arrays with tags in each other
+    bytes.fromhex("a26161d840563b000000000000001cffffffffd84d4600008100036161d840d840d84046000081000300")
+)
+def test_cbor_gives_the_same_message_as_lists_and_as_arrays(data):
+    forms: dict[str, Any] = {}
+    for arrays in ("list", "numpy"):
+        try:
+            forms[arrays] = cbor_codec.decode(data, max_size=MAX_SIZE, max_depth=MAX_DEPTH, arrays=arrays)
+        except DecodeError as error:
+            check_sentence(error)
+    assert len(forms) in {0, 2}
+    if not forms:
+        return
+    for message in forms.values():
+        check_plain(message, finite=False, depth=MAX_DEPTH + 1)
+    assert repr(with_lists(forms["numpy"])) == repr(forms["list"])
+    written = cbor_codec.encode(forms["list"], max_size=100 * MAX_SIZE, pack_floats=False)
+    assert repr(cbor_codec.decode(written, max_size=100 * MAX_SIZE)) == repr(forms["list"])
+
+
+@given(st.binary(max_size=400))
+@example(png.encode(b'{"op":"publish","topic":"/a","msg":{}}').encode())
+def test_a_picture_gives_bytes_within_the_limit(data):
+    try:
+        assert len(png.decode(data.decode("latin-1"), max_size=MAX_SIZE)) <= 16 * MAX_SIZE
+    except DecodeError as error:
+        check_sentence(error)
+    assert png.decode(png.encode(data), max_size=2 * MAX_SIZE).startswith(data)
+
+
+@given(
+    st.lists(
+        st.fixed_dictionaries(
+            {
+                "id": st.sampled_from((0, 1, "a", None, True)),
+                "num": st.sampled_from((0, 1, 2, 3, "1", "0x1", 2.0, -1, 1.5, None, math.nan)),
+                "total": st.sampled_from((1, 2, 3, 2.5, "3", 0, -1, 1e9, math.inf, None)),
+                "data": st.sampled_from(("", "a", "b" * 30, "c" * 70, None, 5)),
+            }
+        ),
+        max_size=40,
+    )
+)
+def test_fragments_in_any_order_and_number_stay_within_their_bounds(fragments):
+    box = Reassembler(max_size=64, max_sets=3, max_age=10)
+    for number, fragment in enumerate(fragments):
+        try:
+            whole = box.take(fragment, number * 1.5)
+            assert whole is None or len(whole) <= 64
+        except DecodeError as error:
+            check_sentence(error)
+        assert len(box) <= 3
+        assert 0 <= box.waiting_bytes <= 4 * (64 + 128)
+        assert (box.waiting_bytes == 0) == (len(box) == 0)
+
+
+@given(st.text(max_size=12) | st.sampled_from(["a.b[10]", "a", "a[1]", "a.a"]), json_like)
+@example("a[1]", b'{"a":"AQID"}')
+def test_any_path_in_any_message_gives_a_value_or_a_reason_in_one_line(name, data):
+    try:
+        field = fields.Field(name)
+        message = json_codec.decode(data, max_size=MAX_SIZE)
+    except BridgeError as error:
+        check_sentence(error)
+        return
+    for form in (message, with_arrays(message)):
+        try:
+            present, _value = field.value(form)
+            said = "" if present else str(field.missing(form))
+        except BridgeError as error:
+            said = str(error)
+        assert "\n" not in said
+
+
+_TYPES = MessageTypes()
+
+
+@given(
+    st.sampled_from(
+        ("sensor_msgs/LaserScan", "std_msgs/String", "std_msgs/Float64MultiArray", "tf2_msgs/TFMessage")
+    ),
+    st.binary(max_size=200),
+)
+@example("std_msgs/String", b"\0\1\0\0\x04\0\0\0abc\0")
+@example("std_msgs/String", b"\x03\0\0\0abc")
+def test_serialised_bytes_give_a_message_of_the_type(name, data):
+    try:
+        assert type(_TYPES.read(data, name)) is dict
+    except DecodeError as error:
+        check_sentence(error)
+
+
+# The client's core between a user and a server that both may do anything
+
+TOPICS = st.sampled_from(("/a", "b", "/a/b"))
+ODD: tuple[Any, ...] = (
+    *(None, True, 0, -1, 3, 1.5, 1e300, 2**63, 2**70, "", "x", "/a", "9", [], [1.5, None], [[[]]]),
+    *({}, {"a": [1]}),
+)
+OPS = (
+    *("publish", "publish", "service_response", "call_service", "status"),
+    *("action_feedback", "action_result", "fragment", "png", "bogus"),
+)
+DELIVERIES = (
+    Delivery(),
+    Delivery(compression="cbor"),
+    Delivery(compression="cbor", arrays="numpy"),
+    Delivery(compression="cbor-raw"),
+    Delivery(compression="png", fragment_size=7),
+    Delivery(arrays="numpy", qos=Qos(depth=1)),
+    Delivery(max_bytes=40),
+)
+
+
+def no_constant(name: str) -> None:
+    raise AssertionError(f"{name} left as JSON")
+
+
+def picture(text: bytes) -> bytes:
+    return json.dumps({"op": "png", "data": png.encode(text)}).encode()
+
+
+@contextlib.contextmanager
+def refusals():
+    """Let a request be refused, by an error of the bridge."""
+    try:
+        yield
+    except BridgeError as error:
+        check_sentence(error)
+
+
+class AnyServer(RuleBasedStateMachine):
+    """Check that errors are the bridge's, memory is bounded, and output is strict JSON."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.core = ClientCore(max_size=MAX_SIZE, max_depth=MAX_DEPTH, fragment_size=50)
+        self.now = 0.0
+        self.subscriptions: set[int] = set()
+        self.advertisements: list[int] = []
+        self.asked: list[str] = []
+        """Identities of calls and goals."""
+        self.tickets: list[int] = []
+
+    @invariant()
+    def bounds_and_strict_json(self) -> None:
+        core = self.core
+        for data in core.data_to_send():
+            assert core.wire.connected
+            assert len(data) <= MAX_SIZE
+            operation = json.loads(data, parse_constant=no_constant)
+            assert type(operation["op"]) is str
+            pieces = list(core.wire.pieces(data))
+            assert pieces == [data] or all(json.loads(piece)["op"] == "fragment" for piece in pieces)
+        assert len(core.services) <= MAX_REQUESTS
+        assert len(core.calls) <= MAX_CALLS
+        assert len(core.goals) <= MAX_GOALS
+        assert core._fragments.waiting_bytes <= 4 * (MAX_SIZE + 128)
+
+    def take(self, data: bytes | str) -> None:
+        self.now += 0.5
+        event = self.core.receive(data, self.now)
+        if isinstance(event, MessageReceived | MessageDiscarded):
+            assert event.subscriptions
+            assert set(event.subscriptions) <= self.subscriptions
+        if isinstance(event, MessageReceived):
+            assert type(event.msg) is dict
+        elif isinstance(event, MessageDiscarded):
+            assert event.size > event.limit
+        elif isinstance(event, ServiceRequested):
+            self.tickets.append(event.ticket)
+        elif isinstance(event, Unusable):
+            assert len(event.reason) <= LONGEST_SENTENCE
+            assert "\n" not in event.reason
+
+    @rule(data=st.binary(max_size=60) | json_like)
+    def receive_raw(self, data: bytes) -> None:
+        self.take(data)
+        with contextlib.suppress(UnicodeDecodeError):
+            self.take(data.decode())
+
+    @rule(draw=st.data(), form=st.sampled_from(("json", "json", "cbor", "fragments", "png", "both")))
+    def receive(self, draw: Any, form: str) -> None:
+        """Receive an operation of which any field may be right, wrong or absent."""
+        right = {
+            "topic": TOPICS,
+            "msg": st.sampled_from(({}, {"a": [1.5, 2]}, {"header": {"stamp": {"sec": 1}}}, {"bytes": "x"})),
+            "id": st.sampled_from((*self.asked[-4:], 7, "x")),
+            "service": st.sampled_from(("/s", "t", "u")),
+            "values": st.sampled_from(({}, {"a": 1}, "no")),
+            "args": st.just({}),
+            "result": st.booleans(),
+            "status": st.integers(0, 8),
+            "level": st.just("error"),
+            "num": st.integers(0, 2),
+            "total": st.just(2),
+            "data": st.just("x"),
+        }
+        operation: dict[str, Any] = {"op": draw.draw(st.sampled_from(OPS))}
+        wrong = draw.draw(st.dictionaries(st.sampled_from(sorted(right)), st.sampled_from(ODD), max_size=2))
+        absent = draw.draw(st.sets(st.sampled_from(sorted(right)), max_size=2))
+        operation |= {name: draw.draw(value) for name, value in right.items() if name not in absent} | wrong
+        text = json.dumps(operation).encode()
+        if form == "cbor":
+            with contextlib.suppress(EncodeError):
+                self.take(cbor_codec.encode(operation))
+        elif form in {"json", "png"}:
+            self.take(text if form == "json" else picture(text))
+        else:
+            for piece in split(picture(text) if form == "both" else text, 20, "f"):
+                self.take(piece)
+
+    @rule()
+    def connect(self) -> None:
+        self.core.lost()
+        self.core.restore()
+
+    @rule()
+    def lose(self) -> None:
+        self.core.lost()
+
+    @rule(
+        topic=TOPICS,
+        type_name=st.sampled_from(("p/T", "p/msg/T", None, "p/U")),
+        rate=st.sampled_from((0, 0, 700, -1)),
+        delivery=st.sampled_from(DELIVERIES),
+    )
+    def subscribe(self, topic: str, type_name: str | None, rate: int, delivery: Delivery) -> None:
+        with refusals():
+            self.subscriptions.add(
+                self.core.subscriptions.subscribe(topic, type_name, throttle_rate=rate, delivery=delivery)
+            )
+
+    @rule(draw=st.data())
+    @precondition(lambda self: self.subscriptions)
+    def unsubscribe(self, draw: Any) -> None:
+        number = draw.draw(st.sampled_from(sorted(self.subscriptions)))
+        self.subscriptions.remove(number)
+        self.core.subscriptions.unsubscribe(number)
+
+    @rule(topic=TOPICS, type_name=st.sampled_from(("p/T", "p/msg/T", "q")), latch=st.booleans())
+    def advertise(self, topic: str, type_name: str, latch: bool) -> None:
+        with refusals():
+            self.advertisements.append(self.core.publications.advertise(topic, type_name, latch=latch))
+
+    @rule(
+        value=st.sampled_from((*ODD, "\ud800", math.nan, np.arange(3.0), np.array([math.inf]), b"x", {1: 2}))
+    )
+    @precondition(lambda self: self.advertisements)
+    def publish(self, value: Any) -> None:
+        with refusals():
+            data = self.core.publications.publish(self.advertisements[-1], {"value": value})
+            assert type(json.loads(data, parse_constant=no_constant)["msg"]) is dict
+
+    @rule()
+    @precondition(lambda self: self.advertisements)
+    def unadvertise(self) -> None:
+        self.core.publications.unadvertise(self.advertisements.pop())
+
+    @rule(name=st.sampled_from(("/s", "t")), value=st.sampled_from(ODD), forget=st.booleans())
+    def call(self, name: str, value: Any, forget: bool) -> None:
+        with refusals():
+            self.asked.append(self.core.calls.send(name, {"x": value}))
+            if forget:
+                self.core.calls.forget(self.asked[-1])
+
+    @rule(value=st.sampled_from(ODD), then=st.sampled_from(("", "cancel", "forget")))
+    def send_goal(self, value: Any, then: str) -> None:
+        with refusals():
+            self.asked.append(self.core.goals.send("/fly", "p/Fly", {"x": value}, feedback=True))
+            if then:
+                getattr(self.core.goals, then)(self.asked[-1])
+
+    @rule(service=st.sampled_from(("/s", "/t")))
+    def serve(self, service: str) -> None:
+        if service in self.core.services:
+            self.core.services.unadvertise(service)
+        else:
+            self.core.services.advertise(service, "p/T")
+
+    @rule(value=st.sampled_from(ODD), ok=st.booleans())
+    @precondition(lambda self: self.tickets)
+    def answer(self, value: Any, ok: bool) -> None:
+        """Answer a request, perhaps one of a lost connection."""
+        with refusals():
+            self.core.services.answer(self.tickets.pop(), {"x": value}, ok=ok)
+
+    @rule(seconds=st.sampled_from((0.0, 20.0)))
+    def pass_time(self, seconds: float) -> None:
+        self.now += seconds
+        self.core.subscriptions.retry_untyped()
+
+
+AnyServer.TestCase.settings = settings(max_examples=100, stateful_step_count=30)
+TestAnyServer = AnyServer.TestCase
+
+
+# What client and hub remember of a publisher's messages
+
+_ENVELOPES = (
+    b'{"op":"publish","topic":"/a","msg":',
+    b'{"op": "publish", "topic": "/a", "msg": ',
+    b'{"op":"publish","topic":"a","msg":',
+    b'{"op":"publish","topic":"b","msg":',
+    b'{"topic":"\\/a","op":"publish","msg":',
+    b'{"op":"publish","topic":"/a","id":1,"msg":',
+    b'{"op":"publish","msg":{},"topic":"/a","msg":',
+    b'{"op":"publish","topic":"/a","msg":{"msg":',
+    b'{"op":"status","topic":"/a","msg":',
+    b'{"op":"publish","topic":"/a","topic":"b","msg":',
+    b'{"op":"publish","topic":"/a","msg":"',
+    b"",
+)
+_DEEP = b'{"a":[[[[[]]]]]}'
+_LONG = b'{"long":"' + b"x" * 600 + b'"}'
+_PARTS = (
+    *(b"{}", b'{"a":1}', b'{"data":[1.5,-0.0,1e15,123456789012345678901234567890]}', b'{"a":{"b":{"c":[]}}}'),
+    *(_DEEP, b'{"a":NaN}', b'{"a":1e999}', b'{"a":"\xff"}', b'{"a":"\\ud800"}', b'{"a":"\\u00e9\xc3\xa9"}'),
+    *(b'{"a":1,"a":2}', b',"topic":"b"', b',"msg":{"z":1}', b"}", b"{", b'"', b" ", b"null", b"[1]", _LONG),
+)
+_message = st.sampled_from(_PARTS[:4]) | st.lists(
+    st.sampled_from(_PARTS) | st.binary(max_size=5), max_size=3
+).map(b"".join)
+published = st.tuples(
+    st.sampled_from(_ENVELOPES), _message, st.sampled_from((b"}", b"}", b"}", b"", b"} ", b"}}"))
+).map(b"".join)
+
+
+@settings(max_examples=200)
+@given(st.lists(published, max_size=8), st.sampled_from((Delivery(), Delivery(arrays="numpy"))))
+@example(
+    [
+        _ENVELOPES[2] + _PARTS[2] + b"} ",
+        _ENVELOPES[10] + b"".join(_PARTS[6:11]) + b"}",
+        _ENVELOPES[0] + b"{}}",
+        _ENVELOPES[6] + b"[1]" + _LONG + b"{}{}}",
+        _ENVELOPES[4] + b',"topic":"b","msg":{"z":1}{}} ',
+        _ENVELOPES[0] + b"[1]" + _LONG * 3 + b"{}{}}",
+    ],
+    Delivery(),
+)
+def test_a_client_that_knows_an_envelope_reads_what_one_does_that_parses_all(messages, delivery):
+    cores = [ClientCore(max_size=200, max_depth=3), ClientCore(max_size=200, max_depth=3)]
+    for core in cores:
+        core.restore()
+        core.subscriptions.subscribe("/a", delivery=delivery)
+        core.subscriptions.subscribe("b")
+    for received in messages:
+        cores[1].subscriptions.forget_envelopes()  # so that it parses everything
+        events = [repr(core.receive(received, 0.0)) for core in cores]
+        assert events[0] == events[1]
+        assert len(cores[0].subscriptions.envelopes) <= 16
+
+
+def _content(payload: bytes) -> str:
+    """Return the content of a payload: strict JSON, or CBOR."""
+    return repr(orjson.loads(payload)) if payload[:1] == b"{" else payload.hex()
+
+
+_AGAIN = [b'{"op":"unadvertise","topic":"/a"}', b'{"op":"advertise","topic":"/a","type":"p/T"}']
+
+
+@settings(max_examples=200)
+@given(st.lists(st.lists(published, max_size=3) | st.just(_AGAIN), max_size=8))
+@example([[_ENVELOPES[0] + b"{}}", _ENVELOPES[1] + _LONG + b"}"], [_ENVELOPES[1] + _LONG + b"}"] * 2])
+@example(
+    [[_ENVELOPES[4] + _DEEP + b"}"]] * 3 + [[_ENVELOPES[4] + b'{"a":1}}'], [_ENVELOPES[6] + _DEEP + b"}"]]
+)
+def test_a_hub_that_knows_envelopes_delivers_what_one_does_that_parses_all(turns):
+    brokers = [Broker(HubLimits(depth=4)), Broker(HubLimits(depth=4))]
+    publishers, listeners = [], []
+    for broker in brokers:
+        publishers.append(broker.connect("publisher"))
+        listeners.append([broker.connect("listener") for _ in range(3)])
+        for client, topic, form in zip(
+            listeners[-1], ("/a", "a", "/a"), ("none", "none", "cbor"), strict=True
+        ):
+            client.outbox.wire = []
+            asked = {"op": "subscribe", "topic": topic, "compression": form, "queue_length": 1000}
+            broker.receive(client, json.dumps(asked).encode(), 0.0)
+        for topic, latch in (("/a", True), ("b", False)):
+            asked = {"op": "advertise", "topic": topic, "type": "p/T", "latch": latch}
+            broker.receive(publishers[-1], json.dumps(asked).encode(), 0.0)
+    for said in turns:
+        rest = said
+        while rest:
+            rest = rest[brokers[0].receive_turn(publishers[0], rest, 0.0) :]
+        for one in said:
+            brokers[1].receive(publishers[1], one, 0.0)
+    for known, parsed in zip(*listeners, strict=True):
+        assert list(map(_content, known.outbox.wire)) == list(map(_content, parsed.outbox.wire))
+    assert publishers[0].refused == publishers[1].refused
+    latched = [
+        broker.graph.topics["/a"].latched if "/a" in broker.graph.topics else None for broker in brokers
+    ]
+    assert repr(orjson.loads(latched[0] or b"{}")) == repr(orjson.loads(latched[1] or b"{}"))
+    assert len(publishers[0].envelopes) <= len(publishers[0].advertisements)
