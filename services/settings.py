@@ -81,7 +81,7 @@ class Settings(BaseSettings):
     )
     metrics: str = Field(
         default="",
-        description="TCP address for metrics and health, tcp://HOST:PORT, besides the run directory",
+        description="address [HOST:]PORT for metrics, on loopback without a host",
     )
     log_level: Literal["debug", "info", "warning"] = Field(
         default="info", description="log level; debug logs one line per frame"
@@ -112,11 +112,14 @@ class Settings(BaseSettings):
     @field_validator("metrics")
     @classmethod
     def _metrics(cls, value: str) -> str:
-        if value and not value.startswith("tcp://"):
-            raise ValueError("expected tcp://HOST:PORT, for example tcp://127.0.0.1:9400")
+        try:
+            if value:
+                metrics_endpoint(value)
+        except SettingsError as error:
+            raise ValueError(str(error)) from error
         return value
 
-    @field_validator("boards", "subscriber", "publisher", "pcie_app", "metrics")
+    @field_validator("boards", "subscriber", "publisher", "pcie_app")
     @classmethod
     def _endpoints(cls, value: str | tuple[str, ...]) -> str | tuple[str, ...]:
         for text in (value,) if isinstance(value, str) else value:
@@ -171,6 +174,16 @@ def _expected(name: str, message: str) -> str:
     if known is not None and known.annotation is float:
         return f"expected seconds from {SHORTEST_S:g} to {LONGEST_S:g}"
     return message.removeprefix("Value error, ").replace("Input should be", "expected", 1)
+
+
+def metrics_endpoint(text: str) -> Endpoint:
+    """Return the address `[HOST:]PORT`, on loopback without a host, or raise a SettingsError."""
+    try:
+        return parse_endpoint(f"tcp://{text}" if ":" in text else f"tcp://127.0.0.1:{text}")
+    except PcieShimError:
+        raise SettingsError(
+            "expected [HOST:]PORT, for example 9400 (on loopback) or 192.168.1.10:9400"
+        ) from None
 
 
 def endpoint_in(directory: Path, name: str) -> Endpoint:

@@ -18,8 +18,6 @@ from terminal.errors import OutputError
 from terminal.health import SUFFIX
 from terminal.output import say
 
-HTTP_SUFFIX = ".http.sock"
-
 DIRECTORY_PREFIX = "rosbayes-"
 
 _DIRECTORY_NAME = re.compile(DIRECTORY_PREFIX + "[a-z0-9_]{8}")
@@ -123,8 +121,8 @@ def _remove_if_orphaned(directory: Path) -> None:
 
 
 def remove_stale_sockets(directory: Path) -> None:
-    """Remove the status and HTTP sockets of killed processes."""
-    for path in [each for end in (SUFFIX, HTTP_SUFFIX) for each in directory.glob(f"*{end}")]:
+    """Remove the status sockets of killed processes."""
+    for path in list(directory.glob(f"*{SUFFIX}")):
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX) as probe:
             probe.settimeout(0.2)
             try:

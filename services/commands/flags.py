@@ -77,9 +77,8 @@ Metrics = Annotated[
     str | None,
     setting(
         "metrics",
-        "Serve metrics and health over TCP too; a master uses the next ports for its processes.",
-        otherwise="only in the run directory",
-        metavar="tcp://HOST:PORT",
+        "Serve metrics for Prometheus, on loopback without a host; a master uses the next ports for its processes.",
+        metavar="[HOST:]PORT",
     ),
 ]
 KeyFile = Annotated[

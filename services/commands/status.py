@@ -7,7 +7,6 @@ import typer
 
 from services.commands import flags as options
 from services.errors import SettingsError
-from services.output.frame_lines import show_frame
 from services.output.status_screen import show
 from services.settings import load_settings
 from services.sockets.stack import Found, find_run
@@ -36,15 +35,6 @@ def status(
     ] = None,
     run: options.Run = None,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Refresh every second until Ctrl-C.")] = False,
-    frame: Annotated[
-        int | None,
-        typer.Option(
-            "--frame",
-            min=1,
-            metavar="N",
-            help="Show one of the last 1000 frames: its stages, boards and outcome.",
-        ),
-    ] = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object; with --watch, one per line.")
     ] = False,
@@ -60,8 +50,6 @@ def status(
 
     async def show_run() -> int:
         found = Found(named, []) if named is not None else await find_run(run)
-        if frame is not None:
-            return await show_frame(found.only_run, frame, json=json)
         return await show(found.run, found.others, watch=watch, json=json)
 
     return run_async(show_run())

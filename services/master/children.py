@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from services.master.peers import Peer
-from services.sockets.http_client import get
-from services.sockets.reporting import STUCK_S, http_socket
+from services.sockets.reporting import STUCK_S
+from services.sockets.status import read_process_status
+from terminal.health import NoHealthError, status_socket
 
 ASK_EVERY = 5.0
 """Seconds between two questions to all children."""
@@ -15,7 +16,7 @@ _ANSWER_TIME = 2.0
 
 
 class ChildrenWatch:
-    """The progress of the processes that a master started, according to their `/healthz`.
+    """The progress of the processes that a master started, according to their status sockets.
 
     A child that is being restarted does not count: the master knows of it. One that is stopped or stuck
     while nothing is expected of it would otherwise go unnoticed.
@@ -41,7 +42,6 @@ class ChildrenWatch:
 
     async def _is_well(self, role: str) -> bool:
         try:
-            status, _ = await get(http_socket(self._directory, role), "/healthz", timeout=_ANSWER_TIME)
-        except (OSError, ValueError):
+            return (await read_process_status(status_socket(self._directory, role), _ANSWER_TIME)).alive
+        except NoHealthError:
             return False
-        return status == 200

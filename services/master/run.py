@@ -83,7 +83,6 @@ class Master:
                 self.status,
                 metrics=settings.metrics,
                 stages=history.latencies,
-                frame=history.timeline,
                 **more,
             )
             await sockets.enter_async_context(report)

@@ -1,126 +1,123 @@
-"""The status of a process in the text format of Prometheus."""
+"""Metrics of a process for Prometheus, by the server of `prometheus_client`.
 
-from __future__ import annotations
+    scraper ──▶ thread of start_http_server ──▶ event loop: get_status ──▶ families
 
-from collections.abc import Iterable, Iterator
+The import takes a tenth of a second, so `reporting` imports this module only for `--metrics`.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from itertools import accumulate
+from typing import Final
 
-from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client import CollectorRegistry, start_http_server
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
 from prometheus_client.metrics_core import Metric
+from prometheus_client.registry import Collector
 
+from pcie_shim.endpoint import Endpoint
 from services.sockets.status import BUCKETS_S, ProcessStatus
+from terminal.output import say
+
+_ANSWER_TIME: Final = 2.0
+"""Seconds in which the event loop must return the status."""
+
+_Family = tuple[type[CounterMetricFamily | GaugeMetricFamily], str, str, str, Mapping[str, float]]
+"""Kind, name, help, the label besides `process` (empty without one), and the values by that label."""
+
+
+@contextlib.asynccontextmanager
+async def serve_metrics(
+    address: Endpoint, name: str, get_status: Callable[[], ProcessStatus]
+) -> AsyncIterator[None]:
+    """Serve metrics within the context; an occupied port only causes a warning, because a robot's run goes on."""
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(_StatusCollector(get_status))
+    try:
+        server, thread = start_http_server(address.port, address.host, registry)
+    except OSError as error:
+        say(f"{name}: warning: its metrics cannot be read at {address}: {error.strerror or error}")
+        yield
+        return
+    # it would print a traceback for each client that resets its connection
+    server.handle_error = lambda *_: None  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        await asyncio.to_thread(server.shutdown)  # takes up to half a second
+        server.server_close()
+        thread.join()
+
+
+class _StatusCollector(Collector):
+    """The metrics of the status, which the thread of a request gets from the event loop that owns it."""
+
+    def __init__(self, get_status: Callable[[], ProcessStatus]) -> None:
+        self._get_status = get_status
+        self._loop = asyncio.get_running_loop()
+
+    def collect(self) -> Iterable[Metric]:
+        answer: Future[ProcessStatus] = Future()
+        # a process that is about to end, or whose loop is stuck, has no metrics
+        with contextlib.suppress(RuntimeError, TimeoutError):
+            self._loop.call_soon_threadsafe(lambda: answer.set_result(self._get_status()))
+            return families(answer.result(_ANSWER_TIME))
+        return []
 
 
 def families(status: ProcessStatus) -> Iterator[Metric]:
     """Return the metrics of a process, each family in turn."""
-    process = [status.name]
-    yield _info(status)
-    yield _gauge("rosbayes_ready", "Whether the process is ready.", [((), status.ready)], process)
-    yield _counter("rosbayes_cpu_seconds", "CPU time, user and system.", [((), status.cpu_s)], process)
-    yield _gauge("rosbayes_memory_bytes", "Resident memory.", [((), status.memory_bytes)], process)
-    yield _gauge("rosbayes_uptime_seconds", "Time since the start.", [((), status.uptime_s)], process)
-    frames = status.frames
-    if frames is not None:
-        yield _counter(
-            "rosbayes_frames_received",
-            "Messages, readings, frames or results that arrived.",
-            [((), frames.received)],
-            process,
-        )
-        completed = [((), frames.completed)]
-        yield _counter(
-            "rosbayes_frames_completed",
-            "Readings, frames or results that were completed.",
-            completed,
-            process,
-        )
-        lost = [((str(reason),), count) for reason, count in frames.lost.items()]
-        yield _counter(
-            "rosbayes_frames_lost",
-            "Messages, readings, frames or results that were lost.",
-            lost,
-            process,
-            "reason",
-        )
-        without = [((topic,), count) for topic, count in frames.without.items()]
-        yield _counter(
-            "rosbayes_frames_without_topic", "Frames computed without this topic.", without, process, "topic"
-        )
-        if frames.last_age_s is not None:
-            yield _gauge(
-                "rosbayes_last_frame_age_seconds",
-                "Time since the last completed one.",
-                [((), frames.last_age_s)],
-                process,
-            )
-    links = [((link.uri,), link) for link in status.connections]
-    if links:
-        yield _gauge(
-            "rosbayes_rosbridge_connected",
-            "Whether the server is connected.",
-            [(labels, link.state == "connected") for labels, link in links],
-            process,
-            "uri",
-        )
-        yield _counter(
-            "rosbayes_rosbridge_reconnections",
-            "Reconnections to the server.",
-            [(labels, link.reconnections) for labels, link in links],
-            process,
-            "uri",
-        )
-    peers = [((peer.name,), peer) for peer in status.peers]
-    if peers:
-        restarts = [(labels, peer.restarts) for labels, peer in peers]
-        yield _counter(
-            "rosbayes_child_restarts", "Restarts of the child by the master.", restarts, process, "child"
-        )
-        ready = [(labels, peer.ready) for labels, peer in peers]
-        yield _gauge("rosbayes_child_ready", "Whether the child is ready.", ready, process, "child")
-    boards = [((str(board.index),), board) for board in status.boards]
-    if boards:
-        usable = [(labels, board.state in {"programmed", "blank"}) for labels, board in boards]
-        yield _gauge("rosbayes_board_usable", "Whether the board answers.", usable, process, "board")
-        restarts = [(labels, board.restarts) for labels, board in boards]
-        yield _counter("rosbayes_board_restarts", "Restarts of the board.", restarts, process, "board")
-    if status.hub is not None:
-        counted = [
-            (("clients",), status.hub.clients),
-            (("topics",), status.hub.topics),
-            (("services",), status.hub.services),
-        ]
-        yield _gauge("rosbayes_hub", "Numbers of clients, topics and services.", counted, process, "kind")
-    if status.stages:
-        yield _histogram(status)
-
-
-def _info(status: ProcessStatus) -> Metric:
-    labels = ["process", "version", "deployment"]
-    info = GaugeMetricFamily("rosbayes_process", "The process, and its deployment in force.", labels=labels)
+    info = GaugeMetricFamily(
+        "rosbayes_process", "The process, and its deployment.", labels=["process", "version", "deployment"]
+    )
     info.add_metric([status.name, status.version, status.deployment], 1)
-    return info
+    yield info
+    for kind, name, meaning, label, values in _numbers(status):
+        family = kind(f"rosbayes_{name}", meaning, labels=["process", label] if label else ["process"])
+        for key, value in values.items():
+            family.add_metric([status.name, key] if label else [status.name], float(value))
+        yield family
+    if status.stages:
+        yield _latencies(status)
 
 
-def _gauge(
-    name: str, help_: str, values: Iterable[tuple[tuple[str, ...], float]], process: list[str], *labels: str
-) -> Metric:
-    family = GaugeMetricFamily(name, help_, labels=["process", *labels])
-    for more, value in values:
-        family.add_metric([*process, *more], float(value))
-    return family
+def _numbers(status: ProcessStatus) -> Iterator[_Family]:
+    gauge, counter = GaugeMetricFamily, CounterMetricFamily
+    yield gauge, "ready", "Whether the process is ready.", "", {"": status.ready}
+    yield counter, "cpu_seconds", "CPU time, user and system.", "", {"": status.cpu_s}
+    yield gauge, "memory_bytes", "Resident memory.", "", {"": status.memory_bytes}
+    yield gauge, "uptime_seconds", "Time since the start.", "", {"": status.uptime_s}
+    if (frames := status.frames) is not None:
+        items = "Messages, readings, frames or results that"
+        yield counter, "frames_received", f"{items} arrived.", "", {"": frames.received}
+        yield counter, "frames_completed", f"{items} were completed.", "", {"": frames.completed}
+        yield counter, "frames_lost", f"{items} were lost.", "reason", frames.lost
+        yield counter, "frames_without_topic", "Frames computed without this topic.", "topic", frames.without
+        if (age := frames.last_age_s) is not None:
+            yield gauge, "last_frame_age_seconds", "Time since the last completed one.", "", {"": age}
+    if links := {link.uri: link for link in status.connections}:
+        connected = {uri: link.state == "connected" for uri, link in links.items()}
+        yield gauge, "rosbridge_connected", "Whether the server is connected.", "uri", connected
+        reconnections = {uri: link.reconnections for uri, link in links.items()}
+        yield counter, "rosbridge_reconnections", "Reconnections to the server.", "uri", reconnections
+    if peers := status.peers:
+        restarts = {peer.name: peer.restarts for peer in peers}
+        yield counter, "child_restarts", "Restarts of the child by the master.", "child", restarts
+        ready = {peer.name: peer.ready for peer in peers}
+        yield gauge, "child_ready", "Whether the child is ready.", "child", ready
+    if boards := {str(board.index): board for board in status.boards}:
+        usable = {index: board.state in {"programmed", "blank"} for index, board in boards.items()}
+        yield gauge, "board_usable", "Whether the board answers.", "board", usable
+        restarts = {index: board.restarts for index, board in boards.items()}
+        yield counter, "board_restarts", "Restarts of the board.", "board", restarts
+    if (hub := status.hub) is not None:
+        counted = {"clients": hub.clients, "topics": hub.topics, "services": hub.services}
+        yield gauge, "hub", "Numbers of clients, topics and services.", "kind", counted
 
 
-def _counter(
-    name: str, help_: str, values: Iterable[tuple[tuple[str, ...], float]], process: list[str], *labels: str
-) -> Metric:
-    family = CounterMetricFamily(name, help_, labels=["process", *labels])
-    for more, value in values:
-        family.add_metric([*process, *more], float(value))
-    return family
-
-
-def _histogram(status: ProcessStatus) -> Metric:
+def _latencies(status: ProcessStatus) -> Metric:
     family = HistogramMetricFamily(
         "rosbayes_stage_seconds",
         "Duration of each stage of published frames; `frame` is the whole.",
@@ -131,20 +128,3 @@ def _histogram(status: ProcessStatus) -> Metric:
         buckets = zip(bounds, accumulate(stage.buckets), strict=True)
         family.add_metric([status.name, stage.stage], list(buckets), stage.sum_s)
     return family
-
-
-def exposition(family: Metric) -> bytes:
-    """Return a family in the text format."""
-    registry = CollectorRegistry(auto_describe=False)
-    registry.register(_One(family))
-    return generate_latest(registry)
-
-
-class _One:
-    """A collector of one family."""
-
-    def __init__(self, family: Metric) -> None:
-        self._family = family
-
-    def collect(self) -> list[Metric]:
-        return [self._family]

@@ -1,9 +1,8 @@
-"""Reports of a process about itself: on its status socket, over HTTP, and to the service manager.
+"""Reports of a process about itself: on its status socket, to the service manager, and as metrics.
 
     get_status ──▶ Report ──▶ NAME.status.sock   one JSON object per connection
-                          ──▶ NAME.http.sock     /metrics /healthz /readyz, and /frames/N of a master
-                          ──▶ --metrics          the same over TCP
                           ──▶ NOTIFY_SOCKET      readiness, and signs of life
+                          ──▶ --metrics          HTTP for Prometheus
 
 Processing of frames only updates counters; everything else happens when something is requested.
 """
@@ -12,45 +11,32 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import importlib
 import os
-import socket
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Iterator
-from http import HTTPStatus
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from pcie_shim.endpoint import Endpoint, listen, parse_endpoint, remove_listener
-from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
-from services.sockets.http_server import Response, refused, serve_http
+from services.settings import metrics_endpoint
 from services.sockets.records import VERSION
 from services.sockets.status import ProcessStatus, StageLatency
 from services.supervision.parent import leave_private_directory
 from services.supervision.service_manager import ServiceManager
 from terminal.health import in_thread, resources, serve_health
-from terminal.output import say
-from terminal.private_directory import HTTP_SUFFIX
 
 STUCK_S = 30.0
 """Seconds without progress after which a process with one blocking thread counts as stuck."""
 _SAMPLE_EVERY = 1.0
 _SAMPLES = 6
 """Number of samples, one per second: a rate covers the last five seconds."""
-_RENDER_EVERY = 1.0
-"""Seconds for which the text of `/metrics` is reused, so that requests cannot slow the frames."""
 
 GetStatus = Callable[[], ProcessStatus]
 """Function that returns the status of a process; identity, rate, CPU time and memory are added here."""
-
-
-def http_socket(directory: Path, name: str) -> Path:
-    """Return the path of the HTTP socket of a process."""
-    return directory.absolute() / f"{name}{HTTP_SUFFIX}"
 
 
 class Report:
@@ -61,7 +47,6 @@ class Report:
         get_status: Returns its status.
         is_alive: Returns whether it makes progress; needed only if this is not evident from an answer.
         stages: Returns the latencies of the stages of its frames.
-        frame: Returns a frame, or a sentence if it is not known.
     """
 
     def __init__(
@@ -71,17 +56,14 @@ class Report:
         *,
         is_alive: Callable[[], bool] = lambda: True,
         stages: Callable[[], list[StageLatency]] = list,
-        frame: Callable[[int], msgspec.Struct | str] | None = None,
     ) -> None:
         self._name = name
         self._get_status = get_status
         self._is_alive = is_alive
         self._stages = stages
-        self._frame = frame
         self._started = time.monotonic()
+        # time, CPU time and completed frames of the last seconds, one sample per second
         self._samples: deque[tuple[float, float, int]] = deque(maxlen=_SAMPLES)
-        self._rendering = asyncio.Lock()
-        self._metrics, self._rendered = b"", 0.0
 
     def sample(self, manager: ServiceManager) -> None:
         """Take a sample for the rate, and report to the service manager."""
@@ -93,6 +75,7 @@ class Report:
     def status(self) -> ProcessStatus:
         """Return the whole status."""
         status, now, cpu_s = self._get_status(), time.monotonic(), time.process_time()
+        alive = self._is_alive()
         frames = status.frames
         percent = 0.0
         if self._samples and (elapsed := now - self._samples[0][0]) > 0:
@@ -101,6 +84,9 @@ class Report:
             frames = msgspec.structs.replace(frames, rate=self._rate(now, frames.completed))
         return msgspec.structs.replace(
             status,
+            ready=status.ready and alive,
+            why=status.why if alive else f"it makes no progress ({status.why})",
+            alive=alive,
             name=self._name,
             pid=os.getpid(),
             version=VERSION,
@@ -122,45 +108,6 @@ class Report:
         """Return the whole status as JSON."""
         return msgspec.json.encode(self.status())
 
-    async def respond(self, path: str) -> Response:
-        """Return the response to an HTTP request."""
-        if path == "/healthz":
-            alive = self._is_alive()
-            status = HTTPStatus.OK if alive else HTTPStatus.SERVICE_UNAVAILABLE
-            return Response(status, b"alive\n" if alive else b"stuck\n")
-        if path == "/readyz":
-            state = self._get_status()
-            status = HTTPStatus.OK if state.ready else HTTPStatus.SERVICE_UNAVAILABLE
-            return Response(status, f"{state.why}\n".encode())
-        if path == "/metrics":
-            return await self._respond_metrics()
-        if path.startswith("/frames/") and self._frame is not None:
-            return self._respond_frame(path.removeprefix("/frames/"))
-        return refused(HTTPStatus.NOT_FOUND)
-
-    def _respond_frame(self, text: str) -> Response:
-        if self._frame is None or not (text.isascii() and text.isdigit() and len(text) < 16):
-            return refused(HTTPStatus.NOT_FOUND)
-        found = self._frame(int(text))
-        if isinstance(found, str):
-            return Response(HTTPStatus.NOT_FOUND, found.encode())
-        return Response(HTTPStatus.OK, msgspec.json.encode(found), "application/json")
-
-    async def _respond_metrics(self) -> Response:
-        async with self._rendering:
-            if not self._metrics or time.monotonic() >= self._rendered + _RENDER_EVERY:
-                # the import takes a tenth of a second, and only scraped processes need it
-                loop = asyncio.get_running_loop()
-                metrics = await loop.run_in_executor(
-                    None, importlib.import_module, "services.sockets.metrics"
-                )
-                parts = []
-                for family in metrics.families(self.status()):
-                    parts.append(metrics.exposition(family))
-                    await asyncio.sleep(0)  # a frame need not wait for the whole text
-                self._metrics, self._rendered = b"".join(parts), time.monotonic()
-            return Response(HTTPStatus.OK, self._metrics, "text/plain; version=0.0.4; charset=utf-8")
-
 
 def _check(directory: Path | None) -> None:
     if directory is not None and not directory.is_dir():
@@ -171,7 +118,7 @@ def _check(directory: Path | None) -> None:
 
 def check_metrics(metrics: str, *, insecure: bool) -> None:
     """Raise a SettingsError if other machines could read metrics, and that was not permitted."""
-    if metrics and not insecure and not parse_endpoint(metrics).is_loopback:
+    if metrics and not insecure and not metrics_endpoint(metrics).is_loopback:
         raise SettingsError(
             f"--metrics {metrics} lets everybody on that network read the state of this process; "
             "use a loopback address, or give --insecure if that is intended"
@@ -182,8 +129,8 @@ def shifted(metrics: str, ports: int) -> str:
     """Return an address for metrics some ports further, for another process of the same run."""
     if not metrics:
         return ""
-    endpoint = parse_endpoint(metrics)
-    return str(Endpoint(host=endpoint.host, port=endpoint.port + ports))
+    endpoint = metrics_endpoint(metrics)
+    return str(replace(endpoint, port=endpoint.port + ports)).removeprefix("tcp://")
 
 
 @contextlib.asynccontextmanager
@@ -192,40 +139,24 @@ async def serve_status(
 ) -> AsyncIterator[None]:
     """Report in the running loop within the context; `more` is passed to `Report`.
 
-    Without a directory, which must exist, there are no sockets in it; without `metrics` nothing is served
-    over TCP. A socket that cannot be opened only causes a warning, because it must not end a robot's run.
+    Without a directory, which must exist, there is no status socket; without `metrics` there is no HTTP
+    server. A socket that cannot be opened only causes a warning, because it must not end a robot's run.
     """
     _check(directory)
     report, manager = Report(name, get_status, **more), ServiceManager()
-    endpoints = [Endpoint(path=str(http_socket(directory, name)))] if directory is not None else []
-    if metrics:
-        endpoints.append(parse_endpoint(metrics))
-    with contextlib.ExitStack() as sockets:
-        async with serve_health(directory, name, report.answer):
-            tasks = [asyncio.ensure_future(_keep_sampling(report, manager))]
-            for endpoint in endpoints:
-                listener = _listener(endpoint, name)
-                if listener is not None:
-                    sockets.callback(remove_listener, endpoint, listener)
-                    local_only = bool(endpoint.host) and endpoint.is_loopback
-                    tasks.append(
-                        asyncio.ensure_future(serve_http(listener, report.respond, local_only=local_only))
-                    )
-            try:
-                yield
-            finally:
-                manager.stopping()
-                for task in tasks:
-                    task.cancel()
-                await asyncio.gather(*tasks, return_exceptions=True)
+    async with contextlib.AsyncExitStack() as serving:
+        await serving.enter_async_context(serve_health(directory, name, report.answer))
+        if metrics:
+            from services.sockets.metrics import serve_metrics
 
-
-def _listener(endpoint: Endpoint, name: str) -> socket.socket | None:
-    try:
-        return listen(endpoint)
-    except PcieShimError as error:
-        say(f"{name}: warning: its metrics cannot be read: {error}")
-        return None
+            await serving.enter_async_context(serve_metrics(metrics_endpoint(metrics), name, report.status))
+        sampling = asyncio.ensure_future(_keep_sampling(report, manager))
+        try:
+            yield
+        finally:
+            manager.stopping()
+            sampling.cancel()
+            await asyncio.gather(sampling, return_exceptions=True)
 
 
 async def _keep_sampling(report: Report, manager: ServiceManager) -> None:

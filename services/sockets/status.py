@@ -97,6 +97,8 @@ class HubStatus(msgspec.Struct, frozen=True):
 class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     """A process. `why` gives the cause while it is not ready, and its state when it is.
 
+    `alive` is false if it answers, but makes no progress (a blocking thread hangs, or a child of the master does).
+
     `cpu_s` is its user and system time so far, `cpu_percent` that of the last seconds (100 is one core), and
     `memory_bytes` its resident memory.
 
@@ -105,6 +107,7 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     ready: bool
     why: str
+    alive: bool = True
     name: str = ""
     pid: int = 0
     version: str = ""

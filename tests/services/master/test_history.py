@@ -7,7 +7,6 @@ import msgspec
 import pytest
 
 from services.master.history import REMEMBERED, FrameHistory
-from services.output.frame_lines import lines
 from services.sockets.frame_timeline import FrameTimeline
 from services.sockets.records import (
     FailureReason,
@@ -69,8 +68,6 @@ def test_a_published_frame_has_its_stages_in_order():
     assert [(board.index, board.cycles) for board in timeline.boards] == [(0, 512), (1, 500)]
     assert (timeline.bank, timeline.stamp_ns) == (1, 5)
     assert msgspec.json.decode(msgspec.json.encode(timeline), type=FrameTimeline) == timeline
-    assert len(lines(timeline)) == 4 + 7 + 2 + 2
-    assert lines(msgspec.structs.replace(timeline, stamp_ns=-(1 << 62)))  # a robot may send any stamp
 
 
 def test_the_memory_is_bounded_and_says_what_it_has():

@@ -41,6 +41,12 @@ async def test_a_process_identifies_itself(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+async def test_a_process_that_makes_no_progress_is_not_ready(tmp_path):
+    with serve_status_in_thread(tmp_path, "pcie-app", get_status, is_alive=lambda: False):
+        found = await read_process_status(status_socket(tmp_path, "pcie-app"), PATIENCE)
+    assert (found.alive, found.ready) == (False, False)
+
+
 async def test_a_status_of_another_version_is_refused(tmp_path):
     with (
         in_thread(lambda: serve_health(tmp_path, "hub", lambda: b'{"ready":true,"why":3}')),
@@ -75,7 +81,6 @@ def test_stale_sockets_are_removed_and_live_ones_stay(tmp_path):
     with serve_status_in_thread(tmp_path, "board0", get_status):
         remove_stale_sockets(tmp_path)
         assert sorted(path.name for path in tmp_path.iterdir()) == [
-            "board0.http.sock",
             "board0.sock",
             "board0.status.sock",
         ]
