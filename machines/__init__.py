@@ -1,6 +1,36 @@
 """Bayesian machines, emulated bit for bit, without sockets and files.
 
-Start at `machines.posterior` (one call, for a notebook) or `machines.kernel` (the machine of a board).
+Start at `machines.posterior` (one call, for a notebook) or `make_kernel` (the machine of a board).
 `machines.bm1` defines a machine, `machines.reference` runs it cycle by cycle, and `machines.fast` gets the
 same results faster. Only `machines.fast` imports numba.
 """
+
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from machines.bm1 import BM1Machine
+    from machines.kernel import BM1Kernel
+
+FAST_CODES_MAX: Final = 2**24
+"""Maximum number of different codes, over all columns, for the fast kernel, which has a table of them."""
+
+
+def make_kernel(machine: "BM1Machine") -> "BM1Kernel":
+    """Return the fastest kernel that can run the machine in a bounded memory."""
+    parameters = machine.parameters
+    codes = parameters.columns << parameters.prob_bits
+    if parameters.shared and parameters.rng.lfsr_bits is not None and codes <= FAST_CODES_MAX:
+        # only a process that runs such machines imports numba
+        from machines.fast import FastBM1
+
+        return FastBM1(machine)
+    from machines.reference import ReferenceBM1
+
+    return ReferenceBM1(machine)
+
+
+def warm_up() -> None:
+    """Load the fast kernel (the first time, compile it) before the first frame; forked processes share it."""
+    from machines import fast
+
+    fast.warm_up()

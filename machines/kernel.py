@@ -1,8 +1,7 @@
-"""The common base of the kernels of a BM1, the checks of their arguments, and their selection."""
+"""The common base of the kernels of a BM1, and the checks of their arguments."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -10,9 +9,6 @@ import numpy.typing as npt
 from machines.bm1 import BM1Machine, Start, StopReason, checked_codes, joint_reason
 from machines.errors import ParameterError, StartError
 from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, SensorMode
-
-FAST_CODES_MAX: Final = 2**24
-"""Maximum number of different codes, over all columns, for the fast kernel, which has a table of them."""
 
 
 class BM1Kernel(ABC):
@@ -139,27 +135,6 @@ class BM1Kernel(ABC):
             )
         if run_until != 0:
             _check("run_until", run_until, self.cycles + 1, CYCLES_MAX)
-
-
-def make_kernel(machine: BM1Machine) -> BM1Kernel:
-    """Return the fastest kernel that can run the machine in a bounded memory."""
-    parameters = machine.parameters
-    codes = parameters.columns << parameters.prob_bits
-    if parameters.shared and parameters.rng.lfsr_bits is not None and codes <= FAST_CODES_MAX:
-        # only a process that runs such machines imports numba
-        from machines.fast import FastBM1
-
-        return FastBM1(machine)
-    from machines.reference import ReferenceBM1
-
-    return ReferenceBM1(machine)
-
-
-def warm_up() -> None:
-    """Load the fast kernel (the first time, compile it) before the first frame; forked processes share it."""
-    from machines import fast
-
-    fast.warm_up()
 
 
 def check_start(parameters: BM1Parameters, start: Start) -> None:

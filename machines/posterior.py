@@ -95,7 +95,7 @@ def posterior(
         NoPosteriorError: All counts (of all replicas) are 0 for these readings.
         StartError: A reading or another argument does not fit the machine.
     """
-    from machines.kernel import make_kernel
+    from machines import make_kernel
 
     if not isinstance(readings, Sized):
         raise StartError(f"Readings must be a list with one for each sensor column, not {readings!r}.")

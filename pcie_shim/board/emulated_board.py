@@ -14,9 +14,10 @@ from typing import Final, NoReturn
 import numpy as np
 import numpy.typing as npt
 
+from machines import make_kernel
 from machines.bm1 import BM1Machine, Start, StopReason, missing_inputs
 from machines.errors import MachineError, StartError
-from machines.kernel import BM1Kernel, make_kernel
+from machines.kernel import BM1Kernel
 from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, RngReset
 from machines.parameters import SensorMode as InputMode
 from pcie_shim import register_map as rm

@@ -137,7 +137,7 @@ class BoardProcesses:
 
     def run(self) -> NoReturn:
         """Keep the boards running until a signal raises here, or boards exit too often (BoardFailedError)."""
-        from machines.kernel import warm_up
+        from machines import warm_up
 
         # children share these pages, because four imports of numba would take 1.6 s
         warm_up()

@@ -130,7 +130,7 @@ def board(
     if engine is not Engine.EMULATED and misbehave:
         raise SettingsError("--misbehave belongs to an emulated board: leave out --engine")
     name_process(f"board{index}")
-    from machines.kernel import warm_up
+    from machines import warm_up
 
     warm_up()
     check_signals()

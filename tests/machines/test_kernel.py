@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
+from machines import make_kernel
 from machines.bm1 import BM1Machine, Start, StopReason
 from machines.fast import FastBM1
-from machines.kernel import make_kernel
 from machines.parameters import BM1Parameters, RngKind
 from machines.reference import ReferenceBM1
 from tests.patience import PROCESS_PATIENCE

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from machines import make_kernel
 from machines.bm1 import BM1Machine, Start, StopReason, joint_reason
 from machines.errors import StartError
-from machines.kernel import make_kernel
 from machines.parameters import BM1Parameters, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
 from tests.machines.random_machines import codes, sessions

@@ -6,9 +6,9 @@ Seeds are fixed, so that nothing here is left to chance: a test that passes, pas
 import numpy as np
 import pytest
 
+from machines import make_kernel
 from machines.bm1 import BM1Machine, Start
 from machines.encode import decode_code
-from machines.kernel import make_kernel
 from machines.parameters import BM1Parameters, RngKind
 
 EVER = 2**32 - 1

@@ -15,8 +15,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from machines import make_kernel
 from machines.bm1 import BM1Machine, Start, StopReason
-from machines.kernel import make_kernel
 from machines.parameters import BM1Parameters, RngKind, SensorMode
 from pcie_shim.board.misbehaviour import Misbehaviour
 from pcie_shim.board.server import StopSignal, serve_board

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from machines.kernel import warm_up
+from machines import warm_up
 from tests.pcie_shim.boards import ServedBoard, free_places
 
 

@@ -12,14 +12,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from toolchain.analysis.accuracy.readings import reading_columns
 from toolchain.deployment.address import to_address
 from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.flag_values import key_values
 from toolchain.learning.fit import LEAST_READINGS, Support, Truth, fit_model, locate
 from toolchain.learning.fit_options import FitMethod, FitOptions
 from toolchain.learning.fitted import Fit, FittedRecording, apply_fit, write_fit
-from toolchain.learning.recording import Recording, read_recording
+from toolchain.learning.recording import Recording, read_recording, reading_columns
 from toolchain.models.case_study import load_model
 from toolchain.models.fusion import exact_posterior
 from toolchain.models.model import Model, cell_centres

@@ -16,8 +16,9 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, Final, TextIO
 
-from toolchain.errors import ModelError
+from toolchain.errors import BuildError, ModelError
 from toolchain.files.bounded_file import open_regular
+from toolchain.flag_values import key_values
 
 MAX_ROWS: Final = 2_000_000
 _LONGEST_LINE: Final = 1 << 20
@@ -54,6 +55,32 @@ def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0
     if path.suffix.lower() == ".csv":
         return _read_csv(path, columns)
     return _read_bag(path, columns, round(tolerance_s * 1e9))
+
+
+def reading_columns(names: Sequence[str], given: Sequence[str], flag: str = "--reading") -> dict[str, str]:
+    """Return the column of each variable, by default its name; a BuildError for a pattern without a match."""
+    if not given:
+        return {name: name for name in names}
+    columns: dict[str, str] = {}
+    for pattern, column in key_values(given, flag, "range=COLUMN").items():
+        before, star, after = pattern.partition("*")
+        fitting = [
+            name
+            for name in names
+            if (
+                name.startswith(before) and name.endswith(after) and len(name) >= len(before) + len(after)
+                if star
+                else name == pattern
+            )
+        ]
+        if not fitting:
+            raise BuildError(
+                f"{flag} {pattern}: not a known variable of the model; expected one of {', '.join(names[:20])}"
+            )
+        for name in fitting:
+            same = name[len(before) : len(name) - len(after)] if star else ""
+            columns[name] = column.replace("*", same)
+    return columns
 
 
 def _read_csv(path: Path, columns: Sequence[str]) -> Recording:

@@ -336,7 +336,7 @@ def of_deployment(stack: Stack, folder: Path) -> None:
 FAKE_PROCESSOR: Final = """
 import llvmlite.binding as llvm
 llvm.get_host_cpu_name = lambda: "goldmont-plus"
-from machines.kernel import warm_up
+from machines import warm_up
 warm_up()
 """
 

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from machines import make_kernel
 from machines.bm1 import Start, StopReason
-from machines.kernel import BM1Kernel, make_kernel
+from machines.kernel import BM1Kernel
 from machines.parameters import CYCLES_MAX, PriorMode, RngKind, RngReset
 from pcie_shim import register_map as rm
 from pcie_shim.board import emulated_board

@@ -14,8 +14,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from machines import make_kernel
 from machines.bm1 import BM1Machine, Start, StopReason
-from machines.kernel import make_kernel
 from pcie_shim import framing
 from pcie_shim import register_map as rm
 from pcie_shim.board import server as board_module

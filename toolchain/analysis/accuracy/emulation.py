@@ -7,8 +7,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from machines import make_kernel
 from machines.bm1 import BM1Machine, Start, StopReason, first_slice
-from machines.kernel import make_kernel
 from machines.parameters import COUNTER_BITS_MAX, CYCLES_MAX, BM1Parameters
 from machines.posterior import joint_posterior
 from toolchain.deployment import Stop

@@ -15,8 +15,7 @@ from toolchain.deployment import Dimension, Scale, Variable
 from toolchain.deployment.address import to_address
 from toolchain.deployment.written_codes import written_codes
 from toolchain.errors import BuildError, ModelError, ReadingError
-from toolchain.flag_values import key_values
-from toolchain.learning.recording import read_recording
+from toolchain.learning.recording import read_recording, reading_columns
 from toolchain.models.model import Known, Model, PriorSelect
 
 MISSING: Final = -1
@@ -238,29 +237,3 @@ def recorded_readings(
     left_out = f", without {refused} that do not fit ({first})" if refused else ""
     source = f"{len(rows)} of {recording.rows} rows of {path.name}{left_out}"
     return Readings(source, addresses[:, sensors], prior)
-
-
-def reading_columns(names: Sequence[str], given: Sequence[str], flag: str = "--reading") -> dict[str, str]:
-    """Return the column of each variable, by default its name; a BuildError for a pattern without a match."""
-    if not given:
-        return {name: name for name in names}
-    columns: dict[str, str] = {}
-    for pattern, column in key_values(given, flag, "range=COLUMN").items():
-        before, star, after = pattern.partition("*")
-        fitting = [
-            name
-            for name in names
-            if (
-                name.startswith(before) and name.endswith(after) and len(name) >= len(before) + len(after)
-                if star
-                else name == pattern
-            )
-        ]
-        if not fitting:
-            raise BuildError(
-                f"{flag} {pattern}: not a known variable of the model; expected one of {', '.join(names[:20])}"
-            )
-        for name in fitting:
-            same = name[len(before) : len(name) - len(after)] if star else ""
-            columns[name] = column.replace("*", same)
-    return columns
