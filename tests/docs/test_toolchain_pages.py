@@ -12,6 +12,7 @@ from typer.main import get_command
 
 from tests.toolchain.running import TARGET, assert_refused, toolchain
 from toolchain.building.build import assemble
+from toolchain.building.machine import plan_machine
 from toolchain.building.options import BuildOptions
 from toolchain.building.sources_file import read_sources
 from toolchain.checks.finding import Check
@@ -154,7 +155,7 @@ def test_every_constant_of_the_parameters():
 def built_for_the_documentation():
     known = Known(name="K", table=np.full((2, 2), 0.5))
     model = Model(name="m", searched=(dimension("s", size=2),), known=(known,))
-    built = assemble(model, BuildOptions(uri="ws://robot:9090", topic="/readings", type="a/B"))
+    built = assemble(plan_machine(model, BuildOptions(uri="ws://robot:9090", topic="/readings", type="a/B")))
     return built.deployment, built.images
 
 

@@ -5,6 +5,7 @@ import pytest
 
 from posteriors import LabelError, Posterior, PosteriorError, posterior
 from toolchain.building.build import build_deployment
+from toolchain.building.machine import plan_machine
 from toolchain.building.options import BuildOptions
 from toolchain.models import Known, Model, dimension
 from toolchain.models.fusion import exact_posterior
@@ -28,7 +29,7 @@ def model():
 def build(tmp_path_factory):
     def built(**options):
         folder = tmp_path_factory.mktemp("built")
-        build_deployment(model(), folder, BuildOptions(**TARGET, **options))
+        build_deployment(plan_machine(model(), BuildOptions(**TARGET, **options)), folder)
         return folder
 
     return built

@@ -1,7 +1,7 @@
 """The path from a model to a deployment (thesis 3.4).
 
-model ──▶ machine_parameters ──▶ quantise ──▶ whole_machine ──▶ board_images ──▶ describe ──▶ files
-└─▶ board_layout (lines and interface of each board, before tables are computed)
+model, options ──▶ plan_machine ──▶ quantise ──▶ whole_machine ──▶ board_images ──▶ describe ──▶ files
+                   └─▶ board_layout (lines and interface of each board, before tables are computed)
 """
 
 import os
@@ -12,13 +12,11 @@ from pathlib import Path
 from pcie_shim.programming_file import Image
 from toolchain.building.board_layout import board_layout
 from toolchain.building.images import board_images, describe
-from toolchain.building.machine import machine_parameters, whole_machine
-from toolchain.building.options import BuildOptions, check_options
+from toolchain.building.machine import MachinePlan, whole_machine
 from toolchain.building.quantise import Quantised, quantise
-from toolchain.building.report import REPORT_NAME, build_report, with_remark
+from toolchain.building.report import REPORT_NAME, build_report
 from toolchain.deployment import FILE_NAME, Deployment, write_deployment
 from toolchain.errors import BuildError, DeploymentError
-from toolchain.models.model import Model
 from toolchain.outputs.output_files import image_files, memory_files, quartus_files, text_file, write_files
 
 
@@ -38,17 +36,17 @@ class Built:
     """The content of `report.txt`."""
 
 
-def build_deployment(model: Model, directory: Path, options: BuildOptions, *, remark: str = "") -> Built:
-    """Write a model's deployment: `deployment.toml`, an image per board, a report, and the hardware project.
+def build_deployment(plan: MachinePlan, directory: Path, *, remark: str = "") -> Built:
+    """Write a deployment: `deployment.toml`, an image per board, a report, and the hardware project.
 
-    The same model and options give the same bytes. A deployment in the folder is replaced; `remark` ends the report.
+    The same plan gives the same bytes. A deployment in the folder is replaced; `remark` ends the report.
 
     Raises:
-        BuildError: The options contradict each other, the model or the register map, or the folder cannot be
-            written.
+        BuildError: The options contradict the register map, or the folder cannot be written.
     """
-    built = assemble(model, options)
-    built = replace(built, report=with_remark(built.report, remark))
+    built = assemble(plan)
+    if remark:
+        built = replace(built, report=f"{built.report}\n{remark}\n")
     try:
         directory.mkdir(parents=True, exist_ok=True)
         # a process that reads the folder meanwhile finds no deployment, instead of parts of two
@@ -70,17 +68,16 @@ def build_deployment(model: Model, directory: Path, options: BuildOptions, *, re
         raise BuildError(str(reason)) from None
 
 
-def assemble(model: Model, options: BuildOptions) -> Built:
-    """Return a model's deployment without writing anything, or raise a BuildError."""
-    check_options(options)
-    parameters = machine_parameters(model, options)
+def assemble(plan: MachinePlan) -> Built:
+    """Return a deployment without writing anything, or raise a BuildError."""
+    model, parameters, options = plan.model, plan.parameters, plan.options
     layout = board_layout(parameters, options.partitions, options.interface)
     quantised = quantise(
         model, prob_bits=parameters.prob_bits, scale=options.scaling, sensor_mode=parameters.sensor_mode
     )
-    machine = whole_machine(parameters, quantised, options)
-    images = board_images(model, machine, layout, options.build_date)
-    deployment = describe(model, parameters, layout, images, options)
+    machine = whole_machine(plan, quantised)
+    images = board_images(plan, machine, layout)
+    deployment = describe(plan, layout, images)
     report = build_report(model, deployment, quantised, layout.reason)
     return Built(
         deployment=deployment,

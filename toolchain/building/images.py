@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pydantic import ValidationError
 
 from machines.bm1 import BM1Machine
-from machines.parameters import BM1Parameters, SensorMode
+from machines.parameters import SensorMode
 from pcie_shim.programming_file import Image, Partition, tool_version
 from toolchain.building.board_layout import BoardLayout
-from toolchain.building.machine import MACHINE_KEYS
+from toolchain.building.machine import MACHINE_KEYS, MachinePlan
 from toolchain.building.options import BuildOptions, refused_option
 from toolchain.building.partition import split
 from toolchain.deployment import Board, Deployment, MachineSection, Output, Variable
@@ -38,34 +38,26 @@ def model_hash(model: Model, machine: BM1Machine) -> str:
     return digest.hexdigest()
 
 
-def board_images(
-    model: Model, machine: BM1Machine, layout: BoardLayout, build_date: str
-) -> tuple[Image, ...]:
+def board_images(plan: MachinePlan, machine: BM1Machine, layout: BoardLayout) -> tuple[Image, ...]:
     """Return one image per board of the whole machine."""
-    identity, count = model_hash(model, machine), len(layout.blocks)
+    identity, count = model_hash(plan.model, machine), len(layout.blocks)
     return tuple(
         Image(
             machine=part,
-            partition=Partition(board, count, block.offset, model.lines),
+            partition=Partition(board, count, block.offset, plan.model.lines),
             interface_sensors=layout.interface[0],
             interface_results=layout.interface[1],
             model_hash=identity,
-            build_date=build_date,
+            build_date=plan.options.build_date,
             tool_version=tool_version(),
         )
         for board, (part, block) in enumerate(zip(split(machine, count), layout.blocks, strict=True))
     )
 
 
-def describe(
-    model: Model,
-    parameters: BM1Parameters,
-    layout: BoardLayout,
-    images: Sequence[Image],
-    options: BuildOptions,
-) -> Deployment:
+def describe(plan: MachinePlan, layout: BoardLayout, images: Sequence[Image]) -> Deployment:
     """Return the deployment of these images, with its hash; a BuildError if an option does not fit the machine."""
-    target = parameters.target_count_max if options.target_count is None else options.target_count
+    model, options = plan.model, plan.options
     try:
         deployment = Deployment(
             name=model.name,
@@ -78,10 +70,10 @@ def describe(
                 lines=model.lines,
                 interface=layout.interface_text,
                 scale=options.scaling,
-                target_count=target,
+                target_count=plan.target_count,
                 max_cycles=options.max_cycles,
                 stop=options.stop,
-                **{key: getattr(parameters, key) for key in MACHINE_KEYS},
+                **{key: getattr(plan.parameters, key) for key in MACHINE_KEYS},
             ),
             prior=options.written_prior,
             boards=tuple(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from pydantic import ValidationError
 
-from machines.parameters import REPLICAS_MAX, PriorMode, RngKind, RngReset, SensorMode
+from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from toolchain.deployment import Output, Queue, Scale, Source, Stop, WrittenPrior
 from toolchain.errors import BuildError
 
@@ -94,6 +94,13 @@ class BuildOptions:
     build_date: str = ""
     """The date of the build, ISO 8601: part of the images' manifests, but not of their hashes."""
 
+    def __post_init__(self) -> None:
+        """Refuse a server, topic, type or path that is none, before a model is read."""
+        try:
+            Output(topic=self.output), self.all_sources, self.written_prior
+        except ValidationError as reason:
+            raise refused_option(reason) from None
+
     @property
     def scaling(self) -> Scale:
         """The part of a table that is divided by its maximum: `scale`, or its default."""
@@ -114,21 +121,6 @@ class BuildOptions:
         if self.sources is not None:
             return self.sources.prior
         return None if self.prior_path is None else WrittenPrior(path=self.prior_path)
-
-
-def check_options(options: BuildOptions) -> None:
-    """Raise a BuildError for wrong or contradictory options, before anything is computed."""
-    try:
-        Output(topic=options.output), options.all_sources, options.written_prior
-    except ValidationError as reason:
-        raise refused_option(reason) from None
-    if options.sensor_mode is not SensorMode.COLUMN and options.scaling is Scale.ADDRESS:
-        raise BuildError(
-            f"--scale address is impossible with --sensor-mode {options.sensor_mode}: lines use different addresses in a "
-            "frame, so the factors of addresses would not cancel; use --scale column or none"
-        )
-    if not 1 <= options.replicas <= REPLICAS_MAX:
-        raise BuildError(f"--replicas is {options.replicas}, expected 1 to {REPLICAS_MAX}")
 
 
 def refused_option(reason: ValidationError) -> BuildError:

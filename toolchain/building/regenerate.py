@@ -11,9 +11,9 @@ from pcie_shim.programming_file import Image
 from toolchain.building.agreement import check_agreement, read_images
 from toolchain.building.board_layout import board_layout
 from toolchain.building.build import assemble
-from toolchain.building.machine import machine_options
+from toolchain.building.machine import machine_options, plan_machine
 from toolchain.building.options import BuildOptions, refused_option
-from toolchain.building.report import REPORT_NAME, build_report, remark_of, with_remark
+from toolchain.building.report import REPORT_NAME, build_report
 from toolchain.deployment import (
     FILE_NAME,
     Deployment,
@@ -142,14 +142,13 @@ def regenerate_memories(directory: Path, model: Model | None = None, *, build_da
     if model is None:
         return write_files(directory, memory_files(deployment, images))
     model = _with_widths(model, deployment)
-    built = assemble(model, replace(_options(deployment, images[0]), build_date=build_date))
+    built = assemble(plan_machine(model, replace(_options(deployment, images[0]), build_date=build_date)))
     new = _with_places(built.deployment, deployment)
     report = build_report(model, new, built.quantised, built.interface_reason)
     parts = [
         image_files(new, built.images),
         memory_files(new, built.images),
-        # the machine has the same size, so the reason for its number of boards is the same
-        text_file(REPORT_NAME, with_remark(report, _remark(directory))),
+        text_file(REPORT_NAME, report),
         text_file(
             FILE_NAME, deployment_text(new)
         ),  # last, so that a partially written folder has the old hashes
@@ -232,15 +231,6 @@ def _listed(values: Sequence[object]) -> str:
     return ", ".join(
         f"{value[0]} ({value[1]})" if isinstance(value, tuple) else str(value) for value in values
     )
-
-
-def _remark(directory: Path) -> str:
-    """Return the remark of the existing report about the choice of options, or an empty text."""
-    report = directory / REPORT_NAME
-    try:
-        return remark_of(report.read_text(encoding="utf-8")) if report.is_file() else ""
-    except (OSError, UnicodeDecodeError):
-        return ""
 
 
 def _with_places(new: Deployment, old: Deployment) -> Deployment:

@@ -1,6 +1,5 @@
 """`report.txt` of a deployment: what was built and what was lost, in plain sentences."""
 
-import re
 from typing import Final
 
 from machines.parameters import PriorMode, SensorMode
@@ -50,17 +49,6 @@ def build_report(
     paragraphs += [f"Warning: {warning}" for warning in quantised.warnings]
     paragraphs.append(f"{_topics_sentence(deployment)} Deployment {deployment.hash[:16]}.")
     return "\n\n".join(paragraphs) + "\n"
-
-
-def with_remark(report: str, remark: str) -> str:
-    """Return a report with a remark at its end about how the options were chosen, if there is one."""
-    return f"{report}\n{remark}\n" if remark else report
-
-
-def remark_of(report: str) -> str:
-    """Return the remark at the end of a report, after the deployment's hash; empty where there is none."""
-    end = re.search(r"Deployment [0-9a-f]{16}\.\n\n(.*)\Z", report, re.DOTALL)
-    return end[1].strip() if end else ""
 
 
 def loss_heading(sensor_mode: SensorMode) -> str:

@@ -9,13 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from machines.errors import MachineError
 from pcie_shim.errors import PcieShimError
 from pcie_shim.programming_file import Image
 from toolchain.building.agreement import check_agreement, read_images
-from toolchain.building.board_layout import board_layout
 from toolchain.building.build import assemble
-from toolchain.building.machine import machine_parameters
+from toolchain.building.machine import MachinePlan, plan_machine
 from toolchain.building.options import BuildOptions
 from toolchain.building.partition import partition_lines
 from toolchain.checks.checked_machine import CheckedMachine
@@ -30,12 +28,22 @@ from toolchain.models.model import Model
 from toolchain.outputs.output_files import Change, compare_files, memory_files, quartus_files
 
 
-def check_model(model: Model, options: BuildOptions) -> list[Finding]:
-    """Return the findings about a model and the machine for it, the worst first."""
-    try:
-        built = assemble(model, options)
+def check_model(
+    model: Model, options: BuildOptions, fit: Callable[[MachinePlan], MachinePlan] = lambda plan: plan
+) -> list[Finding]:
+    """Return the findings about a model and the machine for it, the worst first; `fit` may add boards to the plan."""
+    refused: list[Finding] = []
+    try:  # besides, so that both mistakes are found at once
+        partition_lines(model.lines, options.partitions)
     except ToolchainError as reason:
-        return _refusals(model, options, reason)
+        refused.append(refusal(reason, "the partitions"))
+    try:
+        plan = plan_machine(model, options)
+        if refused:
+            return refused
+        built = assemble(fit(plan))
+    except ToolchainError as reason:
+        return [*refused, refusal(reason, "the machine")]
     machine = _machine(built.deployment, built.images, model)
     return _sorted([*_check(machine), *loss_findings(built.quantised, options)])
 
@@ -54,28 +62,6 @@ def check_deployment(directory: Path) -> list[Finding]:
 def refusal(reason: Exception, about: str) -> Finding:
     """Return the finding that a model cannot be built, or a deployment cannot be read."""
     return error(Check.CANNOT_BE_BUILT, about, str(reason).rstrip("."))
-
-
-def _refusals(model: Model, options: BuildOptions, first: ToolchainError) -> list[Finding]:
-    """Return the reasons why a model cannot be built; parts are checked separately, to find all mistakes."""
-    tries: list[tuple[str, Callable[[], object]]] = [
-        ("the partitions", lambda: partition_lines(model.lines, options.partitions)),
-        ("the machine", lambda: machine_parameters(model, options)),
-        (
-            "the interface",
-            lambda: board_layout(machine_parameters(model, options), options.partitions, options.interface),
-        ),
-    ]
-    found: dict[str, Finding] = {}
-    for about, attempt in tries:
-        try:
-            attempt()
-        except (ToolchainError, MachineError) as reason:
-            finding = refusal(reason, about)
-            found.setdefault(finding.what, finding)
-    finding = refusal(first, "the machine")
-    found.setdefault(finding.what, finding)
-    return list(found.values())
 
 
 def _machine(deployment: Deployment, images: Sequence[Image], model: Model | None) -> CheckedMachine:

@@ -2,13 +2,15 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from toolchain.building.options import BuildOptions
 from toolchain.commands.flags import MESSAGES, BuildFlags, ModelPath
 from toolchain.deployment import Queue
+
+if TYPE_CHECKING:
+    from toolchain.building.sources_file import SourcesFile
 
 
 def build(
@@ -76,38 +78,42 @@ def build(
     --topic /patient --type clinic_msgs/Patient`
     """
     from toolchain.building.build import build_date, build_deployment
-    from toolchain.building.options import check_options
+    from toolchain.building.machine import plan_machine
     from toolchain.building.report import REPORT_NAME
     from toolchain.commands.request import build_options, fit_to_device, model_file, read_model, read_named
 
-    options = _with_sources(
-        replace(
-            build_options(flags, uri=uri, topic=topic, message_type=message_type),
-            output=output,
-            prior_path=prior_path,
-            queue=queue,
-            tolerance_s=tolerance,
+    options = replace(
+        build_options(
+            flags,
+            uri=uri,
+            topic=topic,
+            message_type=message_type,
+            sources=_sources(sources, uri=uri, topic=topic, message_type=message_type, prior_path=prior_path),
         ),
-        sources,
+        output=output,
+        prior_path=prior_path,
+        queue=queue,
+        tolerance_s=tolerance,
     )
-    check_options(options)
     options = read_named(options, flags)
     typer.echo(f"Reading {model_file(model)}", err=True)
     read = read_model(model, flags, flags.bits)
-    options, why = fit_to_device(options, read, flags.device)
-    typer.echo(f"Quantising {read.name} and writing its images", err=True)
     dated = replace(options, build_date=build_date(model_file(model)))
-    built = build_deployment(read, directory, dated, remark=why)
+    plan, why = fit_to_device(plan_machine(read, dated), flags.device)
+    typer.echo(f"Quantising {read.name} and writing its images", err=True)
+    built = build_deployment(plan, directory, remark=why)
     typer.echo(built.report, nl=False)
     typer.echo(f"Wrote {built.deployment.path} and {directory / REPORT_NAME}", err=True)
 
 
-def _with_sources(options: "BuildOptions", path: Path | None) -> "BuildOptions":
-    """Return the options with the file that assigns variables to topics, if there is one."""
+def _sources(
+    path: Path | None, *, uri: str, topic: str, message_type: str, prior_path: str | None
+) -> "SourcesFile | None":
+    """Return the file that assigns variables to topics, if there is one; otherwise the flags must name a topic."""
     from toolchain.building.sources_file import read_sources
     from toolchain.errors import BuildError
 
-    target = {"--uri": options.uri, "--topic": options.topic, "--type": options.type}
+    target = {"--uri": uri, "--topic": topic, "--type": message_type}
     if path is None:
         missing = [flag for flag, value in target.items() if not value]
         if missing:
@@ -115,8 +121,8 @@ def _with_sources(options: "BuildOptions", path: Path | None) -> "BuildOptions":
                 f"{missing[0]} is missing: give the source of the readings with --uri, --topic and --type, or with "
                 "--sources FILE for several topics"
             )
-        return options
-    for flag, value in (*target.items(), ("--prior-path", options.prior_path)):
+        return None
+    for flag, value in (*target.items(), ("--prior-path", prior_path)):
         if value and flag != "--uri":
             raise BuildError(f"{flag} {value}: the file of --sources sets that for each topic; omit the flag")
-    return replace(options, sources=read_sources(path, options.uri or None))
+    return read_sources(path, uri or None)

@@ -11,6 +11,7 @@ from toolchain.commands.flags import BuildFlags
 from toolchain.errors import BuildError, ToolchainError
 
 if TYPE_CHECKING:
+    from toolchain.building.machine import MachinePlan
     from toolchain.checks.finding import Finding
 
 
@@ -79,9 +80,13 @@ def _of_model(path: Path, flags: BuildFlags) -> "list[Finding]":
     try:
         options = read_named(options, flags)
         model = read_model(path, flags, flags.bits)
-        options, why = fit_to_device(options, model, flags.device)
     except ToolchainError as reason:
         return [refusal(reason, "the model")]
-    if why:
-        typer.echo(why, err=True)
-    return check_model(model, options)
+
+    def fitted(plan: "MachinePlan") -> "MachinePlan":
+        plan, why = fit_to_device(plan, flags.device)
+        if why:
+            typer.echo(why, err=True)
+        return plan
+
+    return check_model(model, options, fitted)

@@ -131,7 +131,7 @@ def _run_sweep(
     kept.check_writable()
     there = sum(task.key in kept.points for task in found)
     typer.echo(
-        f"{len(found)} machines of {model.name} over {frames.columns(found[0].options.replicas).source}"
+        f"{len(found)} machines of {model.name} over {frames.columns(found[0].plan.options.replicas).source}"
         + (f"; {there} of them are in {results}" if there else ""),
         err=True,
     )
@@ -140,7 +140,7 @@ def _run_sweep(
             run_sweep(
                 found,
                 kept.points,
-                lambda task: run_task(model, task, frames, device, sweep.banks),
+                lambda task: run_task(task, frames, device, sweep.banks),
                 kept.append,
                 lambda point: advance(_name_of(point)),
             )
@@ -148,9 +148,7 @@ def _run_sweep(
         # Ctrl-C may arrive between the write of a point and its return, so read the file.
         kept = Results(results)
         points = [
-            with_resources(model, task, kept.points[task.key], device)
-            for task in found
-            if task.key in kept.points
+            with_resources(task, kept.points[task.key], device) for task in found if task.key in kept.points
         ]
         if points:
             front = pareto(points)

@@ -8,11 +8,10 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from machines.errors import MachineError
 from machines.parameters import ADDRESS_BITS_MAX, RngKind
 from toolchain.analysis.resources.boards_needed import boards_needed
 from toolchain.analysis.resources.device import device_named
-from toolchain.building.machine import machine_parameters
+from toolchain.building.machine import MachinePlan
 from toolchain.building.options import BuildOptions
 from toolchain.deployment import parse_interface
 from toolchain.errors import BuildError
@@ -23,6 +22,7 @@ from toolchain.networks import is_network, read_network
 from toolchain.outputs.rng_table import LENGTH, read_table
 
 if TYPE_CHECKING:
+    from toolchain.building.sources_file import SourcesFile
     from toolchain.commands.flags import BuildFlags, ModelFlags
 
 
@@ -38,11 +38,13 @@ def read_model(path: Path, flags: ModelFlags, bits: Iterable[str] | None = None)
     return _with_bits(model, key_values(bits or (), "--bits", "range=8"))
 
 
-def build_options(flags: BuildFlags, *, uri: str, topic: str, message_type: str) -> BuildOptions:
+def build_options(
+    flags: BuildFlags, *, uri: str, topic: str, message_type: str, sources: SourcesFile | None = None
+) -> BuildOptions:
     """Return the options of a build, without the files named by flags."""
     common = {field.name for field in fields(BuildOptions)} & {field.name for field in fields(flags)}
     values = {name: getattr(flags, name) for name in common - {"interface", "rng_table"}}
-    return BuildOptions(uri=uri, topic=topic, type=message_type, **values)
+    return BuildOptions(uri=uri, topic=topic, type=message_type, sources=sources, **values)
 
 
 def read_named(options: BuildOptions, flags: BuildFlags) -> BuildOptions:
@@ -59,23 +61,19 @@ def read_named(options: BuildOptions, flags: BuildFlags) -> BuildOptions:
     return options
 
 
-def fit_to_device(options: BuildOptions, model: Model, name: str | None) -> tuple[BuildOptions, str]:
-    """Return the options with as many boards as the lines need on a device, and the reason as a sentence."""
+def fit_to_device(plan: MachinePlan, name: str | None) -> tuple[MachinePlan, str]:
+    """Return the plan with as many boards as the lines need on a device, and the reason as a sentence."""
     if name is None:
-        return options, ""
-    device = device_named(name)
-    try:
-        parameters = machine_parameters(model, options)
-    except MachineError as reason:
-        raise BuildError(str(reason)) from None
+        return plan, ""
+    options = plan.options
     count, why = boards_needed(
-        parameters,
-        device,
+        plan.parameters,
+        device_named(name),
         table_length=LENGTH if options.rng_table is None else options.rng_table.size,
     )
     if options.partitions > count:
         why += f" --partitions {options.partitions} asks for more."
-    return replace(options, partitions=max(count, options.partitions)), why
+    return replace(plan, options=replace(options, partitions=max(count, options.partitions))), why
 
 
 def _with_bits(model: Model, bits: dict[str, str]) -> Model:

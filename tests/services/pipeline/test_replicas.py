@@ -13,6 +13,7 @@ from services.pipeline.frames import FrameAssembler
 from services.pipeline.inference import Inference
 from services.sockets.records import FrameResult
 from toolchain.building.build import assemble
+from toolchain.building.machine import plan_machine
 from toolchain.building.options import BuildOptions
 from toolchain.models.model import Known, Model, PriorSelect, dimension
 
@@ -28,7 +29,7 @@ def deployment(*, written=False, **changes):
         else PriorSelect(name="P", table=np.full((2, 2), 0.5), on_missing="missing"),
     )
     options = BuildOptions(uri="ws://r:9090", topic="/t", type="a/B", **changes)
-    return assemble(model, options).deployment
+    return assemble(plan_machine(model, options)).deployment
 
 
 CELLS = deployment(replicas=3, sensor_mode=SensorMode.CELL)

@@ -119,7 +119,7 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path):
 
     def measure(task):
         measured.append(task.key)
-        return run_task(model, task, readings, D8, 1)
+        return run_task(task, readings, D8, 1)
 
     first = Results(tmp_path / "r.jsonl")
     with pytest.raises(KeyboardInterrupt):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
-from toolchain.analysis.resources.boards_needed import boards_needed, with_lines
+from toolchain.analysis.resources.boards_needed import boards_needed
 from toolchain.analysis.resources.device import DEVICES, device_named
 from toolchain.analysis.resources.estimate import Pcie, estimate
 from toolchain.analysis.resources.logic import logic_of
@@ -20,7 +20,7 @@ def on_d8(parameters, **others):
 
 
 def test_tables_in_bits_and_blocks():
-    quarter = with_lines(BOAT, 256)
+    quarter = replace(BOAT, lines=256)
     assert on_d8(quarter).memories.table_bits == 256 * 3 * 8 * (128 + 512)
     seeds_and_inputs = 2
     # 256 codes of 8 bits side by side, 5 in each block of 512 words of 40 bits
@@ -36,7 +36,7 @@ def test_tables_in_bits_and_blocks():
 
 
 def test_a_table_of_random_numbers_is_as_long_as_the_users():
-    played = replace(with_lines(BOAT, 8), rng=RngKind.TABLE, steps_per_clock=1)
+    played = replace(replace(BOAT, lines=8), rng=RngKind.TABLE, steps_per_clock=1)
     made, own = on_d8(played), on_d8(played, table_length=500)
     # 7 generators, each with a copy: of 65,536 words of 8 bits, or of 500
     assert made.memories.blocks - own.memories.blocks == 7 * (32 - 1)
@@ -107,10 +107,10 @@ def test_boards_for_the_boat():
     assert 2 <= count <= 4
     assert why.startswith("1024 lines need two boards: on one Gidel Proce V D8")
     assert "209,920 of 262,400 can be used" in why
-    assert boards_needed(with_lines(cells, 256), D8)[0] == 1
+    assert boards_needed(replace(cells, lines=256), D8)[0] == 1
     for boards in range(1, count):
-        assert not on_d8(with_lines(cells, -(-1024 // boards))).fits
-    assert on_d8(with_lines(cells, -(-1024 // count))).fits
+        assert not on_d8(replace(cells, lines=-(-1024 // boards))).fits
+    assert on_d8(replace(cells, lines=-(-1024 // count))).fits
 
 
 def test_boards_for_more_lines_than_the_register_map_holds():

@@ -13,6 +13,7 @@ from machines.parameters import RngKind, RngReset
 from pcie_shim.programming_file import read_image
 from tests.toolchain.running import OPTIONS
 from toolchain.building.build import assemble, build_date, build_deployment
+from toolchain.building.machine import plan_machine
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Queue, Scale, Stop, load_deployment
 from toolchain.errors import BuildError, DeploymentError, ToolchainError
@@ -33,7 +34,9 @@ def model(size=5, sensors=2):
 
 @pytest.mark.parametrize("partitions", [1, 3, 4, 25])
 def test_the_boards_together_are_the_machine(tmp_path, partitions):
-    built = build_deployment(model(), tmp_path, replace(OPTIONS, partitions=partitions, prob_bits=7))
+    built = build_deployment(
+        plan_machine(model(), replace(OPTIONS, partitions=partitions, prob_bits=7)), tmp_path
+    )
     deployment = load_deployment(tmp_path)
     assert deployment == built.deployment
     images = [read_image(deployment.image_path(i)) for i in range(partitions)]
@@ -62,7 +65,7 @@ def test_options_arrive_in_the_deployment_and_in_the_images(tmp_path):
     frames = {"queue": Queue.ALL, "tolerance_s": 0.2}
     others = {"output": "/where", "interface": (4, 30), "build_date": "2020-02-02T02:02:02Z"}
     options = replace(OPTIONS, scale=Scale.COLUMN, **limits, **machine, **frames, **others)
-    deployment = build_deployment(model(), tmp_path, options).deployment
+    deployment = build_deployment(plan_machine(model(), options), tmp_path).deployment
     image = read_image(deployment.image_path(0))
     for section, fields in (
         (deployment.machine, limits | machine | {"interface": "4x30", "steps_per_clock": 8}),
@@ -79,20 +82,20 @@ def test_options_arrive_in_the_deployment_and_in_the_images(tmp_path):
 def test_seeds_that_no_memory_holds(tmp_path):
     options = replace(OPTIONS, rng_banks=65536, shared=False)
     with pytest.raises(BuildError, match="9633792 .* 57065, or --shared"):
-        build_deployment(model(size=7), tmp_path / "out", options)
+        build_deployment(plan_machine(model(size=7), options), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
-    built = build_deployment(model(sensors=21), tmp_path, OPTIONS)
+    built = build_deployment(plan_machine(model(sensors=21), OPTIONS), tmp_path)
     assert built.deployment.machine.interface == "21x1200"
     assert "Interface: 21x1200, larger than the default 20x1200: " in built.report
-    default = build_deployment(model(), tmp_path, OPTIONS)
+    default = build_deployment(plan_machine(model(), OPTIONS), tmp_path)
     assert "Interface: 20x1200.\n" in default.report
     assert default.deployment.machine.target_count == 255
     for interface in ((2, 25), (64, 4096)):  # exactly the machine's size, and the register map's
         assert assemble(
-            model(), replace(OPTIONS, interface=interface)
+            plan_machine(model(), replace(OPTIONS, interface=interface))
         ).deployment.machine.interface == "{}x{}".format(*interface)
 
 
@@ -123,7 +126,7 @@ def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
 )
 def test_options_that_do_not_fit(tmp_path, changes):
     with pytest.raises(BuildError) as caught:
-        build_deployment(model(), tmp_path / "new", replace(OPTIONS, **changes))
+        build_deployment(plan_machine(model(), replace(OPTIONS, **changes)), tmp_path / "new")
     assert caught.value.exit_code == 2
     assert not (tmp_path / "new").exists()  # nothing is written before all is known to fit
 
@@ -135,27 +138,30 @@ def test_a_model_larger_than_the_register_map(tmp_path):
         known=(Known(name="K", table=np.ones((1, 5000))),),
     )
     with pytest.raises(BuildError, match="room for 64 and 4096: use --partitions 2 or more"):
-        build_deployment(flat, tmp_path, OPTIONS)
-    assert len(build_deployment(flat, tmp_path, replace(OPTIONS, partitions=2)).deployment.boards) == 2
+        build_deployment(plan_machine(flat, OPTIONS), tmp_path)
+    assert (
+        len(build_deployment(plan_machine(flat, replace(OPTIONS, partitions=2)), tmp_path).deployment.boards)
+        == 2
+    )
 
 
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(BuildError, match=rf"^{re.escape(str(folder))} .* -o$"):
-            build_deployment(model(), folder, OPTIONS)
+            build_deployment(plan_machine(model(), OPTIONS), folder)
 
 
 def test_a_build_over_another_leaves_nothing_of_it_even_if_it_fails_half_way(tmp_path):
-    build_deployment(model(), tmp_path, replace(OPTIONS, partitions=4))
+    build_deployment(plan_machine(model(), replace(OPTIONS, partitions=4)), tmp_path)
     (tmp_path / "boards" / "notes.txt").write_text("mine")
-    build_deployment(model(), tmp_path, replace(OPTIONS, partitions=2))
+    build_deployment(plan_machine(model(), replace(OPTIONS, partitions=2)), tmp_path)
     assert sorted(p.name for p in (tmp_path / "boards").iterdir()) == ["board0.bm", "board1.bm", "notes.txt"]
     load_deployment(tmp_path)
     (tmp_path / "boards" / "board1.bm").unlink()
     (tmp_path / "boards" / "board1.bm" / "in the way").mkdir(parents=True)
     with pytest.raises(BuildError, match=r"boards/board1\.bm "):
-        build_deployment(model(), tmp_path, replace(OPTIONS, partitions=2))
+        build_deployment(plan_machine(model(), replace(OPTIONS, partitions=2)), tmp_path)
     with pytest.raises(DeploymentError, match="deployment.toml"):
         load_deployment(tmp_path)
 
@@ -163,7 +169,7 @@ def test_a_build_over_another_leaves_nothing_of_it_even_if_it_fails_half_way(tmp
 def test_the_report_has_loss_and_warnings(tmp_path):
     known = normal("D", mean=np.arange(40.0), sigma=1.0, values=40, floor=1e-3)
     line = Model(name="line", searched=(interval("x", -0.5, 39.5, cells=40),), known=(known,))
-    built = build_deployment(line, tmp_path, OPTIONS)
+    built = build_deployment(plan_machine(line, OPTIONS), tmp_path)
     assert built.report == (tmp_path / "report.txt").read_text()
     assert "Model line: 40 lines (x 40), 1 known variable, D." in built.report
     assert "Warning: Variable D: its outlier floor of 0.001 vanishes" in built.report

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from machines import make_kernel
 from machines.bm1 import Start
 from machines.encode import decode_code
-from machines.kernel import make_kernel
 from machines.parameters import RngKind, SensorMode
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
@@ -25,6 +25,7 @@ from toolchain.analysis.resources.device import DEVICES
 from toolchain.analysis.resources.estimate import estimate
 from toolchain.analysis.resources.logic import logic_of
 from toolchain.building.build import BuildError, assemble, build_deployment
+from toolchain.building.machine import plan_machine
 from toolchain.checks.check import check_deployment, check_model
 from toolchain.deployment import REPLICA, Deployment, Scale, Stop, Variable, load_deployment
 from toolchain.deployment.address import to_address
@@ -50,7 +51,7 @@ def model(lines=6, *, select=False, **known):
 
 
 def deployment_of(options, **changes) -> Deployment:
-    return assemble(model(**changes), options).deployment
+    return assemble(plan_machine(model(**changes), options)).deployment
 
 
 # Arrays to addresses
@@ -175,7 +176,7 @@ def test_written_priors_of_replicas():
     ],
 )
 def test_a_build_of_each_kind(tmp_path, options):
-    built = build_deployment(model(select=True), tmp_path, options)
+    built = build_deployment(plan_machine(model(select=True), options), tmp_path)
     deployment = load_deployment(tmp_path)
     assert deployment == built.deployment
     text = (tmp_path / "deployment.toml").read_text()
@@ -195,7 +196,9 @@ def test_a_build_of_each_kind(tmp_path, options):
 
 
 def test_a_machine_of_cells_computes_what_the_model_says(tmp_path):
-    build_deployment(model(), tmp_path, replace(CELL, replicas=2, prob_bits=12, counter_bits=16))
+    build_deployment(
+        plan_machine(model(), replace(CELL, replicas=2, prob_bits=12, counter_bits=16)), tmp_path
+    )
     (image,) = [read_image(tmp_path / "boards/board0.bm")]
     random = np.random.default_rng(0)
     readings = random.integers(0, 5, (2, 2, 6))
@@ -221,8 +224,8 @@ CALLED_REPLICA = replace(model(), searched=(dimension(REPLICA, size=6),))
 )
 def test_options_that_do_not_fit_have_a_way_out(of, options, mended, advice):
     with pytest.raises(BuildError, match=advice):
-        assemble(of, options)
-    assemble(of, replace(options, **mended))
+        assemble(plan_machine(of, options))
+    assemble(plan_machine(of, replace(options, **mended)))
 
 
 @pytest.mark.parametrize(("mode", "replicas"), [("cell", 2), ("threshold", 1), ("column", 3)])
@@ -242,7 +245,7 @@ def test_regenerated_memories_are_the_same(case, mode, replicas):
 )
 def test_drawn_readings_give_the_models_posterior(options):
     of = model()
-    built = assemble(of, replace(options, prob_bits=12, counter_bits=16))
+    built = assemble(plan_machine(of, replace(options, prob_bits=12, counter_bits=16)))
     machines = [one_replica(image.machine) for image in built.images]
     drawn = sample_readings(of, 12, seed=4)
     readings = readings_of_lines(drawn, of, machines[0], scale=Scale.COLUMN, seed=4)
@@ -259,7 +262,7 @@ def test_replicas_share_the_generators_and_multiply_the_rest():
     def parts(parameters):
         return {part.name: part for part in logic_of(parameters).parts}
 
-    one = assemble(model(), CELL).images[0].machine.parameters
+    one = assemble(plan_machine(model(), CELL)).images[0].machine.parameters
     ten, per_column = replace(one, replicas=10), replace(one, sensor_mode=SensorMode.COLUMN)
     codes = replace(one, sensor_mode=SensorMode.THRESHOLD, sensor_bits=(8, 8))
     alone, together = parts(one), parts(ten)
@@ -276,7 +279,7 @@ def test_replicas_share_the_generators_and_multiply_the_rest():
 
 def test_a_device_gets_as_many_boards_as_the_register_map_needs():
     device = DEVICES["proce-v-d8"]
-    parameters = assemble(model(40), CELL).images[0].machine.parameters
+    parameters = assemble(plan_machine(model(40), CELL)).images[0].machine.parameters
     parameters = replace(parameters, replicas=200, prob_bits=2, counter_bits=2)
     count, why = boards_needed(parameters, device)
     assert count == 2
@@ -288,7 +291,7 @@ def test_a_device_gets_as_many_boards_as_the_register_map_needs():
 @pytest.mark.parametrize("mode", list(SensorMode))
 def test_a_frame_of_replicas_is_measured_as_a_board_runs_it(mode):
     of = model()
-    built = assemble(of, replace(OPTIONS, sensor_mode=mode, replicas=3))
+    built = assemble(plan_machine(of, replace(OPTIONS, sensor_mode=mode, replicas=3)))
     (machine,) = [image.machine for image in built.images]
     alone = one_replica(machine)
     readings = sample_readings(of, 12, seed=5)

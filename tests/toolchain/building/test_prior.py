@@ -16,6 +16,7 @@ from pcie_shim.programming_file import read_image
 from tests.toolchain.running import OPTIONS
 from toolchain.analysis.accuracy.emulation import joined
 from toolchain.building.build import build_deployment
+from toolchain.building.machine import plan_machine
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Variable, WrittenPrior, load_deployment
 from toolchain.deployment.address import to_address
@@ -42,7 +43,7 @@ def selected(**fields):
 
 
 def build(tmp_path, built_model, **options):
-    build_deployment(built_model, tmp_path, replace(OPTIONS, **options))
+    build_deployment(plan_machine(built_model, replace(OPTIONS, **options)), tmp_path)
     return load_deployment(tmp_path)
 
 

@@ -15,6 +15,7 @@ from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
 from tests.toolchain.running import OPTIONS, assert_refused, toolchain
 from toolchain.building.build import assemble, build_deployment
+from toolchain.building.machine import plan_machine
 from toolchain.checks.check import check_deployment, check_model
 from toolchain.checks.codes import line_name, reading
 from toolchain.checks.finding import Check, Severity
@@ -78,7 +79,7 @@ def test_the_machine_bears_it_out(sparse, scale, data):
     """An impossible reading ends every frame that has it; of the others some frame goes; a dead line never counts."""
     bits, boards = data.draw(st.sampled_from([1, 4])), data.draw(st.integers(1, sparse.lines))
     options = replace(OPTIONS, prob_bits=bits, scale=scale, partitions=boards)
-    findings, assembled = check_model(sparse, options), assemble(sparse, options)
+    findings, assembled = check_model(sparse, options), assemble(plan_machine(sparse, options))
     kernels = [ReferenceBM1(image.machine) for image in assembled.images]
 
     def run(*addresses):
@@ -135,7 +136,7 @@ def test_a_possible_reading_without_a_code():
     assert finding.severity is Severity.WARNING
     assert "1 of its 2 values (1, 0.001 of all readings)" in finding.what
     assert finding.advice == "use --scale address or more --prob-bits"
-    machine = assemble(model_of(table), options).images[0].machine
+    machine = assemble(plan_machine(model_of(table), options)).images[0].machine
     start = Start(addresses=(1,), target_count=255, max_cycles=100)
     assert ReferenceBM1(machine).start(start) is StopReason.IMPOSSIBLE
 
@@ -318,7 +319,7 @@ def test_several_mistakes_at_once():
 
 @pytest.fixture
 def deployment(tmp_path):
-    build_deployment(model(), tmp_path / "out", replace(OPTIONS, partitions=2))
+    build_deployment(plan_machine(model(), replace(OPTIONS, partitions=2)), tmp_path / "out")
     return tmp_path / "out"
 
 
@@ -326,7 +327,7 @@ def test_a_deployment_contains_the_values_of_its_model(tmp_path):
     table = np.array([[0.0, 0.0, 0.0], [0.999, 0.5, 1.0], [0.001, 0.5, 0.0]])
     options = replace(OPTIONS, scale=Scale.COLUMN, rng=RngKind.LFSR16, partitions=2, rng_banks=1)
     one = model_of(table, prior=np.array([0.0, 0.5, 0.5]))
-    build_deployment(one, tmp_path / "out", options)
+    build_deployment(plan_machine(one, options), tmp_path / "out")
     said = {(finding.check, finding.about) for finding in check_model(one, options)}
     assert {(finding.check, finding.about) for finding in check_deployment(tmp_path / "out")} == said
     assert (Check.IMPOSSIBLE_READINGS, "K") in said

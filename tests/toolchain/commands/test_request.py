@@ -39,5 +39,5 @@ def test_every_flag_reaches_the_options():
         *(field.name for field in fields(ModelFlags)),
     }
     assert {field.name for field in fields(BuildFlags)} == set(OTHERS) | read_elsewhere
-    default = build_options(BuildFlags(), uri="", topic="", message_type="")
+    default = build_options(BuildFlags(), uri="ws://a:1", topic="/b", message_type="c/D")
     assert not [name for name, value in OTHERS.items() if getattr(default, name) == value]

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from tests.toolchain.deployments import boat
 from tests.toolchain.running import OPTIONS
 from toolchain.building.build import build_deployment
+from toolchain.building.machine import plan_machine
 from toolchain.deployment import (
     Board,
     Dimension,
@@ -281,7 +282,7 @@ def test_objects_are_checked_like_files():
 def with_images(tmp_path):
     known = Known(name="K", table=np.array([[0.9, 0.5, 0.2, 0.1], [0.1, 0.5, 0.8, 0.9]]))
     model = Model(name="m", searched=(dimension("x", size=4),), known=(known,))
-    build_deployment(model, tmp_path, replace(OPTIONS, partitions=2))
+    build_deployment(plan_machine(model, replace(OPTIONS, partitions=2)), tmp_path)
     return tmp_path
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.toolchain.running import OPTIONS, refused_within
-from toolchain.building.machine import machine_parameters
+from toolchain.building.machine import plan_machine
 from toolchain.building.partition import partition_lines
 from toolchain.errors import BuildError, ModelError
 from toolchain.models import IntegerType, IntervalType, Known, Model, PriorSelect, Symbol
@@ -79,9 +79,9 @@ def test_a_question_with_large_tables_is_answered():
 
 
 def test_codes_that_no_memory_holds_are_refused_before_they_are_made():
-    assert machine_parameters(model_of_views(2**14, 16), OPTIONS).lines == 2**14
+    assert plan_machine(model_of_views(2**14, 16), OPTIONS).parameters.lines == 2**14
     with pytest.raises(BuildError):
-        machine_parameters(model_of_views(2**14 + 1, 16), OPTIONS)
+        plan_machine(model_of_views(2**14 + 1, 16), OPTIONS)
 
 
 def test_a_board_for_every_line_takes_linear_time():

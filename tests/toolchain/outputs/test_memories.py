@@ -16,6 +16,7 @@ from pcie_shim.programming_file import read_image
 from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.running import OPTIONS, contents
 from toolchain.building.build import build_deployment
+from toolchain.building.machine import plan_machine
 from toolchain.deployment import load_deployment
 from toolchain.models.conditional import normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
@@ -49,7 +50,7 @@ def model(*, select=False, lines=7):
 
 def build(folder, *, select=False, lines=7, **changes):
     select = select and changes.get("prior_mode") is not PriorMode.WRITTEN
-    build_deployment(model(select=select, lines=lines), folder, replace(OPTIONS, **changes))
+    build_deployment(plan_machine(model(select=select, lines=lines), replace(OPTIONS, **changes)), folder)
     deployment = load_deployment(folder)
     return [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
 
@@ -228,7 +229,9 @@ def test_ghdl_finds_every_parameter(tmp_path, changes):
 def test_no_sensors_and_many_seeds(tmp_path):
     """A package with an empty array of widths, and one whose seeds are in the memory alone."""
     place = interval("x", 0, 10, cells=2)
-    build_deployment(Model(name="p", searched=(place,), known=()), tmp_path, replace(OPTIONS, rng_banks=5000))
+    build_deployment(
+        plan_machine(Model(name="p", searched=(place,), known=()), replace(OPTIONS, rng_banks=5000)), tmp_path
+    )
     text = (tmp_path / "bm_arch" / "bm1_parameters.vhd").read_text()
     assert "SENSOR_BITS       : natural_array_t(1 to 0) := (others => 0);" in text
     assert "The seeds are in Memory_MIFs alone" in text
@@ -241,7 +244,9 @@ def test_no_sensors_and_many_seeds(tmp_path):
 )
 def test_ghdl_takes_an_empty_array_of_widths(tmp_path):
     place = interval("x", 0, 10, cells=2)
-    build_deployment(Model(name="p", searched=(place,), known=()), tmp_path, replace(OPTIONS, rng_banks=5000))
+    build_deployment(
+        plan_machine(Model(name="p", searched=(place,), known=()), replace(OPTIONS, rng_banks=5000)), tmp_path
+    )
     ghdl(tmp_path, "-a", "--std=08", "bm_arch/bm1_parameters.vhd")
 
 
@@ -330,7 +335,7 @@ from pathlib import Path
 from tests.toolchain.outputs.test_memories import model
 from tests.toolchain.running import OPTIONS
 from toolchain.building.build import build_deployment
-build_deployment(model(), Path(sys.argv[1]), replace(OPTIONS, partitions=2, build_date="2020-02-02T02:02:02Z"))
+build_deployment(plan_machine(model(), replace(OPTIONS, partitions=2, build_date="2020-02-02T02:02:02Z")), Path(sys.argv[1]))
 """
 
 

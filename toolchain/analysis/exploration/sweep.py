@@ -5,7 +5,7 @@ import itertools
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from machines.bm1 import BM1Machine
@@ -14,12 +14,11 @@ from toolchain.analysis.accuracy.emulation import EmulatedBoards, one_replica
 from toolchain.analysis.accuracy.measurement import measure
 from toolchain.analysis.accuracy.readings import Readings, check_frames, readings_of_lines, sample_readings
 from toolchain.analysis.exploration.results import Point
-from toolchain.analysis.resources.boards_needed import with_lines
 from toolchain.analysis.resources.device import Device
 from toolchain.analysis.resources.estimate import Pcie, estimate
 from toolchain.building.board_layout import board_layout
-from toolchain.building.machine import machine_parameters, whole_machine
-from toolchain.building.options import BuildOptions, check_options
+from toolchain.building.machine import MachinePlan, plan_machine, whole_machine
+from toolchain.building.options import BuildOptions
 from toolchain.building.partition import partition_lines, split
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Stop
@@ -98,7 +97,7 @@ class Sweep:
 class Task:
     """A machine to measure, and the key of its results."""
 
-    options: BuildOptions
+    plan: MachinePlan
     key: str
 
 
@@ -164,15 +163,14 @@ def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Ta
     refused = ""
     for options in sweep.options():
         try:
-            check_options(options)
-            parameters = machine_parameters(model, options)
-            board_layout(parameters, options.partitions, None)
+            plan = plan_machine(model, options)
+            board_layout(plan.parameters, options.partitions, None)
         except BuildError as reason:
             refused = refused or str(reason)
             continue
         words = {
             "inputs": frames.fingerprint(options),
-            "parameters": str(parameters),
+            "parameters": str(plan.parameters),
             "scale": options.scale,
             "target": options.target_count,
             "max_cycles": options.max_cycles,
@@ -182,25 +180,24 @@ def tasks(model: Model, sweep: Sweep, frames: Frames, device: Device) -> list[Ta
             "device": device.name,
         }
         key = hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
-        found.setdefault(
-            key, Task(options, key)
-        )  # 0 steps and the number that this selects are the same machine
+        # 0 steps and the number that this selects are the same machine
+        found.setdefault(key, Task(plan, key))
     if not found:
         raise BuildError(f"none of these machines can be built: {refused}")
     return list(found.values())
 
 
-def run_task(model: Model, task: Task, frames: Frames, device: Device, banks: int) -> Point:
+def run_task(task: Task, frames: Frames, device: Device, banks: int) -> Point:
     """Measure one machine; a ToolchainError if it cannot be built or run."""
-    options = task.options
-    parameters = machine_parameters(model, options)
+    model, options, parameters = task.plan.model, task.plan.options, task.plan.parameters
     quantised = quantise(
         model, prob_bits=options.prob_bits, scale=options.scaling, sensor_mode=options.sensor_mode
     )
-    whole = one_replica(whole_machine(parameters, quantised, options))
+    whole = one_replica(whole_machine(task.plan, quantised))
     machines = split(whole, options.partitions)
-    target = options.target_count or parameters.target_count_max
-    boards = EmulatedBoards(machines, target_count=target, max_cycles=options.max_cycles, stop=options.stop)
+    boards = EmulatedBoards(
+        machines, target_count=task.plan.target_count, max_cycles=options.max_cycles, stop=options.stop
+    )
     accuracy = measure(boards, frames.of(whole, options), model, banks=banks, replicas=options.replicas)
     machine, quantising = accuracy.machine, accuracy.quantising
     point = Point(
@@ -211,7 +208,7 @@ def run_task(model: Model, task: Task, frames: Frames, device: Device, banks: in
         rng=options.rng.value,
         steps_per_clock=parameters.steps_per_clock,
         prob_bits=parameters.prob_bits,
-        target_count=target,
+        target_count=task.plan.target_count,
         counter_bits=parameters.counter_bits,
         partitions=options.partitions,
         frames=accuracy.frames,
@@ -229,16 +226,16 @@ def run_task(model: Model, task: Task, frames: Frames, device: Device, banks: in
         blocks=None,
         fits=None,
     )
-    return with_resources(model, task, point, device)
+    return with_resources(task, point, device)
 
 
-def with_resources(model: Model, task: Task, point: Point, device: Device) -> Point:
+def with_resources(task: Task, point: Point, device: Device) -> Point:
     """Return a point with the current estimate of the resources of its largest board."""
-    options = task.options
+    parameters, options = task.plan.parameters, task.plan.options
     if options.rng is RngKind.IDEAL:
         return point
-    lines = partition_lines(model.lines, options.partitions)[0].lines
-    largest = with_lines(machine_parameters(model, options), lines)
+    lines = partition_lines(parameters.lines, options.partitions)[0].lines
+    largest = replace(parameters, lines=lines)
     took = estimate(largest, device, pcie=Pcie.HARD)
     update = {"alms": took.alms, "blocks": took.memories.blocks, "fits": took.fits}
     return point.model_copy(update=update)

@@ -26,7 +26,6 @@ from toolchain.analysis.resources.energy import Energy, energy
 from toolchain.analysis.resources.estimate import Estimate, Pcie, estimate
 from toolchain.building.agreement import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
-from toolchain.building.report import REPORT_NAME
 from toolchain.deployment import Deployment, Scale
 from toolchain.errors import BuildError, DeploymentError
 from toolchain.models.model import Model
@@ -79,7 +78,6 @@ class Inspection:
     deployment: Deployment
     machine: BM1Machine
     losses: tuple[ColumnLoss, ...] | None
-    reported_losses: str
     readings: Readings
     accuracy: Accuracy
     resources: tuple[Estimate, ...]
@@ -125,7 +123,6 @@ def inspect_deployment(
         deployment=deployment,
         machine=whole,
         losses=losses,
-        reported_losses=_reported(deployment.directory),
         readings=readings,
         accuracy=accuracy,
         resources=resources,
@@ -209,11 +206,3 @@ def _readings(
 
 def _is_slow(machine: BM1Machine) -> bool:
     return not machine.parameters.shared or machine.parameters.rng.lfsr_bits is None
-
-
-def _reported(directory: Path) -> str:
-    try:
-        text = (directory / REPORT_NAME).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        return ""
-    return next((part for part in text.split("\n\n") if part.startswith("Lost by quantising")), "")

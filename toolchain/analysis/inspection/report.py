@@ -69,7 +69,7 @@ def _machine_part(found: Inspection) -> str:
 
 def _loss_part(found: Inspection) -> str:
     if found.losses is None:
-        return found.reported_losses or "Lost by quantising: unknown here; name the model with --model."
+        return "Lost by quantising: as report.txt says, which the build wrote; give the model with --model to compare."
     width = max(6, *(len(loss.name) for loss in found.losses))
     rows = [
         loss_heading(found.machine.parameters.sensor_mode),

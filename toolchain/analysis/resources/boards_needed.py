@@ -32,7 +32,7 @@ def boards_needed(
     """Return the minimum number of boards for a machine, and the reason as a sentence, or raise a BuildError."""
 
     def on(lines: int) -> Estimate:
-        return estimate(with_lines(parameters, lines), device, pcie=pcie, table_length=table_length)
+        return estimate(replace(parameters, lines=lines), device, pcie=pcie, table_length=table_length)
 
     room = interface_room(parameters)
     largest_lines = min(largest_lines, room[1] // parameters.replicas)
@@ -75,8 +75,3 @@ def _most_lines(fits: Callable[[int], bool], highest: int) -> int:
         else:
             high = middle
     return low
-
-
-def with_lines(parameters: BM1Parameters, lines: int) -> BM1Parameters:
-    """Return the same machine with another number of lines."""
-    return replace(parameters, lines=lines)
