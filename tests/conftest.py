@@ -14,6 +14,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+import uvloop
 from hypothesis import HealthCheck, settings
 
 from tests.patience import PATIENCE, PROCESS_TEST_LIMIT, TEST_LIMIT
@@ -68,8 +69,20 @@ def _may_start_processes(item: pytest.Item) -> bool:
     return any(item.get_closest_marker(kind) for kind in ("process", "thorough"))
 
 
+def _is_second_loop(item: pytest.Item) -> bool:
+    """Return whether a test runs on asyncio's loop too (`pytest_asyncio_loop_factories` in tests/bridge)."""
+    parameters = (
+        item.callspec.params if isinstance(item, pytest.Function) and hasattr(item, "callspec") else {}
+    )
+    is_chosen = any("loop_factories" in marker.kwargs for marker in item.iter_markers("asyncio"))
+    return parameters.get("_asyncio_loop_factory") is uvloop.new_event_loop and not is_chosen
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest selects by markers
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
+        if _is_second_loop(item):
+            item.add_marker(pytest.mark.thorough)
         if _may_start_processes(item) and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(PROCESS_TEST_LIMIT))
 

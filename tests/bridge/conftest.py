@@ -1,4 +1,4 @@
-"""The client must live on either event loop: every asynchronous test of it runs on both."""
+"""The client must live on either event loop: every asynchronous test of it runs on both, on uvloop with `--all`."""
 
 import asyncio
 from collections.abc import Callable, Mapping
