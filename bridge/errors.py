@@ -44,7 +44,11 @@ class ConcurrentReadError(UsageError):
 
 
 class WrongThreadError(UsageError):
-    """Raised when a client is used from another thread than that of its event loop, or a blocking one from its own."""
+    """Raised when a client is used from another thread than that of its event loop."""
+
+
+class ActionlibError(UsageError):
+    """Raised for an action of a ROS 1 server: these are topics (actionlib), which this client does not handle."""
 
 
 class EncodeError(UsageError):

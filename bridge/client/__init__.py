@@ -1,7 +1,6 @@
 """The asyncio rosbridge client."""
 
-from bridge.client.actions.goals import Goal
-from bridge.client.actions.server import GoalRequest
+from bridge.client.actions import Goal, GoalRequest
 from bridge.client.handles import Publication, Service, Subscription
 from bridge.client.ros import Ros, connect
 from bridge.client.session import Message, State

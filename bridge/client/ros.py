@@ -14,11 +14,7 @@ from dataclasses import replace
 from ssl import SSLContext
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
-from bridge.client.actions.actionlib import base_type, is_actionlib_type
-from bridge.client.actions.actionlib_goals import ActionlibSender
-from bridge.client.actions.actionlib_server import ActionlibServer
-from bridge.client.actions.goals import Goal, OperationGoal
-from bridge.client.actions.server import ActionServer, GoalHandler
+from bridge.client.actions import ActionServer, Goal, GoalHandler
 from bridge.client.graph import NodeDetails, Params, ask_definitions, ask_names, ask_node, ask_text
 from bridge.client.handles import (
     PUBLISH_QUEUE_SIZE,
@@ -37,8 +33,8 @@ from bridge.client.websocket import Limits, check_uri
 from bridge.codecs.cbor_codec import Arrays
 from bridge.codecs.json_codec import MAX_SIZE
 from bridge.codecs.message_check import Definitions
-from bridge.errors import OptionError
-from bridge.names import absolute, ros2_type, ros_version_of_type
+from bridge.errors import ActionlibError, OptionError
+from bridge.names import ros2_type, ros_version_of_type
 from bridge.qos import Qos
 
 if TYPE_CHECKING:
@@ -62,7 +58,6 @@ class Ros:
         self._types = TypeChecks(session) if check_types else None
         self.params = Params(session)
         self._publishes = False
-        self._senders: dict[tuple[str, str], ActionlibSender] = {}
 
     async def __aenter__(self) -> Self:
         await self._session.open()
@@ -309,18 +304,14 @@ class Ros:
         feedback: bool = True,
         timeout: float = 5.0,
     ) -> Goal:
-        """Send a goal to an action of ROS 2, or of ROS 1 (actionlib).
-
-        The ROS version of the server decides (`detect_ros_version`). If it stays unknown, `pkg/NameAction` and the
-        types of packages whose name begins with actionlib are actions of ROS 1, and others of ROS 2.
+        """Send a goal to an action of ROS 2.
 
         Args:
             action: Name of the action.
-            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle; in ROS 1 also
-                `actionlib_tutorials/FibonacciAction`, or without the ending.
+            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle.
             goal: Fields of the goal.
             feedback: Whether to receive feedback.
-            timeout: Timeout in seconds for a slow server, and in ROS 1 for the first status of the action's server.
+            timeout: Timeout in seconds for a slow server.
 
         Returns:
             The active goal: `async for feedback in goal`, `await goal.result(timeout)`, and `async with goal`, which
@@ -328,6 +319,7 @@ class Ros:
 
         Raises:
             NameFormError: The name or the type is malformed.
+            ActionlibError: The server is one of ROS 1, whose actions are topics.
             SlowPeerError: The server did not accept it in time, or too many goals are active.
             DisconnectedError: There is no connection.
             MessageTypeError: The goal has a field that its type does not have, or an array of another shape.
@@ -335,54 +327,43 @@ class Ros:
         """
         if self._session.must_wait():
             await self._session.wait_turn(f"a goal of {action}", timeout)
-        deadline = time.monotonic() + timeout
-        if await self._uses_actionlib(type, min(timeout, DETECT_TIMEOUT)):
-            sender = await self._sender(action, type)
-            return await sender.send(goal or {}, max(0.0, deadline - time.monotonic()), feedback=feedback)
+        await self._require_ros_2(action, min(timeout, DETECT_TIMEOUT))
         if self._types is not None:
             await self._types.check_goal(action, type, goal or {}, timeout)
-        return OperationGoal(self._session, action, type, goal or {}, feedback=feedback)
+        return Goal(self._session, action, type, goal or {}, feedback=feedback)
 
-    async def _uses_actionlib(self, type_name: str, limit: float) -> bool:
-        version = await self.detect_ros_version(limit)
-        return version == 1 or (version is None and is_actionlib_type(type_name))
-
-    async def _sender(self, action: str, type_name: str) -> ActionlibSender:
-        key = absolute(action), base_type(type_name)
-        if key not in self._senders:
-            self._publishes = True
-            self._senders[key] = await ActionlibSender(self, self._session, action, type_name).start()
-        return self._senders[key]
+    async def _require_ros_2(self, action: str, limit: float = DETECT_TIMEOUT) -> None:
+        if await self.detect_ros_version(limit) == 1:
+            raise ActionlibError(
+                f"{self.uri} is a ROS 1 server, whose action {action} is a set of topics that this client does not "
+                "handle: use roslibpy's actionlib, or a ROS 2 server"
+            )
 
     async def advertise_action(
         self,
         action: str,
         type: str,
         handler: GoalHandler,
-    ) -> ActionServer | ActionlibServer:
-        """Serve an action of ROS 2, or of ROS 1 (actionlib) if the server is known to be one (`detect_ros_version`).
-
-        If the version stays unknown, the type decides as in `send_goal`.
+    ) -> ActionServer:
+        """Serve an action of ROS 2.
 
         Args:
             action: Name of the action.
-            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle; in ROS 1
-                `actionlib_tutorials/FibonacciAction`, or without the ending.
+            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle.
             handler: Coroutine function that is called with each goal, and executes it: it may send feedback,
                 and should check whether the goal has been cancelled. The goal succeeds with the fields that it
                 returns, or is cancelled with them if the sender asked for that, unless the handler has ended
                 the goal differently. If it raises an error, the goal is aborted, and the error is logged; so is
                 a result or feedback that does not fit the type. Up to 64 goals are executed concurrently. It is
-                cancelled when the connection is lost (ROS 2).
+                cancelled when the connection is lost.
 
         Raises:
             NameFormError: The name or the type is malformed.
+            ActionlibError: The server is one of ROS 1, whose actions are topics.
             TypeConflictError: This client already serves this action.
             DisconnectedError: The client was closed.
         """
-        if await self._uses_actionlib(type, DETECT_TIMEOUT):
-            self._publishes = True
-            return await ActionlibServer(self, self._session, action, type, handler).start()
+        await self._require_ros_2(action)
         server = ActionServer(self._session, action, type, handler)
         if self._types is not None:
             name = ros2_type(type, "action")
@@ -521,7 +502,7 @@ def connect(
         proxy: `http://proxy:3128`, `https://` or `socks5h://` (with the package python-socks), or
             `environment` for the proxy in HTTPS_PROXY etc.; None for a direct connection.
         max_size: Maximum size of a message in bytes, in both directions. A larger inbound message ends the
-            connection; a topic with a second one is left out of the next (`TopicLeftOutError`).
+            connection, and its topic is left out of the next one (`TopicLeftOutError`).
         fragment_size: Maximum number of characters of a message before it is sent in fragments; None for no
             limit.
         ping_interval: Seconds of silence after which the server is pinged.

@@ -85,7 +85,6 @@ class GoalEnded:
     ok: bool
     status: GoalStatus
     values: Any
-    text: str = ""
 
 
 @dataclass(frozen=True, slots=True)

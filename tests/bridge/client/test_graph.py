@@ -1,17 +1,13 @@
 """Parameters, and questions about topics, services and nodes, in the forms of ROS 1 and ROS 2."""
 
-import asyncio
-
 import numpy as np
 import pytest
 
 from bridge.client import connect
-from bridge.client.blocking import connect as connect_blocking
 from bridge.client.graph import NodeDetails
 from bridge.codecs.message_check import FieldType
 from bridge.errors import EncodeError, ParamError, ServiceError
 from tests.bridge.hub.sockets import running_hub
-from tests.patience import PATIENCE
 
 DOCK = "/dock"
 
@@ -85,16 +81,3 @@ async def test_topics_services_and_nodes(ros):
     assert (await ros.message_details("nav_msgs/msg/Odometry"))["geometry_msgs/PoseWithCovariance"][
         "covariance"
     ] == FieldType("float64", 36)
-
-
-async def test_the_blocking_form():
-    def program(uri):
-        with connect_blocking(uri) as ros:
-            ros.params.set("/node:rate", 15)
-            assert ros.params.get("/node:rate") == 15
-            assert ros.params.get("/node:gain", default=2) == 2
-            assert ros.params.names() == ["/node:rate"]
-            assert ros.service_node("/rosapi/topics") == "/rosapi"
-
-    async with running_hub(ros_version=2) as port:
-        await asyncio.wait_for(asyncio.to_thread(program, f"ws://127.0.0.1:{port}"), PATIENCE)

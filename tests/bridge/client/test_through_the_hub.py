@@ -14,7 +14,7 @@ from websockets.asyncio.client import ClientConnection
 from websockets.asyncio.client import connect as plain_connect
 
 from bridge.client import Ros, State, connect
-from bridge.client.actions.goals import FEEDBACK_QUEUE_SIZE
+from bridge.client.actions import FEEDBACK_QUEUE_SIZE
 from bridge.client.protocol.events import GoalFeedback, GoalStatus
 from bridge.errors import (
     ConcurrentReadError,

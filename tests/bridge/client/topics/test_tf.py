@@ -6,24 +6,10 @@ import numpy as np
 import pytest
 
 from bridge.client import connect
-from bridge.client.blocking import connect as connect_blocking
 from bridge.errors import FrameUnknownError
 from tests.bridge.hub.sockets import running_hub
 from tests.bridge.test_transforms import SECOND, message, turned
 from tests.patience import PATIENCE
-
-
-async def test_the_blocking_form():
-    def program(uri: str) -> None:
-        with connect_blocking(uri) as ros, ros.transforms() as transforms:
-            static = ros.advertise("/tf_static", "tf2_msgs/TFMessage", latch=True)
-            static.publish(message("base", "laser", turned(0.5, 0, SECOND)))
-            assert np.allclose(transforms.lookup("base", "laser", timeout=PATIENCE).translation, [0.5, 0, 0])
-            with pytest.raises(FrameUnknownError):
-                transforms.lookup("base", "arm", timeout=0.05)
-
-    async with running_hub(ros_version=2) as port:
-        await asyncio.wait_for(asyncio.to_thread(program, f"ws://127.0.0.1:{port}"), PATIENCE)
 
 
 @pytest.mark.parametrize("version", [1, 2])

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from bridge.client import connect
 from tests.bridge.hub.sockets import running_hub
 from tests.patience import PROCESS_PATIENCE
 
 _SESSION = Path(__file__).with_name("roslibpy_session.py")
+_ACTIONLIB = Path(__file__).with_name("roslibpy_actionlib.py")
 
 
 @pytest.mark.parametrize(
@@ -68,3 +70,34 @@ async def test_a_session_of_roslibpy(transport: str) -> None:
     assert found["graph"]["rosapi_serves"] > 15
     assert found["graph"]["action_servers"] == {"action_servers": []}
     assert before <= found["graph"]["seconds"] <= time.time()
+
+
+@pytest.mark.thorough
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_actionlib_of_roslibpy_on_both_sides() -> None:
+    async def start(part: str) -> asyncio.subprocess.Process:
+        return await asyncio.create_subprocess_exec(
+            *(sys.executable, str(_ACTIONLIB), part, str(port)),
+            env={**os.environ, "ROSLIBPY_TRANSPORT": "asyncio"},
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+        )
+
+    async with running_hub(ros_version=1) as port, connect(f"ws://127.0.0.1:{port}") as ros:
+        server = await start("server")
+        try:
+            async with asyncio.timeout(PROCESS_PATIENCE):
+                while not await ros.subscribers("/count/goal"):
+                    await asyncio.sleep(0.05)
+                client = await start("client")
+                found = json.loads((await client.communicate())[0])
+        finally:
+            server.kill()
+            await server.communicate()
+    assert found == {
+        "feedback": [{"sequence": [0, 1]}],
+        "result": {"sequence": [0, 1, 2, 3, 4]},
+        "status": 3,
+        "cancelled": {"sequence": []},
+        "cancelled_status": 2,
+    }

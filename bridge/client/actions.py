@@ -1,0 +1,292 @@
+"""Actions of ROS 2: goals of this client, and actions that it serves.
+
+    Ros.send_goal        ->  send_action_goal     ->  Goal, which receives feedback and the end
+    Ros.advertise_action ->  advertise_action     ->  ActionServer, which runs a handler with each GoalRequest
+
+Actions of ROS 1 (actionlib) are topics, and are not supported (see `Ros.send_goal`).
+"""
+
+import asyncio
+import logging
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+from bridge.client.handles import Handle
+from bridge.client.protocol.events import CancelRequested, GoalEnded, GoalFeedback, GoalRequested, GoalStatus
+from bridge.client.session import Session
+from bridge.codecs.message_check import MessageCheck
+from bridge.errors import BridgeError, ConcurrentReadError, DisconnectedError, GoalError, NoAnswerError
+from bridge.names import absolute
+
+_log = logging.getLogger("bridge")
+
+FEEDBACK_QUEUE_SIZE: Final = 64
+"""Maximum number of queued feedback messages; then the oldest is dropped."""
+
+
+@dataclass(frozen=True, slots=True)
+class GoalResult:
+    """Result of a goal.
+
+    Attributes:
+        status: Succeeded, canceled or aborted.
+        values: Fields of the result.
+    """
+
+    status: GoalStatus
+    values: dict[str, Any]
+
+
+class Goal:
+    """One active goal: `async for feedback in goal`, then `await goal.result(timeout)`.
+
+    The iteration ends with the goal. If the connection is lost, iteration and result fail, because the server
+    forgets the sender of a goal and never reports its end.
+
+    Attributes:
+        action: Name of the action.
+        lost: Number of feedback messages dropped because the reader was too slow.
+    """
+
+    def __init__(
+        self, session: Session, action: str, type_name: str, goal: Mapping[str, Any], *, feedback: bool
+    ) -> None:
+        """Send a goal (see `bridge.client.Ros.send_goal`)."""
+        identity = session.core.goals.send(action, type_name, goal, feedback=feedback)
+        self.action = action
+        self.lost = 0
+        self._session = session
+        self._identity = identity
+        self._sent_at = time.monotonic()
+        self._feedback: deque[dict[str, Any]] = deque(maxlen=FEEDBACK_QUEUE_SIZE)
+        self._reader: asyncio.Future[None] | None = None
+        self._ended: asyncio.Future[GoalEnded] = asyncio.get_running_loop().create_future()
+        session.goals[identity] = self
+        session.flush()
+
+    def receive(self, event: GoalFeedback | GoalEnded) -> None:
+        """Handle an event of this goal."""
+        if isinstance(event, GoalFeedback):
+            if len(self._feedback) == FEEDBACK_QUEUE_SIZE:
+                self.lost += 1
+            self._feedback.append(event.values)
+        elif not self._ended.done():
+            self._ended.set_result(event)
+        self._wake()
+
+    def fail(self, reason: str) -> None:
+        """End the goal without a result."""
+        if not self._ended.done():
+            self._ended.set_exception(DisconnectedError(f"{reason} during a goal of {self.action}"))
+            self._ended.exception()  # mark the exception as retrieved, because it need not be awaited
+        self._wake()
+
+    def _wake(self) -> None:
+        if self._reader is not None and not self._reader.done():
+            self._reader.set_result(None)
+
+    @property
+    def done(self) -> bool:
+        """True if the goal has ended."""
+        return self._ended.done()
+
+    async def cancel(self) -> None:
+        """Ask the server to cancel the goal, if it is active; `result` returns whether it did."""
+        self._session.check_thread()
+        self._session.core.goals.cancel(self._identity)
+        self._session.flush()
+
+    async def result(self, timeout: float) -> GoalResult:
+        """Wait for the end of the goal; return its status even if canceled or aborted. May be repeated.
+
+        Raises:
+            GoalError: The action refused the goal, or does not exist.
+            NoAnswerError: The goal did not end in time, and is still active.
+            DisconnectedError: The connection was lost before it ended.
+        """
+        try:
+            async with asyncio.timeout(timeout):
+                ended = await asyncio.shield(self._ended)
+        except TimeoutError:
+            raise NoAnswerError(
+                f"the goal of action {self.action} at {self._session.uri} did not end within {timeout:g} s"
+                f"{self._session.context_since(self._sent_at)}"
+            ) from None
+        if not ended.ok:
+            raise GoalError(ended.values, f"{self.action} at {self._session.uri}")
+        return GoalResult(ended.status, ended.values)
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> dict[str, Any]:
+        while not self._feedback:
+            if self._ended.done():
+                if (error := self._ended.exception()) is not None:
+                    raise error
+                raise StopAsyncIteration
+            if self._reader is not None:
+                raise ConcurrentReadError(
+                    f"another task is already waiting for feedback of this goal of {self.action}"
+                )
+            self._reader = asyncio.get_running_loop().create_future()
+            try:
+                await self._reader
+            finally:
+                self._reader = None
+        return self._feedback.popleft()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_exception: object) -> None:
+        try:
+            if not self.done:
+                await self.cancel()
+        finally:
+            self.forget()
+
+    def forget(self) -> None:
+        """Ignore further events of this goal."""
+        self._session.goals.pop(self._identity, None)
+        self._session.core.goals.forget(self._identity)
+
+
+FeedBack = Callable[[Mapping[str, Any]], None]
+End = Callable[[GoalStatus, Mapping[str, Any] | str], None]
+
+
+class GoalRequest:
+    """A goal that this client executes, for its handler.
+
+    The first of `succeed`, `abort` and `cancel` ends it; the handler may continue, to clean up.
+
+    Attributes:
+        values: Fields of the goal.
+    """
+
+    def __init__(self, values: dict[str, Any], feed_back: FeedBack, end: End) -> None:
+        self.values = values
+        self._feed_back = feed_back
+        self._end = end
+        self._canceling = asyncio.Event()
+        self.ended = False
+
+    @property
+    def canceling(self) -> bool:
+        """True if the sender has cancelled the goal."""
+        return self._canceling.is_set()
+
+    async def wait_canceling(self) -> None:
+        """Wait until the sender has cancelled the goal."""
+        await self._canceling.wait()
+
+    def ask_to_cancel(self) -> None:
+        """Tell the handler that the sender has cancelled the goal."""
+        self._canceling.set()
+
+    def feed_back(self, values: Mapping[str, Any]) -> None:
+        """Send feedback; no effect after the end."""
+        if not self.ended:
+            self._feed_back(values)
+
+    def succeed(self, values: Mapping[str, Any] | None = None) -> None:
+        """End the goal with its result."""
+        self._finish(GoalStatus.SUCCEEDED, values or {})
+
+    def abort(self, values: Mapping[str, Any] | str | None = None) -> None:
+        """End the goal without success, with a result or the text of a reason."""
+        self._finish(GoalStatus.ABORTED, values or {})
+
+    def cancel(self, values: Mapping[str, Any] | None = None) -> None:
+        """End the goal as cancelled, with the values reached so far."""
+        self._finish(GoalStatus.CANCELED, values or {})
+
+    def _finish(self, status: GoalStatus, values: Mapping[str, Any] | str) -> None:
+        if not self.ended:
+            self._end(status, values)
+            self.ended = True
+
+
+GoalHandler = Callable[[GoalRequest], Awaitable[Mapping[str, Any] | None]]
+
+
+async def execute(goal: GoalRequest, handler: GoalHandler, action: str) -> None:
+    """Have a handler execute a goal, which ends even if the handler fails."""
+    try:
+        values = await handler(goal)
+        if goal.canceling:
+            goal.cancel(values)
+        else:
+            goal.succeed(values)
+    except BridgeError as error:
+        _log.error("a goal of action %s failed: %s", action, error)
+        goal.abort(str(error))
+    except Exception as error:
+        _log.exception("the handler of action %s failed", action)
+        goal.abort(f"{action} failed: {type(error).__name__}")
+
+
+class ActionServer(Handle):
+    """One action that this client serves.
+
+    Attributes:
+        name: Name of the action.
+        result_check: The check of results, if their type is known.
+        feedback_check: The check of feedback, if its type is known.
+    """
+
+    def __init__(self, session: Session, name: str, type_name: str, handler: GoalHandler) -> None:
+        super().__init__(session)
+        self.name = name
+        self.result_check: MessageCheck | None = None
+        self.feedback_check: MessageCheck | None = None
+        self._handler = handler
+        self._goals: dict[str, tuple[GoalRequest, asyncio.Task[None]]] = {}
+        session.core.actions.advertise(name, type_name)
+        session.action_servers[absolute(name)] = self
+        self._register()
+
+    def receive(self, event: GoalRequested | CancelRequested) -> None:
+        """Start a goal, or ask its handler to cancel it."""
+        if isinstance(event, CancelRequested):
+            if event.goal in self._goals:
+                self._goals[event.goal][0].ask_to_cancel()
+            return
+        actions, flush, identity = self._session.core.actions, self._session.flush, event.goal
+
+        def feed_back(values: Mapping[str, Any]) -> None:
+            if self.feedback_check is not None:
+                self.feedback_check(values)
+            actions.feed_back(identity, values)
+            flush()
+
+        def end(status: GoalStatus, values: Mapping[str, Any] | str) -> None:
+            if self.result_check is not None and not isinstance(values, str):
+                self.result_check(values)
+            actions.end(identity, status, values)
+            flush()
+
+        goal = GoalRequest(event.values, feed_back, end)
+        task = asyncio.get_running_loop().create_task(execute(goal, self._handler, self.name))
+        self._goals[identity] = goal, task
+        task.add_done_callback(lambda _task: self._goals.pop(identity, None))
+
+    def lost(self) -> None:
+        """Cancel the handlers of a lost connection, because nobody waits for their results."""
+        for _goal, task in self._goals.values():
+            task.cancel()
+
+    def end(self) -> None:
+        """Cancel the handlers."""
+        super().end()
+        self.lost()
+
+    def _withdraw(self) -> None:
+        for goal, _task in self._goals.values():
+            goal.abort(f"action {self.name} is no longer served")
+        del self._session.action_servers[absolute(self.name)]
+        self._session.core.actions.unadvertise(self.name)

@@ -1,0 +1,128 @@
+"""Goals of actions that this client sends and serves, through the hub."""
+
+import asyncio
+import contextlib
+from typing import Any
+
+import pytest
+
+from bridge.client import GoalRequest, State, connect
+from bridge.client.protocol.events import GoalStatus
+from bridge.errors import ActionlibError, GoalError
+from tests.bridge.hub.sockets import running_hub
+from tests.patience import PATIENCE
+
+FIBONACCI = "actionlib_tutorials/Fibonacci"
+
+
+async def count(goal: GoalRequest) -> dict[str, Any] | None:
+    """Count to the order of the goal, and end it in the way that its order says."""
+    order = goal.values["order"]
+    goal.feed_back({"sequence": [0, 1]})
+    if order == 1:
+        goal.abort({"sequence": [1]})
+        return None
+    if order == 2:
+        await goal.wait_canceling()
+        return {"sequence": [2]}
+    if order == 3:
+        raise RuntimeError("a bug")
+    return {"sequence": list(range(order))}
+
+
+@contextlib.asynccontextmanager
+async def serving():
+    async with running_hub(ros_version=2) as port:
+        uri = f"ws://127.0.0.1:{port}"
+        async with (
+            connect(uri) as server,
+            connect(uri) as ros,
+            await server.advertise_action("/count", FIBONACCI, count),
+        ):
+            await server.call("/rosapi/get_time", timeout=PATIENCE)  # it has the action then
+            yield server, ros
+
+
+@pytest.mark.parametrize(
+    ("order", "status", "sequence"),
+    [
+        (5, GoalStatus.SUCCEEDED, [0, 1, 2, 3, 4]),
+        (1, GoalStatus.ABORTED, [1]),
+        (2, GoalStatus.CANCELED, [2]),
+    ],
+)
+async def test_a_goal_is_fed_back_and_ends(order, status, sequence):
+    async with (
+        serving() as (_server, ros),
+        await ros.send_goal("/count", FIBONACCI, {"order": order}) as goal,
+    ):
+        assert await anext(goal) == {"sequence": [0, 1]}
+        if order == 2:
+            await goal.cancel()
+        result = await goal.result(PATIENCE)
+        assert (result.status, result.values) == (status, {"sequence": sequence})
+
+
+@pytest.mark.parametrize("wrong", ["feedback", "result"])
+async def test_feedback_or_a_result_of_another_type_aborts_the_goal(wrong):
+    async def handle(goal):
+        goal.feed_back({"sequenze": [0]} if wrong == "feedback" else {"sequence": [0]})
+        return {"sequence": [[0]]} if wrong == "result" else {"sequence": [0]}
+
+    async with (
+        running_hub(ros_version=2) as port,
+        connect(f"ws://127.0.0.1:{port}") as ros,
+        await ros.advertise_action("/wrong", FIBONACCI, handle),
+    ):
+        goal = await ros.send_goal("/wrong", FIBONACCI, {"order": 1})
+        with pytest.raises(GoalError) as caught:
+            await goal.result(PATIENCE)
+    assert "sequence" in caught.value.reason
+
+
+async def test_a_handler_that_fails_and_a_server_that_goes_away_end_the_goal():
+    async with serving() as (server, ros):
+        failed = await ros.send_goal("/count", FIBONACCI, {"order": 3})
+        with pytest.raises(GoalError) as caught:
+            await failed.result(PATIENCE)
+        assert "RuntimeError" in caught.value.reason
+        waiting = await ros.send_goal("/count", FIBONACCI, {"order": 2})
+        await anext(waiting)
+        await server.close()
+        with pytest.raises(GoalError):
+            await waiting.result(PATIENCE)
+
+
+async def test_an_action_comes_back_with_its_connection_and_its_goals_do_not(fake, ros):
+    started, cancelled = asyncio.Event(), asyncio.Event()
+
+    async def wait(goal: GoalRequest) -> None:
+        started.set()
+        try:
+            await goal.wait_canceling()
+        except asyncio.CancelledError:
+            cancelled.set()
+            raise
+
+    await ros.advertise_action("/wait", "p/action/Wait", wait)
+    await fake.wait_for_op("advertise_action", action="/wait", type="p/action/Wait")
+    await fake.say({"op": "send_action_goal", "id": "1", "action": "/wait", "args": {}})
+    await asyncio.wait_for(started.wait(), PATIENCE)
+    await fake.cut()
+    await asyncio.wait_for(cancelled.wait(), PATIENCE)
+    await ros.wait_for_state(State.CONNECTED, PATIENCE)
+    await fake.wait_for_op("advertise_action", count=2)
+    await fake.say({"op": "send_action_goal", "id": "1", "action": "/other", "args": {}})
+    assert (await fake.wait_for_op("action_result", id="1"))["result"] is False
+
+
+@pytest.mark.parametrize("configured", ["1", "auto"])
+async def test_actions_of_ros_1_are_refused(configured):
+    async with (
+        running_hub(ros_version=1) as port,
+        connect(f"ws://127.0.0.1:{port}", ros_version=configured) as ros,
+    ):
+        with pytest.raises(ActionlibError):
+            await ros.send_goal("/count", FIBONACCI, {"order": 5})
+        with pytest.raises(ActionlibError):
+            await ros.advertise_action("/count", FIBONACCI, count)
