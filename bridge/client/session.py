@@ -203,7 +203,6 @@ class Session:
         self._retry_timer: asyncio.TimerHandle | None = None
         self._renewal_delay = SILENCE
         self._looking: asyncio.Task[None] | None = None
-        self._probe_timer: asyncio.TimerHandle | None = None
         self._largest_sent = 0
         self._burst = 0
         self._turn = asyncio.Lock()  # fair: first in, first out
@@ -253,9 +252,8 @@ class Session:
         websocket, self._websocket = self._websocket, None
         self.core.lost()
         # except the current task: a service's handler may close the client
-        for timer in (self._retry_timer, self._probe_timer):
-            if timer is not None:
-                timer.cancel()
+        if self._retry_timer is not None:
+            self._retry_timer.cancel()
         ending = {*self._serving, *(each for each in (self._reconnecting, self._looking) if each is not None)}
         ending -= {asyncio.current_task()}
         for task in ending:
@@ -296,7 +294,6 @@ class Session:
         for message in self.core.data_to_send():
             if self.is_open:
                 self.send_now(message)
-        self._release_suspect()
         self.watch_silence()
         self._set_state(State.CONNECTED, "")
 
@@ -308,7 +305,7 @@ class Session:
         if websocket.loss is Loss.SENT_TOO_LARGE:
             self.core.wire.limit(self._largest_sent - 1)
         elif websocket.loss is Loss.RECEIVED_TOO_LARGE:
-            self._blame_topic(topic_in(websocket.refused))
+            reason += self._leave_out(topic_in(websocket.refused))
         self.core.lost()
         for server in self.action_servers.values():
             server.lost()
@@ -321,29 +318,26 @@ class Session:
         self._reconnecting = asyncio.get_running_loop().create_task(self._reconnect())
         self._set_state(State.RECONNECTING, reason)
 
-    def _blame_topic(self, named: str | None) -> None:
-        """Find out which topic had the message that was too large for the connection."""
-        only_topics = not self.core.calls and not self.core.goals
-        left_out = self.core.subscriptions.blame(named, only_topics=only_topics)
-        for number in left_out:
+    def _leave_out(self, topic: str | None) -> str:
+        """Handle a message that was too large for the connection; return the end of the sentence about the loss.
+
+        Its topic is left out, if its beginning named one; otherwise the next such message ends the connection again.
+        """
+        subscriptions = self.core.subscriptions
+        numbers = subscriptions.leave_out(topic)
+        for number in numbers:
             self.watchers[number].leave_out(self.why_left_out())
+        if numbers:
+            return f"; it was one of {topic}, which is left out"
+        largest, size = subscriptions.largest
+        return f"; the largest so far was one of {largest}, with {size} bytes" if size else ""
 
     def why_left_out(self) -> str:
         """Return the end of an error's sentence: the reason why a topic is left out."""
         return (
-            f"is left out: its messages have more than the {self.core.wire.max_size} bytes (max_size) that this "
+            f"is left out: a message of it has more than the {self.core.wire.max_size} bytes (max_size) that this "
             f"client of {self.uri} accepts"
         )
-
-    def _release_suspect(self) -> None:
-        """Subscribe to the next topic that is held back because a message was too large."""
-        if self._probe_timer is not None:
-            self._probe_timer.cancel()
-            self._probe_timer = None
-        if self.is_open and self.core.subscriptions.release():
-            self.flush()
-            patience = self.core.subscriptions.probation.patience
-            self._probe_timer = asyncio.get_running_loop().call_later(patience, self._release_suspect)
 
     def reconnect_now(self) -> None:
         """Do not wait before the next attempt to reconnect, if the connection is lost."""
@@ -423,7 +417,7 @@ class Session:
         if get_ident() != self._thread and self._thread is not None:
             raise WrongThreadError(
                 f"the client of {self.uri} belongs to the thread of its event loop: call it there with "
-                "asyncio.run_coroutine_threadsafe, or use bridge.client.blocking"
+                "asyncio.run_coroutine_threadsafe"
             )
 
     def must_wait(self) -> bool:
@@ -574,8 +568,6 @@ class Session:
                     receivers[number](message)
             else:
                 self._take_other(event)
-        if self._probe_timer is not None and self.core.subscriptions.probation.is_settled:
-            self._release_suspect()
 
     def _take_other(self, event: Event | None) -> None:
         match event:

@@ -1,29 +1,18 @@
 """Checks of outbound messages against the definition of their type: names of fields, and shapes of arrays.
 
-A message is checked completely if its structure differs from that of the last checked one. The structure consists
-of the keys of the objects outside arrays, their scalars, and the Python types and lengths of arrays in their fields.
-After `CLOSELY` messages, only the outermost keys of each message are compared, and the whole structure of every
-`SAMPLE`-th, because comparing nested objects would take a tenth of the time of publishing them. Values of scalars are
-left to the server.
+They find the mistakes of a program (a misspelt field, nested arrays), which are in its first message already. Values of
+scalars are left to the server.
 """
 
 import difflib
-from collections.abc import Callable, Mapping
-from operator import itemgetter
-from types import NoneType
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
 from bridge.errors import MessageTypeError, NameFormError
 from bridge.names import ros1_type, ros2_type
 
-_SCALARS: Final = frozenset({bool, int, float, str, NoneType})
-"""Types of scalars that are recognised at once; other values, such as NumPy's, are inspected."""
 SCALAR: Final = -1
 """Length of a field that is not an array; 0 is an array of any length."""
-CLOSELY: Final = 64
-"""Number of messages of the same structure after which only the outermost keys are compared."""
-SAMPLE: Final = 16
-"""After `CLOSELY` messages, the whole structure of one message in this many is compared."""
 _MAX_TYPES: Final = 1000
 _MAX_FIELDS: Final = 1000
 _MAX_LENGTH: Final = (1 << 32) - 1
@@ -114,32 +103,13 @@ def _key(type_name: str) -> str:
         return type_name  # a primitive
 
 
-class _Shape(NamedTuple):
-    """Structure of a checked message: its keys, scalars and objects, and types and lengths of its arrays."""
-
-    keys: tuple[str, ...]
-    scalars: tuple[str, ...]
-    objects: tuple[tuple[str, "_Shape"], ...]
-    arrays: tuple[tuple[str, type, int], ...]  # the length is checked if it is not 0
-
-
-_NO_SHAPE: Final = _Shape(("",), (), (), ())
-_NONE: Final = -1
-"""Instead of a number of keys: no message is trusted."""
-
-
 class MessageCheck:
-    """The check of messages of one type, which remembers the last structure; a message that `is_trusted` needs none."""
+    """The check of messages of one type."""
 
     def __init__(self, type_name: str, definitions: Definitions) -> None:
         """Prepare the check of a type that is among the definitions; its name has the form of ROS 1."""
         self._type = type_name
         self._definitions = definitions
-        self._last = _NO_SHAPE
-        self._count = 0
-        self._trusted_size = _NONE
-        self._trusted_fields: Callable[[dict[str, Any]], object] = itemgetter("")
-        self._until_due = 0
 
     def __call__(self, msg: Mapping[str, Any]) -> None:
         """Check a message.
@@ -147,54 +117,26 @@ class MessageCheck:
         Raises:
             MessageTypeError: It has a field that the type does not have, or an array of another shape.
         """
-        if not _has_shape(msg, self._last):
-            self._last = self._shape(self._type, msg, "")
-            self._count = 0
-        self._count += 1
-        keys = self._last.keys
-        if self._count < CLOSELY or not keys:
-            self._trusted_size = _NONE
-        elif self._trusted_size == _NONE:
-            self._trusted_size, self._trusted_fields = len(keys), itemgetter(*keys)
-            self._until_due = 0
+        self._check(self._type, msg, "")
 
-    def is_trusted(self, msg: Mapping[str, Any]) -> bool:
-        """Return whether a message need not be checked: it has the keys of many before it, and is not a sample."""
-        if self._until_due and len(msg) == self._trusted_size and type(msg) is dict:
-            try:
-                self._trusted_fields(msg)  # takes half the time of comparing the keys
-            except KeyError:
-                return False
-            self._until_due -= 1
-            return True
-        self._until_due = SAMPLE - 1
-        return False
-
-    def _shape(self, type_name: str, msg: Any, place: str) -> _Shape:
-        """Check an object completely, and return its structure."""
+    def _check(self, type_name: str, msg: Any, place: str) -> None:
         if not isinstance(msg, Mapping):
             raise MessageTypeError(f"{place[:-1] or 'it'} is {_shown(msg)}, expected an object ({type_name})")
         fields = _TIME_FIELDS if type_name in _TIMES else self._definitions.get(type_name)
         if fields is None:
-            return _Shape(tuple(msg), (), (), ())
-        scalars, objects, arrays = [], [], []
+            return
         for name, value in msg.items():
             field = fields.get(name)
             if field is None:
                 raise _unknown_field(type_name, fields, name, place)
             if value is None:
-                scalars.append(name)
-                continue
+                continue  # absent, as in ROS
             if field.length != SCALAR:
                 self._check_array(type_name, field, value, f"{place}{name}")
-                arrays.append((name, type(value), 0 if isinstance(value, str) else field.length))
             elif self._is_object(field.element):
-                objects.append((name, self._shape(field.element, value, f"{place}{name}.")))
-            elif field.element in _PRIMITIVES:
-                if _is_nested(value):
-                    raise _misshapen(type_name, f"{place}{name}", field, value)
-                scalars.append(name)
-        return _Shape(tuple(msg), tuple(scalars), tuple(objects), tuple(arrays))
+                self._check(field.element, value, f"{place}{name}.")
+            elif field.element in _PRIMITIVES and _is_nested(value):
+                raise _misshapen(type_name, f"{place}{name}", field, value)
 
     def _is_object(self, element: str) -> bool:
         return element in _TIMES or element in self._definitions
@@ -215,7 +157,7 @@ class MessageCheck:
             raise _misshapen(type_name, place, field, value)
         if self._is_object(field.element):
             for index, item in enumerate(value):
-                self._shape(field.element, item, f"{place}[{index}].")
+                self._check(field.element, item, f"{place}[{index}].")
 
 
 def check_from_rosapi(answer: Any) -> MessageCheck | None:
@@ -225,24 +167,6 @@ def check_from_rosapi(answer: Any) -> MessageCheck | None:
         case {"typedefs": [{"type": str(name)}, *_]} if (key := _key(name)) in definitions:
             return MessageCheck(key, definitions)
     return None
-
-
-def _has_shape(msg: Mapping[str, Any], shape: _Shape) -> bool:
-    keys, scalars, objects, arrays = shape
-    if tuple(msg) != keys:
-        return False
-    for name in scalars:
-        if type(msg[name]) not in _SCALARS:
-            return False
-    for name, kind, length in arrays:
-        value = msg[name]
-        if type(value) is not kind or (length and len(msg[name]) != length):
-            return False
-    for name, inner in objects:
-        value = msg[name]
-        if type(value) is not dict or not _has_shape(value, inner):
-            return False
-    return True
 
 
 def _is_nested(value: Any) -> bool:

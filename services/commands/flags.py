@@ -104,7 +104,7 @@ MessageBytes = Annotated[
     int | None,
     setting(
         "message_bytes",
-        "Largest message of a topic, in bytes; a larger one ends the connection, a second one the topic.",
+        "Largest message of a topic, in bytes; a larger one ends the connection, and its topic is left out of the next.",
         min=1 << 10,
         max=1 << 28,
         rich_help_panel=SERVER,

@@ -24,7 +24,8 @@ class _Advertised:
     wire_id: str
     prefix: bytes  # start of its messages on the wire, which end with a brace
     holders: set[int] = field(default_factory=set)
-    check: MessageCheck | None = None
+    check: MessageCheck | None = None  # of its type, once that is known
+    unchecked: set[int] = field(default_factory=set)  # holders whose first message the check has still to see
     latched: bytes | None = None  # the last message, repeated after a reconnection
 
 
@@ -73,6 +74,8 @@ class Publications:
                 f"qos={advertised.qos}; it cannot be advertised as {type_name}, latch={latch}, qos={qos} too"
             )
         advertised.holders.add(number)
+        if advertised.check is not None:
+            advertised.unchecked.add(number)
         self._advertisements[number] = advertised
         return number
 
@@ -93,7 +96,7 @@ class Publications:
         return ros1_type(type_name) in self._definitions
 
     def define(self, type_name: str, definitions: Definitions) -> None:
-        """Check messages of a type from now on, if its definition is among these."""
+        """Check the next message of each publication of a type, if its definition is among these."""
         self._definitions[ros1_type(type_name)] = definitions
         for advertised in self._advertised.values():
             if same_type(advertised.type, type_name):
@@ -102,15 +105,18 @@ class Publications:
     def _set_check(self, advertised: _Advertised) -> None:
         name = ros1_type(advertised.type)
         definitions = self._definitions.get(name, {})
-        advertised.check = MessageCheck(name, definitions) if name in definitions else None
+        if name in definitions:
+            advertised.check = MessageCheck(name, definitions)
+            advertised.unchecked = set(advertised.holders)
 
     def publish(self, advertisement: int, msg: Mapping[str, Any]) -> bytes:
         """Return the bytes of a message of an advertised topic, which bypass the outbox."""
         advertised = self._advertisements[advertisement]
-        prefix, check = advertised.prefix, advertised.check
+        prefix = advertised.prefix
         try:
-            if check is not None and not check.is_trusted(msg):
-                check(msg)
+            if advertised.check is not None and advertisement in advertised.unchecked:
+                advertised.check(msg)
+                advertised.unchecked.discard(advertisement)
             body = encode(
                 msg,
                 nonfinite="refuse",
@@ -128,6 +134,7 @@ class Publications:
         """End an advertisement; after the last one of a topic, withdraw the topic from the server."""
         advertised = self._advertisements.pop(advertisement)
         advertised.holders.discard(advertisement)
+        advertised.unchecked.discard(advertisement)
         if not advertised.holders:
             del self._advertised[absolute(advertised.topic)]
             self._wire.write(op="unadvertise", id=advertised.wire_id, topic=advertised.topic)

@@ -5,12 +5,12 @@ Some servers deliver a first message twice, or not at all, to a client that subs
 
 import sys
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 import orjson
 
 from bridge.client.protocol.events import MessageDiscarded, MessageReceived, Unusable
-from bridge.client.protocol.probation import Probation
 from bridge.client.protocol.subscription_options import Delivery
 from bridge.client.protocol.wire import RosVersion, Wire
 from bridge.codecs.arrays import with_arrays, with_lists
@@ -54,7 +54,11 @@ class _Subscribed:
     as_json: bool = False
     """True if the subscription requests JSON instead of CBOR."""
     envelopes_tried: int = 0
+    largest: int = 0
+    """Size of its largest message so far."""
     discarded: int = 0
+    left_out: bool = False
+    """True after a message that was too large for the connection: the topic is not subscribed to again."""
 
     def combine(self) -> bool:
         """Combine the options to the fastest rate and the longest queue; return whether these changed."""
@@ -105,7 +109,6 @@ class Subscriptions:
         binary: Whether any topic is subscribed as CBOR.
         numpy: Whether any topic is subscribed with NumPy arrays.
         envelopes: The known envelopes of messages.
-        probation: The topics that are not subscribed now, because a message was too large.
     """
 
     def __init__(self, wire: Wire) -> None:
@@ -113,7 +116,6 @@ class Subscriptions:
         self.binary = False
         self.numpy = False
         self.envelopes: dict[bytes, _Known] = {}
-        self.probation = Probation()
         self._known = _UNKNOWN  # the last of these
         self._wire = wire
         self._subscribed: dict[str, _Subscribed] = {}
@@ -176,30 +178,31 @@ class Subscriptions:
             self._send_subscribe(subscribed)
         return number
 
-    def blame(self, named: str | None, *, only_topics: bool) -> tuple[int, ...]:
-        """Handle a message that was too large for the connection (see `Probation.blame`).
+    def leave_out(self, topic: str | None) -> tuple[int, ...]:
+        """Do not subscribe to a topic again, because each of its messages would end the connection.
 
         Returns:
-            Numbers of the subscriptions to the topic that is left out from now on.
+            Numbers of its subscriptions; none if the topic is not subscribed to.
         """
-        subscribed = [key for key in self._subscribed if not self.probation.holds(key)]
-        culprit = self.probation.blame(subscribed, named and absolute(named), only_topics=only_topics)
-        return () if culprit is None else self._subscribed[culprit].all_numbers
-
-    def release(self) -> bool:
-        """Subscribe to the next suspect of such a message; return whether there was one."""
-        topic = self.probation.release()
-        if topic is None:
-            return False
-        self._send_subscribe(self._subscribed[topic])
-        return True
+        subscribed = None if topic is None else self._subscribed.get(absolute(topic))
+        if subscribed is None:
+            return ()
+        subscribed.left_out = True
+        return subscribed.all_numbers
 
     def has_left_out(self, topic: str) -> bool:
         """Return whether a topic is left out, because its messages are too large for the connection."""
-        return self.probation.has_left_out(absolute(topic))
+        subscribed = self._subscribed.get(absolute(topic))
+        return subscribed is not None and subscribed.left_out
+
+    @property
+    def largest(self) -> tuple[str, int]:
+        """The topic with the largest message so far, and its size in bytes; 0 before the first message."""
+        known = [(subscribed.topic, subscribed.largest) for subscribed in self._subscribed.values()]
+        return max(known, key=itemgetter(1), default=("", 0))
 
     def _send_subscribe(self, subscribed: _Subscribed) -> None:
-        if self.probation.holds(absolute(subscribed.topic)):
+        if subscribed.left_out:
             return
         operation: dict[str, Any] = {"op": "subscribe", "id": subscribed.wire_id, "topic": subscribed.topic}
         if subscribed.type is not None:
@@ -230,7 +233,6 @@ class Subscriptions:
                 self._send_subscribe(subscribed)
         else:
             del self._subscribed[absolute(subscribed.topic)]
-            self.probation.forget(absolute(subscribed.topic))
             self._note_deliveries()
             self._send_unsubscribe(subscribed)
 
@@ -242,7 +244,9 @@ class Subscriptions:
 
         Servers drop such a subscription if they do not know the topic yet, most of them silently.
         """
-        waiting = [s for s in self._subscribed.values() if s.type is None and not s.has_messages]
+        waiting = [
+            s for s in self._subscribed.values() if s.type is None and not s.has_messages and not s.left_out
+        ]
         for subscribed in waiting:
             self._send_subscribe(subscribed)
         return bool(waiting)
@@ -251,8 +255,8 @@ class Subscriptions:
         """Return the topics with a type that have had no message on this connection."""
         return [
             s.topic
-            for key, s in self._subscribed.items()
-            if s.type is not None and not s.has_messages and not self.probation.holds(key)
+            for s in self._subscribed.values()
+            if s.type is not None and not s.has_messages and not s.left_out
         ]
 
     def renew(self, topic: str) -> bool:
@@ -283,9 +287,12 @@ class Subscriptions:
                 return None
             self._known = known = found
         subscribed = known.subscribed
+        if len(data) > subscribed.largest:
+            if len(data) > self._wire.max_size:
+                return None
+            subscribed.largest = len(data)
         if len(data) > subscribed.max_size:
-            is_usable = len(data) <= self._wire.max_size
-            return subscribed.discard(known.topic, len(data)) if is_usable else None
+            return subscribed.discard(known.topic, len(data))
         if data[-1] != BRACE or subscribed.has_throttled:
             return None
         message = data[known.size : -1]
@@ -331,7 +338,6 @@ class Subscriptions:
             return None
         if not subscribed.has_messages:
             subscribed.has_messages = True
-            self.probation.hear(absolute(topic))
             self.seen_version = self.seen_version or ros_version_of_message(msg)
         if (
             type(data) is bytes
@@ -340,6 +346,7 @@ class Subscriptions:
             and subscribed.envelopes_tried < _ENVELOPES
         ):
             self._learn_envelope(data, topic, subscribed)
+        subscribed.largest = max(subscribed.largest, len(data))
         if len(data) > subscribed.max_size:
             return subscribed.discard(topic, len(data))
         receivers = subscribed.receivers(now)

@@ -1,17 +1,11 @@
 """Messages are compared with the definition of their type: names of fields, and shapes of arrays."""
 
-from collections import defaultdict
 from types import MappingProxyType
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from bridge.codecs import message_check
 from bridge.codecs.message_check import (
-    CLOSELY,
-    SAMPLE,
     MessageCheck,
     bundled_definitions,
     check_from_rosapi,
@@ -59,9 +53,7 @@ def check(request, version):
     ],
 )
 def test_what_fits_passes(check, type_name, msg):
-    checked = check(type_name)
-    checked(msg)
-    checked(msg)
+    check(type_name)(msg)
 
 
 @pytest.mark.parametrize(
@@ -88,41 +80,10 @@ def test_what_fits_passes(check, type_name, msg):
     ],
 )
 def test_what_does_not_fit_is_refused_with_type_field_and_expectation(check, type_name, msg, named):
-    checked = check(type_name)
-    for _ in range(2):
-        with pytest.raises(MessageTypeError) as caught:
-            checked(msg)
-        for part in named:
-            assert any(each in str(caught.value) for each in part.split("|"))
-    checked({})
-
-
-def test_a_misspelt_field_after_right_messages_is_refused(check):
-    checked = check(ODOMETRY)
-    for _ in range(3):
-        checked({"pose": {"covariance": [0.0] * 36, "pose": {"position": {"x": 1}}}})
-    for wrong in (
-        {"covariance": [0.0] * 35},
-        {"covariance": np.zeros((36, 1))},
-        {"pose": {"position": {"u": 1}}},
-        {"pose": {"position": {"x": [1]}}},
-    ):
-        with pytest.raises(MessageTypeError):
-            checked({"pose": {"covariance": [0.0] * 36, "pose": {"position": {"x": 1}}} | wrong})
-
-
-def test_an_object_after_none_is_checked(check):
-    checked = check(ODOMETRY)
-    checked({"pose": None})
-    with pytest.raises(MessageTypeError):
-        checked({"pose": {"u": 1}})
-
-
-def test_a_message_of_the_same_structure_is_not_checked_again(check, monkeypatch):
-    checked = check(ODOMETRY)
-    checked({"pose": {"covariance": [0.0] * 36}})
-    monkeypatch.setattr(message_check.MessageCheck, "_shape", None)
-    checked({"pose": {"covariance": [1.0] * 36}})
+    with pytest.raises(MessageTypeError) as caught:
+        check(type_name)(msg)
+    for part in named:
+        assert any(each in str(caught.value) for each in part.split("|"))
 
 
 def test_a_type_that_is_not_a_standard_one_is_not_bundled():
@@ -172,64 +133,3 @@ def test_parts_of_unknown_type_are_not_checked():
         checked({"c": value})
     with pytest.raises(MessageTypeError):
         checked({"d": 1})
-
-
-_VALUES = st.sampled_from(
-    [
-        *(None, 1.0, "text", [], [1.0], [0.0] * 36, (1,), {}, {"x": 1}, {"x": [1]}, {"u": 1}),
-        *(np.zeros(36), np.zeros((6, 6)), {"covariance": np.zeros(36)}, {"covariance": np.zeros(35)}),
-        *({"pose": {"position": {"x": 1}}}, {"pose": {"position": {"u": 1}}}, MappingProxyType({"x": 1})),
-    ]
-)
-_MESSAGES = st.dictionaries(
-    st.sampled_from(["header", "pose", "twist", "child_frame_id", "poze"]), _VALUES, max_size=3
-)
-
-
-def _refuses(check: MessageCheck, msg) -> bool:
-    try:
-        check(msg)
-    except MessageTypeError:
-        return True
-    return False
-
-
-@given(st.lists(st.tuples(_MESSAGES, st.integers(1, 3)), max_size=8))
-def test_a_check_that_remembers_a_structure_refuses_what_a_new_one_refuses(runs):
-    definitions = bundled_definitions(ODOMETRY, 2)
-    used = MessageCheck(ODOMETRY, definitions)
-    for msg, count in runs:
-        for _ in range(count):
-            assert _refuses(used, msg) == _refuses(MessageCheck(ODOMETRY, definitions), msg)
-
-
-@given(st.lists(st.tuples(_MESSAGES, st.integers(1, CLOSELY + 2 * SAMPLE)), min_size=1, max_size=6))
-def test_only_messages_with_the_keys_of_many_before_are_trusted_and_some_of_them_checked(runs):
-    definitions = bundled_definitions(ODOMETRY, 2)
-    check = MessageCheck(ODOMETRY, definitions)
-    right, unchecked, before = 0, 0, None
-    for msg, count in runs:
-        for _ in range(count):
-            size = len(msg)
-            if check.is_trusted(msg):
-                unchecked += 1
-                assert unchecked < SAMPLE
-                assert right >= CLOSELY
-                assert set(msg) == before
-            else:
-                unchecked = 0
-                if not _refuses(check, msg):
-                    right = right + 1 if set(msg) == before else 1
-                    before = set(msg)
-            assert len(msg) == size
-
-
-def test_a_message_that_makes_up_values_is_not_read_before_it_is_checked():
-    check = MessageCheck(TWIST, bundled_definitions(TWIST, 2))
-    for _ in range(CLOSELY + 1):
-        check({"linear": {}})
-    assert not check.is_trusted({"linear": {}})  # the sample
-    assert check.is_trusted({"linear": {}})
-    made_up = defaultdict(dict, {"lineer": {}})
-    assert not check.is_trusted(made_up)
-    assert list(made_up) == ["lineer"]

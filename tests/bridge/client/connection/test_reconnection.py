@@ -12,9 +12,9 @@ import pytest
 
 from bridge.client import Ros, State, connect
 from bridge.client.session import FIRST_DELAY, MAX_DELAY
-from bridge.errors import DisconnectedError, NoMessageError, StateTimeoutError
+from bridge.errors import DisconnectedError, StateTimeoutError
 from tests.bridge.client.tcp_service import tcp_service
-from tests.bridge.client.waits import give_up, until
+from tests.bridge.client.waits import until
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 
@@ -204,25 +204,6 @@ async def test_a_sleep_of_this_process_is_not_the_servers_silence(fake, ros):
     websocket._check_liveness(time.monotonic() - 2.5)  # it is called late, while the answer is in transit
     await until(lambda: websocket.last_heard > heard)
     assert (ros.state, ros.reconnections, fake.connections) == (State.CONNECTED, 0, 1)
-
-
-@pytest.mark.parametrize("ros", [{"max_size": 1000}], indirect=True)
-async def test_a_message_that_is_too_large_ends_the_connection_and_says_so(fake, ros):
-    subscription = ros.subscribe("/a", "p/T", queue_size=5)
-    await fake.wait_for_op("subscribe")
-    waiting = asyncio.create_task(subscription.next(timeout=3600))
-    await asyncio.sleep(0)
-    await fake.publish("/a", {"n": "x" * 2000})
-    await ros.wait_for_state(State.RECONNECTING, PATIENCE)
-    reason = "the server sent a message of more than 1000 bytes (max_size allows larger ones)"
-    assert ros.last_error == reason
-    await ros.wait_for_state(State.CONNECTED, PATIENCE)
-    give_up(subscription)
-    with pytest.raises(NoMessageError, match=re.escape(f"the connection was lost: {reason}")):
-        await waiting
-    await fake.wait_for_op("subscribe", count=2)
-    await fake.publish("/a", {"n": 1})
-    assert (await subscription.next(PATIENCE)).msg == {"n": 1}
 
 
 async def test_waiting_for_a_state_is_bounded_and_closing_ends_it_and_the_reconnecting(fake, ros):
