@@ -1,4 +1,4 @@
-"""Endpoints of boards, `unix:/path`, `tcp://host:port` or `tls://host:port`, and their sockets."""
+"""Endpoints of boards and services, `unix:/path` or `tcp://host:port`, and their sockets."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import errno
 import ipaddress
 import os
 import socket
-import ssl
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -14,9 +13,7 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-from pcie_shim.credentials import NO_CREDENTIALS, Credentials
-from pcie_shim.errors import EndpointError, KeyRefusedError, LinkTimeoutError, UnreachableError
-from pcie_shim.tunnel import tunnel_to_board
+from pcie_shim.errors import EndpointError, LinkTimeoutError, UnreachableError
 
 UNIX_PATH_BYTES: Final = 107
 """Maximum length in bytes of the path of a Unix socket on Linux."""
@@ -32,21 +29,19 @@ class Endpoint:
         path: Path of the unix socket; empty for TCP.
         host: Name or address of the TCP host; empty for a unix socket.
         port: TCP port; 0 for a unix socket.
-        tls: Whether the link over TCP is encrypted.
-        credentials: The key and certificates of a link over TCP; a unix socket needs none, since it is private.
+        key: Key of a link over TCP, empty for none; a unix socket needs none, since it is private.
     """
 
     path: str = ""
     host: str = ""
     port: int = 0
-    tls: bool = False
-    credentials: Credentials = field(default=NO_CREDENTIALS, repr=False, compare=False)
+    key: bytes = field(default=b"", repr=False, compare=False)
 
     def __str__(self) -> str:
         if self.path:
             return f"unix:{self.path}"
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"{'tls' if self.tls else 'tcp'}://{host}:{self.port}"
+        return f"tcp://{host}:{self.port}"
 
     @property
     def is_loopback(self) -> bool:
@@ -68,7 +63,7 @@ class Endpoint:
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """Parse `unix:/path`, `tcp://host:port` or `tls://host:port`, or raise an EndpointError."""
+    """Parse `unix:/path` or `tcp://host:port`, or raise an EndpointError."""
     if text.startswith("unix:"):
         endpoint = Endpoint(path=text.removeprefix("unix:"))
         if not endpoint.path.startswith("/"):
@@ -86,10 +81,15 @@ def parse_endpoint(text: str) -> Endpoint:
         (host or "").encode("idna")  # like the resolver, which would fail with a UnicodeError (a ValueError)
     except ValueError:
         host, port = None, None
-    if text.startswith(("tcp://", "tls://")) and host and port and port < 65535 and text.count("/") == 2:
-        return Endpoint(host=host, port=port, tls=text.startswith("tls://"))
+    if text.startswith("tls://"):
+        raise EndpointError(
+            f"The endpoint '{text}' asks for TLS, which links to boards do not have: use tcp:// with a key, through ssh or "
+            "WireGuard (docs/how-to/hosts.md)"
+        )
+    if text.startswith("tcp://") and host and port and port < 65535 and text.count("/") == 2:
+        return Endpoint(host=host, port=port)
     raise EndpointError(
-        f"The endpoint '{text}' is not understood: use unix:/path/board0.sock, tcp://host:port or tls://host:port, with a "
+        f"The endpoint '{text}' is not understood: use unix:/path/board0.sock or tcp://host:port, with a "
         "port from 1 to 65534 (the next one is for programming)"
     )
 
@@ -151,16 +151,12 @@ def connect(endpoint: Endpoint, *, timeout: float) -> socket.socket:
 
     Raises:
         UnreachableError: Nothing listens there.
-        KeyRefusedError: TLS cannot be begun, or the board's certificate is not trusted.
         LinkTimeoutError: The host of a TCP endpoint does not answer.
     """
     deadline = time.monotonic() + timeout
     while True:
         try:
             return _connect_once(endpoint, max(deadline - time.monotonic(), _RETRY_S))
-        except ssl.SSLError as error:
-            why = getattr(error, "verify_message", "") or error.reason or str(error)
-            raise KeyRefusedError(f"{endpoint} did not begin a trusted TLS connection: {why}") from None
         except TimeoutError:
             raise LinkTimeoutError(f"{endpoint} did not take a connection within {timeout:g} s") from None
         except OSError as error:
@@ -177,10 +173,7 @@ def _connect_once(endpoint: Endpoint, timeout: float) -> socket.socket:
         tcp = socket.create_connection((endpoint.host, endpoint.port), timeout=timeout)
         no_delay(tcp)
         tcp.settimeout(None)
-        if not endpoint.tls:
-            return tcp
-        context = endpoint.credentials.tls or ssl.create_default_context()
-        return tunnel_to_board(tcp, context, endpoint.host, timeout)
+        return tcp
     unix = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         unix.settimeout(timeout)

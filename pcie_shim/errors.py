@@ -16,7 +16,7 @@ class EndpointError(PcieShimError):
 
 
 class CredentialsError(PcieShimError):
-    """A key or certificate that cannot be used."""
+    """A file with a key that cannot be used."""
 
     exit_code = 2
 
@@ -82,7 +82,7 @@ class DeviceGoneError(LinkError):
 
 
 class KeyRefusedError(LinkError):
-    """A board and a host that do not have the same key, or a certificate that is not trusted."""
+    """A board and a host that do not have the same key."""
 
     exit_code = 2
 

@@ -44,10 +44,6 @@ class Settings(BaseSettings):
         description="certificates (PEM) that sign that of a wss:// server; the system's without it",
     )
     key_file: Path | None = Field(default=None, description="file with the key that boards over TCP share")
-    board_ca: Path | None = Field(
-        default=None,
-        description="certificates (PEM) that sign those of boards over TLS; the system's without it",
-    )
     subscriber: str = Field(default="", description="endpoint of a running subscriber")
     publisher: str = Field(default="", description="endpoint of a running publisher")
     pcie_app: str = Field(default="", description="endpoint of a running pcie-app")
@@ -88,7 +84,7 @@ class Settings(BaseSettings):
     )
     log_format: LogFormat = Field(default=LogFormat.TEXT, description="lines on standard error")
 
-    @field_validator("deployment", "ca", "key_file", "board_ca", "run_directory", mode="before")
+    @field_validator("deployment", "ca", "key_file", "run_directory", mode="before")
     @classmethod
     def _no_directory(cls, value: object) -> object:
         return value or None  # an empty variable means no folder, not the current one

@@ -28,7 +28,6 @@ from pcie_shim.framing import Frame, ProgramBegin
 from pcie_shim.programming_file import MAX_IMAGE_BYTES
 from pcie_shim.register_layout import ALL_ONES
 from pcie_shim.register_map import ErrorCode
-from pcie_shim.tunnel import tunnel_to_host
 
 _LOG: Final = logging.getLogger(__name__)
 
@@ -130,7 +129,6 @@ class _Connection:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_S)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_S)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
-        connection = _tunnelled(connection, endpoint)
         # reads never block, because epoll precedes them; writes may take SEND_S
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", int(SEND_S), 0))
         self.socket = connection
@@ -138,7 +136,7 @@ class _Connection:
         self.sequence = 0
         self.open = True
         self.stalled = False
-        self._key = endpoint.credentials.key if endpoint.host else b""
+        self._key = endpoint.key if endpoint.host else b""
         self._greeting = greeting
         self._nonce = b""
         if self._key:
@@ -307,7 +305,7 @@ class _Server:
         except OSError:
             return  # the peer has disconnected already
         if self._is_held():
-            _refuse(connection, self._endpoint, _HELD)
+            _refuse(connection, _HELD)
             return
         if len(self._silent_hosts) == MAX_SILENT:
             self._drop_host(next(iter(self._silent_hosts.values())))
@@ -458,7 +456,7 @@ class _Server:
         except OSError:
             return
         if self._is_being_programmed():
-            _refuse(connection, self._endpoint, _PROGRAMMED)
+            _refuse(connection, _PROGRAMMED)
             return
         if len(self._silent_loaders) == MAX_SILENT:
             self._drop_loader(next(iter(self._silent_loaders.values())))
@@ -546,13 +544,7 @@ class _Server:
         loader.socket.close()
 
 
-def _tunnelled(connection: socket.socket, endpoint: Endpoint) -> socket.socket:
-    tls = endpoint.credentials.tls
-    return connection if tls is None or not endpoint.host else tunnel_to_host(connection, tls)
-
-
-def _refuse(connection: socket.socket, endpoint: Endpoint, detail: str) -> None:
-    connection = _tunnelled(connection, endpoint)
+def _refuse(connection: socket.socket, detail: str) -> None:
     with suppress(OSError):
         connection.sendall(framing.encode_error(0, 0, ErrorCode.HELD, detail))
     connection.close()

@@ -75,7 +75,7 @@ class SocketLink(Link):
         Raises:
             KeyRefusedError: One of the two has no key, or another one.
         """
-        key = self.endpoint.credentials.key
+        key = self.endpoint.key
         if frame.operation != framing.AUTHENTICATE:
             if key and frame.operation == framing.GREET:
                 raise KeyRefusedError(
@@ -109,7 +109,7 @@ class SocketLink(Link):
         Raises:
             UnreachableError: Nothing listens there.
             HeldError: Another host holds the board.
-            KeyRefusedError: Host and board do not have the same key, or the certificate is not trusted.
+            KeyRefusedError: Host and board do not have the same key.
             GreetingMismatchError: It has another protocol version, register map or BAR size.
             LinkError: It does not greet, or is not a board.
         """

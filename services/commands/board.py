@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import typer
 
 from pcie_shim.board.misbehaviour import Misbehaviour
-from pcie_shim.credentials import Credentials, board_tls, read_key
+from pcie_shim.credentials import read_key
 from pcie_shim.endpoint import Endpoint
 from services.boards.deployed import images_of
 from services.boards.hardware import Engine, SimulatedHardware
@@ -28,7 +28,6 @@ from terminal.output import say
 from terminal.signals import check_signals, stopped_error
 
 _SEVERAL: Final = "Several boards"
-_OVER_TCP: Final = "A board over TCP"
 
 app = CommandLine(
     help="Emulate boards of the mini-cluster. They start blank; pcie-app or the loader programs them.\n\n"
@@ -76,18 +75,6 @@ def board(
         ),
     ] = RESTARTS,
     key_file: options.KeyFile = None,
-    tls_cert: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Certificate of the board (PEM), to serve tls:// instead of tcp://.",
-            rich_help_panel=_OVER_TCP,
-        ),
-    ] = None,
-    tls_key: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Private key of the certificate (PEM).", rich_help_panel=_OVER_TCP),
-    ] = None,
     insecure: options.Insecure = False,
     metrics: options.Metrics = None,
     log_format: options.LogFormat = None,
@@ -134,7 +121,7 @@ def board(
 
     warm_up()
     check_signals()
-    endpoint = _endpoint(listen or "", settings.key_file, tls_cert, tls_key, insecure=insecure)
+    endpoint = _endpoint(listen or "", settings.key_file, insecure=insecure)
     hardware = _hardware(engine, settings, (index,))
 
     def on_ready() -> None:
@@ -164,27 +151,17 @@ def _hardware(engine: Engine, settings: Settings, boards: Collection[int]) -> Si
     return SimulatedHardware(engine, {at: image for at, image in enumerate(images) if at in boards})
 
 
-def _endpoint(
-    listen: str, key_file: Path | None, certificate: Path | None, key: Path | None, *, insecure: bool
-) -> Endpoint:
-    """Return the endpoint of the board, with its credentials."""
+def _endpoint(listen: str, key_file: Path | None, *, insecure: bool) -> Endpoint:
+    """Return the endpoint of the board, with its key."""
     endpoint = endpoint_from(listen, "--listen")
-    if not endpoint.host:
-        return endpoint
-    if (certificate is None) != (key is None) or (endpoint.tls and certificate is None):
-        raise SettingsError(
-            "TLS needs both the certificate and its key: give --tls-cert FILE and --tls-key FILE"
-        )
-    if key_file is None and not endpoint.is_loopback and not insecure:
+    if endpoint.host and key_file is not None:
+        return replace(endpoint, key=read_key(key_file))
+    if not endpoint.is_loopback and not insecure:
         raise SettingsError(
             f"--listen {listen} lets everybody on that network use this board; give --key-file FILE with the key of its "
             "hosts, or --insecure if that is intended"
         )
-    credentials = Credentials(
-        key=read_key(key_file) if key_file is not None else b"",
-        tls=board_tls(certificate, key) if certificate is not None and key is not None else None,
-    )
-    return replace(endpoint, tls=credentials.tls is not None, credentials=credentials)
+    return endpoint
 
 
 def main() -> None:

@@ -90,16 +90,6 @@ KeyFile = Annotated[
         rich_help_panel=BOARDS,
     ),
 ]
-BoardCa = Annotated[
-    Path | None,
-    setting(
-        "board_ca",
-        "Certificates that sign those of boards over TLS.",
-        otherwise="the system's",
-        metavar="FILE",
-        rich_help_panel=BOARDS,
-    ),
-]
 MessageBytes = Annotated[
     int | None,
     setting(

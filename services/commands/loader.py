@@ -33,7 +33,6 @@ def loader(
     boards: options.Boards = None,
     peer_timeout: options.PeerTimeout = None,
     key_file: options.KeyFile = None,
-    board_ca: options.BoardCa = None,
 ) -> int:
     """Program one board, or all boards of a deployment."""
     end_with_parent()
@@ -42,7 +41,6 @@ def loader(
         boards=boards,
         peer_timeout=peer_timeout,
         key_file=key_file,
-        board_ca=board_ca,
     )
     if image is None:
         loaded = deployment_for(settings, images=True)

@@ -53,7 +53,6 @@ def master(
     board_timeout: options.BoardTimeout = None,
     stop_timeout: options.StopTimeout = None,
     key_file: options.KeyFile = None,
-    board_ca: options.BoardCa = None,
     fused: Annotated[
         bool | None,
         options.setting(
@@ -101,7 +100,6 @@ def master(
         board_timeout=board_timeout,
         stop_timeout=stop_timeout,
         key_file=key_file,
-        board_ca=board_ca,
         fused=fused,
         metrics=metrics,
         log_level=log_level,

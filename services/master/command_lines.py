@@ -41,7 +41,6 @@ def service_command(
         command += ["--peer-timeout", str(settings.peer_timeout + compiling_time)]
         command += ["--board-timeout", str(settings.board_timeout)]
         command += ["--key-file", str(settings.key_file)] if settings.key_file else []
-        command += ["--board-ca", str(settings.board_ca)] if settings.board_ca else []
         return [*command, "--reprogram"] if reprogram else command
     command += ["--uri", settings.uri] if settings.uri else []
     command += ["--ros-version", settings.ros_version, "--connect-timeout", str(settings.connect_timeout)]

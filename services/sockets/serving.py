@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol, Self
 
-from pcie_shim.credentials import Credentials, host_tls, read_key
+from pcie_shim.credentials import read_key
 from pcie_shim.endpoint import Endpoint, listen, parse_endpoint, remove_listener
 from pcie_shim.errors import PcieShimError
 from services.errors import OtherPeerError, OutdatedError, SettingsError
@@ -250,20 +250,16 @@ def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint
 
 
 def board_endpoint(text: str, where: str, settings: Settings) -> Endpoint:
-    """Return the endpoint of a board, with the credentials of the settings if it is on TCP.
+    """Return the endpoint of a board, with the key of the settings if it is on TCP.
 
     Raises:
         SettingsError: It is not an endpoint.
-        CredentialsError: The key or the certificates cannot be used.
+        CredentialsError: The key cannot be used.
     """
     endpoint = endpoint_from(text, where)
-    if not endpoint.host:
+    if not endpoint.host or settings.key_file is None:
         return endpoint
-    credentials = Credentials(
-        key=read_key(settings.key_file) if settings.key_file is not None else b"",
-        tls=host_tls(settings.board_ca) if settings.board_ca is not None else None,
-    )
-    return replace(endpoint, credentials=credentials)
+    return replace(endpoint, key=read_key(settings.key_file))
 
 
 def own_endpoint(text: str, *, insecure: bool) -> Endpoint:

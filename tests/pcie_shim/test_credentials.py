@@ -1,4 +1,4 @@
-"""Boards over TCP: a shared key, TLS, and connections that do neither."""
+"""Boards over TCP: a shared key, and connections without it."""
 
 import socket
 from dataclasses import replace
@@ -6,29 +6,22 @@ from pathlib import Path
 
 import pytest
 
-from pcie_shim import framing, tunnel
+from pcie_shim import framing
 from pcie_shim import register_map as rm
-from pcie_shim.credentials import Credentials, board_tls, host_tls, read_key
+from pcie_shim.credentials import read_key
 from pcie_shim.endpoint import Endpoint, parse_endpoint
-from pcie_shim.errors import CredentialsError, KeyRefusedError, LinkClosedError, LinkError
+from pcie_shim.errors import CredentialsError, KeyRefusedError, LinkClosedError
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import SocketLink
-from tests.certificates import issue
 from tests.patience import PATIENCE
 from tests.pcie_shim.boards import image, machine, tcp_endpoint
 
-KEY = Credentials(key=b"sixteen-letters-at-least")
-OTHER = Credentials(key=b"sixteen-letters-and-others")
+KEY = b"sixteen-letters-at-least"
+OTHER = b"sixteen-letters-and-others"
 
 
-@pytest.fixture(scope="module")
-def certificate(tmp_path_factory):
-    tunnel._loop()  # the thread of all tunnels, which stays
-    return issue(tmp_path_factory.mktemp("tls"), "board")
-
-
-def with_credentials(text: str, credentials: Credentials) -> Endpoint:
-    return replace(parse_endpoint(text), credentials=credentials)
+def with_key(text: str, key: bytes) -> Endpoint:
+    return replace(parse_endpoint(text), key=key)
 
 
 def identity(endpoint: Endpoint) -> int:
@@ -37,7 +30,7 @@ def identity(endpoint: Endpoint) -> int:
 
 
 def test_a_host_with_the_key_uses_and_programs_the_board(start_board):
-    endpoint = with_credentials(tcp_endpoint(), KEY)
+    endpoint = with_key(tcp_endpoint(), KEY)
     start_board(endpoint)
     expected = image(machine(1))
     assert program(endpoint, expected, timeout=PATIENCE) == expected.image_hash
@@ -46,20 +39,20 @@ def test_a_host_with_the_key_uses_and_programs_the_board(start_board):
         assert link.greeting.image_hash == expected.image_hash
 
 
-@pytest.mark.parametrize(("board", "host"), [(KEY, OTHER), (KEY, Credentials()), (Credentials(), KEY)])
+@pytest.mark.parametrize(("board", "host"), [(KEY, OTHER), (KEY, b""), (b"", KEY)])
 def test_without_the_same_key_there_is_no_link(start_board, board, host):
     text = tcp_endpoint()
-    start_board(with_credentials(text, board))
+    start_board(with_key(text, board))
     with pytest.raises(KeyRefusedError):
-        identity(with_credentials(text, host))
+        identity(with_key(text, host))
     with pytest.raises(KeyRefusedError):
-        program(with_credentials(text, host), image(machine(1)), timeout=PATIENCE)
-    assert identity(with_credentials(text, board)) == rm.ID_VALUE
+        program(with_key(text, host), image(machine(1)), timeout=PATIENCE)
+    assert identity(with_key(text, board)) == rm.ID_VALUE
 
 
 def test_a_proof_does_not_fit_another_challenge(start_board):
     """A recorded answer is worth nothing, and a request without a proof ends the connection."""
-    endpoint = with_credentials(tcp_endpoint(), KEY)
+    endpoint = with_key(tcp_endpoint(), KEY)
     start_board(endpoint)
     answers = []
 
@@ -80,21 +73,6 @@ def test_a_proof_does_not_fit_another_challenge(start_board):
             assert bytes(answers[0][20:]) not in received
             assert received[3] in {framing.AUTHENTICATE, 0}
             assert b"ROSBAYES" not in received  # the greeting
-
-
-@pytest.mark.thorough
-def test_a_link_over_tls(start_board, certificate):
-    endpoint = with_credentials(tcp_endpoint().replace("tcp", "tls"), KEY)
-    start_board(replace(endpoint, credentials=replace(KEY, tls=board_tls(*certificate))))
-    host = replace(endpoint, credentials=replace(KEY, tls=host_tls(certificate[0])))
-    expected = image(machine(1, lines=600))
-    assert program(host, expected, timeout=PATIENCE) == expected.image_hash
-    for _ in range(20):  # more than the board keeps of silent ones
-        assert identity(host) == rm.ID_VALUE
-    with pytest.raises(KeyRefusedError):
-        identity(endpoint)  # the system does not trust this certificate
-    with pytest.raises(LinkError):
-        SocketLink.open(replace(host, tls=False), timeout=2)
 
 
 def test_a_silent_loader_keeps_nobody_from_programming(start_board):
@@ -121,22 +99,10 @@ def test_a_file_that_is_not_a_key(tmp_path: Path, content):
 
 def test_a_key_is_private(tmp_path: Path):
     path = tmp_path / "key"
-    path.write_bytes(KEY.key + b"\n")
+    path.write_bytes(KEY + b"\n")
     path.chmod(0o640)
     with pytest.raises(CredentialsError, match="chmod"):
         read_key(path)
     path.chmod(0o600)
-    assert read_key(path) == KEY.key
-    assert "letters" not in repr(with_credentials("tcp://localhost:7", KEY))
-
-
-@pytest.mark.thorough
-def test_files_that_are_not_certificates(tmp_path: Path, certificate):
-    nothing = tmp_path / "nothing"
-    for make in (
-        lambda: board_tls(nothing, nothing),
-        lambda: board_tls(*[certificate[1]] * 2),
-        lambda: host_tls(nothing),
-    ):
-        with pytest.raises(CredentialsError):
-            make()
+    assert read_key(path) == KEY
+    assert "letters" not in repr(with_key("tcp://localhost:7", KEY))

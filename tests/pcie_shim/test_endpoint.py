@@ -38,6 +38,12 @@ def test_other_texts_are_refused(text: str) -> None:
         parse_endpoint(text)
 
 
+def test_an_endpoint_with_tls_is_told_what_to_use_instead() -> None:
+    with pytest.raises(EndpointError, match="hosts.md") as caught:
+        parse_endpoint("tls://board-3.local:7000")
+    assert caught.value.exit_code == 2
+
+
 def test_paths_that_no_socket_takes_are_refused() -> None:
     assert parse_endpoint("unix:/" + "x" * 98).programming.path
     with pytest.raises(EndpointError):

@@ -30,8 +30,7 @@ def key(tmp_path):
     [
         (["--listen", EVERYWHERE], "--key-file"),
         (["--listen", "tcp://board.example:7000"], "--key-file"),
-        (["--listen", "tls://127.0.0.1:7000"], "--tls-cert"),
-        (["--listen", "tcp://127.0.0.1:7000", "--tls-key", "key.pem"], "--tls-cert"),
+        (["--listen", "tls://127.0.0.1:7000"], "hosts.md"),
         (["--listen", EVERYWHERE, "--key-file", "{key}"], "chmod 600"),
         (["--boards", "2", "--directory", "{open}"], "chmod 700"),
     ],
