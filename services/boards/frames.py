@@ -119,8 +119,8 @@ def decode_boards(result: FrameResult) -> list[BoardResult]:
     return _decoder.decode(result.boards)
 
 
-def result_record(number: int, output: FrameOutput, began_tick: int = 0) -> FrameResult:
-    """Return the boards' results as a record; `began_tick` is the monotonic time of the first write."""
+def result_record(number: int, output: FrameOutput) -> FrameResult:
+    """Return the boards' results as a record."""
     return FrameResult(
         number=number,
         boards=encode_boards(output.boards),
@@ -128,7 +128,6 @@ def result_record(number: int, output: FrameOutput, began_tick: int = 0) -> Fram
         compute_ns=output.compute_ns,
         reads_ns=output.reads_ns,
         boards_compute_ns=output.boards_compute_ns,
-        began_tick=began_tick,
     )
 
 

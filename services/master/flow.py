@@ -18,7 +18,7 @@ from services.errors import (
     RosbridgeLostError,
     VariableError,
 )
-from services.master.history import FrameHistory
+from services.master.latencies import Latencies
 from services.master.peers import ANSWER_TIME, Awaited, Peer, Peers
 from services.pipeline.frames import WaitingFrames
 from services.settings import Settings
@@ -92,15 +92,15 @@ class FrameFlow:
         self._show = show
         self._readings: WaitingFrames[WaitingReading] = WaitingFrames(settings.queue or deployment.queue)
         self._computing: _Computing | None = None
-        self._at_publisher = 0
+        self._at_publisher: dict[int, Publish] = {}
         self._published_at = 0.0
         self._number = 0
         self._received = 0
         self._last = (0, 0)
         self._losses: Counter[LossReason] = Counter()
         self._reported_causes: set[str] = set()
-        self.history = FrameHistory()
-        """The last frames."""
+        self.latencies = Latencies()
+        """Those of the published frames."""
         self._failures: deque[float] = deque(maxlen=RESTARTS + 1)
         self.published = 0
         self.newest: Publish | None = None
@@ -169,12 +169,10 @@ class FrameFlow:
                 self._log.debug(
                     LossReason.WITH_APP, frame=self._computing.number, _reason=LossReason.WITH_APP
                 )
-            self.history.lost(self._computing.number, LossReason.WITH_APP)
             self._computing = None
         if peer is self._peers.publisher and self._at_publisher:
-            self._losses[LossReason.WITH_PUBLISHER] += self._at_publisher
-            self.history.lost_at_publisher(LossReason.WITH_PUBLISHER)
-            self._at_publisher = 0
+            self._losses[LossReason.WITH_PUBLISHER] += len(self._at_publisher)
+            self._at_publisher.clear()
 
     def awaited(self, peer: Peer) -> Awaited | None:
         """Return the frame or the results that a peer has not answered yet."""
@@ -220,9 +218,9 @@ class FrameFlow:
         app = self._peers.app
         if self._computing is not None or not app.ready or app.protocol is None:
             return
-        if self._at_publisher >= MOST_AT_PUBLISHER or not self._peers.publisher.ready:
+        if len(self._at_publisher) >= MOST_AT_PUBLISHER or not self._peers.publisher.ready:
             return
-        if self._count is not None and self.published + self._at_publisher >= self._count:
+        if self._count is not None and self.published + len(self._at_publisher) >= self._count:
             return  # until it is known whether the results at the publisher are enough
         waiting = self._readings.get()
         if waiting is None:
@@ -230,9 +228,7 @@ class FrameFlow:
         self._number += 1
         reading, number = waiting.reading, self._number
         bank = number % self._deployment.machine.rng_banks
-        now = time.monotonic_ns()
-        self._computing = _Computing(number, waiting, now)
-        self.history.sent(number, bank, reading, (waiting.arrived, now))
+        self._computing = _Computing(number, waiting, time.monotonic_ns())
         app.protocol.send(Frame(number, reading.addresses, bank, reading.prior_codes))
         if self._follows:
             self._follow(number, bank, waiting)
@@ -270,18 +266,17 @@ class FrameFlow:
         if not self._at_publisher:
             self._published_at = time.monotonic()
         self.newest = record
-        self.history.computed(result)
-        self._at_publisher += 1  # before sending: a publisher in this process answers at once
+        self._at_publisher[result.number] = (
+            record  # before sending: a publisher in this process answers at once
+        )
         if publisher is None or not publisher.send(record):
-            self._at_publisher -= 1
+            del self._at_publisher[result.number]
             self._losses[LossReason.WITH_PUBLISHER] += 1
-            self.history.lost(result.number, LossReason.WITH_PUBLISHER)
         self._send_next()
 
     def _take_failure(self, record: FrameFailed) -> None:
         if self._computing is not None and self._computing.number == record.number:
             self._computing = None
-            self.history.lost(record.number, LossReason.FAILED, record.sentence)
         if self._once:
             self.fail(ReportedError(record.exit_code, record.sentence))
             return
@@ -303,10 +298,11 @@ class FrameFlow:
         self._send_next()
 
     def _take_outcome(self, record: Published) -> None:
-        self._at_publisher = max(0, self._at_publisher - 1)
+        publish = self._at_publisher.pop(record.number, None)
         self._published_at = time.monotonic()
-        self.history.ended(record, record.outcome)
         if record.outcome is Outcome.PUBLISHED:
+            if publish is not None:
+                self.latencies.add(publish, record)
             self.published += 1
             self._last = (record.number, time.monotonic_ns())
             self._losses[LossReason.SOME_TOPICS] += bool(record.missed)

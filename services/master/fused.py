@@ -5,7 +5,6 @@ Records are passed by calls instead of over local sockets. Boards remain separat
 
 import asyncio
 import threading
-import time
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from typing import Any, TypeVar, cast
@@ -83,7 +82,6 @@ class FusedBoards:
         self._link = link(self._take)
         self._number: int | None = None  # that of the posted frame
         self._next_frame: Frame | None = None  # it waits for the search of lost boards
-        self._began = 0
         self._watched: int | None = None
         self._loop = asyncio.get_running_loop()
         self._looking: asyncio.Task[None] | None = None
@@ -139,7 +137,6 @@ class FusedBoards:
 
     def _start(self, record: Frame) -> None:
         self._progress.asked += 1
-        self._began = time.monotonic_ns()
         try:
             self._boards.post(record)
         except BoardError as error:
@@ -179,7 +176,7 @@ class FusedBoards:
             return
         self._number = None
         self._progress.computed(number, output)
-        self._link.send(result_record(number, output, self._began))
+        self._link.send(result_record(number, output))
         if self._number is None:  # sending may have brought the next frame
             self._start_next_frame()
 

@@ -72,7 +72,6 @@ class Master:
             peers.prepare()
             run_directory = settings.run_directory or peers.directory
             more: dict[str, Any] = {}
-            history = self._flow.history
             if run_directory is not None:
                 watch = ChildrenWatch(peers, run_directory)
                 self._begin_task(watch.run())
@@ -82,7 +81,7 @@ class Master:
                 ROLE,
                 self.status,
                 metrics=settings.metrics,
-                stages=history.latencies,
+                stages=self._flow.latencies.summary,
                 **more,
             )
             await sockets.enter_async_context(report)

@@ -203,14 +203,13 @@ class PcieApp:
     def _compute(self, frame: Frame) -> None:
         progress = self._progress
         progress.asked += 1
-        began = time.monotonic_ns()
         try:
             output = self._boards.run(frame)
         except BoardError as error:
             progress.failed += 1
             self._send(frame_failed(frame.number, error))
         else:
-            self._send(result_record(frame.number, output, began))
+            self._send(result_record(frame.number, output))
             progress.computed(frame.number, output)
 
     def _recover_boards(self) -> None:

@@ -181,7 +181,6 @@ class ResultTopics:
             total_ns=now - publish.received_tick,
             missed=missed,
             out_ns=self._previous_out_ns,
-            boards=[(board.cycles, board.reason.value) for board in inference.boards],
         )
 
     async def publish_array(self, values: Any) -> None:

@@ -147,8 +147,7 @@ class Frame(Record, tag="frame", frozen=True):
 class FrameResult(Record, tag="result", frozen=True):
     """pcie-app to master: the results of the boards, and durations.
 
-    `boards` is a list of `pcie_shim.host.frame.BoardResult`, which only its sender and the publisher read;
-    `began_tick` is the begin of the register writes.
+    `boards` is a list of `pcie_shim.host.frame.BoardResult`, which only its sender and the publisher read.
     """
 
     number: int
@@ -157,7 +156,6 @@ class FrameResult(Record, tag="result", frozen=True):
     compute_ns: int
     reads_ns: int
     boards_compute_ns: int
-    began_tick: int = 0
 
 
 class FrameFailed(Record, tag="failed", frozen=True):
@@ -186,8 +184,7 @@ class Published(Record, tag="published", frozen=True):
 
     `seen` is whether it was seen on the wire (None if that was not checked). `best_line` has `best_probability`;
     `total_ns` is the time from the reading's receipt to the result's sending. `missed` counts the outputs, of several,
-    whose servers were away. `out_ns` is the duration of publishing, `boards` has the cycles and the stop
-    reason of each board.
+    whose servers were away. `out_ns` is the duration of publishing.
     """
 
     number: int
@@ -199,7 +196,6 @@ class Published(Record, tag="published", frozen=True):
     total_ns: int
     missed: int = 0
     out_ns: int = 0
-    boards: list[tuple[int, int]] = []
 
 
 AnyRecord = (

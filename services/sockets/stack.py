@@ -46,13 +46,6 @@ class Found(NamedTuple):
     run: Path | None
     others: list[Path]
 
-    @property
-    def only_run(self) -> Path:
-        """The run, or a SettingsError if there is none."""
-        if self.run is None:
-            raise no_run_error()
-        return self.run
-
 
 def run_directories() -> list[Path]:
     """Return the private directories of this user's processes, alive or dead, sorted by name."""
