@@ -1,4 +1,11 @@
-"""One round of a campaign: a stack that is subjected to one fault after the other, and judged after each."""
+"""One round of a campaign: a stack that is subjected to one fault after the other, and judged after each.
+
+    start ─▶ recover ─▶ settle ─▶ calm ─┬▶ inject a step's faults ─▶ recover ─▶ settle ─▶ calm ─┐
+                                        └──────────────────────────────────────────────────────┘
+
+`recover` waits for the result of a reading published from then on, `settle` until nothing is in flight, and then judges
+the counters; `calm` wants results without a fault, and settles strictly.
+"""
 
 from __future__ import annotations
 
@@ -6,28 +13,22 @@ import asyncio
 import contextlib
 import random
 import time
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
 
-from scripts.campaigning.containers import ContainerStack, EngineError
+from scripts.campaigning.accounts import ROSBRIDGE_AWAY, Counters, Excuses, Overdue, in_transit, judge
+from scripts.campaigning.connections import REPORTS, Client
+from scripts.campaigning.expected import POOL, Addresses, Outcome, addresses_of
 from scripts.campaigning.faults import Kind, Step, excuses_of
-from scripts.campaigning.injection import Injector, steppable_clock
-from scripts.campaigning.judging.accounts import Counters, Excuses, Overdue, in_transit, judge
-from scripts.campaigning.judging.expected import Addresses, Outcome, UnusableError, addresses_of
-from scripts.campaigning.judging.measures import Recovery, RoundResult
-from scripts.campaigning.judging.observer import Finding, Flaw, Observer
+from scripts.campaigning.injection import Injector
+from scripts.campaigning.observer import Finding, Flaw, Observer
 from scripts.campaigning.stack import NotThereError, Stack, Topology
-from scripts.campaigning.wire import REPORTS, Client, now
 from scripts.running.patience import FACTOR
 
-POOL = (
-    *((0, 0), (2, 1), (3, 2), (5, 3), (6, 4), (3, None), (None, 2), (None, None)),
-    *((4, 1), (5, 1), (6, 1), (0, 3)),  # sensors that contradict each other need several slices
-)
-"""Number of different readings in a campaign; few, because the reference kernel is slow."""
 _ANSWER = 0.1 * FACTOR
 """Seconds to wait for a result during a fault before the next reading is published."""
 _ANSWER_LIMIT = 10.0 * FACTOR
@@ -41,6 +42,26 @@ _SETTLE_LIMIT = 30.0 * FACTOR
 _QUIET = 0.6 * FACTOR
 """Seconds without a change after which nothing is in flight any more."""
 _stamps = count(time.time_ns() // 10**9 * 10**9, 1_000_000)
+now = time.monotonic
+"""The campaign's clock, in seconds."""
+
+
+@dataclass(slots=True)
+class RoundResult:
+    """The findings and measurements of a round."""
+
+    findings: list[Finding] = field(default_factory=list)
+    frames: int = 0
+    readings: int = 0
+    steps: int = 0
+    """Number of steps that were taken; the last one led to the findings."""
+    losses: Counter[str] = field(default_factory=Counter)
+    """Counted losses, and readings and results that were between two processes when they were cut."""
+    recoveries: list[tuple[float, str]] = field(default_factory=list)
+    """Seconds until results arrived again after a step's end, which are only reported, and the step."""
+    resources: dict[tuple[str, int], list[tuple[int, int, int]]] = field(default_factory=dict)
+    """By role and process: frames so far, resident KiB and descriptors."""
+    words: str = ""
 
 
 class Round:
@@ -50,49 +71,41 @@ class Round:
         self,
         folder: Path,
         topology: Topology,
-        deployments: list[Path],
-        expected: Callable[[str, Addresses, int], Outcome],
+        deployment: Path,
+        expected: Callable[[Addresses, int], Outcome],
         seed: int,
         *,
         calm_frames: int,
     ) -> None:
         """Store an empty folder, and the number of frames to compute between two steps."""
-        rng = random.Random(seed)
-        self._rng = rng
-        self._folder = folder
+        self._rng = random.Random(seed)
+        self._topology = topology
         self._calm_frames = calm_frames
-        self.stack = (
-            ContainerStack(folder, deployments[0], rng)
-            if topology is Topology.CONTAINERS
-            else Stack(folder, topology, deployments[0], rng)
-        )
-        self.observer = Observer(expected, deployments[0].name)
-        self._injector = Injector(self.stack, folder, publish=self._special)
+        self.stack = Stack(folder, topology, deployment, self._rng)
+        self.observer = Observer(expected)
+        self._injector = Injector(self.stack, topology, folder / "clock", self._special)
         self._client = Client(self.stack.hub_port, self._take, self.observer.reconnected)
         self._result = RoundResult()
+        # The master's counters when they were last judged, and what was missing then.
         self._base = Counters()
-        self._arrived = now()
-        self._master = 0
-        self._news = asyncio.Event()
-        self._paused = False
-        self._driving = True
-        self._last: Addresses = ()
         self._overdue = Overdue()
+        # Set by each message to the observer, which came at this time.
+        self._news = asyncio.Event()
+        self._arrived = now()
+        # While it is True, `_drive` does not publish.
+        self._paused = False
+        self._last: Addresses = ()
 
     # --- readings and results ------------------------------------------------------------------
 
     def _take(self, topic: str, message: Any) -> None:
         self._arrived = now()
-        (self.observer.report if topic == REPORTS else self.observer.result)(message, now())
+        (self.observer.report if topic == REPORTS else self.observer.result)(message)
         self._news.set()
 
-    async def _publish(self, values: dict[str, object], stamp: int) -> bool:
-        try:
-            addresses = addresses_of(values)
-        except UnusableError:
-            addresses = None
-        self.observer.published(stamp, addresses, now())
-        return await self._client.publish(stamp, values)
+    async def _publish(self, values: dict[str, object], stamp: int) -> None:
+        self.observer.published(stamp, addresses_of(values), now())
+        await self._client.publish(stamp, values)
 
     def _reading(self) -> dict[str, object]:
         while (near_far := self._rng.choice(POOL)) == self._last:
@@ -102,7 +115,7 @@ class Round:
 
     async def _drive(self) -> None:
         """Publish readings, each after the result of the previous one has arrived or is late."""
-        while self._driving:
+        while True:
             if self._paused or not self._client.connected.is_set():
                 await asyncio.sleep(0.01)
                 continue
@@ -114,11 +127,11 @@ class Round:
                     break
                 await self._some_news()
 
-    async def _some_news(self, seconds: float = _ANSWER) -> None:
-        """Wait some seconds for a message to the observer."""
+    async def _some_news(self) -> None:
+        """Wait a moment for a message to the observer."""
         self._news.clear()
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
+            async with asyncio.timeout(_ANSWER):
                 await self._news.wait()
 
     async def _special(self, what: str, number: int) -> None:
@@ -143,27 +156,25 @@ class Round:
     async def run(self, steps: list[Step]) -> RoundResult:
         """Run all steps, or up to the first one with findings."""
         result, observer = self._result, self.observer
-        if any(fault.kind == Kind.CLOCK for step in steps for fault in step):
-            self.stack.environment |= steppable_clock(self._folder)
+        if any(fault.kind is Kind.CLOCK for step in steps for fault in step):
+            self.stack.environment |= self._injector.steppable_clock()
         driver = None
         try:
             await self.stack.start(observer.forwarded)
             await self._client.start()
             driver = asyncio.create_task(self._drive())
             observer.fault()
-            await self._recover("start", noted=False)
-            await self._settle(Excuses(readings=True, results=True, until=now()))
+            await self._recover("start")
+            await self._settle(Excuses(frozenset({ROSBRIDGE_AWAY}), readings=True, results=True, until=now()))
             await self._calm()
-            steps = [] if observer.findings else steps
-            for number, step in enumerate(steps):
-                await self._take_step(step)
+            for step in steps:
                 if observer.findings:
-                    result.failed_step = number
                     break
-        except (NotThereError, EngineError) as error:
-            observer.findings.append(Finding(Flaw.ENDED, str(error), now()))
+                result.steps += 1
+                await self._take_step(step)
+        except NotThereError as error:
+            observer.find(Flaw.ENDED, str(error))
         finally:
-            self._driving = False
             if driver is not None:
                 driver.cancel()
                 await asyncio.gather(driver, return_exceptions=True)
@@ -172,67 +183,57 @@ class Round:
                 result.words = self.stack.last_words()
             await self.stack.end()
         result.findings = observer.findings
-        result.frames, result.readings = observer.tally["results"], observer.tally["readings"]
+        result.frames, result.readings = observer.results, observer.readings
         return result
 
     async def _take_step(self, step: Step) -> None:
         name = " + ".join(map(str, step))
         self.observer.fault()
-        results = await asyncio.gather(
-            *(self._injector.inject(fault) for fault in step), return_exceptions=True
-        )
-        for error in results:
-            if isinstance(error, BaseException):
+        outcomes = await asyncio.gather(*map(self._injector.inject, step), return_exceptions=True)
+        for error in outcomes:
+            if error is not None:
                 raise error
         if "master" in await self._injector.restart():
-            self._begin_master()
-        await self._recover(name, noted=True)
-        excuses = replace(excuses_of(step, self.stack.topology), until=now())
+            self._base = Counters()
+            self.observer.master_started()
+        begun = now()
+        await self._recover(name)
+        self._result.recoveries.append((now() - begun, name))
         self.observer.calm()
-        await self._settle(excuses)
+        await self._settle(excuses_of(step, self._topology, until=now()))
         await self._calm()
 
-    def _begin_master(self) -> None:
-        self._base = Counters()
-        self.observer.master_started(self.stack.deployment.name)
-
-    async def _recover(self, name: str, *, noted: bool) -> None:
+    async def _recover(self, name: str) -> None:
         """Wait for the result of a reading that is published from now on."""
-        begun = now()
-        first = self.observer.tally["readings"]
+        begun, first = now(), self.observer.readings
         while not self.observer.has_result_since(first):
             if now() - begun > _RECOVERY_LIMIT:
-                self._find(Flaw.SILENT, f"no result {_RECOVERY_LIMIT:.0f} s after: {name}")
+                self.observer.find(Flaw.SILENT, f"no result {_RECOVERY_LIMIT:.0f} s after: {name}")
                 return
             if self.stack.is_over("master"):
                 words = await self.stack.wait("master")
-                self._find(Flaw.ENDED, f"the master ended after: {name}: {words}")
+                self.observer.find(Flaw.ENDED, f"the master ended after: {name}: {words}")
                 return
             await self._some_news()
-        if noted:
-            self._result.recoveries.append(Recovery(name, now() - begun))
-
-    def _find(self, flaw: Flaw, sentence: str) -> None:
-        self.observer.findings.append(Finding(flaw, sentence, now()))
 
     async def _settle(self, excuses: Excuses) -> None:
         """Stop publishing until nothing is in flight, and compare the counters with the published readings."""
         self._paused = True
-        strict = Excuses(overdue=self._overdue)
         excuses = replace(excuses, overdue=self._overdue)
+        strict = replace(excuses, readings=False, results=False)
         try:
             deadline, changed = now() + _SETTLE_LIMIT + _QUIET, now()
             last: object = None
             while True:
                 counters = await self.stack.counters()
-                state = counters, self.observer.tally["results"], self.observer.given
+                readings = self.observer.pending_readings()
+                state = counters, self.observer.results, sum(each.forwarded for each in readings)
                 if state != last:
                     last, changed = state, now()
                 if counters is not None:
                     added = counters.since(self._base)
-                    readings = self.observer.pending_readings()
-                    findings = judge(added, readings, excuses, now())
-                    if not judge(added, readings, strict, now()):
+                    findings = judge(added, readings, excuses)
+                    if not judge(added, readings, strict):
                         break
                     if (not findings and now() - changed > _QUIET) or now() > deadline:
                         break
@@ -240,39 +241,28 @@ class Round:
                     return  # the master has ended, which is a separate finding
                 await asyncio.sleep(0.02)
             self.observer.findings += findings
-            self._overdue = cut = in_transit(added, readings, self._overdue)
-            self._result.transit = (
-                self._result.transit[0] + cut.uncounted,
-                self._result.transit[1] + cut.astray,
-            )
-            self.observer.settle()
+            self._overdue = cut = in_transit(added, readings, excuses)
             self._base = counters
-            for reason, number in added.lost.items():
-                self._result.losses[reason] = self._result.losses.get(reason, 0) + number
+            self.observer.settle()
+            self._result.losses.update(added.lost)
+            self._result.losses.update({"readings cut off": cut.uncounted, "results cut off": cut.astray})
         finally:
             self._paused = False
 
     async def _calm(self) -> None:
-        """Compute frames without faults, and then settle strictly."""
-        self.observer.calm()
-        wanted = self.observer.tally["results"] + self._calm_frames
+        """Compute frames without faults, settle strictly, and sample the processes' resources."""
+        observer = self.observer
+        observer.calm()
+        wanted = observer.results + self._calm_frames
         deadline = now() + _RECOVERY_LIMIT + self._calm_frames * _CALM_LIMIT
-        while self.observer.tally["results"] < wanted and now() < deadline and not self.observer.findings:
+        while observer.results < wanted and now() < deadline and not observer.findings:
             await self._some_news()
-        if self.observer.tally["results"] < wanted and not self.observer.findings:
-            done = self._calm_frames - wanted + self.observer.tally["results"]
-            last = now() - self._arrived
-            self._find(
+        if observer.results < wanted and not observer.findings:
+            observer.find(
                 Flaw.SILENT,
-                f"{done} of {self._calm_frames} results without a fault, the last one {last:.1f} s ago; "
-                f"counted: {await self.stack.counters()}",
+                f"{self._calm_frames - wanted + observer.results} of {self._calm_frames} results without a fault, "
+                f"the last one {now() - self._arrived:.1f} s ago; counted: {await self.stack.counters()}",
             )
         await self._settle(Excuses())
-        await self._sample()
-
-    async def _sample(self) -> None:
-        for role in self.stack.roles:
-            pid = await self.stack.pid(role)
-            if pid and (used := self.stack.resources(pid)):
-                samples = self._result.resources.setdefault((role, pid), [])
-                samples.append((self.observer.tally["results"], *used))
+        for process, used in (await self.stack.resources()).items():
+            self._result.resources.setdefault(process, []).append((observer.results, *used))

@@ -14,10 +14,9 @@ from collections.abc import AsyncIterator, Callable
 from enum import StrEnum
 from pathlib import Path
 
-from scripts.campaigning.judging.accounts import Counters
-from scripts.campaigning.judging.expected import BOARDS
-from scripts.campaigning.proxy import Proxy
-from scripts.campaigning.wire import process_status
+from scripts.campaigning.accounts import Counters
+from scripts.campaigning.connections import Proxy, process_status
+from scripts.campaigning.expected import BOARDS
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
 from scripts.running.processes import Process
 
@@ -42,8 +41,6 @@ class Topology(StrEnum):
     APART = "apart"
     """The campaign starts services and boards; proxies stand between all parts."""
     FUSED_APART = "fused, boards apart"
-    CONTAINERS = "containers"
-    """Everything runs in containers of the compose file; only with `--topology`, because it needs the engine."""
 
     @property
     def fused(self) -> bool:
@@ -55,13 +52,19 @@ class Topology(StrEnum):
         """True if the campaign starts the boards, instead of the master."""
         return self in {Topology.APART, Topology.FUSED_APART}
 
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """All roles that are processes in this topology."""
+        services = () if self.fused else SERVICES
+        parent = () if self.apart else (BOARDS_PARENT,)
+        return ("hub", *parent, *BOARD_NAMES, *services, "master")
 
-def _parent(pid: int) -> int:
-    """Return the parent of a process; 0 if it has ended."""
-    try:
-        return int(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[1])
-    except OSError:
-        return 0
+    @property
+    def own_parts(self) -> tuple[str, ...]:
+        """Roles whose processes the campaign starts, in order."""
+        boards = BOARD_NAMES if self.apart else ()
+        services = SERVICES if self is Topology.APART else ()
+        return ("hub", *boards, *services, "master")
 
 
 class NotThereError(Exception):
@@ -82,46 +85,34 @@ class Stack:
     """A run of the stack in its own folder.
 
     Attributes:
+        environment: Variables of all processes.
         hub_port: Port of the hub itself, for the campaign's own client.
-        proxied_port: Port of the hub for the stack.
         links: Proxies by name: `rosbridge`, and each service and board if the campaign starts them.
-        expected_ends: Roles whose processes were asked to end or were killed.
     """
 
     def __init__(self, folder: Path, topology: Topology, deployment: Path, rng: random.Random) -> None:
-        """Store an empty folder with a short path, and the first deployment."""
+        """Store an empty folder with a short path, and the deployment."""
         self._folder = folder
-        self.topology = topology
-        self.deployment = deployment
-        self.environment = {name: f"{limit:g}" for name, limit in PRODUCT_LIMITS.items()}
-        self._parts: dict[str, Process] = {}
+        self._topology = topology
+        self._deployment = deployment
         self._runs = folder / "run"
-        self.hub_port, self.proxied_port = free_port(), free_port()
-        self._uri = f"ws://127.0.0.1:{self.proxied_port}"
-        self.links = {"rosbridge": Proxy(self.proxied_port, self.hub_port, rng)}
         self._runs.mkdir(mode=0o700, parents=True)
         (folder / "tmp").mkdir(mode=0o700)
+        self.environment = {name: f"{limit:g}" for name, limit in PRODUCT_LIMITS.items()}
+        self.environment |= {"BM_RUN_DIRECTORY": str(self._runs), "TMPDIR": str(folder / "tmp")}
+        # The newest process of each of `own_parts`, and the number of all starts, which numbers their logs.
+        self._parts: dict[str, Process] = {}
+        self._starts = 0
+        self.hub_port, proxied_port = free_port(), free_port()
+        self._uri = f"ws://127.0.0.1:{proxied_port}"
+        self.links = {"rosbridge": Proxy(proxied_port, self.hub_port, rng)}
         for name in SERVICES if topology is Topology.APART else ():
             self.links[name] = Proxy(str(folder / f"{name}.sock"), str(folder / f"real-{name}.sock"), rng)
+        # By board, the ports of its proxy and of the board itself; the next port is that for programming.
         self._board_ports = {name: (free_port(), free_port()) for name in BOARD_NAMES if topology.apart}
         for name, (outer, inner) in self._board_ports.items():
             self.links[name] = Proxy(outer, inner, rng)
             self.links[f"{name} programming"] = Proxy(outer + 1, inner + 1, rng)
-        self._starts = 0
-
-    @property
-    def own_parts(self) -> tuple[str, ...]:
-        """Roles whose processes the campaign starts, in order."""
-        boards = BOARD_NAMES if self.topology.apart else ()
-        services = SERVICES if self.topology is Topology.APART else ()
-        return ("hub", *boards, *services, "master")
-
-    @property
-    def roles(self) -> tuple[str, ...]:
-        """All roles that are processes in this topology."""
-        services = () if self.topology.fused else SERVICES
-        parent = () if self.topology.apart else (BOARDS_PARENT,)
-        return ("hub", *parent, *BOARD_NAMES, *services, "master")
 
     async def start(self, on_reading: Callable[[int], None]) -> None:
         """Start everything, but do not wait until the master is ready.
@@ -132,14 +123,14 @@ class Stack:
         self.links["rosbridge"].on_reading = on_reading
         for link in self.links.values():
             await link.start()
-        for role in self.own_parts:
+        for role in self._topology.own_parts:
             await self.start_part(role)
 
     def _command(self, role: str, misbehave: str) -> list[str]:
-        deployment, folder = ["-d", str(self.deployment)], self._folder
+        deployment, folder = ["-d", str(self._deployment)], self._folder
         rosbridge = ["--uri", self._uri, "--connect-timeout", f"{60 * FACTOR:g}", "--ros-version", "1"]
         outside = [f"tcp://127.0.0.1:{outer}" for outer, _ in self._board_ports.values()]
-        boards = ["--boards", ",".join(outside)]
+        boards = ["--boards", ",".join(outside)] if outside else []
         limits = ["--board-timeout", f"{BOARD_TIMEOUT:g}"]
         listen = ["--listen", f"unix:{folder}/real-{role}.sock"]
         if role == "hub":
@@ -153,13 +144,12 @@ class Stack:
         if role in SERVICES:
             return [role, *deployment, *listen, *rosbridge]
         master = ["master", "--loop", *deployment, *rosbridge, *limits]
-        if self.topology is Topology.APART:
+        if self._topology is Topology.APART:
             return [*master, "--connect", str(folder)]
-        fused = ["--fused"] if self.topology.fused else []
-        return [*master, *fused, *(boards if self.topology.apart else [])]
+        return [*master, *(["--fused"] if self._topology.fused else []), *boards]
 
     async def start_part(self, role: str, misbehave: str = "") -> None:
-        """Start a process that the campaign supervises, and wait until it is ready if it is a server.
+        """Start a process of the campaign's own, and wait until it is ready if it is a server.
 
         Raises:
             NotThereError: It does not become ready.
@@ -167,8 +157,7 @@ class Stack:
         self._starts += 1
         process = Process(role, self._folder / f"{self._starts:03}-{role}.log")
         command = self._command(role, misbehave)
-        variables = {"BM_RUN_DIRECTORY": str(self._runs), "TMPDIR": str(self._folder / "tmp")}
-        settings = [f"{name}={value}" for name, value in {**variables, **self.environment}.items()]
+        settings = [f"{name}={value}" for name, value in self.environment.items()]
         program = str(Path(sys.executable).with_name(command[0]))
         await process.start(shutil.which("env") or "env", *settings, program, *command[1:])
         self._parts[role] = process
@@ -180,17 +169,12 @@ class Stack:
                 raise NotThereError(f"{role} did not come up: {error}") from error
 
     def is_over(self, role: str) -> bool:
-        """Return whether a process that the campaign supervises has ended."""
+        """Return whether a process of the campaign's own has ended."""
         process = self._parts.get(role)
-        if process is None or not process.pid:
-            return True
-        try:
-            return Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
-        except OSError:
-            return True
+        return process is None or not process.pid or (_stat(process.pid) or "Z")[0] == "Z"
 
     async def wait(self, role: str) -> str:
-        """Wait for the end of a process that the campaign supervises, and return its exit code and last line."""
+        """Wait for the end of a process of the campaign's own, and return its exit code and last line."""
         try:
             async with asyncio.timeout(END_LIMIT):
                 code = await self._parts[role].wait()
@@ -199,8 +183,8 @@ class Stack:
         return str(self._parts[role].failure(code)) if code else "exit code 0"
 
     async def forget_run(self) -> None:
-        """Wait until the children of a killed master have ended, and remove their status sockets."""
-        left = [role for role in (*SERVICES, *BOARD_NAMES) if role not in self.own_parts]
+        """Wait until the children of a killed master have ended."""
+        left = set(self._topology.roles) - {*self._topology.own_parts, BOARDS_PARENT}
         deadline = asyncio.get_running_loop().time() + END_LIMIT
         while asyncio.get_running_loop().time() < deadline:
             if not [role for role in left if await self.status(role) is not None]:
@@ -213,29 +197,21 @@ class Stack:
             return 0 if self.is_over(role) else self._parts[role].pid
         status = await self.status(BOARD_NAMES[0] if role == BOARDS_PARENT else role)
         pid = 0 if status is None else int(str(status["pid"]))
-        return _parent(pid) if role == BOARDS_PARENT and pid else pid
+        return int((_stat(pid) or "Z 0").split()[1]) if role == BOARDS_PARENT and pid else pid
 
     async def kill(self, role: str) -> bool:
         """Kill a role's process, and return whether it was found."""
-        return self._signal(await self.pid(role), signal.SIGKILL)
+        return _signal(await self.pid(role), signal.SIGKILL)
 
     @contextlib.asynccontextmanager
     async def paused(self, role: str) -> AsyncIterator[None]:
         """Stop a role's process within the context, if it is found."""
         pid = await self.pid(role)
-        self._signal(pid, signal.SIGSTOP)
+        _signal(pid, signal.SIGSTOP)
         try:
             yield
         finally:
-            self._signal(pid, signal.SIGCONT)
-
-    @staticmethod
-    def _signal(pid: int, number: signal.Signals) -> bool:
-        with contextlib.suppress(ProcessLookupError):
-            if pid:
-                os.kill(pid, number)
-                return True
-        return False
+            _signal(pid, signal.SIGCONT)
 
     async def status(self, role: str) -> dict[str, object] | None:
         """Return the status of a process; None if it does not answer."""
@@ -249,13 +225,14 @@ class Stack:
             return None
         return Counters(frames["received"], frames["completed"], frames["lost"])
 
-    def resources(self, pid: int) -> tuple[int, int] | None:
-        """Return a process's resident memory in KiB and its open descriptors; None if it has ended."""
-        try:
-            pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-            return pages * os.sysconf("SC_PAGE_SIZE") // 1024, len(list(Path(f"/proc/{pid}/fd").iterdir()))
-        except (OSError, IndexError):
-            return None
+    async def resources(self) -> dict[tuple[str, int], tuple[int, int]]:
+        """Return the resident memory in KiB and the open descriptors of each process, by role and PID."""
+        found = {}
+        for role in self._topology.roles:
+            if pid := await self.pid(role):
+                with contextlib.suppress(OSError):
+                    found[role, pid] = used_by(pid)[1:]
+        return found
 
     def last_words(self) -> str:
         """Return the last lines of all logs, for a finding."""
@@ -266,9 +243,33 @@ class Stack:
 
     async def end(self) -> None:
         """End everything."""
-        for role in reversed(self.own_parts):
+        for role in reversed(self._topology.own_parts):
             if role in self._parts:
                 with contextlib.suppress(ProcessLookupError):
                     await self._parts[role].end()
         for link in self.links.values():
             await link.end()
+
+
+def used_by(pid: int) -> tuple[int, int, int]:
+    """Return a process's bytes of address space, KiB in memory, and descriptors; raise an OSError if it has ended."""
+    size, resident = (
+        int(n) * os.sysconf("SC_PAGE_SIZE") for n in Path(f"/proc/{pid}/statm").read_text().split()[:2]
+    )
+    return size, resident // 1024, len(list(Path(f"/proc/{pid}/fd").iterdir()))
+
+
+def _stat(pid: int) -> str:
+    """Return the state and the parent of a process and more, as in /proc; empty if it has ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].strip()
+    except OSError:
+        return ""
+
+
+def _signal(pid: int, number: signal.Signals) -> bool:
+    with contextlib.suppress(ProcessLookupError):
+        if pid:
+            os.kill(pid, number)
+            return True
+    return False

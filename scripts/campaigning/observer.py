@@ -8,16 +8,16 @@ flight (`accounts.py`).
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from scripts.campaigning.judging.expected import BANKS, BOARDS, LINES, Addresses, Outcome
+from scripts.campaigning.expected import BANKS, BOARDS, LINES, Addresses, Outcome
 
 REMEMBERED = 20_000
 """Readings by which a repeated result is recognised."""
+DEPLOYMENT = "campaign"
 LAYOUT = {"dim": [{"label": "x", "size": LINES, "stride": LINES}], "data_offset": 0}
 
 
@@ -38,6 +38,8 @@ class Flaw(StrEnum):
     """A report that announced a result which did not follow, although nothing cut the connection."""
     UNCOUNTED = "lost without being counted"
     MISCOUNTED = "counted, but not lost"
+    UNEXPLAINED = "lost without a cause"
+    """Counted under a reason that no fault in force explains."""
     SILENT = "no results"
     """No result came within a generous limit."""
     ENDED = "ended"
@@ -48,22 +50,32 @@ class Flaw(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A flaw that was found, and its time (seconds of the campaign's clock)."""
+    """A flaw that was found."""
 
     flaw: Flaw
     sentence: str
-    at: float
 
 
 @dataclass(slots=True)
 class Reading:
-    """A published reading: its index, its addresses, its time of publication, and its result's arrival."""
+    """A published reading.
+
+    Attributes:
+        index: Its place among all readings.
+        addresses: Its addresses; None if it is unusable.
+        published: Time of its publication, in seconds of the campaign's clock.
+        crowded: Whether the reading before it had no result yet, so that one may replace the other.
+        forwarded: Whether all its bytes have been sent to the stack.
+        arrived: Whether its result has come.
+        settled: Whether it is included in counters that were judged.
+    """
 
     index: int
     addresses: Addresses | None
     published: float
+    crowded: bool = False
     forwarded: bool = False
-    arrived: float | None = None
+    arrived: bool = False
     settled: bool = False
 
 
@@ -71,54 +83,52 @@ class Reading:
 class _Announced:
     """The contents of a report about the result that follows it."""
 
-    stamp: int
     number: int
     outcome: Outcome | None
     reading: Reading | None
 
 
 class Observer:
-    """Judges results in the order of their arrival.
+    """Judges results in the order of their arrival."""
 
-    Attributes:
-        findings: Everything wrong so far.
-        in_fault: Whether a fault has begun and not ended.
-        tally: Numbers of readings, results and unusable readings.
-    """
-
-    def __init__(self, expected: Callable[[str, Addresses, int], Outcome], deployment: str) -> None:
-        """Store the function from deployment, addresses and bank to the correct outcome, and the deployment."""
+    def __init__(self, expected: Callable[[Addresses, int], Outcome]) -> None:
+        """Store the function from addresses and bank to the correct outcome."""
         self._expected = expected
-        self._deployment = deployment
+        # All readings by stamp, except the oldest settled ones.
         self._readings: dict[int, Reading] = {}
+        # The reading published last; None after `settle`, when no reading is in flight.
+        self._previous: Reading | None = None
+        # The report without its result so far. A connection that was restored forgets it.
         self._announced: _Announced | None = None
+        # Of the current master, which numbers frames from 1, and of all results.
         self._last_number = 0
         self._last_index = -1
-        self.in_fault = False
+        # False from the beginning of a fault until the counters were judged after its end.
         self._undisturbed = True
+        self.in_fault = False
         self.findings: list[Finding] = []
-        self.tally: Counter[str] = Counter()
+        self.readings = self.results = 0
 
     # --- called by the campaign ----------------------------------------------------------------
 
     def published(self, stamp: int, addresses: Addresses | None, now: float) -> None:
         """Record a published reading with its stamp in ns; `addresses` is None for an unusable one."""
         assert stamp not in self._readings
-        self._readings[stamp] = Reading(self.tally["readings"], addresses, now)
-        self.tally["readings"] += 1
+        crowded = self._previous is not None and not self._previous.arrived
+        self._previous = self._readings[stamp] = Reading(self.readings, addresses, now, crowded)
+        self.readings += 1
 
     def forwarded(self, stamp: int) -> None:
         """Record that all bytes of a reading have been sent to the stack."""
         if (reading := self._readings.get(stamp)) is not None:
             reading.forwarded = True
 
-    def master_started(self, deployment: str) -> None:
+    def master_started(self) -> None:
         """Record a new master, whose frame numbers begin again."""
-        self._deployment = deployment
         self._last_number = 0
         self._announced = None
         for reading in self.pending_readings():  # the former master counted them, and its counters are gone
-            reading.settled = reading.arrived is not None
+            reading.settled = reading.arrived
 
     def fault(self) -> None:
         """Record the beginning of a fault."""
@@ -135,16 +145,11 @@ class Observer:
 
     def seen(self, stamp: int) -> bool:
         """Return whether the result of a reading has arrived."""
-        return stamp in self._readings and self._readings[stamp].arrived is not None
+        return stamp in self._readings and self._readings[stamp].arrived
 
     def has_result_since(self, index: int) -> bool:
         """Return whether a result has arrived of a reading with this index or a later one."""
         return self._last_index >= index
-
-    @property
-    def given(self) -> int:
-        """Return the unsettled readings that were sent to the stack."""
-        return sum(each.forwarded for each in self.pending_readings())
 
     def pending_readings(self) -> list[Reading]:
         """Return the readings since the last `settle`, and older ones that had not reached the stack then."""
@@ -153,65 +158,54 @@ class Observer:
     def settle(self) -> None:
         """Record that nothing is in flight, and remove old readings."""
         self._undisturbed = not self.in_fault
+        self._previous = None
         for reading in self.pending_readings():
             reading.settled = reading.forwarded
-        newest = self.tally["readings"] - REMEMBERED
+        newest = self.readings - REMEMBERED
         self._readings = {stamp: each for stamp, each in self._readings.items() if each.index >= newest}
+
+    def find(self, flaw: Flaw, sentence: str) -> None:
+        """Record a flaw."""
+        self.findings.append(Finding(flaw, sentence))
 
     # --- received messages ---------------------------------------------------------------------
 
-    def report(self, message: Any, now: float) -> None:
+    def report(self, message: Any) -> None:
         """Judge a message of `/bm/frame`."""
         if self._announced is not None and self._undisturbed:
-            self._find(Flaw.WITHOUT_RESULT, f"frame {self._announced.number} has no result", now)
+            self.find(Flaw.WITHOUT_RESULT, f"frame {self._announced.number} has no result")
         self._announced = None
         try:
-            self._announced = self._read_report(message, now)
+            self._announced = self._read_report(message)
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            self._find(Flaw.MALFORMED, f"/bm/frame: {error!r}", now)
+            self.find(Flaw.MALFORMED, f"/bm/frame: {error!r}")
 
-    def result(self, message: Any, now: float) -> None:
+    def result(self, message: Any) -> None:
         """Judge a message of `/BMresults`, which belongs to the report before it."""
-        self.tally["results"] += 1
+        self.results += 1
         announced, self._announced = self._announced, None
         if announced is None:
-            self._find(Flaw.UNREPORTED, "a result without a report", now)
+            self.find(Flaw.UNREPORTED, "a result without a report")
             return
         try:
-            data = self._data(message)
+            data = _posterior(message)
         except (KeyError, TypeError, ValueError) as error:
-            self._find(Flaw.MALFORMED, f"/BMresults of frame {announced.number}: {error!r}", now)
+            self.find(Flaw.MALFORMED, f"/BMresults of frame {announced.number}: {error!r}")
             return
         if announced.outcome is not None and data != announced.outcome.posterior:
-            self._find(Flaw.WRONG, f"posterior of frame {announced.number}: {data}", now)
-        if announced.reading is not None:
-            self._arrived(announced, announced.reading, now)
-
-    def _find(self, flaw: Flaw, sentence: str, now: float) -> None:
-        self.findings.append(Finding(flaw, sentence, now))
-
-    def _arrived(self, announced: _Announced, reading: Reading, now: float) -> None:
-        if reading.arrived is not None:
-            self._find(Flaw.DUPLICATE, f"frame {announced.number}: reading {reading.index} again", now)
+            self.find(Flaw.WRONG, f"posterior of frame {announced.number}: {data}")
+        if (reading := announced.reading) is None:
             return
-        reading.arrived = now
+        if reading.arrived:
+            self.find(Flaw.DUPLICATE, f"frame {announced.number}: reading {reading.index} again")
+            return
+        reading.arrived = True
         if reading.index <= self._last_index:
             sentence = f"frame {announced.number}: reading {reading.index} after {self._last_index}"
-            self._find(Flaw.OUT_OF_ORDER, sentence, now)
+            self.find(Flaw.OUT_OF_ORDER, sentence)
         self._last_index = max(self._last_index, reading.index)
 
-    def _data(self, message: Any) -> tuple[float, ...]:
-        layout = message["layout"]
-        if layout != LAYOUT:
-            raise ValueError(f"the layout is {layout}")
-        data = message["data"]
-        if len(data) != LINES or not all(type(each) in {float, int} for each in data):
-            raise ValueError(f"the data are {data}")
-        if not all(0.0 <= each <= 1.0 for each in data) or not math.isclose(math.fsum(data), 1.0):
-            raise ValueError(f"these are not probabilities: {data}")
-        return tuple(data)
-
-    def _read_report(self, message: Any, now: float) -> _Announced | None:
+    def _read_report(self, message: Any) -> _Announced | None:
         stamp = message["header"]["stamp"]
         stamp_ns = (stamp.get("secs", 0) or stamp.get("sec", 0)) * 10**9
         stamp_ns += stamp.get("nsecs", 0) or stamp.get("nanosec", 0)
@@ -220,30 +214,41 @@ class Observer:
         number = int(values["number"])
         if number <= self._last_number:
             flaw = Flaw.DUPLICATE if number == self._last_number else Flaw.OUT_OF_ORDER
-            self._find(flaw, f"frame {number} after frame {self._last_number}", now)
+            self.find(flaw, f"frame {number} after frame {self._last_number}")
         self._last_number = max(number, self._last_number)
+        if first["hardware_id"] != DEPLOYMENT:
+            self.find(Flaw.WRONG, f"frame {number} names the deployment {first['hardware_id']}")
         reading = self._readings.get(stamp_ns)
         if reading is None or reading.addresses is None:
-            self._find(Flaw.UNKNOWN, f"frame {number} names a reading of {stamp_ns} ns", now)
-            return _Announced(stamp_ns, number, None, None)
-        if (said := first["hardware_id"]) != self._deployment:
-            self._find(Flaw.WRONG, f"frame {number}: {said}, expected {self._deployment}", now)
-        outcome = self._expected(self._deployment, reading.addresses, number % BANKS)
+            self.find(Flaw.UNKNOWN, f"frame {number} names a reading of {stamp_ns} ns")
+            return _Announced(number, None, None)
+        outcome = self._expected(reading.addresses, number % BANKS)
         if values["published"] != "true" or first["level"] != 0:
-            self._find(Flaw.WRONG, f"frame {number} is said to have no posterior", now)
+            self.find(Flaw.WRONG, f"frame {number} is said to have no posterior")
             return None
-        boards = [self._board(each) for each in others]
+        said = [_board(each) for each in others]
         right = [(f"board{at}", b.cycles, b.total, b.reason) for at, b in enumerate(outcome.boards)]
         whole = (max(b.cycles for b in outcome.boards), sum(b.total for b in outcome.boards))
-        if boards != right or len(boards) != BOARDS:
-            self._find(Flaw.WRONG, f"frame {number}: boards {boards}, expected {right}", now)
+        if said != right or len(said) != BOARDS:
+            self.find(Flaw.WRONG, f"frame {number}: boards {said}, expected {right}")
         if (int(values["cycles"]), int(values["counts_total"])) != whole:
-            self._find(Flaw.WRONG, f"frame {number}: its sums are not those of its boards", now)
-        return _Announced(stamp_ns, number, outcome, reading)
+            self.find(Flaw.WRONG, f"frame {number}: its sums are not those of its boards")
+        return _Announced(number, outcome, reading)
 
-    @staticmethod
-    def _board(status: Any) -> tuple[str, int, int, str]:
-        values = {pair["key"]: pair["value"] for pair in status["values"]}
-        if values["reason"] != status["message"]:
-            raise ValueError(f"reason {values['reason']} and message {status['message']}")
-        return status["hardware_id"], int(values["cycles"]), int(values["counts_total"]), values["reason"]
+
+def _board(status: Any) -> tuple[str, int, int, str]:
+    values = {pair["key"]: pair["value"] for pair in status["values"]}
+    if values["reason"] != status["message"]:
+        raise ValueError(f"reason {values['reason']} and message {status['message']}")
+    return status["hardware_id"], int(values["cycles"]), int(values["counts_total"]), values["reason"]
+
+
+def _posterior(message: Any) -> tuple[float, ...]:
+    layout, data = message["layout"], message["data"]
+    if layout != LAYOUT:
+        raise ValueError(f"the layout is {layout}")
+    if len(data) != LINES or not all(type(each) in {float, int} for each in data):
+        raise ValueError(f"the data are {data}")
+    if not all(0.0 <= each <= 1.0 for each in data) or not math.isclose(math.fsum(data), 1.0):
+        raise ValueError(f"these are not probabilities: {data}")
+    return tuple(data)

@@ -1,16 +1,37 @@
-"""A proxy between two parts of the stack, which delays, holds, cuts, repeats and corrupts data."""
+"""Connections of the campaign: proxies between the parts of the stack, its own rosbridge client, and status sockets.
+
+    robot side                                   stack
+    Client ── hub ── Proxy "rosbridge" ── subscriber, publisher ── Proxy ── master ── Proxy ── pcie-app ── Proxy ── boards
+
+A proxy delays, holds, cuts, repeats and corrupts data. The client uses only `websockets` and `json`.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import random
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import WebSocketException
+
+from scripts.running.patience import FACTOR
+
+TOPIC, TYPE = "/campaign/readings", "campaign_msgs/Reading"
+RESULTS, REPORTS = "/BMresults", "/bm/frame"
+OUTPUT_TYPES = {REPORTS: "diagnostic_msgs/DiagnosticArray", RESULTS: "std_msgs/Float64MultiArray"}
+QUEUE = 1000
 CHUNK = 1 << 16
 _STAMP = re.compile(rb'"secs":\s*(\d+),\s*"nsecs":\s*(\d+)')
+_ANSWER = 1.0 * FACTOR
+"""Seconds within which a process must answer with its status."""
+_AGAIN = 0.05
+"""Seconds between two attempts to connect."""
 
 
 @dataclass(slots=True)
@@ -21,8 +42,8 @@ class Weather:
         open: Whether data is forwarded; otherwise connections remain open and silent.
         delay: Seconds by which each piece is delayed.
         rate: Bytes per second; 0 for no limit.
-        spoil: Number of next pieces in which a byte is changed.
-        repeat: Number of pieces to send again before the next one.
+        spoil: Whether a bit of the next piece is changed.
+        repeat: Whether the last piece is sent again before the next one.
         cut_inside: Whether the next piece is cut in its middle, and its connection with it.
         insert: Bytes to send to each client before its next message.
     """
@@ -30,33 +51,33 @@ class Weather:
     open: asyncio.Event = field(default_factory=asyncio.Event)
     delay: float = 0.0
     rate: float = 0.0
-    spoil: int = 0
-    repeat: int = 0
+    spoil: bool = False
+    repeat: bool = False
     cut_inside: bool = False
     insert: bytes = b""
 
+    def __post_init__(self) -> None:
+        self.open.set()
+
 
 class Proxy:
-    """A listener that forwards each connection; `to_client` may inspect the stream from the server."""
+    """A listener that forwards each connection; `on_reading` may inspect the stream from the server."""
 
     def __init__(self, listen: str | int, connect: str | int, rng: random.Random) -> None:
         """Store two addresses, each the path of a Unix socket or a port of this machine."""
         self._listen, self._connect = listen, connect
-        self.host = "127.0.0.1"
-        """Address to listen on, if `listen` is a port."""
         self._rng = rng
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._tasks: set[asyncio.Task[None]] = set()
         self.weather = Weather()
-        self.weather.open.set()
         self.on_reading: Callable[[int], None] | None = None
         """Function to call with the stamp of each reading sent to a client; requires WebSockets."""
 
     async def start(self) -> None:
         """Start to listen."""
         if isinstance(self._listen, int):
-            self._server = await asyncio.start_server(self._serve, self.host, self._listen)
+            self._server = await asyncio.start_server(self._serve, "127.0.0.1", self._listen)
         else:
             self._server = await asyncio.start_unix_server(self._serve, self._listen)
 
@@ -91,32 +112,26 @@ class Proxy:
         task.add_done_callback(self._tasks.discard)
         try:
             await self._pass(reader, writer)
-        except asyncio.CancelledError:
+        except (asyncio.CancelledError, OSError):
             writer.transport.abort()
 
     async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            if isinstance(self._connect, int):
-                onwards = await asyncio.open_connection("127.0.0.1", self._connect)
-            else:
-                onwards = await asyncio.open_unix_connection(self._connect)
-        except OSError:
-            writer.transport.abort()
-            return
+        if isinstance(self._connect, int):
+            onwards = await asyncio.open_connection("127.0.0.1", self._connect)
+        else:
+            onwards = await asyncio.open_unix_connection(self._connect)
         both = {writer, onwards[1]}
         self._writers |= both
+        pumps = {
+            asyncio.ensure_future(self._pump(reader, onwards[1], to_client=False)),
+            asyncio.ensure_future(self._pump(onwards[0], writer, to_client=True)),
+        }
         try:
-            pumps = {
-                asyncio.ensure_future(self._pump(reader, onwards[1], to_client=False)),
-                asyncio.ensure_future(self._pump(onwards[0], writer, to_client=True)),
-            }
-            try:
-                await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
-            finally:
-                for pump in pumps:
-                    pump.cancel()
-                await asyncio.gather(*pumps, return_exceptions=True)
+            await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
         finally:
+            for pump in pumps:
+                pump.cancel()
+            await asyncio.gather(*pumps, return_exceptions=True)
             self._writers -= both
             for each in both:
                 each.close()
@@ -136,9 +151,7 @@ class Proxy:
                     piece = await _websocket_frame(reader)
                 else:
                     piece = await reader.read(CHUNK)
-                if not piece:
-                    return
-                if not await self._give(piece, former, writer, to_client=to_client):
+                if not piece or not await self._give(piece, former, writer, to_client=to_client):
                     return
                 former = piece
 
@@ -158,11 +171,11 @@ class Proxy:
         if to_client and weather.insert:
             writer.write(weather.insert)
         if weather.spoil:
-            weather.spoil -= 1
+            weather.spoil = False
             at = self._rng.randrange(len(piece))
             piece = piece[:at] + bytes([piece[at] ^ (1 << self._rng.randrange(8))]) + piece[at + 1 :]
         if weather.repeat:
-            weather.repeat -= 1
+            weather.repeat = False
             piece = former + piece
         if rate := weather.rate:
             for start in range(0, len(piece), 256):
@@ -185,3 +198,73 @@ async def _websocket_frame(reader: asyncio.StreamReader) -> bytes:
         head += extended
         size = int.from_bytes(extended, "big")
     return head + await reader.readexactly(size)
+
+
+class Client:
+    """A connection to the hub that is restored whenever it is lost."""
+
+    def __init__(self, port: int, take: Callable[[str, Any], None], lost: Callable[[], None]) -> None:
+        """Store functions to call with messages, by topic, and at the loss of a connection."""
+        self._uri = f"ws://127.0.0.1:{port}"
+        self._take, self._lost = take, lost
+        self._connection: ClientConnection | None = None
+        self._task: asyncio.Task[None] | None = None
+        self.connected = asyncio.Event()
+
+    async def start(self) -> None:
+        """Start to connect."""
+        self._task = asyncio.create_task(self._keep())
+
+    async def end(self) -> None:
+        """Disconnect."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.gather(self._task, return_exceptions=True)
+
+    async def publish(self, stamp: int, values: dict[str, object]) -> None:
+        """Publish a reading, if there is a connection."""
+        secs, nsecs = divmod(stamp, 10**9)
+        message = {"header": {"stamp": {"secs": secs, "nsecs": nsecs}, "frame_id": ""}, **values}
+        if self._connection is not None:
+            with contextlib.suppress(OSError, WebSocketException):
+                await self._connection.send(json.dumps({"op": "publish", "topic": TOPIC, "msg": message}))
+
+    async def _keep(self) -> None:
+        while True:
+            with contextlib.suppress(OSError, WebSocketException, TimeoutError):
+                await self._converse()
+            self._connection = None
+            self.connected.clear()
+            self._lost()
+            await asyncio.sleep(_AGAIN)
+
+    async def _converse(self) -> None:
+        async with connect(
+            self._uri, compression=None, ping_interval=None, open_timeout=20 * FACTOR, max_size=1 << 24
+        ) as connection:
+            operations: list[dict[str, object]] = [{"op": "advertise", "topic": TOPIC, "type": TYPE}]
+            for topic, kind in OUTPUT_TYPES.items():
+                operations.append({"op": "subscribe", "topic": topic, "type": kind, "queue_length": QUEUE})
+            for operation in operations:
+                await connection.send(json.dumps(operation))
+            self._connection = connection
+            self.connected.set()
+            async for text in connection:
+                operation = json.loads(text)
+                if operation.get("op") == "publish":
+                    self._take(operation["topic"], operation["msg"])
+
+
+async def process_status(path: str) -> dict[str, Any] | None:
+    """Return the JSON object from a process's status socket, or None without an answer."""
+    try:
+        async with asyncio.timeout(_ANSWER):
+            reader, writer = await asyncio.open_unix_connection(path)
+            try:
+                data = await reader.read()
+            finally:
+                writer.close()
+        status: dict[str, Any] = json.loads(data)
+    except (OSError, TimeoutError, ValueError):
+        return None
+    return status

@@ -1,0 +1,307 @@
+"""The campaign: its observer finds planted bugs, faults explain only their own losses, and schedules are seeded."""
+
+import copy
+import random
+from collections import Counter
+
+import pytest
+
+from scripts.campaigning.accounts import (
+    FAILED,
+    PASSED_OVER,
+    UNUSABLE,
+    WITH_APP,
+    WITH_PUBLISHER,
+    Counters,
+    Excuses,
+    Overdue,
+    judge,
+)
+from scripts.campaigning.expected import BANKS, LINES, BoardOutcome, Outcome, addresses_of
+from scripts.campaigning.faults import ENDS, MOST_ENDS, SHORT, Fault, Kind, Schedule, ended_roles, excuses_of
+from scripts.campaigning.observer import DEPLOYMENT, Flaw, Observer, Reading
+from scripts.campaigning.stack import Topology
+
+HALF = LINES // 2
+
+
+def outcome(addresses, bank, tables=0):
+    """Outcomes that differ for each reading, bank and set of tables."""
+    weights = [1 + (line * (3 + tables) + sum(addresses) * 5 + bank) % 13 for line in range(LINES)]
+    boards = (
+        BoardOutcome(200 + bank, sum(weights[:HALF]), "overflow"),
+        BoardOutcome(256, sum(weights[HALF:]), "slice"),
+    )
+    return Outcome(tuple(each / sum(weights) for each in weights), boards)
+
+
+def stamp(index):
+    return 1_700_000_000 * 10**9 + index
+
+
+def status(name, message, **values):
+    pairs = [{"key": key, "value": str(value)} for key, value in values.items()]
+    return {"hardware_id": name, "level": 0, "message": message, "values": pairs}
+
+
+def report(index, number, tables=0):
+    boards = outcome((index, index), number % BANKS, tables).boards
+    sums = {"cycles": max(each.cycles for each in boards), "counts_total": sum(each.total for each in boards)}
+    secs, nsecs = divmod(stamp(index), 10**9)
+    return {
+        "header": {"stamp": {"secs": secs, "nsecs": nsecs}},
+        "status": [
+            status(DEPLOYMENT, "posterior", number=number, published="true", **sums),
+            *(
+                status(
+                    f"board{at}", each.reason, cycles=each.cycles, counts_total=each.total, reason=each.reason
+                )
+                for at, each in enumerate(boards)
+            ),
+        ],
+    }
+
+
+def result(index, number, tables=0):
+    dim = [{"label": "x", "size": LINES, "stride": LINES}]
+    data = list(outcome((index, index), number % BANKS, tables).posterior)
+    return {"layout": {"dim": dim, "data_offset": 0}, "data": data}
+
+
+class Recording:
+    """Eight readings and their results, in a list that a test may spoil before it is played."""
+
+    def __init__(self):
+        self.events = []
+        for index in range(8):
+            self.events.append(("reading", index))
+            self.events += [("report", report(index, index + 1)), ("result", result(index, index + 1))]
+        self.counters = Counters(8, 8)
+        self.excuses = Excuses()
+
+    def message(self, kind, index):
+        """The message of a reading, to be changed in its place."""
+        return self.events[3 * index + ("reading", "report", "result").index(kind)][1]
+
+    def value(self, index, key, value, *, status=0):
+        pairs = self.message("report", index)["status"][status]["values"]
+        next(pair for pair in pairs if pair["key"] == key)["value"] = value
+
+    def play(self):
+        observer = Observer(outcome)
+        for kind, what in self.events:
+            if kind == "reading":
+                observer.published(stamp(what), (what, what), what * 0.1)
+                observer.forwarded(stamp(what))
+            elif kind == "fault":
+                observer.fault()
+            else:
+                getattr(observer, kind)(copy.deepcopy(what))
+        observer.findings += judge(self.counters, observer.pending_readings(), self.excuses)
+        return {finding.flaw for finding in observer.findings}
+
+
+def swapped_boards(run):
+    data = run.message("result", 4)["data"]
+    data[:] = data[HALF:] + data[:HALF]
+
+
+def last_bit(run):
+    run.message("result", 4)["data"][3] += 2**-54
+
+
+def result_of_another_reading(run):
+    """As without sequence numbers on the link."""
+    run.events[3 * 4 + 2] = ("result", result(5, 5))
+
+
+def other_tables(run):
+    run.events[13:15] = [("report", report(4, 5, tables=1)), ("result", result(4, 5, tables=1))]
+
+
+def other_deployment(run):
+    run.message("report", 4)["status"][0]["hardware_id"] = "other"
+
+
+def other_bank(run):
+    run.value(7, "number", "9")
+
+
+def slice_too_early(run):
+    run.value(4, "cycles", "128", status=2)
+
+
+def sums_disagree(run):
+    run.value(4, "counts_total", "1")
+
+
+def duplicated(run):
+    run.events += [("report", report(7, 9)), ("result", result(7, 9))]
+
+
+def out_of_order(run):
+    run.events[10:12] = []
+    run.events[13:13] = [("report", report(3, 6)), ("result", result(3, 6))]
+
+
+def lost_uncounted(run):
+    del run.events[3 * 7 + 1 :]
+    run.counters = Counters(8, 7)
+
+
+def lost_after_counting(run):
+    """The publisher counts a result that never arrives."""
+    del run.events[3 * 7 + 1 :]
+
+
+def counted_twice(run):
+    run.counters = Counters(8, 8, {PASSED_OVER: 1})
+
+
+def lost_without_a_fault(run):
+    del run.events[3 * 7 + 1 :]
+    run.counters = Counters(8, 7, {FAILED: 1})
+
+
+def passed_over_alone(run):
+    """The last reading is not followed by another one."""
+    del run.events[3 * 7 + 1 :]
+    run.counters = Counters(8, 7, {PASSED_OVER: 1})
+
+
+def not_a_number(run):
+    run.message("result", 4)["data"][3] = float("nan")
+
+
+def unknown_stamp(run):
+    run.message("report", 4)["header"]["stamp"]["nsecs"] += 1000
+
+
+def without_report(run):
+    del run.events[3 * 4 + 1]
+
+
+def without_result(run):
+    run.events[3 * 7 + 1 :] = []
+    del run.events[3 * 4 + 2]
+
+
+BUGS = {
+    swapped_boards: Flaw.WRONG,
+    last_bit: Flaw.WRONG,
+    result_of_another_reading: Flaw.WRONG,
+    other_tables: Flaw.WRONG,
+    other_deployment: Flaw.WRONG,
+    other_bank: Flaw.WRONG,
+    slice_too_early: Flaw.WRONG,
+    sums_disagree: Flaw.WRONG,
+    duplicated: Flaw.DUPLICATE,
+    out_of_order: Flaw.OUT_OF_ORDER,
+    lost_uncounted: Flaw.UNCOUNTED,
+    lost_after_counting: Flaw.UNCOUNTED,
+    counted_twice: Flaw.MISCOUNTED,
+    lost_without_a_fault: Flaw.UNEXPLAINED,
+    passed_over_alone: Flaw.UNEXPLAINED,
+    not_a_number: Flaw.MALFORMED,
+    unknown_stamp: Flaw.UNKNOWN,
+    without_report: Flaw.UNREPORTED,
+    without_result: Flaw.WITHOUT_RESULT,
+}
+
+
+def test_a_right_run_has_no_findings():
+    assert Recording().play() == set()
+
+
+@pytest.mark.parametrize("plant", BUGS, ids=lambda plant: plant.__name__)
+def test_a_planted_bug_is_found(plant):
+    run = Recording()
+    plant(run)
+    assert BUGS[plant] in run.play()
+
+
+@pytest.mark.parametrize(("until", "flaws"), [(0.8, set()), (0.55, {Flaw.UNCOUNTED})])
+def test_a_fault_excuses_what_it_cuts_off_before_the_recovery(until, flaws):
+    run = Recording()
+    run.events = [each for at, each in enumerate(run.events) if at < 3 * 6 or at % 3 == 0]
+    run.events.insert(3 * 6, ("fault", None))
+    run.counters = Counters(7, 7)
+    run.excuses = Excuses(readings=True, results=True, until=until)
+    assert run.play() == flaws
+
+
+def test_results_of_a_killed_publisher_may_arrive():
+    run = Recording()
+    run.counters = Counters(8, 7, {WITH_PUBLISHER: 1})
+    run.excuses = excuses_of((Fault(Kind.SIGNALS, "kill", "publisher"),), Topology.APART)
+    assert run.play() == set()
+
+
+@pytest.mark.parametrize(
+    ("added", "arrives", "flaws"),
+    [
+        (Counters(7, 8), True, set()),
+        (Counters(7, 7, {WITH_APP: 1}), False, set()),
+        (Counters(7, 7, {FAILED: 1}), False, {Flaw.UNEXPLAINED}),
+        (Counters(7, 7), False, set()),
+        (Counters(7, 8), False, {Flaw.UNCOUNTED}),
+        (Counters(7, 7, {WITH_APP: 2}), False, {Flaw.MISCOUNTED, Flaw.UNEXPLAINED}),
+    ],
+)
+def test_a_reading_that_was_excused_too_early_is_counted_in_the_next_step(added, arrives, flaws):
+    late = Reading(0, (0, 0), 0.0, forwarded=True, settled=True, arrived=arrives)
+    others = [Reading(at, (0, 0), 0.0, forwarded=True, arrived=True) for at in range(1, 8)]
+    found = judge(added, others, Excuses(overdue=Overdue([late], 1, reasons=frozenset({WITH_APP}))))
+    assert {each.flaw for each in found} == flaws
+
+
+def test_only_a_crowd_and_an_unusable_value_are_lost_without_a_fault():
+    observer = Observer(outcome)
+    for index, addresses in enumerate([(0, 0), (1, 1), None]):
+        observer.published(stamp(index), addresses, 0.0)
+        observer.forwarded(stamp(index))
+    readings = observer.pending_readings()
+    assert judge(Counters(2, 0, {PASSED_OVER: 2, UNUSABLE: 1}), readings, Excuses()) == []
+    (finding,) = judge(Counters(1, 0, {PASSED_OVER: 1, UNUSABLE: 2}), readings, Excuses())
+    assert finding.flaw is Flaw.UNEXPLAINED
+
+
+@pytest.mark.parametrize(
+    ("fault", "reasons", "readings", "results"),
+    [
+        (Fault(Kind.SIGNALS, "kill", "pcie-app"), {"lost with pcie-app"}, False, False),
+        (Fault(Kind.SIGNALS, "kill", "board0"), {"failed on a board"}, False, False),
+        (Fault(Kind.SIGNALS, "stop", "subscriber", 1.0), set(), False, False),
+        (Fault(Kind.SIGNALS, "kill", "subscriber"), set(), True, False),
+        (Fault(Kind.ROSBRIDGE, "gone", "rosbridge", 1.0), {"rosbridge away"}, True, True),
+        (Fault(Kind.INPUT, "burst", "readings", 0.0, 10_000), set(), False, False),
+    ],
+    ids=str,
+)
+def test_a_fault_excuses_only_its_own_losses(fault, reasons, readings, results):
+    excuses = excuses_of((fault,), Topology.APART)
+    assert (excuses.reasons, excuses.readings, excuses.results) == (reasons, readings, results)
+
+
+@pytest.mark.parametrize(
+    ("values", "addresses"),
+    [
+        ({"near": 2.5, "far": None}, (3, None)),
+        ({"near": float("nan")}, (None, None)),
+        ({"near": float("inf"), "far": -(10**400)}, (6, 0)),
+        ({"near": "three", "far": 1}, None),
+    ],
+)
+def test_addresses_are_those_of_the_deployment(values, addresses):
+    assert addresses_of(values) == addresses
+
+
+@pytest.mark.parametrize("topology", Topology)
+def test_a_seed_gives_the_same_steps_within_what_a_master_forgives(topology):
+    for seed in range(30):
+        steps, again = (Schedule(random.Random(seed), topology, list(Kind)).steps(10) for _ in range(2))
+        assert steps == again
+        ends = Counter(role for step in steps for fault in step for role in ended_roles(fault))
+        assert all(number <= ENDS.get(role, MOST_ENDS) for role, number in ends.items())
+    ends = Counter(role for step in SHORT for fault in step for role in ended_roles(fault))
+    assert all(number <= ENDS.get(role, MOST_ENDS) for role, number in ends.items())
