@@ -146,6 +146,21 @@ def test_another_array_is_refused(options, value, error):
         to_addresses(deployment, deployment.variables[0], value)
 
 
+@pytest.mark.parametrize("number", [None, math.nan])
+def test_a_likelihood_is_missing_on_all_lines_or_on_none(number):
+    deployment = deployment_of(replace(THRESHOLD, replicas=2), on_missing="missing")
+    variable = deployment.variables[0]
+    codes = to_addresses(deployment, variable, [number] * 6 + [0.5] * 6)
+    assert codes == [MISSING] * 6 + [255] * 6
+    assert to_addresses(deployment, variable, [number] * 12) is None
+    # a likelihood of 0 would make this line impossible
+    with pytest.raises(ReadingMissingError, match="replica 1"):
+        to_addresses(deployment, variable, [0.5] * 11 + [number])
+    needed = variable_of(deployment, on_missing="error")
+    with pytest.raises(ReadingMissingError):
+        to_addresses(deployment, needed, [number] * 6 + [0.5] * 6)
+
+
 @pytest.mark.parametrize("scale", [Scale.COLUMN, Scale.NONE])
 def test_likelihoods_become_codes(scale):
     deployment = deployment_of(replace(THRESHOLD, scale=scale))
