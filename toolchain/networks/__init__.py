@@ -56,15 +56,15 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
 def _reader(path: Path) -> Callable[[bytes, NetworkBuilder], None]:
     match _suffix(path):
         case ".bif":
-            from toolchain.networks.bif import read_bif as reader
+            from toolchain.networks.text_formats import read_bif as reader
         case ".xmlbif" | ".bifxml" | ".xml":
-            from toolchain.networks.xmlbif import read_xmlbif as reader
+            from toolchain.networks.xml_formats import read_xmlbif as reader
         case ".uai":
-            from toolchain.networks.uai import read_uai as reader
+            from toolchain.networks.text_formats import read_uai as reader
         case ".net":
-            from toolchain.networks.net import read_net as reader
+            from toolchain.networks.text_formats import read_net as reader
         case ".xdsl":
-            from toolchain.networks.xdsl import read_xdsl as reader
+            from toolchain.networks.xml_formats import read_xdsl as reader
         case _:
             raise NetworkFileError(
                 f"expected a name that ends in {', '.join(SUFFIXES)}, with or without .gz", path=path

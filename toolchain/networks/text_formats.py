@@ -1,0 +1,423 @@
+"""Readers of network files in plain text: BIF, Hugin's NET and UAI, over one scanner of words, signs and numbers."""
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from toolchain.errors import NetworkFileError
+from toolchain.networks.builder import MAX_PARENTS, MAX_STATES, MAX_VARIABLES, ROUNDING, NetworkBuilder
+
+_SHOWN: Final = 40
+
+
+class Scanner:
+    """A forward scanner; its methods raise a NetworkFileError for an unexpected token."""
+
+    def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str = "") -> None:
+        """Scan the bytes of a file.
+
+        `signs` are tokens themselves, and end a word. `comments` is a regular expression for comments, or
+        only for the beginning of /* ... */.
+        """
+        self._path = path
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError as reason:
+            line = data.count(b"\n", 0, reason.start) + 1
+            raise NetworkFileError("not UTF-8 text", path=path, line=line) from None
+        self._text = text
+        self._start = self._end = 0
+        if comments:
+            self._text = self._without(re.compile(rf'"[^"\n]*"|{comments}'))
+        signs = re.escape(signs)
+        self._signs = re.compile(f"[{signs}]")
+        self._token = re.compile(rf'\s*(?:"([^"\n]*)"|([{signs}])|([^\s{signs}"]+)|(\Z)|(.))')
+        self.quoted = False
+        """True if the last word was quoted."""
+
+    def error(self, sentence: str) -> NetworkFileError:
+        """Return an error at the line of the last token."""
+        start = self._end - len(self._text[self._start : self._end].lstrip())
+        line = self._text.count("\n", 0, start) + 1
+        return NetworkFileError(sentence, path=self._path, line=line)
+
+    def next(self) -> str:
+        """Consume the next token: a word, a quoted word without its quotes, or a sign; empty at the end."""
+        match = self._token.match(self._text, self._end)
+        if match is None:  # the last alternative matches any character
+            raise AssertionError
+        self._start, self._end = match.span()
+        self.quoted = match[1] is not None
+        if match[5] is not None:
+            raise self.error(f"{match[5]!r} opens a quote that is not closed")
+        return match[match.lastindex or 4]
+
+    def peek(self) -> str:
+        """Return the next token without consuming it."""
+        start, end, quoted = self._start, self._end, self.quoted
+        piece = self.next()
+        self._start, self._end, self.quoted = start, end, quoted
+        return piece
+
+    def sign(self, wanted: str) -> None:
+        """Consume a sign or a keyword."""
+        found = self.next()
+        if found != wanted or self.quoted:
+            raise self.error(f"expected {wanted!r}, found {_shown(found)}")
+
+    def word(self, what: str) -> str:
+        """Consume a word, plain or quoted; `what` names it in errors."""
+        found = self.next()
+        if not self.quoted and (not found or self._is_sign(found)):
+            raise self.error(f"expected {what}, found {_shown(found)}")
+        return found
+
+    def words(self, end: str, what: str, most: int) -> list[str]:
+        """Consume at most `most` words up to a sign and the sign, with or without commas."""
+        found: list[str] = []
+        while True:
+            piece = self.next()
+            if piece == end and not self.quoted:
+                return found
+            if piece == "," and not self.quoted and found:
+                continue
+            if not self.quoted and (not piece or self._is_sign(piece)):
+                raise self.error(f"expected {what} or {end!r}, found {_shown(piece)}")
+            if len(found) == most:
+                raise self.error(f"more than {most} of {what}")
+            found.append(piece)
+
+    def scope(self, what: str, most: int) -> tuple[str, list[str]]:
+        """Consume `( CHILD | PARENTS )` or `( CHILD )`; `what` names the child in errors."""
+        self.sign("(")
+        child = self.word(what)
+        separator = self.next()
+        if separator not in {"|", ")"}:
+            raise self.error(f"expected '|' or ')', found {_shown(separator)}")
+        return child, self.words(")", "parents", most) if separator == "|" else []
+
+    def count(self, what: str, most: int) -> int:
+        """Consume a whole number from 0 to `most`."""
+        word = self.word(what)
+        if not (word.isascii() and word.isdigit() and len(word) <= 9) or int(word) > most:
+            raise self.error(f"expected {what}, 0 to {most}, found {_shown(word)}")
+        return int(word)
+
+    def numbers(self, end: str, wanted: int, what: str, *, between: str = ",") -> NDArray[np.float64]:
+        """Consume numbers up to a sign and the sign, ignoring the signs `between`: float64[wanted]."""
+        stop = self._text.find(end, self._end)
+        if stop < 0:
+            self._start = self._end = len(self._text)
+            raise self.error(f"expected {end!r}, found the end of the file")
+        piece = self._text[self._end : stop]
+        begin, self._start, self._end = self._end, stop, stop + len(end)
+        if "(" in between and piece.count("(") != piece.count(")"):
+            raise self.error(f"the brackets of {what} don't match")
+        for sign in between:
+            piece = piece.replace(sign, " ")
+        return self._floats(piece.split(maxsplit=wanted), wanted, what, begin)
+
+    def next_numbers(self, wanted: int, what: str) -> NDArray[np.float64]:
+        """Consume this many numbers separated by white space: float64[wanted]."""
+        begin, words = self._end, []
+        for _ in range(wanted):
+            word = self.next()
+            if not word:
+                break
+            words.append(word)
+        return self._floats(words, wanted, what, begin)
+
+    def skip(self, end: str) -> None:
+        """Consume everything up to a sign and the sign, except for signs in brackets and quotes."""
+        depth = 0
+        while True:
+            piece = self.next()
+            if self.quoted:
+                continue
+            if not piece:
+                raise self.error(f"expected {end!r}, found the end of the file")
+            if piece == end and depth == 0:
+                return
+            depth += (piece in "({[") - (piece in ")}]")
+            if depth < 0:
+                raise self.error(f"expected {end!r}, found {piece!r}")
+
+    def _without(self, comments: re.Pattern[str]) -> str:
+        """Return the text with comments replaced by spaces, keeping line numbers."""
+        parts, end, at = [], 0, 0
+        while match := comments.search(self._text, at):
+            begin, at = match.span()
+            if match[0].startswith('"'):
+                continue
+            if match[0] == "/*":
+                at = self._text.find("*/", at) + 2
+                if at < 2:
+                    self._start, self._end = begin, begin + 2
+                    raise self.error("this comment is not closed")
+            parts += [self._text[end:begin], " " + "\n" * self._text.count("\n", begin, at)]
+            end = at
+        return "".join(parts) + self._text[end:]
+
+    def _is_sign(self, piece: str) -> bool:
+        return self._signs.fullmatch(piece) is not None
+
+    def _floats(self, words: list[str], wanted: int, what: str, begin: int) -> NDArray[np.float64]:
+        """Return words as numbers; the last one may be the rest of the text, and is only counted."""
+        values = []
+        for word in words[:wanted]:
+            try:
+                values.append(_float(word))
+            except ValueError:
+                at = self._text.find(word, begin)
+                self._start, self._end = at, at + 1
+                raise self.error(f"{_shown(word)} in {what} is not a number") from None
+        if len(words) != wanted:
+            count = f"more than {wanted}" if len(words) > wanted else str(len(words))
+            raise self.error(f"{what} has {count} numbers, expected {wanted}")
+        return np.array(values)
+
+
+def _float(word: str) -> float:
+    number = float(word)
+    if "_" in word or math.isnan(number):  # the former is the notation of Python
+        raise ValueError
+    return number
+
+
+def _shown(piece: str) -> str:
+    if not piece:
+        return "the end of the file"
+    return repr(piece if len(piece) <= _SHOWN else piece[:_SHOWN] + "...")
+
+
+# BIF, the Interchange Format for Bayesian networks (version 0.15): `variable` and `probability` blocks
+
+_BIF_COMMENTS: Final = r"//[^\n]*|/\*"
+
+
+def read_bif(data: bytes, builder: NetworkBuilder) -> None:
+    """Read a BIF file.
+
+    In `table`, the child varies slowest and the last parent fastest; `(a, b) ...` defines one row, `default
+    ...` all others.
+    """
+    text = Scanner(data, builder.path, comments=_BIF_COMMENTS)
+    while (block := text.next()) or text.quoted:
+        match block:
+            case "network":
+                builder.name(text.word("the network's name"))
+                _bif_properties(text)
+            case "variable":
+                _bif_variable(text, builder)
+            case "probability":
+                _bif_probability(text, builder)
+            case _:
+                raise text.error(f"expected network, variable or probability, found {block[:40]!r}")
+
+
+def _bif_properties(text: Scanner) -> None:
+    text.sign("{")
+    while text.peek() != "}":
+        text.sign("property")
+        text.skip(";")
+    text.sign("}")
+
+
+def _bif_variable(text: Scanner, builder: NetworkBuilder) -> None:
+    name = text.word("a variable's name")
+    states: list[str] | None = None
+    text.sign("{")
+    while (entry := text.next()) != "}":
+        if entry == "property":
+            text.skip(";")
+        elif entry == "type":
+            text.sign("discrete")
+            text.sign("[")
+            count = text.count("the number of states", MAX_STATES)
+            text.sign("]")
+            text.sign("{")
+            states = text.words("}", "states", MAX_STATES)
+            text.sign(";")
+            if len(states) != count:
+                raise text.error(f"{name} is to have {count} states, but {len(states)} are named")
+        else:
+            raise text.error(f"expected type, property or '}}', found {entry[:40] or 'the end'!r}")
+    if states is None:
+        raise text.error(f"the variable {name} has no type")
+    builder.variable(name, states, text)
+
+
+def _bif_probability(text: Scanner, builder: NetworkBuilder) -> None:
+    child, parents = text.scope("a variable's name", MAX_PARENTS)
+    shape = builder.shape((child, *parents), text)
+    rows = math.prod(shape[1:])
+    values = np.full((shape[0], rows), np.nan)
+    default = None
+    text.sign("{")
+    while (entry := text.next()) != "}":
+        match entry:
+            case "property":
+                text.skip(";")
+            case "table":
+                if not np.isnan(values).all():
+                    raise text.error(f"{child} has rows or a table before this one")
+                values[:] = text.numbers(";", values.size, f"the table of {child}").reshape(values.shape)
+            case "default":
+                if default is not None:
+                    raise text.error(f"{child} has two defaults")
+                default = text.numbers(";", shape[0], f"the default of {child}")
+            case "(":
+                labels = text.words(")", "the parents' states", MAX_PARENTS)
+                if len(labels) != len(parents):
+                    raise text.error(f"{len(labels)} states for the {len(parents)} parents of {child}")
+                at = 0
+                for parent, size, label in zip(parents, shape[1:], labels, strict=True):
+                    at = at * size + builder.state(parent, label, text)
+                if not np.isnan(values[0, at]):
+                    raise text.error(f"{child} has two rows for ({', '.join(labels)})")
+                values[:, at] = text.numbers(";", shape[0], f"a row of {child}")
+            case _:
+                raise text.error(f"expected table, default, a row or '}}', found {entry[:40] or 'the end'!r}")
+    missing = np.isnan(values[0])
+    if default is not None:
+        values[:, missing] = default[:, np.newaxis]
+    elif missing.any():
+        raise text.error(f"{np.count_nonzero(missing)} of the {rows} rows of {child} are not given")
+    builder.distribution(child, parents, values.reshape(shape), text)
+
+
+# NET, the format of Hugin: `node` blocks with states, `potential` blocks with data
+
+_NET_COMMENTS: Final = r"%[^\n]*"
+_OTHER_NODES: Final = {"continuous", "utility", "decision", "function"}
+
+
+def read_net(data: bytes, builder: NetworkBuilder) -> None:
+    """Read a NET file of discrete chance nodes; in `data`, parents are in order and the child is fastest."""
+    text = Scanner(data, builder.path, signs="{}()|;,=", comments=_NET_COMMENTS)
+    in_class = False
+    while (block := text.next()) or text.quoted:
+        match block:
+            case "class" if not in_class:
+                builder.name(text.word("the class's name"))
+                text.sign("{")
+                in_class = True
+            case "}" if in_class:
+                in_class = False
+            case "net" if text.peek() == "{":
+                text.sign("{")
+                text.skip("}")
+            case "discrete":
+                text.sign("node")
+                _net_node(text, builder)
+            case "node":
+                _net_node(text, builder)
+            case "potential":
+                _net_potential(text, builder)
+            case _ if block in _OTHER_NODES:
+                raise text.error(f"a {block} node: only discrete chance nodes can be read")
+            case _ if in_class:
+                text.sign("=")
+                text.skip(";")
+            case _:
+                raise text.error(f"expected net, node or potential, found {block[:40]!r}")
+    if in_class:
+        raise text.error("expected '}' of the class, found the end of the file")
+
+
+def _net_keys(text: Scanner) -> Iterator[str]:
+    text.sign("{")
+    while (key := text.next()) != "}":
+        if not key:
+            raise text.error("expected '}', found the end of the file")
+        text.sign("=")
+        yield key
+
+
+def _net_node(text: Scanner, builder: NetworkBuilder) -> None:
+    name = text.word("a node's name")
+    states: list[str] | None = None
+    for key in _net_keys(text):
+        if key == "states":
+            text.sign("(")
+            states = text.words(")", "states", MAX_STATES)
+            text.sign(";")
+        else:
+            text.skip(";")
+    if states is None:
+        raise text.error(f"the node {name} has no states")
+    builder.variable(name, states, text)
+
+
+def _net_potential(text: Scanner, builder: NetworkBuilder) -> None:
+    child, parents = text.scope("a node's name", MAX_PARENTS)
+    shape = builder.shape((*parents, child), text)
+    values = None
+    for key in _net_keys(text):
+        if key == "data":
+            numbers = text.numbers(";", int(np.prod(shape)), f"the data of {child}", between="(),")
+            values = np.moveaxis(numbers.reshape(shape), -1, 0)
+        else:
+            text.skip(";")
+    if values is None:
+        raise text.error(f"the potential of {child} has no data")
+    builder.distribution(child, parents, values, text)
+
+
+# UAI, a network of only numbers, BAYES or MARKOV; its variables are named 0, 1, 2 and so on
+
+_MAX_FACTORS: Final = 4 * MAX_VARIABLES
+_UAI_COMMENTS: Final = r"#[^\n]*|(?m:^c\b[^\n]*)"
+
+
+def read_uai(data: bytes, builder: NetworkBuilder) -> None:
+    """Read a UAI file: a preamble (kind, sizes, variables of each factor), then the numbers of each factor.
+
+    The last variable of a factor varies fastest; in a BAYES file it is the child. (pyagrum 3.3.1 writes the
+    first parent fastest, contrary to the format.)
+    """
+    text = Scanner(data, builder.path, comments=_UAI_COMMENTS)
+    kind = text.word("BAYES or MARKOV")
+    if kind not in {"BAYES", "MARKOV"}:
+        raise text.error(f"expected BAYES or MARKOV, found {kind[:40]!r}")
+    variables = text.count("the number of variables", MAX_VARIABLES)
+    for number in range(variables):
+        builder.variable(str(number), text.count("a variable's size", MAX_STATES), text)
+    factors = text.count("the number of factors", _MAX_FACTORS)
+    scopes = []
+    for _ in range(factors):
+        size = text.count("a factor's number of variables", MAX_PARENTS + 1)
+        scopes.append(tuple(str(text.count("a variable", variables - 1)) for _ in range(size)))
+    for number, scope in enumerate(scopes):
+        what = f"factor {number}"
+        shape = builder.shape(scope, text)
+        given = text.count(f"the number of entries of {what}", 10**9 - 1)
+        if given != math.prod(shape):
+            raise text.error(f"{what} is to have {given} entries, but its variables make {math.prod(shape)}")
+        values = text.next_numbers(given, what).reshape(shape)
+        if kind == "BAYES" and scope:
+            _check_uai_order(scope[-1], values, text)
+            builder.distribution(scope[-1], scope[:-1], np.moveaxis(values, -1, 0), text)
+        else:
+            builder.potential(scope, values, text)
+    if rest := text.next():
+        raise text.error(f"expected the end of the file after the last factor, found {rest[:40]!r}")
+
+
+def _check_uai_order(child: str, values: NDArray[np.float64], text: Scanner) -> None:
+    """Refuse a table that is a distribution only if the child, last in its scope, varies slowest."""
+    flat = values.ravel()
+    fastest, slowest = (
+        flat.reshape(-1, values.shape[-1]).sum(axis=1),
+        flat.reshape(values.shape[-1], -1).sum(axis=0),
+    )
+    if not np.allclose(fastest, 1, atol=ROUNDING) and np.allclose(slowest, 1, atol=ROUNDING):
+        raise text.error(
+            f"the table of {child} sums to 1 only if {child} varies slowest, as pgmpy writes UAI files; in the format it "
+            "varies fastest: save the network as BIF instead"
+        )
