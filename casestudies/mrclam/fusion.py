@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from casestudies.mrclam.landmarks import Landmark
 from casestudies.mrclam.model import BEARING_SIGMA, FLOOR, RANGE_SIGMA, X_LIMITS, Y_LIMITS
-from toolchain.models.fusion import fuse
-from toolchain.models.model import cell_centres, interval
+from toolchain.models.model import cell_centres, fuse, interval
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

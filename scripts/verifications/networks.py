@@ -31,9 +31,8 @@ from scripts.running.flags import ScriptParser
 from toolchain.building.quantise import quantise
 from toolchain.errors import ModelError
 from toolchain.models.distribution import Distribution
-from toolchain.models.fusion import exact_posterior
 from toolchain.models.joint import JointDistribution
-from toolchain.models.model import Model
+from toolchain.models.model import Model, exact_posterior
 from toolchain.networks import read_network
 
 INDEPENDENT = Path(__file__).with_name("independent_networks.py")

@@ -17,7 +17,7 @@ from casestudies.boat.model import model as boat_model
 from tests.integration.conftest import PROGRAMMED, READING, build_boat, stamp_of
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
-from toolchain.models.fusion import exact_posterior
+from toolchain.models.model import exact_posterior
 
 LISTENER = str(Path(__file__).with_name("roslibpy_listener.py"))
 FRAMES, SEED = 400, 20261121

@@ -8,7 +8,7 @@ from toolchain.building.build import build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.building.options import BuildOptions
 from toolchain.models import Known, Model, dimension
-from toolchain.models.fusion import exact_posterior
+from toolchain.models.model import exact_posterior
 
 TARGET = {"uri": "ws://robot:9090", "topic": "/readings", "type": "test_msgs/Readings"}
 LIKELY = np.array([[0.7, 0.2, 0.1, 0.3, 0.5, 0.6], [0.3, 0.8, 0.9, 0.7, 0.5, 0.4]])

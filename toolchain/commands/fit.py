@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from toolchain.commands.flags import ReadingColumns, Settings
-from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
+from toolchain.learning import FitMethod, FitOptions, FitPrior
 
 
 def fit(

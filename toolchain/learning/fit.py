@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from toolchain.deployment import Dimension
 from toolchain.deployment.address import to_address
 from toolchain.errors import ModelError, ReadingError
-from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
+from toolchain.learning import FitMethod, FitOptions, FitPrior
 from toolchain.learning.fitted import Fit, FitFile, FittedRecording, FittedVariable, mean_slopes, wrapped
 from toolchain.models.model import Known, Model
 

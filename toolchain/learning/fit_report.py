@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from toolchain.deployment.address import to_address
 from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.flag_values import key_values
+from toolchain.learning import FitMethod, FitOptions
 from toolchain.learning.fit import LEAST_READINGS, Support, Truth, fit_model, locate
-from toolchain.learning.fit_options import FitMethod, FitOptions
 from toolchain.learning.fitted import Fit, FittedRecording, apply_fit, write_fit
 from toolchain.learning.recording import Recording, read_recording, reading_columns
 from toolchain.models.case_study import load_model
-from toolchain.models.fusion import exact_posterior
-from toolchain.models.model import Model, cell_centres
+from toolchain.models.model import Model, cell_centres, exact_posterior
 
 _CHUNK: Final = 1 << 20
 _MOST_BITS: Final = 60

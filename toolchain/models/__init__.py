@@ -10,9 +10,16 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from toolchain.models.conditional import normal, wrapped_normal
     from toolchain.models.distribution import conditional_normal, function, potential, table, uniform
-    from toolchain.models.fusion import exact_posterior
     from toolchain.models.joint import JointDistribution, Question
-    from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
+    from toolchain.models.model import (
+        Known,
+        Model,
+        PriorSelect,
+        cell_centres,
+        dimension,
+        exact_posterior,
+        interval,
+    )
     from toolchain.models.symbol import IntegerType, IntervalType, LabelType, Symbol
 
 __all__ = [
@@ -41,9 +48,8 @@ __all__ = [
 _HOMES: Final = {
     "conditional": ("normal", "wrapped_normal"),
     "distribution": ("conditional_normal", "function", "potential", "table", "uniform"),
-    "fusion": ("exact_posterior",),
     "joint": ("JointDistribution", "Question"),
-    "model": ("Known", "Model", "PriorSelect", "cell_centres", "dimension", "interval"),
+    "model": ("Known", "Model", "PriorSelect", "cell_centres", "dimension", "exact_posterior", "interval"),
     "symbol": ("IntegerType", "IntervalType", "LabelType", "Symbol"),
 }
 _HOME_OF: Final = {name: module for module, names in _HOMES.items() for name in names}

@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal_table, wrapped_normal_table
-from toolchain.models.limits import MAX_ENTRIES, check_size
-from toolchain.models.model import Normal
+from toolchain.models.model import MAX_ENTRIES, Normal, check_size
 from toolchain.models.symbol import Symbol
 
 Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike

@@ -19,10 +19,17 @@ from numpy.typing import NDArray
 
 from toolchain.errors import ModelError
 from toolchain.models.distribution import Distribution, Factor
-from toolchain.models.elimination import Term, eliminate, product, reduced
-from toolchain.models.limits import MAX_ENTRIES, MAX_MODEL_ENTRIES, check_size
-from toolchain.models.model import Known, Model, Normal, PriorSelect, dimension
-from toolchain.models.separation import Links, relevant, without_idle
+from toolchain.models.inference import Links, Term, eliminate, product, reduced, relevant, without_idle
+from toolchain.models.model import (
+    MAX_ENTRIES,
+    MAX_MODEL_ENTRIES,
+    Known,
+    Model,
+    Normal,
+    PriorSelect,
+    check_size,
+    dimension,
+)
 from toolchain.models.symbol import Symbol
 
 Named: TypeAlias = Symbol | str

@@ -2,10 +2,12 @@
 
 The machine computes P(S | k_1 ... k_N), proportional to P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2). A
 model consists of the prior P(S) and a table P(K_i | S) for each known variable, in the order of the columns.
+`exact_posterior` computes the same in float64, the reference for the posterior of a machine.
 """
 
 import math
 from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Final, Literal
 
@@ -16,7 +18,28 @@ from pydantic import ValidationError
 from toolchain.deployment import Dimension, Variable
 from toolchain.deployment.fields import NAME_MAX
 from toolchain.errors import ModelError
-from toolchain.models.limits import MAX_LINES, MAX_TABLE_ENTRIES, MAX_VALUES, check_size
+
+MAX_LINES: Final = 2**24
+"""Values of all searched dimensions together: 4,096 boards with the maximum number of lines in the register
+map.
+"""
+MAX_VALUES: Final = 2**16 - 1
+"""Values of a known variable: a column has at most 16 address bits, and the top address means a missing
+reading.
+"""
+MAX_ENTRIES: Final = 2**24
+"""Entries of a factor of a joint distribution (128 MiB as float64)."""
+MAX_TABLE_ENTRIES: Final = 2**26
+"""Entries of a known variable's table (512 MiB as float64)."""
+MAX_MODEL_ENTRIES: Final = 2**28
+"""Entries of the tables of all known variables of a question together."""
+
+
+def check_size(what: str, entries: int, most: int, advice: str = "") -> None:
+    """Raise a ModelError for a size above its limit."""
+    if entries > most:
+        raise ModelError(f"{what} would have {entries} entries; the maximum is {most}{advice}")
+
 
 _SUM_TOLERANCE: Final = 1e-6
 
@@ -279,3 +302,61 @@ def _first(reason: ValidationError) -> str:
         return str(detail["ctx"]["error"])
     what = detail["msg"].removeprefix("Input should be ").removeprefix("String should have ")
     return f"{detail['loc'][0]} = {detail['input']!r}, expected {what}"
+
+
+def exact_posterior(
+    model: Model, addresses: Sequence[int | NDArray[np.int64] | None], *, prior_address: int | None = None
+) -> NDArray[np.float64]:
+    """Return P(S | readings) of the unquantised model.
+
+    Args:
+        model: The model.
+        addresses: One per known variable, in the order of the columns; None for a missing reading. If lines
+            have their own readings (`sensor_mode = cell`), int64[lines] per variable.
+        prior_address: The row of the selected prior; None for the prior without a selection.
+
+    Returns:
+        float64[lines], summing to 1.
+
+    Raises:
+        ModelError: The number of addresses is wrong, an address is not supported, or the readings are
+            impossible on every line.
+    """
+    if len(addresses) != len(model.known):
+        raise ModelError(
+            f"{len(addresses)} readings for the {len(model.known)} known variables of {model.name!r}"
+        )
+    factors = []
+    for known, address in zip(model.known, addresses, strict=True):
+        if address is None:
+            continue
+        if isinstance(address, np.ndarray):
+            factors.append(known.table[address, np.arange(model.lines)])
+            continue
+        if not 0 <= address < known.values:
+            raise ModelError(f"variable {known.name}: address {address} is not one of its {known.values}")
+        factors.append(known.table[address])
+    if prior_address is None:
+        return fuse(model.prior_distribution, factors)
+    rows = None if model.prior_select is None else model.prior_select.table
+    if rows is None or not 0 <= prior_address < len(rows):
+        raise ModelError(f"model {model.name!r} has no prior of address {prior_address}")
+    return fuse(rows[prior_address], factors)
+
+
+def fuse(prior: NDArray[np.float64], likelihoods: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return the normalised product of a prior and likelihoods, float64[lines] each, up to factors.
+
+    The product is a sum of logarithms, so that many small likelihoods don't underflow; a ModelError if it is
+    0.
+    """
+    with np.errstate(divide="ignore"):  # log 0 = -inf is an impossible line
+        logarithm = np.log(prior)
+        for likelihood in likelihoods:
+            logarithm = logarithm + np.log(likelihood)
+    largest = logarithm.max()
+    if largest == -np.inf:
+        raise ModelError("these readings are impossible on every line: there is no posterior")
+    weights = np.exp(logarithm - largest)
+    posterior: NDArray[np.float64] = weights / weights.sum()
+    return posterior

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolchain.errors import ModelError
-from toolchain.models.limits import MAX_ENTRIES, check_size
+from toolchain.models.model import MAX_ENTRIES, check_size
 
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
 _NO_AND_YES: Final = ({"false", "true"}, {"no", "yes"}, {"off", "on"})

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from toolchain.errors import ModelError, NetworkFileError
 from toolchain.models.distribution import Factor, potential, table
 from toolchain.models.joint import JointDistribution
-from toolchain.models.limits import MAX_ENTRIES
+from toolchain.models.model import MAX_ENTRIES
 from toolchain.models.symbol import IntegerType, LabelType, Symbol
 
 MAX_VARIABLES: Final = 20_000

@@ -31,7 +31,7 @@ from machines.posterior import joint_posterior
 from machines.reference import ReferenceBM1
 from pcie_shim.programming_file import read_image
 from toolchain.deployment import load_deployment
-from toolchain.models.fusion import exact_posterior
+from toolchain.models.model import exact_posterior
 
 KEPT = 512
 """Number of readings kept until their results arrive."""

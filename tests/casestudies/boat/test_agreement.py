@@ -11,7 +11,7 @@ from casestudies.boat.geometry import map_grid
 from casestudies.boat.model import model
 from casestudies.boat.normaliser import normalise
 from casestudies.boat.simulator import Boat
-from toolchain.models.fusion import exact_posterior
+from toolchain.models.model import exact_posterior
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -16,7 +16,7 @@ from toolchain.building.quantise import quantise
 from toolchain.deployment.address import to_address
 from toolchain.errors import ModelError
 from toolchain.models.case_study import load_model
-from toolchain.models.fusion import exact_posterior, fuse
+from toolchain.models.model import exact_posterior, fuse
 
 LANDMARKS = (Landmark(6, 5.7, 5.0), Landmark(9, 2.3, 3.4), Landmark(17, 0.0, -2.8), Landmark(20, 2.1, -3.9))
 CSV = "landmark,x_m,y_m\n" + "".join(f"{each.number},{each.x},{each.y}\n" for each in LANDMARKS)

@@ -13,8 +13,7 @@ from toolchain.analysis.accuracy.readings import MISSING, Readings, sample_readi
 from toolchain.building.partition import split
 from toolchain.deployment import Stop
 from toolchain.errors import ModelError
-from toolchain.models.fusion import exact_posterior
-from toolchain.models.model import Known, Model, dimension
+from toolchain.models.model import Known, Model, dimension, exact_posterior
 
 
 def boards_of(machine, count=1, *, target=255, limit=2**15, stop=Stop.SLICES):

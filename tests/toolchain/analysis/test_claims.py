@@ -19,7 +19,7 @@ from toolchain.analysis.exploration.claims import (
     run_claims,
 )
 from toolchain.analysis.exploration.pictures import draw_claims
-from toolchain.models.fusion import exact_posterior
+from toolchain.models.model import exact_posterior
 
 
 @pytest.fixture(scope="module")

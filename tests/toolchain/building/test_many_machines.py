@@ -32,8 +32,7 @@ from toolchain.deployment.address import to_address
 from toolchain.deployment.address_array import MISSING, to_addresses
 from toolchain.deployment.written_codes import written_prior
 from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError, ValueOutOfRangeError
-from toolchain.models.fusion import exact_posterior
-from toolchain.models.model import Known, Model, PriorSelect, dimension
+from toolchain.models.model import Known, Model, PriorSelect, dimension, exact_posterior
 
 CELL = replace(OPTIONS, sensor_mode=SensorMode.CELL)
 THRESHOLD = replace(OPTIONS, sensor_mode=SensorMode.THRESHOLD)

@@ -23,9 +23,8 @@ from toolchain.deployment.address import to_address
 from toolchain.deployment.written_codes import written_prior
 from toolchain.errors import BuildError, DeploymentError, ModelError, ReadingError
 from toolchain.models.distribution import table
-from toolchain.models.fusion import exact_posterior, fuse
 from toolchain.models.joint import JointDistribution
-from toolchain.models.model import Known, Model, PriorSelect, dimension
+from toolchain.models.model import Known, Model, PriorSelect, dimension, exact_posterior, fuse
 from toolchain.models.symbol import IntegerType, LabelType, Symbol
 
 FINE = {"prob_bits": 14, "counter_bits": 16, "target_count": 20000}

@@ -16,7 +16,7 @@ from tests.toolchain.running import toolchain as run
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.models.case_study import load_model
-from toolchain.models.fusion import exact_posterior
+from toolchain.models.model import exact_posterior
 
 # runs a program with a server that never answers in the place of the robot's
 WAITING = """

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.errors import ModelError
+from toolchain.learning import FitMethod, FitOptions, FitPrior
 from toolchain.learning.fit import LEAST_READINGS, fit_model, locate, mixture
-from toolchain.learning.fit_options import FitMethod, FitOptions, FitPrior
 from toolchain.learning.fitted import Fit, apply_fit, cell_spread, mean_slopes, read_fit, with_fit, write_fit
 from toolchain.models.case_study import load_model
 from toolchain.models.conditional import normal, wrapped_normal

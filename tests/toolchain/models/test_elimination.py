@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from toolchain.errors import ModelError
-from toolchain.models import elimination
-from toolchain.models.elimination import Term, eliminate, product
+from toolchain.models import inference
+from toolchain.models.inference import Term, eliminate, product
 
 
 def random_network(seed):
@@ -25,7 +25,7 @@ def random_network(seed):
 
 
 def summed(terms, names, sizes, kept):
-    """The answer by elimination, and by one sum over everything; both normalised."""
+    """The answer by inference, and by one sum over everything; both normalised."""
     left = eliminate(terms, [name for name in names if name not in kept], sizes)
     found = product(left, kept, sizes)
     letters = {name: chr(ord("a") + at) for at, name in enumerate(names)}
@@ -42,26 +42,26 @@ def test_it_is_the_sum(seed, both_orders):
     terms, names, sizes = random_network(seed)
     with pytest.MonkeyPatch.context() as patch:
         if both_orders:
-            patch.setattr(elimination, "_CHEAP", 0)
+            patch.setattr(inference, "_CHEAP", 0)
         found, whole = summed(terms, names, sizes, [names[0], names[-1]])
     assert found == pytest.approx(whole)
 
 
 def test_min_fill_answers_what_smallest_tables_would_refuse(monkeypatch):
     terms, names, sizes = random_network(2964)  # the largest tables have 1600 and 480 entries
-    monkeypatch.setattr(elimination, "MAX_ENTRIES", 1000)
-    monkeypatch.setattr(elimination, "_CHEAP", 10**9)
+    monkeypatch.setattr(inference, "MAX_ENTRIES", 1000)
+    monkeypatch.setattr(inference, "_CHEAP", 10**9)
     with pytest.raises(ModelError, match="summing over"):
         summed(terms, names, sizes, [names[0], names[-1]])
-    monkeypatch.setattr(elimination, "_CHEAP", 100)
+    monkeypatch.setattr(inference, "_CHEAP", 100)
     found, whole = summed(terms, names, sizes, [names[0], names[-1]])
     assert found == pytest.approx(whole)
 
 
 def test_if_both_orders_are_too_large_the_table_is_named(monkeypatch):
     terms, names, sizes = random_network(2964)
-    monkeypatch.setattr(elimination, "MAX_ENTRIES", 100)
-    monkeypatch.setattr(elimination, "_CHEAP", 0)
+    monkeypatch.setattr(inference, "MAX_ENTRIES", 100)
+    monkeypatch.setattr(inference, "_CHEAP", 0)
     with pytest.raises(ModelError, match=r"summing over v\d+ needs a table of \d+ entries"):
         summed(terms, names, sizes, [names[0], names[-1]])
 

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from toolchain.errors import ModelError
-from toolchain.models.fusion import exact_posterior, fuse
-from toolchain.models.model import Known, Model, dimension
+from toolchain.models.model import Known, Model, dimension, exact_posterior, fuse
 
 
 def random_model(seed, lines=5, sensors=3, values=4):

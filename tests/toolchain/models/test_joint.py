@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.distribution import conditional_normal, potential, table, uniform
-from toolchain.models.fusion import exact_posterior
 from toolchain.models.joint import JointDistribution, Question
-from toolchain.models.model import cell_centres, interval
+from toolchain.models.model import cell_centres, exact_posterior, interval
 from toolchain.models.symbol import IntegerType, IntervalType, LabelType, Symbol
 
 YES_NO = LabelType("no", "yes")

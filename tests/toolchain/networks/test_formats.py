@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from toolchain.errors import NetworkFileError
 from toolchain.models.distribution import Potential
-from toolchain.models.fusion import exact_posterior
+from toolchain.models.model import exact_posterior
 from toolchain.models.symbol import IntegerType, LabelType
 from toolchain.networks import MAX_BYTES, is_network, read_network
 

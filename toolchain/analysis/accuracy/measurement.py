@@ -20,8 +20,7 @@ from toolchain.analysis.accuracy.emulation import EmulatedBoards, Inputs, inputs
 from toolchain.analysis.accuracy.intervals import Interval, bootstrap, bootstrap_rows, share_of_frames
 from toolchain.analysis.accuracy.readings import Readings
 from toolchain.errors import BuildError, ModelError
-from toolchain.models.fusion import exact_posterior, fuse
-from toolchain.models.model import Model
+from toolchain.models.model import Model, exact_posterior, fuse
 
 EXPECTED_COUNT: Final = 5.0
 """Minimum expected count of lines with z-scores, because lower counts are not approximately normal."""

@@ -49,7 +49,7 @@ class Readings:
         return len(self.addresses)
 
     def of_model(self, frame: int) -> tuple[tuple[int | NDArray[np.int64] | None, ...], int | None]:
-        """Return a frame in the form for `toolchain.models.fusion.exact_posterior`."""
+        """Return a frame in the form for `toolchain.models.model.exact_posterior`."""
         row = int(self.prior_addresses[frame])
         addresses: tuple[int | NDArray[np.int64] | None, ...]
         if self.addresses.ndim > 2:

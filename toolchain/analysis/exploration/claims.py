@@ -22,8 +22,7 @@ from toolchain.analysis.accuracy.readings import Readings, sample_readings
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Stop
 from toolchain.models.conditional import normal
-from toolchain.models.fusion import exact_posterior
-from toolchain.models.model import Model, cell_centres, interval
+from toolchain.models.model import Model, cell_centres, exact_posterior, interval
 
 _Word = TypeVar("_Word", np.uint16, np.uint32)
 
