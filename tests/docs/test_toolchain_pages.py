@@ -13,8 +13,7 @@ from typer.main import get_command
 from tests.toolchain.running import TARGET, assert_refused, toolchain
 from toolchain.building.build import assemble
 from toolchain.building.machine import plan_machine
-from toolchain.building.options import BuildOptions
-from toolchain.building.sources_file import read_sources
+from toolchain.building.options import BuildOptions, read_sources
 from toolchain.checks.finding import Check
 from toolchain.commands.main import app
 from toolchain.deployment import DeploymentFile, Variable

@@ -8,10 +8,8 @@ from pydantic import ValidationError
 
 from machines.parameters import SensorMode
 from pcie_shim.programming_file import Image
-from toolchain.building.agreement import check_agreement, read_images
-from toolchain.building.board_layout import board_layout
-from toolchain.building.build import assemble
-from toolchain.building.machine import machine_options, plan_machine
+from toolchain.building.build import assemble, check_agreement, read_images
+from toolchain.building.machine import board_layout, machine_options, plan_machine
 from toolchain.building.options import BuildOptions, refused_option
 from toolchain.building.report import REPORT_NAME, build_report
 from toolchain.deployment import (

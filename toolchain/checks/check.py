@@ -11,11 +11,9 @@ import numpy as np
 
 from pcie_shim.errors import PcieShimError
 from pcie_shim.programming_file import Image
-from toolchain.building.agreement import check_agreement, read_images
-from toolchain.building.build import assemble
-from toolchain.building.machine import MachinePlan, plan_machine
+from toolchain.building.build import assemble, check_agreement, read_images
+from toolchain.building.machine import MachinePlan, partition_lines, plan_machine
 from toolchain.building.options import BuildOptions
-from toolchain.building.partition import partition_lines
 from toolchain.checks.checked_machine import CheckedMachine
 from toolchain.checks.codes import code_findings, loss_findings
 from toolchain.checks.finding import Check, Finding, Severity, error, warning

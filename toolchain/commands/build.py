@@ -10,7 +10,7 @@ from toolchain.commands.flags import MESSAGES, BuildFlags, ModelPath
 from toolchain.deployment import Queue
 
 if TYPE_CHECKING:
-    from toolchain.building.sources_file import SourcesFile
+    from toolchain.building.options import SourcesFile
 
 
 def build(
@@ -110,7 +110,7 @@ def _sources(
     path: Path | None, *, uri: str, topic: str, message_type: str, prior_path: str | None
 ) -> "SourcesFile | None":
     """Return the file that assigns variables to topics, if there is one; otherwise the flags must name a topic."""
-    from toolchain.building.sources_file import read_sources
+    from toolchain.building.options import read_sources
     from toolchain.errors import BuildError
 
     target = {"--uri": uri, "--topic": topic, "--type": message_type}

@@ -22,7 +22,7 @@ from toolchain.networks import is_network, read_network
 from toolchain.outputs.rng_table import LENGTH, read_table
 
 if TYPE_CHECKING:
-    from toolchain.building.sources_file import SourcesFile
+    from toolchain.building.options import SourcesFile
     from toolchain.commands.flags import BuildFlags, ModelFlags
 
 

@@ -10,7 +10,7 @@ from toolchain.analysis.accuracy.emulation import EmulatedBoards
 from toolchain.analysis.accuracy.intervals import bootstrap, share_of_frames
 from toolchain.analysis.accuracy.measurement import _difference, _line_probabilities, measure
 from toolchain.analysis.accuracy.readings import MISSING, Readings, sample_readings
-from toolchain.building.partition import split
+from toolchain.building.machine import split
 from toolchain.deployment import Stop
 from toolchain.errors import ModelError
 from toolchain.models.model import Known, Model, dimension, exact_posterior

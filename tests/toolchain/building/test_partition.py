@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from toolchain.building.partition import partition_lines
+from toolchain.building.machine import partition_lines
 from toolchain.errors import BuildError
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from bridge.errors import PathError
 from bridge.fields import parse_path
 from tests.toolchain.running import assert_refused, done, toolchain
-from toolchain.building.sources_file import read_sources
+from toolchain.building.options import read_sources
 from toolchain.deployment import Variable, deployment_hash, load_deployment, write_deployment
 from toolchain.deployment.fields import MESSAGE_PATH
 from toolchain.errors import BuildError

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.toolchain.running import refused_within
-from toolchain.building.sources_file import read_sources
+from toolchain.building.options import read_sources
 from toolchain.deployment import load_deployment
 from toolchain.errors import BuildError, DeploymentError, MifError, ModelError, NetworkFileError
 from toolchain.files.bounded_file import read_bounded

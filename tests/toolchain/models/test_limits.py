@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from tests.toolchain.running import OPTIONS, refused_within
-from toolchain.building.machine import plan_machine
-from toolchain.building.partition import partition_lines
+from toolchain.building.machine import partition_lines, plan_machine
 from toolchain.errors import BuildError, ModelError
 from toolchain.models import IntegerType, IntervalType, Known, Model, PriorSelect, Symbol
 from toolchain.models.conditional import normal, wrapped_normal

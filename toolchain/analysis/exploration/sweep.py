@@ -16,10 +16,15 @@ from toolchain.analysis.accuracy.readings import Readings, check_frames, reading
 from toolchain.analysis.exploration.results import Point
 from toolchain.analysis.resources.device import Device
 from toolchain.analysis.resources.estimate import Pcie, estimate
-from toolchain.building.board_layout import board_layout
-from toolchain.building.machine import MachinePlan, plan_machine, whole_machine
+from toolchain.building.machine import (
+    MachinePlan,
+    board_layout,
+    partition_lines,
+    plan_machine,
+    split,
+    whole_machine,
+)
 from toolchain.building.options import BuildOptions
-from toolchain.building.partition import partition_lines, split
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError

@@ -24,7 +24,7 @@ from toolchain.analysis.accuracy.readings import (
 from toolchain.analysis.resources.device import Device
 from toolchain.analysis.resources.energy import Energy, energy
 from toolchain.analysis.resources.estimate import Estimate, Pcie, estimate
-from toolchain.building.agreement import read_images
+from toolchain.building.build import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
 from toolchain.deployment import Deployment, Scale
 from toolchain.errors import BuildError, DeploymentError

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from machines.parameters import SensorMode
 from pcie_shim.programming_file import interface_room
 from toolchain.analysis.resources.estimate import Pcie, estimate
-from toolchain.building.partition import partition_lines
+from toolchain.building.machine import partition_lines
 from toolchain.errors import BuildError
 from toolchain.outputs.rng_table import LENGTH
 
