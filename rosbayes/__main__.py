@@ -7,40 +7,27 @@ import typer
 
 from terminal.command_line import CommandLine
 
-_RUNNING: Final = "Running a deployment"
-_MODELS: Final = "Models"
-_SERVERS: Final = "rosbridge servers"
-_PROCESSES: Final = "Processes that a master starts"
-_BOAT: Final = "The boat case study"
+# each command line, and what it does in the list of `rosbayes --help`
+_COMMANDS: Final = {
+    "toolchain": ("toolchain.commands.main", "From a model to a deployment."),
+    "master": ("services.commands.master", "Move readings to the boards and posteriors back."),
+    "listen": ("services.commands.listen", "Print, draw or save the posteriors of a running stack."),
+    "status": ("services.commands.status", "Show the whole stack in one screen."),
+    "hub": ("services.commands.hub", "Serve rosbridge without ROS."),
+    "discover": ("services.commands.discover", "List the rosbridge servers on this network."),
+    "subscriber": ("services.commands.subscriber", "Take variables out of a ROS topic."),
+    "publisher": ("services.commands.publisher", "Publish posteriors over rosbridge."),
+    "pcie-app": ("services.commands.pcie_app", "Drive the boards of a mini-cluster."),
+    "board": ("services.commands.board", "Emulate boards of the mini-cluster."),
+    "loader": ("services.commands.loader", "Program a board with an image."),
+    "boat-simulator": ("casestudies.boat.simulator", "Publish the readings of a simulated boat."),
+    "boat-normaliser": ("casestudies.boat.normaliser", "Turn raw readings into whole numbers in range."),
+    "boat-viewer": ("casestudies.boat.viewer", "Show posteriors beside the boat's true position."),
+}
 
-app = CommandLine(name="rosbayes", no_args_is_help=True)
-for name, place, panel, purpose in (
-    ("toolchain", "toolchain.commands.main", _MODELS, "From a model to a deployment."),
-    ("master", "services.commands.master", _RUNNING, "Move readings to the boards and posteriors back."),
-    (
-        "listen",
-        "services.commands.listen",
-        _RUNNING,
-        "Print, draw or save the posteriors of a running stack.",
-    ),
-    ("status", "services.commands.status", _RUNNING, "Show the whole stack in one screen."),
-    ("hub", "services.commands.hub", _SERVERS, "Serve rosbridge without ROS."),
-    ("discover", "services.commands.discover", _SERVERS, "List the rosbridge servers on this network."),
-    ("subscriber", "services.commands.subscriber", _PROCESSES, "Take variables out of a ROS topic."),
-    ("publisher", "services.commands.publisher", _PROCESSES, "Publish posteriors over rosbridge."),
-    ("pcie-app", "services.commands.pcie_app", _PROCESSES, "Drive the boards of a mini-cluster."),
-    ("board", "services.commands.board", _PROCESSES, "Emulate boards of the mini-cluster."),
-    ("loader", "services.commands.loader", _PROCESSES, "Program a board with an image."),
-    ("boat-simulator", "casestudies.boat.simulator", _BOAT, "Publish the readings of a simulated boat."),
-    (
-        "boat-normaliser",
-        "casestudies.boat.normaliser",
-        _BOAT,
-        "Turn raw readings into whole numbers in range.",
-    ),
-    ("boat-viewer", "casestudies.boat.viewer", _BOAT, "Show posteriors beside the boat's true position."),
-):
-    app.add_later(name, place, purpose=purpose, panel=panel)
+app = CommandLine(name="rosbayes")
+for _name, (_module, _purpose) in _COMMANDS.items():
+    app.add_later(_name, _module, purpose=_purpose)
 
 
 def _print_version(wanted: bool) -> None:

@@ -11,7 +11,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
-from terminal.log_line import LogFormat, use_log_format
+from terminal.logs import LogFormat, use_log_format
 from toolchain.deployment.fields import TOPIC_BYTES_MAX, TOPIC_BYTES_MIN
 
 SHORTEST_S, LONGEST_S = 0.001, 86_400.0

@@ -1,20 +1,18 @@
-"""The base of all command lines: common flags, start-up and exit."""
+"""The base of all command lines: start-up, checks of all flags, and exit."""
 
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
-from typing import Any, Final, NoReturn, cast
+from typing import Any, Final, NoReturn
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from terminal.ending import outcome
-from terminal.errors import ReaderGoneError
-from terminal.help.help_page import WIDTH, write_help
-from terminal.help.usage import Parameter, RefusedValueError, metavar
+from terminal.errors import ExitCode, ReaderGoneError
 from terminal.logs import escape_last_resort
 from terminal.output import open_standard_streams
 from terminal.signals import raise_on_signals
@@ -31,7 +29,7 @@ class CommandLine(typer.Typer):
             cls=_Group,
             pretty_exceptions_enable=False,
             rich_markup_mode=None,
-            context_settings={"help_option_names": ["-h", "--help"], "max_content_width": WIDTH},
+            context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
             **settings,
         )
 
@@ -41,7 +39,7 @@ class CommandLine(typer.Typer):
         """Register a function as a command; its integer result is the exit code."""
         return super().command(name, cls=cls or _Command, **settings)
 
-    def add_later(self, name: str, module: str, *, purpose: str, panel: str) -> None:
+    def add_later(self, name: str, module: str, *, purpose: str) -> None:
         """Add the command line `app` of a module as a subcommand; it is imported when the subcommand is named."""
 
         def load() -> Any:
@@ -50,7 +48,7 @@ class CommandLine(typer.Typer):
             command.params = [each for each in command.params if each.name not in _COMPLETION]
             return command
 
-        self.command(name, cls=_Later, help=purpose, rich_help_panel=panel)(load)
+        self.command(name, cls=_Later, help=purpose)(load)
 
     def __call__(self, arguments: Sequence[str] | None = None) -> NoReturn:
         """Run the command with `sys.argv`, or with these arguments, and exit."""
@@ -65,27 +63,27 @@ class CommandLine(typer.Typer):
 
 
 class _Command(TyperCommand):
-    """A command that names the values of its flags in `--help`, and refuses blank and non-finite values."""
-
-    def __init__(self, *args: Any, **settings: Any) -> None:
-        super().__init__(*args, **settings)
-        for parameter in self.params:
-            if isinstance(parameter, Parameter):
-                parameter.metavar = metavar(parameter)
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        write_help(self, ctx, formatter)
+    """A command that refuses blank and non-finite values, which no flag accepts."""
 
     def invoke(self, ctx: Any) -> Any:
         with _noticing_closed_pipe():
             return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        with _naming(ctx):
-            rest: list[str] = super().parse_args(ctx, list(args))
-            typed, _, _ = self.make_parser(ctx).parse_args(args=list(args))
-            for parameter in self.params:
-                _check_value(ctx, parameter, typed.get(parameter.name))
+        rest: list[str] = super().parse_args(ctx, list(args))
+        # once more, because afterwards Path("") cannot be told from the current folder
+        typed, _, _ = self.make_parser(ctx).parse_args(args=list(args))
+        parameter: Any
+        for parameter in self.params:
+            texts = typed.get(parameter.name)
+            for each in texts if isinstance(texts, list | tuple) else (texts,):
+                if isinstance(each, str) and not each.strip():
+                    raise typer.BadParameter(
+                        f"expected a text that is not blank, not {each!r}", ctx, parameter
+                    )
+            found = ctx.params.get(parameter.name)
+            if isinstance(found, float) and not math.isfinite(found):
+                raise typer.BadParameter(f"expected a finite number, not {texts}", ctx, parameter)
         return rest
 
 
@@ -95,9 +93,6 @@ class _Later(_Command):
 
 class _Group(TyperGroup):
     """A group of commands."""
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        write_help(self, ctx, formatter)
 
     def invoke(self, ctx: Any) -> Any:
         with _noticing_closed_pipe():
@@ -110,8 +105,10 @@ class _Group(TyperGroup):
         return name, command, rest
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        with _naming(ctx):
-            return super().parse_args(ctx, args)
+        if not args and not ctx.resilient_parsing:
+            print(ctx.get_help())
+            raise typer.Exit(ExitCode.USAGE)
+        return super().parse_args(ctx, args)
 
 
 @contextmanager
@@ -121,24 +118,3 @@ def _noticing_closed_pipe() -> Iterator[None]:
         yield
     except BrokenPipeError as error:
         raise ReaderGoneError from error
-
-
-@contextmanager
-def _naming(context: Any) -> Iterator[None]:
-    """Add the name of the subcommand to a usage error if typer omits it."""
-    try:
-        yield
-    except typer.TyperException as error:
-        if getattr(error, "ctx", context) is None:
-            cast("Any", error).ctx = context
-        raise
-
-
-def _check_value(context: Any, parameter: Any, typed: object) -> None:
-    """Raise a RefusedValueError for blank text and numbers that are not finite."""
-    for each in typed if isinstance(typed, list | tuple) else (typed,):
-        if isinstance(each, str) and not each.strip():
-            raise RefusedValueError(each, context, parameter)
-    found = context.params.get(parameter.name)
-    if isinstance(found, float) and not math.isfinite(found):
-        raise RefusedValueError(str(typed), context, parameter)

@@ -5,13 +5,13 @@ import os
 import sys
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 import typer
 
 from terminal.errors import ExitCode, ReaderGoneError, StoppedError, exit_code_of
-from terminal.help.usage import usage_sentence
-from terminal.log_line import PARENT_VARIABLE
+from terminal.logs import PARENT_VARIABLE
 from terminal.output import discard_output, say, say_lines
 from terminal.signals import check_signals, ignore_signals, received_stop
 
@@ -44,10 +44,11 @@ def report(error: BaseException) -> int:
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else ExitCode.DONE
     if isinstance(error, typer.TyperException):
-        if type(error).__name__ == "NoArgsIsHelpError":
-            print(error.message.rstrip())
-        else:
-            say(f"error: {usage_sentence(error)}")
+        context = getattr(error, "ctx", None)
+        command = Path(sys.argv[0]).name if context is None else context.command_path
+        # some of typer's messages have several lines
+        message = " ".join(error.format_message().split()).replace("Value error, ", "").removesuffix(".")
+        say(f"error: {message}; {command} --help says more")
         return ExitCode.USAGE
     if isinstance(error, ReaderGoneError | BrokenPipeError):
         discard_output()

@@ -1,14 +1,160 @@
-"""Logging to standard error, in one line format for every process."""
+"""Lines on standard error, in one format for every process: text, or one JSON object per line.
 
+    say, show_progress (terminal.output) ──┐
+    get_logger (structlog) ────────────────┼──▶ text or JSON ──▶ write_line ──▶ standard error
+    logging of libraries ──────────────────┤
+    relayed lines of children ─────────────┘
+
+The format is that of `BM_LOG_FORMAT`, which children inherit. Whatever a peer sent is escaped, so that it can
+neither begin a line nor control a terminal.
+"""
+
+import json
 import logging
-from typing import Any
+import os
+import re
+import sys
+from contextlib import suppress
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final, TextIO
 
 import structlog
-from structlog.typing import FilteringBoundLogger
+from structlog.typing import EventDict, FilteringBoundLogger
 
-from terminal.log_line import LogFormat, dated_lines, json_line, log_format, logged
 from terminal.one_line import lines_of, one_line
-from terminal.output import write_line
+
+PARENT_VARIABLE: Final = "ROSBAYES_PARENT"
+"""Environment variable that a process sets for its children, which exit with it and report nothing."""
+FORMAT_VARIABLE: Final = "BM_LOG_FORMAT"
+
+_ERROR: Final = "error: "
+_WARNING: Final = re.compile(r"(?:[\w-]+: )?warning: ")
+_IS_CHILD: Final = PARENT_VARIABLE in os.environ
+_CLEAR_LINE: Final = "\r\x1b[K"
+
+_stamp: Final = structlog.processors.TimeStamper(fmt="iso", utc=True, key="time")
+_json: Final = structlog.processors.JSONRenderer(default=str)
+_text: Final = structlog.dev.ConsoleRenderer(
+    colors=False, sort_keys=False, pad_event_to=0, pad_level=False, timestamp_key="time", event_key="message"
+)
+
+
+class _Process:
+    """State of this process's lines."""
+
+    name = ""
+    """Its name in JSON lines if it is not that of its command; set at start-up."""
+    shows_progress = False
+    """True while the last line of the terminal is a progress, which the next line replaces."""
+
+
+class LogFormat(StrEnum):
+    """A format of the lines on standard error."""
+
+    TEXT = "text"
+    JSON = "json"
+
+
+def log_format() -> LogFormat:
+    """Return the format in force; that of an invalid variable, which the settings report, is text."""
+    value = os.environ.get(FORMAT_VARIABLE, "")
+    return LogFormat(value) if value in set(LogFormat) else LogFormat.TEXT
+
+
+def use_log_format(value: str) -> None:
+    """Use this format from now on, in this process and in its later children."""
+    os.environ[FORMAT_VARIABLE] = value
+
+
+def name_process(name: str) -> None:
+    """Set the name of this process in its JSON lines, which is otherwise that of its command."""
+    _Process.name = name
+
+
+def _own_name() -> str:
+    name = Path(sys.argv[0]).stem
+    is_umbrella = name in {"rosbayes", "__main__"} and len(sys.argv) > 1
+    return _Process.name or (sys.argv[1] if is_umbrella else name)
+
+
+# --- lines ------------------------------------------------------------------------------------------
+
+
+def json_line(level: str, message: str, *, process: str = "", **fields: object) -> str:
+    """Return a JSON object on one line, in ASCII."""
+    record = {"level": level, "process": process or _own_name(), "message": message, **fields}
+    return str(_json(None, level, _stamp(None, level, record)))
+
+
+def formatted(text: str) -> str:
+    """Return a text for the user in the format in force.
+
+    The `error: ` of a child remains text, because its parent reports it.
+    """
+    is_error = text.startswith(_ERROR)
+    if log_format() is LogFormat.TEXT or (_IS_CHILD and is_error):
+        return lines_of(text)
+    if is_error:
+        return json_line("error", text.removeprefix(_ERROR))
+    if found := _WARNING.match(text):
+        return json_line("warning", text[found.end() :])
+    return json_line("info", text)
+
+
+def relayed(line: str, process: str) -> str:
+    """Return a line of a child in the format in force; JSON of a child of the same version remains as it is."""
+    if log_format() is LogFormat.TEXT or _is_record(line):
+        return one_line(line)
+    return json_line("info", line, process=process)
+
+
+def _is_record(line: str) -> bool:
+    try:
+        record = json.loads(line)
+    except (ValueError, RecursionError):
+        return False
+    return isinstance(record, dict) and {"time", "level", "process", "message"} <= record.keys()
+
+
+def write_line(text: str) -> None:
+    """Print a text that is in the format in force on standard error."""
+    stream = SurvivingStream(sys.stderr)
+    stream.write(text + "\n")
+    stream.flush()
+
+
+def write_progress(text: str) -> None:
+    """Show a text without a line's end, which the next line replaces."""
+    stream = SurvivingStream(sys.stderr)
+    stream.write(text)
+    stream.flush()
+    _Process.shows_progress = True
+
+
+class SurvivingStream:
+    """Standard error that may disappear, because a closed terminal must not end a robot's run."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text if the stream still accepts it, in place of the progress."""
+        try:
+            if _Process.shows_progress:
+                _Process.shows_progress = False
+                self._stream.write(_CLEAR_LINE)
+            return self._stream.write(text)
+        except (OSError, ValueError):
+            return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream if it is still there."""
+        with suppress(OSError, ValueError):
+            self._stream.flush()
+
+
+# --- loggers ----------------------------------------------------------------------------------------
 
 
 class _StandardError:
@@ -20,28 +166,33 @@ class _StandardError:
     debug = warning = error = critical = info
 
 
-class _OneLine(logging.Formatter):
-    """Formatter with one line per record: a library may quote untrusted text. Tracebacks keep their lines."""
+def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
+    """Return the logger of a process; its lines contain its name, and the number of the frame if any.
 
-    def formatMessage(self, record: logging.LogRecord) -> str:
-        return one_line(super().formatMessage(record))
+    The first call in a process sets the minimum level: debug, info or warning.
+    """
+    # our own records cover the warnings of libraries; only their errors are new
+    log_libraries(logging.ERROR, "%(name)s: %(message)s")
+    if not structlog.is_configured():
+        structlog.configure(
+            processors=[structlog.processors.add_log_level, _stamp, _line],
+            wrapper_class=structlog.make_filtering_bound_logger(
+                logging.getLevelNamesMapping()[level.upper()]
+            ),
+            logger_factory=_StandardError,
+            cache_logger_on_first_use=True,
+        )
+    logger: FilteringBoundLogger = structlog.get_logger().bind(process=role)
+    return logger
 
-    def format(self, record: logging.LogRecord) -> str:
-        if log_format() is not LogFormat.JSON:
-            return dated_lines(super().format(record))
-        fields = {"logger": record.name}
-        if record.exc_info:
-            fields["traceback"] = super().formatException(record.exc_info)
-        return json_line(record.levelname.lower(), record.getMessage(), **fields)
 
-    def formatException(self, ei: Any) -> str:
-        return lines_of(super().formatException(ei))
-
-
-def escape_last_resort() -> None:
-    """Escape warnings of libraries if logging is not configured, because some quote a server."""
-    if logging.lastResort is not None:
-        logging.lastResort.setFormatter(_OneLine())
+def _line(logger: Any, level: str, record: EventDict) -> str:
+    """Return a record as a line; fields whose names begin with `_` are only in JSON."""
+    record["message"] = record.pop("event")
+    if log_format() is LogFormat.JSON:
+        return str(_json(logger, level, {key.lstrip("_"): value for key, value in record.items()}))
+    shown = {key: value for key, value in record.items() if not key.startswith("_")}
+    return one_line(_text(logger, level, shown))
 
 
 def log_libraries(level: int, form: str) -> None:
@@ -51,29 +202,22 @@ def log_libraries(level: int, form: str) -> None:
     logging.basicConfig(level=level, handlers=[handler])
 
 
-def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
-    """Return the logger of a process; its lines contain its name, and the number of the frame if any.
-
-    The first call in a process sets the minimum level: debug, info or warning.
-    """
-    # our own records cover the warnings of libraries; only their errors are new
-    log_libraries(logging.ERROR, "%(name)s: %(message)s")
-    if not structlog.is_configured():
-        _configure(level)
-    logger: FilteringBoundLogger = structlog.get_logger().bind(process=role)
-    return logger
+def escape_last_resort() -> None:
+    """Escape warnings of libraries if logging is not configured, because some quote a server."""
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_OneLine())
 
 
-def _configure(level: str) -> None:
-    structlog.configure(
-        processors=[
-            _line,
-        ],
-        wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelNamesMapping()[level.upper()]),
-        logger_factory=_StandardError,
-        cache_logger_on_first_use=True,
-    )
+class _OneLine(logging.Formatter):
+    """Formatter with one line per record: a library may quote untrusted text. Tracebacks keep their lines."""
 
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        return one_line(super().formatMessage(record))
 
-def _line(_: Any, level: str, event: structlog.typing.EventDict) -> str:
-    return logged(level, event.pop("process"), event.pop("event"), event)
+    def format(self, record: logging.LogRecord) -> str:
+        if log_format() is LogFormat.TEXT:
+            return lines_of(super().format(record))
+        fields = {"logger": record.name}
+        if record.exc_info:
+            fields["traceback"] = super().formatException(record.exc_info)
+        return json_line(record.levelname.lower(), record.getMessage(), **fields)

@@ -9,46 +9,13 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, TextIO
+from typing import Any
 
 import orjson
 
 from terminal.errors import OutputError
-from terminal.log_line import LogFormat, formatted, log_format, relayed
+from terminal.logs import LogFormat, formatted, log_format, relayed, write_line, write_progress
 from terminal.one_line import one_line
-
-_CLEAR_LINE: Final = "\r\x1b[K"
-
-
-class _Progress:
-    """State of the terminal: `shown` is true while its last line is a progress, which the next line replaces."""
-
-    shown = False
-
-
-_progress = _Progress()
-
-
-class SurvivingStream:
-    """Standard error that may disappear, because a closed terminal must not end a robot's run."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        """Write a text if the stream still accepts it, in place of the progress."""
-        try:
-            if _progress.shown:
-                _progress.shown = False
-                self._stream.write(_CLEAR_LINE)
-            return self._stream.write(text)
-        except (OSError, ValueError):
-            return len(text)
-
-    def flush(self) -> None:
-        """Flush the stream if it is still there."""
-        with contextlib.suppress(OSError, ValueError):
-            self._stream.flush()
 
 
 def say(text: str) -> None:
@@ -59,17 +26,13 @@ def say(text: str) -> None:
 def show_progress(text: str) -> None:
     """Show the progress of this command in one line of the terminal, which the next line replaces.
 
-    In another format than text, it is a line of its own.
+    In JSON it is a line of its own.
     """
-    if log_format() is not LogFormat.TEXT:
+    if log_format() is LogFormat.JSON:
         say(text)
         return
-    stream = SurvivingStream(sys.stderr)
-    stream.write(
-        one_line(text)[: shutil.get_terminal_size().columns - 1]
-    )  # a longer one could not be replaced
-    stream.flush()
-    _progress.shown = True
+    # a longer one could not be replaced
+    write_progress(one_line(text)[: shutil.get_terminal_size().columns - 1])
 
 
 @contextlib.contextmanager
@@ -92,13 +55,6 @@ def say_lines(text: str) -> None:
 def relay(line: str, process: str) -> None:
     """Print a line that a child has printed on standard error."""
     write_line(relayed(line, process))
-
-
-def write_line(text: str) -> None:
-    """Print a text that is in the format in force on standard error."""
-    stream = SurvivingStream(sys.stderr)
-    stream.write(text + "\n")
-    stream.flush()
 
 
 def print_json_line(value: Any) -> None:

@@ -24,7 +24,7 @@ from services.supervision.child import describe_exit
 from services.supervision.parent import end_with_parent, outlive_parent
 from services.supervision.service_manager import ServiceManager
 from terminal.errors import StoppedError, exit_code_of
-from terminal.log_line import PARENT_VARIABLE, name_process
+from terminal.logs import PARENT_VARIABLE, name_process
 from terminal.output import say
 from terminal.private_directory import remove_stale_sockets
 from terminal.signals import check_signals

@@ -23,7 +23,7 @@ from services.sockets.serving import deployment_for, endpoint_from
 from services.supervision.child import RESTARTS
 from services.supervision.parent import end_with_parent, leave_private_directory
 from terminal.command_line import CommandLine
-from terminal.log_line import PARENT_VARIABLE, name_process
+from terminal.logs import PARENT_VARIABLE, name_process
 from terminal.output import say
 from terminal.signals import check_signals, stopped_error
 

@@ -159,9 +159,7 @@ LogLevel = Annotated[
 ]
 LogFormat = Annotated[
     str | None,
-    setting(
-        "log_format", "Lines on standard error: text, dated text, or JSON objects.", metavar="text|dated|json"
-    ),
+    setting("log_format", "Lines on standard error: text, or JSON objects.", metavar="text|json"),
 ]
 Count = Annotated[
     int | None,

@@ -14,7 +14,7 @@ from pathlib import Path
 from services.errors import ReportedError, StackError
 from services.supervision.parent import DIRECTORY_VARIABLE
 from terminal.errors import ExitCode
-from terminal.log_line import PARENT_VARIABLE
+from terminal.logs import PARENT_VARIABLE
 from terminal.output import relay
 
 RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"

@@ -8,7 +8,7 @@ import signal
 import time
 from pathlib import Path
 
-from terminal.log_line import PARENT_VARIABLE
+from terminal.logs import PARENT_VARIABLE
 from terminal.private_directory import remove_stale_sockets
 from terminal.signals import stopped_error
 

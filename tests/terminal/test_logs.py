@@ -1,17 +1,21 @@
-"""Any text in a sentence is printed as one line without control characters."""
+"""Lines on standard error: text or JSON, and no control characters of anybody else in them."""
 
 import asyncio
 import json
+import os
+import re
 import subprocess
 import sys
+import time
 from asyncio.subprocess import PIPE
 from pathlib import Path
 
 import pytest
 import websockets
 
+from terminal.logs import LogFormat, log_format
 from terminal.one_line import one_line, shown
-from terminal.output import print_json_line, say, say_lines
+from terminal.output import print_json_line, say, say_if_slow, say_lines, show_progress
 from tests.patience import PROCESS_PATIENCE
 
 HOSTILE = "a\nerror: all is well\r\x1b[2J\x9b31m\x07\x08\x7f\u202eend\ud800"
@@ -46,54 +50,120 @@ def test_a_message_is_one_line(capsys):
     assert capsys.readouterr().err == "one\n\\x1btwo\n"
 
 
-@pytest.mark.thorough
-def test_what_is_logged_is_a_line():
-    code = f"""
+CODE = f"""
 import logging
-from terminal.logs import get_logger, log_libraries
+from terminal.logs import get_logger, log_libraries, name_process
+from terminal.output import relay, say, say_lines
+name_process("board3")
 log_libraries(logging.WARNING, "hub: %(message)s")
-get_logger("master").warning({HOSTILE!r}, reason={HOSTILE!r}, frame=7)
-logging.getLogger("bridge").warning("a topic: %s", {HOSTILE!r})
+log = get_logger("master", "info")
+log.debug("nobody sees this")
+log.warning({HOSTILE!r}, frame=7, why={HOSTILE!r}, _reason="failed")
+say("hub: listening")
+say("hub: warning: it is late")
+say("error: no robot")
+say_lines("Traceback\\n  line")
+relay("a library complains \\x1b", "pcie-app")
+relay('{{"time": "2026-01-01T00:00:00", "level": "info", "process": "x", "message": "of a child"}}', "pcie-app")
 try:
     raise ValueError("one\\n\\x1btwo")
 except ValueError:
-    logging.getLogger("bridge").exception("failed")
+    logging.getLogger("bridge").exception("a topic: %s", {HOSTILE!r})
 """
+
+
+def lines(form, **more):
+    environment = {
+        key: value for key, value in os.environ.items() if key not in {"BM_LOG_FORMAT", "ROSBAYES_PARENT"}
+    }
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=PROCESS_PATIENCE, check=True
+        [sys.executable, "-c", CODE],
+        capture_output=True,
+        text=True,
+        timeout=PROCESS_PATIENCE,
+        check=True,
+        env=environment | {"BM_LOG_FORMAT": form} | more,
     )
-    ours, theirs, *trace = done.stderr.splitlines()
-    assert f"warning: frame=7 {HARMLESS} reason=" in ours
-    assert theirs == f"hub: a topic: {HARMLESS}"
-    assert trace[-2:] == ["ValueError: one", "\\x1btwo"]
     assert all(line.isprintable() for line in done.stderr.splitlines())
+    return done.stderr.splitlines()
 
 
-LINES = """
-from terminal.logs import get_logger
-log = get_logger("pcie-app", {level!r})
-log.debug("computed", frame=17, cycles=512)
-log.debug("computed", frame=170, cycles=512)
-log.info("4 boards programmed")
-log.warning("board 2 is gone", frame=17, why='closed "now"')
-"""
+@pytest.mark.process
+def test_json_is_one_object_per_line():
+    found = [json.loads(line) for line in lines("json")]
+    assert [(each["process"], each["level"], each["message"]) for each in found] == [
+        ("master", "warning", HOSTILE),
+        ("board3", "info", "hub: listening"),
+        ("board3", "warning", "it is late"),
+        ("board3", "error", "no robot"),
+        ("board3", "info", "Traceback\n  line"),
+        ("pcie-app", "info", "a library complains \x1b"),
+        ("x", "info", "of a child"),
+        ("board3", "error", f"a topic: {HOSTILE}"),
+    ]
+    assert (found[0]["frame"], found[0]["why"], found[0]["reason"]) == (7, HOSTILE, "failed")
+    assert re.match(r"\d{4}-\d\d-\d\dT.*Z", found[0]["time"])
+    assert found[-1]["logger"] == "bridge"
+    assert "ValueError" in found[-1]["traceback"]
 
 
-@pytest.mark.parametrize(("level", "count"), [("debug", 4), ("info", 2), ("warning", 1)])
 @pytest.mark.thorough
-def test_a_frame_is_found_by_its_number_and_nothing_is_logged_below_the_level(level, count):
-    command = [sys.executable, "-c", LINES.format(level=level)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=PROCESS_PATIENCE)
-    lines = [line.split(" ", 1)[1] for line in done.stderr.splitlines()]
-    assert (
-        lines
-        == [
-            "pcie-app: debug: frame=17 computed cycles=512",
-            "pcie-app: debug: frame=170 computed cycles=512",
-            "pcie-app: 4 boards programmed",
-            r'pcie-app: warning: frame=17 board 2 is gone why="closed \"now\""',
-        ][-count:]
-    )
+def test_text_is_a_line_for_a_person():
+    first, *rest = lines("")
+    time, level, _ = first.split(" ", 2)
+    assert re.match(r"\d{4}-\d\d-\d\dT.*Z", time)
+    assert level == "[warning]"
+    assert HARMLESS in first
+    assert re.search(r"process=master frame=7 why=", first)
+    assert rest[:5] == [
+        "hub: listening",
+        "hub: warning: it is late",
+        "error: no robot",
+        "Traceback",
+        "  line",
+    ]
+    assert rest[5] == "a library complains \\x1b"
+    assert f"hub: a topic: {HARMLESS}" in rest
+    assert rest[-2:] == ["ValueError: one", "\\x1btwo"]
+
+
+@pytest.mark.thorough
+def test_the_error_of_a_child_remains_text_for_its_parent():
+    assert "error: no robot" in lines("json", ROSBAYES_PARENT="1")
+
+
+@pytest.mark.parametrize("value", ["", "xml"])
+def test_another_format_is_text(monkeypatch, value):
+    monkeypatch.setenv("BM_LOG_FORMAT", value)
+    assert log_format() is LogFormat.TEXT
+
+
+def test_progress_is_one_line_that_the_next_line_replaces(capsys, monkeypatch):
+    monkeypatch.delenv("BM_LOG_FORMAT", raising=False)
+    show_progress("1 result\n")
+    show_progress("2 results")
+    say("a warning")
+    say("another")
+    assert capsys.readouterr().err == "1 result\\n\r\x1b[K2 results\r\x1b[Ka warning\nanother\n"
+    monkeypatch.setenv("COLUMNS", "20")
+    show_progress("x" * 20)  # a line that wraps could not be replaced
+    say("end")
+    assert capsys.readouterr().err.startswith("x" * 19 + "\r")
+    monkeypatch.setenv("BM_LOG_FORMAT", "json")
+    show_progress("3 results")
+    assert json.loads(capsys.readouterr().err)["message"] == "3 results"
+
+
+def test_only_a_long_wait_is_reported(capsys, monkeypatch):
+    monkeypatch.delenv("BM_LOG_FORMAT", raising=False)
+    said = ""
+    with say_if_slow("waiting", after_s=0.0):
+        while not said.endswith("\n"):
+            time.sleep(0.01)
+            said += capsys.readouterr().err
+    with say_if_slow("waiting", after_s=3600.0):
+        pass
+    assert (said, capsys.readouterr().err) == ("waiting\n", "")
 
 
 @pytest.mark.parametrize("variables", [("--variables", "K"), ()], ids=["without the variable", "all of it"])

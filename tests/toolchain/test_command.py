@@ -59,7 +59,7 @@ def test_a_build(case):
         (["--rng-table", "a.mif"], ["--rng-table", "--rng lfsr32"]),
         (["--rng", "table", "--rng-table", "/no.mif"], ["/no.mif", "No such file"]),
         (["--sensor-mode", "cell", "--scale", "address"], ["--scale address", "--sensor-mode cell"]),
-        (["--replicas", "257"], ["--replicas 257", "1 to 256"]),
+        (["--replicas", "257"], ["--replicas", "256"]),
         (["--searched", "s"], ["--searched"]),
     ],
 )

@@ -12,7 +12,7 @@ from toolchain.commands.flags import add_commands
 from toolchain.commands.inspect import inspect
 from toolchain.commands.new import new
 
-app = CommandLine(no_args_is_help=True)
+app = CommandLine()
 app.add_typer(regenerate.app, name="regenerate")
 add_commands(app, build, check, inspect, explore, fit, new)
 

@@ -14,7 +14,7 @@ from toolchain.deployment import FILE_NAME, Queue, Stop
 if TYPE_CHECKING:
     from toolchain.building.regenerate import Changes
 
-app = CommandLine(no_args_is_help=True)
+app = CommandLine()
 
 Directory: TypeAlias = Annotated[
     Path, typer.Argument(help="Folder of the deployment, written by `toolchain build`.", metavar="DIR")

@@ -50,7 +50,7 @@ asyncio.run(main())
 KILLED_IN_PART = '''
 import ctypes, os, platform, socket, subprocess, sys, threading, time
 from services.supervision.parent import DIRECTORY_VARIABLE
-from terminal.log_line import PARENT_VARIABLE
+from terminal.logs import PARENT_VARIABLE
 from terminal.private_directory import PrivateDirectory
 directory = PrivateDirectory().path
 listener = socket.socket(socket.AF_UNIX)

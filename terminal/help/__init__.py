@@ -1,1 +1,0 @@
-"""Help: the page of `--help`, and sentences for usage errors."""
