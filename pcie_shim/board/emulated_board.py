@@ -54,7 +54,6 @@ class EmulatedBoard:
         programmed: Number of images loaded so far.
         done: The number of the last start or resume that has stopped (register DONE).
         running: Whether the machine is running and `step` must be called.
-        stuck: Set by misbehaviour: a machine that is started now runs forever without a cycle.
     """
 
     def __init__(self, make: Callable[[BM1Machine], BM1Kernel] = make_kernel) -> None:
@@ -80,7 +79,6 @@ class EmulatedBoard:
         self.programmed = 0
         self.done = 0
         self.running = False
-        self.stuck = False
         self._power_up()
 
     # ---- identity -------------------------------------------------------------------------------------
@@ -384,10 +382,6 @@ class EmulatedBoard:
 
     def _run(self, kernel: BM1Kernel, start: Start | None, end: int, halted: Collection[int] = ()) -> None:
         """Run one chunk, to cycle `end`, of a new frame (`start`) or of the current one."""
-        if self.stuck:
-            self.running = True
-            self._publish(BoardState.RUNNING, StopReason.NONE, 0)
-            return
         began = time.perf_counter_ns()
         reason = kernel.resume(end, halted) if start is None else kernel.start(start)
         elapsed = time.perf_counter_ns() - began

@@ -42,7 +42,6 @@ class RtlBoard:
         programmed: Number of images loaded so far.
         done: The number of the last start or resume that has stopped (register DONE).
         running: True while the machine is running and `step` must be called.
-        stuck: False, because simulated hardware does not misbehave.
     """
 
     def __init__(self, simulate: Callable[[Image], Simulation]) -> None:
@@ -62,7 +61,6 @@ class RtlBoard:
         self.programmed = 0
         self.done = 0
         self.running = False
-        self.stuck = False
 
     def close(self) -> None:
         """End the simulation."""

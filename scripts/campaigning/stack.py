@@ -138,7 +138,9 @@ class Stack:
         if role in BOARD_NAMES:
             index = ["--index", role.removeprefix("board")]
             listen = ["--listen", f"tcp://127.0.0.1:{self._board_ports[role][1]}"]
-            return ["board", *listen, *index, *(["--misbehave", misbehave] if misbehave else [])]
+            if misbehave:
+                return ["python", "-m", "tests.pcie_shim.misbehaving", listen[1], index[1], misbehave]
+            return ["board", *listen, *index]
         if role == "pcie-app":
             return [role, *deployment, *listen, *boards, *limits]
         if role in SERVICES:

@@ -10,10 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, NoReturn
 
-from pcie_shim.board.board import Board
-from pcie_shim.board.misbehaviour import Misbehaviour
 from pcie_shim.board.rtl_board import RtlBoard
-from pcie_shim.board.server import StopSignal, serve_board
+from pcie_shim.board.server import Board, StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint, is_served
 from services.boards.hardware import SimulatedHardware
 from services.errors import BoardFailedError, SettingsError
@@ -38,7 +36,6 @@ _LISTENS: Final = 128
 def serve_one(
     endpoint: Endpoint,
     index: int,
-    misbehave: Misbehaviour | None,
     directory: Path | None,
     *,
     board: RtlBoard | None = None,
@@ -88,7 +85,7 @@ def serve_one(
     name = f"board{index}"
     try:
         with serve_status_in_thread(directory, name, status, metrics=metrics, is_alive=is_alive):
-            serve_board(endpoint, index=index, stop=stop, board=board, misbehave=misbehave, on_ready=ready)
+            serve_board(endpoint, index=index, stop=stop, board=board, on_ready=ready)
     finally:
         if board is not None:
             board.close()
@@ -202,7 +199,6 @@ class BoardProcesses:
             ended_by = serve_one(
                 self._endpoints[at],
                 at,
-                None,
                 self._run_directory,
                 board=None if self._hardware is None else self._hardware.board(at),
                 metrics=shifted(self._metrics, at),

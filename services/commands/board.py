@@ -9,7 +9,6 @@ from typing import Annotated, Final
 
 import typer
 
-from pcie_shim.board.misbehaviour import Misbehaviour
 from pcie_shim.credentials import read_key
 from pcie_shim.endpoint import Endpoint
 from services.boards.deployed import images_of
@@ -78,13 +77,6 @@ def board(
     insecure: options.Insecure = False,
     metrics: options.Metrics = None,
     log_format: options.LogFormat = None,
-    misbehave: Annotated[
-        str,
-        typer.Option(
-            help="For tests: one of the misbehaviours listed in docs/reference/boards.md.",
-            metavar="KIND[:AFTER[:TIMES]]",
-        ),
-    ] = "",
 ) -> int:
     """Emulate boards of the mini-cluster."""
     end_with_parent()
@@ -98,8 +90,6 @@ def board(
             "give either --listen ENDPOINT for one board, or --directory DIR for several, with --boards N or a deployment"
         )
     if boards is not None:
-        if misbehave:
-            raise SettingsError("--misbehave belongs to a single board: start it with --listen ENDPOINT")
         if directory is None:
             raise SettingsError("--boards needs --directory DIR, a folder for the boards' sockets")
         try:
@@ -114,8 +104,6 @@ def board(
             )
         hardware = _hardware(engine, settings, range(boards))
         BoardProcesses(directory, boards, restarts, settings, hardware).run()
-    if engine is not Engine.EMULATED and misbehave:
-        raise SettingsError("--misbehave belongs to an emulated board: leave out --engine")
     name_process(f"board{index}")
     from machines import warm_up
 
@@ -128,11 +116,9 @@ def board(
         if PARENT_VARIABLE not in os.environ:  # a master monitors its boards itself
             say(f"board {index} listens at {endpoint}")
 
-    fault = Misbehaviour.parse(misbehave) if misbehave else None
     ended_by = serve_one(
         endpoint,
         index,
-        fault,
         run_directory,
         board=None if hardware is None else hardware.board(index),
         metrics=settings.metrics,

@@ -1,10 +1,9 @@
-"""docs/reference/boards.md: every error, misbehaviour and operation is described, and its bytes are the encoder's."""
+"""docs/reference/boards.md: every error and operation is described, and its bytes are the encoder's."""
 
 import inspect
 from pathlib import Path
 
 from pcie_shim import errors, framing
-from pcie_shim.board.misbehaviour import MisbehaviourKind
 
 TEXT = (Path(__file__).parents[2] / "docs/reference/boards.md").read_text()
 
@@ -13,11 +12,6 @@ def test_every_error_of_a_board_or_image_is_documented_with_its_exit_code() -> N
     for name, error in inspect.getmembers(errors, inspect.isclass):
         if issubclass(error, errors.BoardError | errors.ImageError) and error is not errors.BoardError:
             assert f"| `{name}` | {error.exit_code} |" in TEXT
-
-
-def test_every_misbehaviour_is_documented() -> None:
-    for kind in MisbehaviourKind:
-        assert f"| `{kind}` |" in TEXT
 
 
 def test_every_operation_and_the_bytes_of_a_frame_are_documented() -> None:

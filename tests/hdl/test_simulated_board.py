@@ -287,12 +287,6 @@ def test_missing_tools_are_named(tmp_path, monkeypatch, engine):
     assert ("verilator g++" in ended.stderr.replace("make ", "")) == (engine == "verilator")
 
 
-def test_simulated_hardware_does_not_misbehave(tmp_path):
-    ended = invoke(app, ["--engine", "rtl", "--misbehave", "drop", "--listen", f"unix:{tmp_path}/a.sock"])
-    assert ended.exit_code == 2
-    assert "--engine" in ended.stderr
-
-
 @needs_ghdl
 def test_a_cache_of_others_is_not_used(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

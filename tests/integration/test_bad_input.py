@@ -7,6 +7,7 @@ import socket
 
 import pytest
 
+from machines import warm_up
 from services.commands import master
 from tests.command_runner import invoke
 from tests.integration.conftest import (
@@ -17,6 +18,7 @@ from tests.integration.conftest import (
     only_error,
     until_subscribed,
 )
+from tests.pcie_shim.boards import ServedBoard
 
 
 async def once(stage, deployment, uri, *options) -> tuple[int, str]:
@@ -159,10 +161,11 @@ async def stuck_board(stage, server, tmp_path):
     _, robot = server
     folder = build_boat(tmp_path / "one", partitions=1)
     endpoint = f"unix:{stage.where}/b.sock"
-    board = stage.start("board", "--listen", endpoint, "--misbehave", "never-done")
-    await board.says("listens")
+    warm_up()
+    board = ServedBoard(endpoint, misbehave="never-done")
     await robot.keep_publishing()
-    return folder, ("--boards", endpoint, "--board-timeout", "0.3")
+    yield folder, ("--boards", endpoint, "--board-timeout", "0.3")
+    board.stop()
 
 
 @pytest.mark.process

@@ -11,6 +11,7 @@ import struct
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -18,13 +19,13 @@ import numpy as np
 from machines import make_kernel
 from machines.bm1 import BM1Machine, Start, StopReason
 from machines.parameters import BM1Parameters, RngKind, SensorMode
-from pcie_shim.board.misbehaviour import Misbehaviour
 from pcie_shim.board.server import StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.host.frame import FrameInput
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, Partition, interface_words
 from tests.patience import PATIENCE
+from tests.pcie_shim.misbehaving import serve_misbehaving
 
 _FORK = multiprocessing.get_context("fork")
 _PLACES: list[socket.socket] = []
@@ -102,14 +103,10 @@ class ServedBoard:
 
     def _run(self, index: int, misbehave: str) -> None:
         try:
-            serve_board(
-                self.endpoint,
-                index=index,
-                stop=self._stop,
-                misbehave=Misbehaviour.parse(misbehave) if misbehave else None,
-                pin=False,
-                on_ready=lambda _board: self._listens.set(),
+            serve = (
+                partial(serve_misbehaving, fault=misbehave) if misbehave else partial(serve_board, pin=False)
             )
+            serve(self.endpoint, index=index, stop=self._stop, on_ready=lambda _board: self._listens.set())
         finally:
             self._stop.close()
             self._listens.set()
@@ -125,10 +122,10 @@ class ServedBoard:
 class BoardProcess:
     """An emulated board in a process of its own, which can be killed."""
 
-    def __init__(self, endpoint: str, *, index: int = 0, misbehave: str = "") -> None:
+    def __init__(self, endpoint: str, *, index: int = 0) -> None:
         self.endpoint = endpoint
         ready, self._tell = os.pipe()
-        self.process = _FORK.Process(target=self._run, args=(index, misbehave), daemon=True)
+        self.process = _FORK.Process(target=self._run, args=(index,), daemon=True)
         self.process.start()
         os.close(self._tell)
         readable, _, _ = select.select([ready], [], [], PATIENCE)
@@ -136,14 +133,13 @@ class BoardProcess:
         os.close(ready)
         assert said, f"the board at {endpoint} did not start"
 
-    def _run(self, index: int, misbehave: str) -> None:
+    def _run(self, index: int) -> None:
         stop = StopSignal()
         signal.signal(signal.SIGTERM, lambda *_: stop.set())
         serve_board(
             self.endpoint,
             index=index,
             stop=stop,
-            misbehave=Misbehaviour.parse(misbehave) if misbehave else None,
             on_ready=lambda _board: os.write(self._tell, b"r") and None,
         )
 

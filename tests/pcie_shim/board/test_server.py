@@ -18,6 +18,7 @@ from machines import make_kernel
 from machines.bm1 import BM1Machine, Start, StopReason
 from pcie_shim import framing
 from pcie_shim import register_map as rm
+from pcie_shim.board import connection as connection_module
 from pcie_shim.board import server as board_module
 from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.endpoint import connect, listen, parse_endpoint
@@ -195,10 +196,10 @@ def test_a_host_that_vanishes_leaves_the_board_well(start_board: StartBoard) -> 
 
 
 def test_a_host_that_has_just_left_does_not_hold_the_board(folder: Path) -> None:
-    endpoint, port = (parse_endpoint(f"unix:{folder}/{name}.sock") for name in ("registers", "programming"))
+    endpoint = parse_endpoint(f"unix:{folder}/a.sock")
     stop = board_module.StopSignal()
-    server = board_module._Server(endpoint, listen(endpoint), listen(port), 0, stop, EmulatedBoard(), None)
-    for where, accept in ((endpoint, server._accept_host), (port, server._accept_loader)):
+    server = board_module.BoardServer(endpoint, 0, stop, EmulatedBoard())
+    for where, accept in ((endpoint, server._accept_host), (endpoint.programming, server._accept_loader)):
         first = connect(where, timeout=PATIENCE)
         accept()
         # a request that was not yet answered, and the end: both come before the next connection is looked at
@@ -211,17 +212,16 @@ def test_a_host_that_has_just_left_does_not_hold_the_board(folder: Path) -> None
             assert decoder.next_frame().operation == framing.GREET
     stop.set()
     server.run()
-    for listening in (server._registers, server._programming):
-        listening.close()
+    server.close()
     stop.close()
 
 
 def test_a_host_whose_machine_is_gone_does_not_hold_the_board_for_ever() -> None:
     endpoint = parse_endpoint(tcp_endpoint())
     with listen(endpoint) as server, connect(endpoint, timeout=PATIENCE):
-        connection = board_module._Connection(server.accept()[0], endpoint, b"").socket
+        connection = connection_module.Connection(server.accept()[0], b"", b"").socket
         assert connection.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
-        assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == board_module.KEEPALIVE_S
+        assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE) == connection_module.KEEPALIVE_S
         assert connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
         connection.close()
 

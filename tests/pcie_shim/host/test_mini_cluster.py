@@ -22,7 +22,6 @@ from machines.parameters import PriorMode
 from pcie_shim import endpoint
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard
-from pcie_shim.board.misbehaviour import Misbehaviour, MisbehaviourKind, UnknownMisbehaviourError
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import (
     BoardGoneError,
@@ -576,15 +575,3 @@ def test_a_closed_cluster_runs_nothing(boards: list[ServedBoard]) -> None:
     cluster.close()
     with pytest.raises(BoardGoneError):
         cluster.run(frame())
-
-
-# ---- misbehaviour's text ----
-
-
-def test_misbehaviours_are_parsed() -> None:
-    assert Misbehaviour.parse("drop") == Misbehaviour(MisbehaviourKind.DROP)
-    assert Misbehaviour.parse("never-done:3:1") == Misbehaviour(MisbehaviourKind.NEVER_DONE, 3, 1)
-    for text in ("", "no-such", "drop:x", "drop:1:2:3", "drop:-1"):
-        with pytest.raises(UnknownMisbehaviourError) as caught:
-            Misbehaviour.parse(text)
-        assert caught.value.exit_code == 2

@@ -1,0 +1,152 @@
+"""Connections to the two ports of a board: frames in order, refusals, and the proof of the key.
+
+host                                      board
+  │◀─ GREET, or AUTHENTICATE with a key ────│
+  │── READ, WRITE, ... sequence 1, 2, 3 ───▶│ handled by the server, which answers
+  │◀─ reply with the same sequence ─────────│
+  │◀─ ERROR: the access is refused ─────────│ the connection stays
+  │◀─ ERROR BAD_FRAME ──────────────────────│ not a frame, or out of order: it is closed
+"""
+
+import hmac
+import socket
+import struct
+import time
+from collections.abc import Callable
+from typing import Final
+
+from pcie_shim import credentials, framing
+from pcie_shim.board.emulated_board import RefusedError
+from pcie_shim.endpoint import no_delay
+from pcie_shim.errors import FramingError
+from pcie_shim.framing import Frame, ProgramBegin
+from pcie_shim.register_layout import ALL_ONES
+from pcie_shim.register_map import ErrorCode
+
+SEND_S: Final = 5.0
+"""Seconds after which the link of a host that does not read the board's frames is closed."""
+KEEPALIVE_S: Final = 5
+"""Interval of TCP keep-alive probes in seconds; three unanswered ones close the link."""
+
+
+class Connection:
+    """A connection of a host or loader, which begins with the board's challenge or greeting."""
+
+    def __init__(self, connection: socket.socket, key: bytes, greeting: bytes) -> None:
+        """Greet, or ask for the proof that the peer has the key, if there is one."""
+        no_delay(connection)
+        if connection.family != socket.AF_UNIX:
+            # a host whose machine or cable failed must not hold the board forever
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_S)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_S)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+        # reads never block, because epoll precedes them; writes may take SEND_S
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", int(SEND_S), 0))
+        self.socket = connection
+        self.decoder = framing.FrameDecoder()
+
+        # Sequence number of the last request. Every request has the next one, so a lost or repeated one is noticed.
+        self.sequence = 0
+
+        # Cleared by whoever finds the connection unusable. The server then drops it; the socket is closed only there,
+        # so that the descriptor cannot be another connection's while the server still knows it.
+        self.open = True
+
+        # The challenge that the peer has to answer before anything else; empty without a key, and after its proof.
+        self._nonce = credentials.nonce() if key else b""
+        self._key = key
+        self._greeting = greeting
+        if key:
+            self.send(framing.encode(framing.AUTHENTICATE, 0, 0, 0, len(self._nonce) // 4, self._nonce))
+        else:
+            self.send(greeting)
+
+    def receive(self) -> bool:
+        """Receive once; return False if nothing arrived or the connection is closed, which clears `open`."""
+        try:
+            count = self.socket.recv_into(self.decoder.room(), 0, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return False
+        except OSError:
+            count = 0
+        self.decoder.received(count)
+        self.open = count > 0
+        return self.open
+
+    def answer(self, handle: Callable[[Frame], None]) -> None:
+        """Handle all complete frames, and answer refusals with ERROR."""
+        while self.open:
+            sequence = address = 0
+            try:
+                frame = self.decoder.next_frame()
+                if frame is None:
+                    return
+                _, _, sequence, address, _, _ = frame
+                self.sequence = due = (self.sequence + 1) & ALL_ONES
+                if sequence == due:
+                    (self._authenticate if self._nonce else handle)(frame)
+                    continue
+                problem = f"request {sequence} arrived instead of {due}"
+            except FramingError as error:
+                problem = str(error)
+            except RefusedError as error:
+                self.send(framing.encode_error(sequence, address, error.code, str(error)))
+                continue
+            # after this, the position in the stream and the peer's count are unknown
+            self.send(framing.encode_error(sequence, address, ErrorCode.BAD_FRAME, problem))
+            self.open = False
+
+    def _authenticate(self, frame: Frame) -> None:
+        """Check the peer's proof, and answer with the board's and the greeting."""
+        answer = bytes(frame.payload)
+        nonce, proof = answer[: credentials.NONCE_BYTES], answer[credentials.NONCE_BYTES :]
+        expected = credentials.host_proof(self._key, self._nonce, nonce)
+        if frame.operation != framing.AUTHENTICATE or not hmac.compare_digest(proof, expected):
+            raise FramingError("the proof that this host has the board's key is missing or wrong")
+        own = credentials.board_proof(self._key, self._nonce, nonce)
+        self._nonce = b""
+        reply = framing.encode(
+            framing.AUTHENTICATE, framing.REPLY, frame.sequence, 0, credentials.PROOF_BYTES // 4, own
+        )
+        self.send(reply + self._greeting)
+
+    def send(self, data: bytes) -> None:
+        """Send all bytes; a connection that accepts none for SEND_S is closed."""
+        try:
+            self.socket.sendall(data)
+        except OSError:
+            self.open = False
+
+
+class HostConnection(Connection):
+    """A link to a host, which holds the board from its first request on."""
+
+    def __init__(
+        self, connection: socket.socket, key: bytes, greeting: bytes, token: bytes, programmed: int
+    ) -> None:
+        """Store the token of the greeting, and how often the board was programmed until then."""
+        super().__init__(connection, key, greeting)
+
+        # A loader that shows this token may program the board although this host holds it: it is the same host.
+        self.token = token
+
+        # If the board's count has changed since, another image is loaded, and the host's knowledge of it is stale.
+        self.programmed = programmed
+
+        # Number of interrupts sent, which is the sequence number of the last one.
+        self.interrupts = 0
+
+
+class LoaderConnection(Connection):
+    """A connection to the programming port, which programs the board from its first request on."""
+
+    def __init__(self, connection: socket.socket, key: bytes, greeting: bytes) -> None:
+        super().__init__(connection, key, greeting)
+
+        # The announced file, from BEGIN until END, and its bytes so far: never more than `begin.size`.
+        self.begin: ProgramBegin | None = None
+        self.content = bytearray()
+
+        # Monotonic time of the last frame; after a long silence another loader may have its turn.
+        self.last_frame = time.monotonic()
