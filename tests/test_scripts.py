@@ -20,7 +20,7 @@ SCRIPTS = sorted(path for path in (ROOT / "scripts").iterdir() if path.is_file()
 
 PARTS = {
     "bench": ("bridge", "cycle", "load", "loop", "mrclam"),
-    "verify": ("client", "containers", "hdl", "networks", "resources", "rosbridge"),
+    "verify": ("conformance", "containers", "hdl", "networks", "resources", "rosbridge"),
 }
 PAGES = [(path, part) for path in SCRIPTS for part in ("", *PARTS.get(path.name, ()))]
 

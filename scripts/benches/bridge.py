@@ -27,9 +27,9 @@ from typing import Any, NamedTuple, TypeVar, cast
 from rich.console import Console
 from rich.table import Table
 
-from scripts.other_clients.installation import install_roslib, install_roslibpy
 from scripts.running.flags import ScriptParser, output_file
 from scripts.running.processes import ROOT, Process, run_script
+from scripts.verifications.installation import install_roslib, install_roslibpy
 from services.errors import StackError
 
 Result = TypeVar("Result")

@@ -19,8 +19,9 @@ from hdl.test.mutants import MUTANTS, Mutant, caught_by
 from hdl.test.project import HardwareToolError
 from hdl.test.verification import Check, formal, sessions, units
 from scripts.running.flags import ScriptParser
-from scripts.verifications.debian import MissingToolError, install
+from scripts.verifications.installation import install_programs
 from scripts.verifications.simulated_boat import FRAMES, SimulatedBoat
+from services.errors import SettingsError
 from toolchain.hardware.simulation import Simulator
 
 _Item = TypeVar("_Item")
@@ -39,8 +40,10 @@ def main() -> int:
     parser.add_argument("--only", default="", metavar="TEXT", help="what has this in its name")
     arguments = parser.parse_args()
     try:
-        install({"ghdl": "ghdl"} if arguments.mutants else {tool: tool for tool in Simulator.VERILATOR.tools})
-    except MissingToolError as error:
+        install_programs(
+            {"ghdl": "ghdl"} if arguments.mutants else {tool: tool for tool in Simulator.VERILATOR.tools}
+        )
+    except SettingsError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     began = time.monotonic()

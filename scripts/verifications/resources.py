@@ -20,7 +20,8 @@ from hdl.test.netlist import Netlist, synthesised
 from hdl.test.project import HardwareToolError, image_of_parameters
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
 from scripts.running.flags import ScriptParser
-from scripts.verifications.debian import MissingToolError, install
+from scripts.verifications.installation import install_programs
+from services.errors import SettingsError
 from toolchain.analysis.resources.logic import COSTS, WORST_ERROR, Of, logic_of
 
 _CELL, _THRESHOLD, _WRITTEN = SensorMode.CELL, SensorMode.THRESHOLD, PriorMode.WRITTEN
@@ -95,9 +96,9 @@ def main() -> int:
         print(f"error: no machine's parameters have {arguments.only!r} in them", file=sys.stderr)
         return 1
     try:
-        install({"ghdl": "ghdl"})
+        install_programs({"ghdl": "ghdl"})
         netlists = [_compared(each) for each in machines]
-    except (MissingToolError, HardwareToolError) as error:
+    except (SettingsError, HardwareToolError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     errors = [_errors(*each) for each in zip(machines, netlists, strict=True)]

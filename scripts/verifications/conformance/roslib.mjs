@@ -1,5 +1,5 @@
-// What users of roslib do, on a rosbridge server: one JSON object a line for each check, "end" at the end.
-//   node conformance_roslib.mjs ROSLIB_MODULE ws://HOST:PORT ROS_VERSION
+// What users of roslib do, on a rosbridge server: one line for each check; the exit code is 1 if one failed.
+//   node roslib.mjs ROSLIB_MODULE ws://HOST:PORT ROS_VERSION
 import assert from "node:assert/strict";
 import { pathToFileURL } from "node:url";
 
@@ -339,16 +339,15 @@ const checks = {
 
 delete checks[two ? "actionlib: goal, feedback, result, cancelling" : "action: goal, feedback, result"];
 
+let failed = 0;
 for (const [test, check] of Object.entries(checks)) {
-  let why = "";
   try {
     await check();
+    console.log(`ok   ${test}`);
   } catch (error) {
-    why = String(error?.message ?? error).split("\n").filter(Boolean).slice(0, 2).join(" ") || "failed";
+    failed += 1;
+    console.log(`FAIL ${test}: ${String(error?.message ?? error).split("\n").filter(Boolean).slice(0, 2).join(" ")}`);
   }
-  console.log(JSON.stringify({ test, ok: why === "", why }));
 }
-ros.close();
-other.close();
-console.log(JSON.stringify("end"));
-process.exit(0);
+console.log(`${Object.keys(checks).length - failed} passed, ${failed} failed`);
+process.exit(failed ? 1 : 0);

@@ -1,0 +1,156 @@
+"""Other projects' tests on the hub: roslibpy's own suites, and what users of roslib do (scripts/verify conformance)."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import re
+import shutil
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from bridge.client import GoalRequest, connect
+from scripts.running.flags import ScriptParser
+from scripts.running.patience import FACTOR
+from scripts.running.processes import Process, run_script
+from scripts.verifications.checks import Tally
+from scripts.verifications.installation import install_roslib, install_roslibpy
+
+NODE_SCRIPT: Final = Path(__file__).with_name("roslib.mjs")
+LIMIT: Final = 240 * FACTOR
+"""Time limit of one suite, in seconds."""
+PORT_OF_THE_SUITES: Final = "9090"
+"""Port in the suites' files, replaced by that of the hub in the copies that run here."""
+SUITES: Final = {
+    "1": (
+        *("ros1/test_topic.py", "ros1/test_ros.py", "ros1/test_service.py", "ros1/test_param.py"),
+        *("ros1/test_rosapi.py", "ros1/test_core.py", "ros1/test_actionlib.py", "test_transport.py"),
+    ),
+    "2": (
+        *("ros2/test_topic.py", "ros2/test_ros.py", "ros2/test_rosapi.py", "ros2/test_core.py"),
+        *("ros2/test_actions.py", "test_transport.py"),
+    ),
+}
+TRANSPORTS: Final = ("twisted", "asyncio")
+STEP: Final = 0.3
+"""Seconds per number of the Fibonacci server: the suites cancel a goal of ten numbers after two seconds."""
+
+
+@asynccontextmanager
+async def hub_of(ros_version: str, folder: Path) -> AsyncIterator[int]:
+    """Run a hub during the block; its port."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = int(free.getsockname()[1])
+    hub = Process("hub", folder / "hub.log")
+    try:
+        await hub.start("hub", "--port", str(port), "--ros-version", ros_version)
+        await hub.line(r"ws://\S+")
+        yield port
+    finally:
+        await hub.end()
+
+
+async def fibonacci(goal: GoalRequest) -> dict[str, Any]:
+    """Execute a goal of roslibpy's tests of ROS 2: one number of the sequence per step."""
+    sequence = [0, 1]
+    while len(sequence) <= goal.values["order"]:
+        if goal.canceling:
+            goal.cancel({"sequence": sequence})
+            break
+        sequence.append(sequence[-1] + sequence[-2])
+        goal.feed_back({"sequence": sequence})
+        await asyncio.sleep(STEP)
+    return {"sequence": sequence}
+
+
+async def roslibpy(ros_version: str, transport: str, folder: Path) -> str | None:
+    """Run roslibpy's suites, and return what failed, or None."""
+    clients = install_roslibpy()
+    shutil.copytree(clients / "source" / "tests", folder / "tests")
+    async with hub_of(ros_version, folder) as port, connect(f"ws://127.0.0.1:{port}") as ros:
+        if ros_version == "2":
+            await ros.advertise_action("/fibonacci", "example_interfaces/action/Fibonacci", fibonacci)
+        for file in (folder / "tests").glob("ros?/*.py"):
+            file.write_text(re.sub(rf"\b{PORT_OF_THE_SUITES}\b", str(port), file.read_text()))
+        pytest = (
+            str(clients / "venv" / "bin" / "python"),
+            "-m",
+            "pytest",
+            "-q",
+            "-rfE",
+            "-p",
+            "no:cacheprovider",
+        )
+        flags = ("-c", os.devnull, "--rootdir", str(folder), "--timeout", str(60 * FACTOR))
+        suites = (f"tests/{suite}" for suite in SUITES[ros_version])
+        return await failure_of(*pytest, *flags, *suites, folder=folder, ROSLIBPY_TRANSPORT=transport)
+
+
+async def roslib(ros_version: str, folder: Path) -> str | None:
+    """Run the checks of roslib.mjs, and return what failed, or None."""
+    module = install_roslib()
+    async with hub_of(ros_version, folder) as port:
+        uri = f"ws://127.0.0.1:{port}"
+        return await failure_of("node", str(NODE_SCRIPT), str(module), uri, ros_version, folder=folder)
+
+
+async def failure_of(*command: str, folder: Path, **environment: str) -> str | None:
+    """Run a suite, print its last line, and return its lines about failures if it ends with another code than 0."""
+    process = await asyncio.create_subprocess_exec(
+        *command,
+        cwd=folder,
+        env=os.environ | environment,
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+    )
+    try:
+        async with asyncio.timeout(LIMIT):
+            printed = (await process.communicate())[0].decode("utf-8", "replace")
+    except TimeoutError:
+        return f"it did not end within {LIMIT:g} s"
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+    lines = printed.strip().splitlines() or ["it said nothing"]
+    print(f"     {lines[-1]}")
+    failed = [line for line in lines if line.startswith(("FAIL", "ERROR"))]
+    return "\n     ".join(failed or lines[-1:]) if process.returncode else None
+
+
+async def verify(arguments: argparse.Namespace) -> int:
+    """Run everything, each suite on its own hub."""
+    tally = Tally()
+    runs: dict[str, Callable[[Path], Awaitable[str | None]]] = {}
+    for version in ("1", "2"):
+        for transport in TRANSPORTS:
+            runs[f"roslibpy, {transport}, ROS {version}"] = partial(roslibpy, version, transport)
+        runs[f"roslib on Node, ROS {version}"] = partial(roslib, version)
+    for name, run in runs.items():
+        if arguments.only in name:
+            began = time.monotonic()
+            with tempfile.TemporaryDirectory(prefix="conformance-rosbayes-") as folder:
+                tally.report(name, began, await run(Path(folder)))
+    return tally.end()
+
+
+def main() -> int:
+    """Parse the flags and run the tests."""
+    parser = ScriptParser(prog="scripts/verify conformance", description=__doc__.splitlines()[0])
+    parser.add_argument("--only", default="", help="runs with this in their names, such as roslibpy")
+    arguments = parser.parse_args()
+    return run_script(lambda: verify(arguments), 1800 * FACTOR)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,138 @@
+"""Software of others that verifications need: packages of PyPI and npm, pinned by hash, and programs of Debian."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final
+
+from services.errors import SettingsError
+
+HERE: Final = Path(__file__).resolve().parent
+ROSLIBPY: Final = HERE / "conformance" / "roslibpy.lock"
+ROSLIB: Final = (HERE / "conformance" / "package.json", HERE / "conformance" / "package-lock.json")
+OLDEST_NODE: Final = 20
+LIMIT: Final = 600.0
+"""Time limit of one installer, in seconds."""
+
+
+def run(*command: str | Path, cwd: Path | None = None) -> None:
+    """Run an installer.
+
+    Raises:
+        SettingsError: It fails or does not end in time.
+    """
+    shown = " ".join(Path(word).name for word in command[:4])
+    try:
+        subprocess.run(command, cwd=cwd, check=True, capture_output=True, text=True, timeout=LIMIT)
+    except subprocess.TimeoutExpired:
+        raise SettingsError(f"`{shown} ...` did not end within {LIMIT:.0f} s; try again") from None
+    except subprocess.CalledProcessError as error:
+        lines = error.stderr.splitlines() or [f"exit code {error.returncode}"]
+        said = next((line for line in lines if re.match(r"ERROR|E:|npm error", line)), lines[-1])
+        raise SettingsError(f"`{shown} ...` failed: {said}") from None
+
+
+def cached(name: str, locks: tuple[Path, ...], make: Callable[[Path], None]) -> Path:
+    """Return the folder that `make` has filled for these lock files, in $XDG_CACHE_HOME/rosbayes."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rosbayes"
+    digest = hashlib.sha256(sys.version.encode() + b"".join(lock.read_bytes() for lock in locks))
+    folder = home / f"{name}-{digest.hexdigest()[:12]}"
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+        with (home / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (folder / ".complete").exists():
+                print(f"installing {name} into {folder} (once) ...", file=sys.stderr)
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                make(folder)
+                (folder / ".complete").touch()
+    except OSError as error:
+        raise SettingsError(
+            f"{error.filename or folder} cannot be written ({error.strerror}); set XDG_CACHE_HOME to another folder"
+        ) from error
+    return folder
+
+
+def make_environment(folder: Path, lock: Path) -> None:
+    """Create a virtual environment, `folder`/venv, with the packages of a lock file."""
+    run(sys.executable, "-m", "venv", folder / "venv")
+    run(*pip(folder), "install", "--no-deps", "--only-binary", ":all:", "--require-hashes", "-r", lock)
+
+
+def pip(folder: Path) -> tuple[str | Path, ...]:
+    """Return the beginning of a command of the pip in `folder`/venv."""
+    return folder / "venv" / "bin" / "python", "-m", "pip", "-q", "--disable-pip-version-check"
+
+
+def install_roslibpy() -> Path:
+    """Return the folder with roslibpy's environment (venv) and its source package (source)."""
+
+    def make(folder: Path) -> None:
+        make_environment(folder, ROSLIBPY)
+        # only the block of roslibpy, whose hashes are those of the wheel and of the source package
+        block = re.search(r"^roslibpy==(?:.*\\\n)+.*\n", ROSLIBPY.read_text(), re.MULTILINE)
+        assert block is not None
+        (folder / "source.lock").write_text(block[0])
+        source = ("--require-hashes", "--no-deps", "--no-binary", ":all:", "--no-build-isolation")
+        run(*pip(folder), "download", *source, "-r", folder / "source.lock", "-d", folder)
+        (archive,) = folder.glob("roslibpy-*.tar.gz")
+        with tarfile.open(archive) as tar:
+            tar.extractall(folder, filter="data")
+        (folder / archive.name.removesuffix(".tar.gz")).rename(folder / "source")
+
+    return cached("roslibpy", (ROSLIBPY,), make)
+
+
+def install_roslib() -> Path:
+    """Return the module of roslib.
+
+    Raises:
+        SettingsError: Node is missing or too old.
+    """
+    node, npm = shutil.which("node"), shutil.which("npm")
+    version = subprocess.run([node, "-v"], capture_output=True, text=True, check=True).stdout if node else ""
+    if npm is None or int(re.sub(r"\D*(\d*).*\n?", r"\1", version) or 0) < OLDEST_NODE:
+        raise SettingsError(
+            f"roslib needs npm and Node {OLDEST_NODE} or later, and Node is {version.strip() or 'absent'}; "
+            "install them (Debian: apt-get install nodejs npm)"
+        )
+
+    def make(folder: Path) -> None:
+        for lock in ROSLIB:
+            shutil.copy(lock, folder)
+        run(str(npm), "ci", "--ignore-scripts", "--no-audit", "--no-fund", cwd=folder)
+
+    return cached("roslib", ROSLIB, make) / "node_modules" / "roslib" / "dist" / "RosLib.js"
+
+
+def install_programs(packages: Mapping[str, str]) -> None:
+    """Install the Debian packages of the programs that are missing.
+
+    Args:
+        packages: The package of each program.
+
+    Raises:
+        SettingsError: This is not Debian, the user may not install packages, or apt-get failed.
+    """
+    absent = [program for program in packages if shutil.which(program) is None]
+    if not absent:
+        return
+    names = sorted({packages[program] for program in absent})
+    wanted = f"{' and '.join(absent)} not found; install {' '.join(names)} (Debian: apt-get install {' '.join(names)})"
+    if shutil.which("apt-get") is None or os.geteuid() != 0:
+        raise SettingsError(f"{wanted} as root")
+    print(f"installing {' '.join(names)} (once) ...", flush=True)
+    run("apt-get", "update", "-qq")
+    run("apt-get", "install", "-qq", "-y", "--no-install-recommends", *names)
+    if any(shutil.which(program) is None for program in absent):
+        raise SettingsError(wanted)
