@@ -12,7 +12,7 @@ import typer
 
 from terminal.errors import ExitCode, ReaderGoneError, StoppedError, exit_code_of
 from terminal.logs import PARENT_VARIABLE
-from terminal.output import discard_output, say, say_lines
+from terminal.output import discard_output, say, say_error, say_lines
 from terminal.signals import check_signals, ignore_signals, received_stop
 
 _NO_SPACE: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
@@ -48,7 +48,7 @@ def report(error: BaseException) -> int:
         command = Path(sys.argv[0]).name if context is None else context.command_path
         # some of typer's messages have several lines
         message = " ".join(error.format_message().split()).replace("Value error, ", "").removesuffix(".")
-        say(f"error: {message}; {command} --help says more")
+        say_error(f"{message}; {command} --help says more")
         return ExitCode.USAGE
     if isinstance(error, ReaderGoneError | BrokenPipeError):
         discard_output()
@@ -61,13 +61,13 @@ def report(error: BaseException) -> int:
             say(str(error))
         return error.exit_code
     if isinstance(error, OSError) and (sentence := _system_sentence(error)) is not None:
-        say(f"error: {sentence}")
+        say_error(sentence)
         return ExitCode.USAGE
     if not hasattr(error, "exit_code"):
         say_lines("".join(traceback.format_exception(error)).rstrip())
-        say("error: this is a bug in rosbayes; please report it with the lines above")
+        say_error("this is a bug in rosbayes; please report it with the lines above")
         return ExitCode.BUG
-    say(f"error: {error}")
+    say_error(str(error))
     return exit_code_of(error)
 
 

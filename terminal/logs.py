@@ -30,7 +30,6 @@ FORMAT_VARIABLE: Final = "BM_LOG_FORMAT"
 
 _ERROR: Final = "error: "
 _WARNING: Final = re.compile(r"(?:[\w-]+: )?warning: ")
-_IS_CHILD: Final = PARENT_VARIABLE in os.environ
 _CLEAR_LINE: Final = "\r\x1b[K"
 
 _stamp: Final = structlog.processors.TimeStamper(fmt="iso", utc=True, key="time")
@@ -88,14 +87,10 @@ def json_line(level: str, message: str, *, process: str = "", **fields: object) 
 
 
 def formatted(text: str) -> str:
-    """Return a text for the user in the format in force.
-
-    The `error: ` of a child remains text, because its parent reports it.
-    """
-    is_error = text.startswith(_ERROR)
-    if log_format() is LogFormat.TEXT or (_IS_CHILD and is_error):
+    """Return a text for the user in the format in force."""
+    if log_format() is LogFormat.TEXT:
         return lines_of(text)
-    if is_error:
+    if text.startswith(_ERROR):
         return json_line("error", text.removeprefix(_ERROR))
     if found := _WARNING.match(text):
         return json_line("warning", text[found.end() :])

@@ -9,7 +9,7 @@ import tempfile
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import orjson
 
@@ -17,10 +17,23 @@ from terminal.errors import OutputError
 from terminal.logs import LogFormat, formatted, log_format, relayed, write_line, write_progress
 from terminal.one_line import one_line
 
+ERROR_DESCRIPTOR: Final = "ROSBAYES_ERROR_DESCRIPTOR"
+"""Environment variable with the descriptor on which a child reports its error to its parent, a JSON object per line."""
+
 
 def say(text: str) -> None:
     """Print one line for the user on standard error, even if that has been closed."""
     write_line(formatted(one_line(text)))
+
+
+def say_error(sentence: str) -> None:
+    """Print the error that ends this process, or report it to the parent that will print it."""
+    descriptor = os.environ.get(ERROR_DESCRIPTOR, "")
+    if descriptor.isdigit():
+        with contextlib.suppress(OSError):  # the parent may be gone
+            os.write(int(descriptor), json.dumps({"error": sentence}).encode() + b"\n")
+            return
+    say(f"error: {sentence}")
 
 
 def show_progress(text: str) -> None:

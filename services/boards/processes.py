@@ -23,7 +23,7 @@ from services.supervision.parent import end_with_parent, outlive_parent
 from services.supervision.service_manager import ServiceManager
 from terminal.errors import StoppedError, exit_code_of
 from terminal.logs import PARENT_VARIABLE, name_process
-from terminal.output import say
+from terminal.output import say, say_error
 from terminal.private_directory import remove_stale_sockets
 from terminal.signals import check_signals
 
@@ -211,7 +211,7 @@ class BoardProcesses:
             code = stopped.exit_code
         except BaseException as error:  # the child must never continue in the code of its parent
             code = exit_code_of(error)
-            say(f"error: board {at}: {error}")
+            say_error(f"board {at}: {error}")
         finally:
             with contextlib.suppress(Exception):
                 sys.stderr.flush()

@@ -1,4 +1,8 @@
-"""Child processes: starting, monitoring, restarting and stopping."""
+"""Child processes: starting, monitoring, restarting and stopping.
+
+parent ◀─ standard error ──────── child   lines for the user, which are passed on
+       ◀─ ROSBAYES_ERROR_DESCRIPTOR       {"error": "the sentence that explains its end"}
+"""
 
 import asyncio
 import contextlib
@@ -8,22 +12,23 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Final
+
+import msgspec
 
 from services.errors import ReportedError, StackError
 from services.supervision.parent import DIRECTORY_VARIABLE
 from terminal.errors import ExitCode
 from terminal.logs import PARENT_VARIABLE
-from terminal.output import relay
+from terminal.output import ERROR_DESCRIPTOR, relay
 
 RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 """Environment variable with the folder of status sockets (the setting `run_directory`)."""
 
 RESTARTS = 3
 """A process may be restarted three times within the setting `restart_window`; then its master gives up."""
-
-_KEPT_ERRORS = 20
 
 
 def own_command(name: str) -> list[str]:
@@ -44,17 +49,66 @@ def describe_exit(code: int | None) -> str:
     return f"ended by itself with exit code {code}"
 
 
+class _ErrorReport(msgspec.Struct, frozen=True):
+    error: str
+
+
+_decoder: Final = msgspec.json.Decoder(_ErrorReport)
+
+
+class _Pipe:
+    """The reading end of a pipe from a child, which gives each line to a function.
+
+    Its own pipe instead of one of asyncio, because processes forked by the child may keep it open after the exit.
+    """
+
+    def __init__(self, take: Callable[[str], None]) -> None:
+        self._take = take
+        self._reader, self.writer = os.pipe()
+        self._is_open = True
+        self._pending = b""
+        """The begin of a line whose end has not arrived."""
+        os.set_blocking(self._reader, False)
+        asyncio.get_running_loop().add_reader(self._reader, self.read)
+
+    def read(self, *, last: bool = False) -> None:
+        """Take what has arrived; the `last` line may have no end."""
+        while self._is_open:
+            try:
+                data = os.read(self._reader, 1 << 16)
+            except BlockingIOError:
+                break
+            self._pending += data
+            if not data:
+                last = True
+                self.close()
+        *lines, self._pending = self._pending.split(b"\n")
+        if last:
+            lines, self._pending = [*lines, self._pending], b""
+        for line in lines:
+            if text := line.decode("utf-8", "replace").rstrip():
+                self._take(text)
+
+    def close(self) -> None:
+        """Stop reading."""
+        if self._is_open:
+            self._is_open = False
+            asyncio.get_running_loop().remove_reader(self._reader)
+            os.close(self._reader)
+
+
 class Child:
-    """A child process. Its errors (lines `error: ...`) are stored, and other lines are forwarded."""
+    """A child process. The error that it reports is stored, and its lines are forwarded."""
 
     def __init__(self, name: str, command: list[str], *, directory: Path | None = None) -> None:
         self.name = name
         self._command = command
         self._directory = directory
-        self._errors: deque[str] = deque(maxlen=_KEPT_ERRORS)
+        # Of the last start: the process, its pipes (standard error and error reports), and its last report.
         self._process: asyncio.subprocess.Process | None = None
-        self._stderr: int | None = None
-        self._pending = b""
+        self._pipes: list[_Pipe] = []
+        self._error = ""
+        # Times of the last restarts (monotonic, s), whose number within a window is limited, and their number.
         self._restarts: deque[float] = deque(maxlen=RESTARTS + 1)
         self.restarts = 0
 
@@ -64,22 +118,25 @@ class Child:
         Raises:
             StackError: The command is not installed.
         """
-        environment = dict(os.environ) | {PARENT_VARIABLE: str(os.getpid()), "PYTHONUNBUFFERED": "1"}
+        self.close()
+        self._error = ""
+        lines, reports = self._pipes = [_Pipe(lambda line: relay(line, self.name)), _Pipe(self._take_report)]
+        environment = dict(os.environ) | {
+            PARENT_VARIABLE: str(os.getpid()),
+            ERROR_DESCRIPTOR: str(reports.writer),
+            "PYTHONUNBUFFERED": "1",
+        }
         if self._directory is not None:
             environment[DIRECTORY_VARIABLE] = str(self._directory)
             if not environment.get(RUN_DIRECTORY_VARIABLE):
                 environment[RUN_DIRECTORY_VARIABLE] = str(self._directory)
-        self.close()
-        self._errors.clear()
-        # our own pipe, because processes forked by the child may keep it open after its exit
-        self._stderr, write_end = os.pipe()
-        os.set_blocking(self._stderr, False)
         try:
             self._process = await asyncio.create_subprocess_exec(
                 *self._command,
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.DEVNULL,
-                stderr=write_end,
+                stderr=lines.writer,
+                pass_fds=(reports.writer,),
                 env=environment,
                 start_new_session=True,
             )
@@ -88,8 +145,12 @@ class Child:
                 f"cannot start {self.name} ({self._command[0]}): {error.strerror or error}; install rosbayes into this environment"
             ) from error
         finally:
-            os.close(write_end)
-        asyncio.get_running_loop().add_reader(self._stderr, self._relay)
+            for pipe in self._pipes:
+                os.close(pipe.writer)
+
+    def _take_report(self, line: str) -> None:
+        with contextlib.suppress(msgspec.MsgspecError):
+            self._error = _decoder.decode(line).error
 
     @property
     def pid(self) -> int:
@@ -106,25 +167,18 @@ class Child:
         """True while the process runs."""
         return self._process is not None and self._process.returncode is None
 
-    def set_flag(self, flag: str, value: str | None = None) -> None:
-        """From now on, start the process with another value of a flag, or with a flag without a value."""
-        if flag not in self._command:
-            self._command = [*self._command, flag, *([] if value is None else [value])]
-        elif value is not None:
-            at = self._command.index(flag) + 1
-            self._command = [*self._command[:at], value, *self._command[at + 1 :]]
-
     async def wait(self) -> None:
         """Wait until the process has exited and its lines have been forwarded."""
         if self._process is not None:
             await self._process.wait()
-            self._relay()
+            for pipe in self._pipes:
+                pipe.read(last=True)
 
     def failure(self) -> StackError:
         """Return the exit of the process as an error, with its own sentence and exit code if it gave any."""
         code = self.exit_code
-        if self._errors:
-            return ReportedError(code if code and code > 0 else ExitCode.CHILD, self._errors[-1])
+        if self._error:
+            return ReportedError(code if code and code > 0 else ExitCode.CHILD, self._error)
         return ReportedError(ExitCode.CHILD, f"{self.name} {describe_exit(code)}")
 
     def may_restart(self, window: float) -> bool:
@@ -148,35 +202,9 @@ class Child:
                 self._process.send_signal(number)
 
     def close(self) -> None:
-        """Stop reading the standard error of an exited process."""
-        if self._stderr is not None:
-            asyncio.get_running_loop().remove_reader(self._stderr)
-            os.close(self._stderr)
-            self._stderr, self._pending = None, b""
-
-    def _relay(self) -> None:
-        """Forward the received lines, but store the sentences of errors."""
-        while self._stderr is not None:
-            try:
-                data = os.read(self._stderr, 1 << 16)
-            except BlockingIOError:
-                break
-            self._pending += data
-            if not data:
-                self._take_lines(last=True)
-                self.close()
-        self._take_lines(last=self.exit_code is not None)
-
-    def _take_lines(self, *, last: bool) -> None:
-        *lines, self._pending = self._pending.split(b"\n")
-        if last:
-            lines, self._pending = [*lines, self._pending], b""
-        for line in lines:
-            text = line.decode("utf-8", "replace").rstrip()
-            if text.startswith("error: "):
-                self._errors.append(text.removeprefix("error: "))
-            elif text:
-                relay(text, self.name)
+        """Stop reading from an exited process."""
+        for pipe in self._pipes:
+            pipe.close()
 
 
 async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:

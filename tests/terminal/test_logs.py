@@ -127,11 +127,6 @@ def test_text_is_a_line_for_a_person():
     assert rest[-2:] == ["ValueError: one", "\\x1btwo"]
 
 
-@pytest.mark.thorough
-def test_the_error_of_a_child_remains_text_for_its_parent():
-    assert "error: no robot" in lines("json", ROSBAYES_PARENT="1")
-
-
 @pytest.mark.parametrize("value", ["", "xml"])
 def test_another_format_is_text(monkeypatch, value):
     monkeypatch.setenv("BM_LOG_FORMAT", value)

@@ -49,16 +49,16 @@ async def failure_of(code: str, number: int = 0) -> ReportedError:
     ("code", "number", "exit_code", "sentence"),
     [
         pytest.param(
-            "print('starting\\nerror: no luck', file=sys.stderr); sys.exit(3)",
-            *(0, 3, "no luck"),
+            "print('starting', file=sys.stderr); say_error('no\\n luck'); sys.exit(3)",
+            *(0, 3, "no\n luck"),
             marks=pytest.mark.process,
             id="error",
         ),
         pytest.param(
-            "sys.stderr.write('starting\\nerror: half a line'); sys.exit(4)",
-            *(0, 4, "half a line"),
+            "sys.stderr.write('starting\\nerror: half a line'); os.write(int(os.environ[ERROR_DESCRIPTOR]), b'{\"error\"')",
+            *(0, ExitCode.CHILD, "tester ended by itself with exit code 0"),
             marks=pytest.mark.thorough,
-            id="no line end",
+            id="no report",
         ),
         pytest.param(
             "print('starting', file=sys.stderr)",
@@ -83,9 +83,11 @@ async def failure_of(code: str, number: int = 0) -> ReportedError:
 def test_an_end_is_an_error_with_the_childs_own_sentence_and_code(
     run, capsys, code, number, exit_code, sentence
 ):
-    failure = run(failure_of(f"import sys, time; {code}", number))
+    failure = run(failure_of(f"import os, sys, time; from terminal.output import *; {code}", number))
     assert (str(failure), failure.exit_code) == (sentence, exit_code)
-    assert capsys.readouterr().err == ("starting\n" if "starting" in code else "")
+    assert capsys.readouterr().err.splitlines() == [
+        line for line in ("starting", "error: half a line") if line in code
+    ]
 
 
 @pytest.mark.thorough
@@ -104,8 +106,9 @@ def test_a_line_is_passed_on_while_the_child_runs(run, capsys):
 def test_an_end_is_noticed_though_a_grandchild_holds_standard_error(run, tmp_path):
     grandchild = tmp_path / "pid"
     code = (
-        "import os, pathlib, subprocess; one = subprocess.Popen(['sleep', '1000']);"
-        f"pathlib.Path({str(grandchild)!r}).write_text(str(one.pid)); os.write(2, b'error: gone\\n'); os._exit(5)"
+        "import os, pathlib, subprocess; from terminal.output import say_error;"
+        "one = subprocess.Popen(['sleep', '1000'], close_fds=False);"
+        f"pathlib.Path({str(grandchild)!r}).write_text(str(one.pid)); say_error('gone'); os._exit(5)"
     )
     assert run(failure_of(code)).exit_code == 5
     os.kill(int(grandchild.read_text()), signal.SIGKILL)
@@ -150,21 +153,3 @@ def test_a_command_that_is_not_there(run):
     with pytest.raises(StackError) as refused:
         run(Child("tester", ["/nonexistent/command"]).start())
     assert refused.value.exit_code == ExitCode.USAGE
-
-
-@pytest.mark.thorough
-def test_a_later_start_has_other_flags(run, tmp_path):
-    out = tmp_path / "out"
-    command = [sys.executable, "-c", f"import sys; open({str(out)!r}, 'w').write(' '.join(sys.argv[1:]))"]
-
-    async def start_twice():
-        one = Child("tester", [*command, "--deployment", "a", "--log-level", "info"])
-        for flags in ((), (("--deployment", "b"), ("--reprogram",), ("--reprogram",))):
-            for flag in flags:
-                one.set_flag(*flag)
-            await one.start()
-            await one.wait()
-        one.close()
-
-    run(start_twice())
-    assert out.read_text() == "--deployment b --log-level info --reprogram"
