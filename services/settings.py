@@ -12,7 +12,7 @@ from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
 from terminal.logs import LogFormat, use_log_format
-from toolchain.deployment.fields import TOPIC_BYTES_MAX, TOPIC_BYTES_MIN
+from toolchain.deployment.sections import TOPIC_BYTES_MAX, TOPIC_BYTES_MIN
 
 SHORTEST_S, LONGEST_S = 0.001, 86_400.0
 """Minimum and maximum timeout in seconds."""

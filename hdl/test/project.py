@@ -82,7 +82,7 @@ def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -
 
 def image_of_parameters(parameters: BM1Parameters) -> Image:
     """Return a board's image of a machine whose tables are all ones, because synthesis leaves them out."""
-    from toolchain.outputs.rng_table import LENGTH
+    from toolchain.outputs.mif import LENGTH
 
     prior, *tables = (
         np.full((1 << bits, parameters.lines), parameters.ones_code, np.uint16)

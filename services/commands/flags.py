@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final
 import typer
 
 from services.settings import ENV_PREFIX, LONGEST_S, SHORTEST_S, Settings
-from toolchain.deployment.fields import TOPIC_BYTES_MAX, TOPIC_BYTES_MIN
+from toolchain.deployment.sections import TOPIC_BYTES_MAX, TOPIC_BYTES_MIN
 
 SERVER: Final = "rosbridge"
 BOARDS: Final = "Boards"

@@ -77,7 +77,7 @@ class _SourceReader:
             if self._prior_optional:
                 return b""
             raise self._prior.missing(message)
-        from toolchain.deployment.written_codes import written_prior
+        from toolchain.deployment.address_array import written_prior
 
         machine = self._deployment.machine
         codes = written_prior(

@@ -37,7 +37,7 @@ from toolchain.deployment import (
     Variable,
     write_deployment,
 )
-from toolchain.deployment.deployment_hash import with_hash
+from toolchain.deployment.deployment import with_hash
 from toolchain.errors import BuildError, DeploymentError
 from toolchain.models.model import Model
 from toolchain.outputs.output_files import image_files, memory_files, quartus_files, text_file, write_files

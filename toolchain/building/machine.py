@@ -15,7 +15,7 @@ from toolchain.deployment import MachineSection, Scale
 from toolchain.errors import BuildError
 from toolchain.models.model import Model
 from toolchain.outputs.memories import generators
-from toolchain.outputs.rng_table import random_table
+from toolchain.outputs.mif import random_table
 
 _MOST_CODES: Final = 1 << 30
 """Maximum number of codes of all columns, which take 2 bytes each while they are computed."""

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Final
 from pydantic import Field, ValidationError
 
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
+from toolchain.bounded_files import TomlFile, nearest_name
 from toolchain.deployment import Output, Queue, Scale, Source, Stop, Variable, WrittenPrior
-from toolchain.deployment.fields import (
+from toolchain.deployment.sections import (
     MessagePath,
     Name,
+    Section,
     Sequence,
 )
-from toolchain.deployment.sections import Section
 from toolchain.errors import BuildError, ToolchainError
-from toolchain.files.toml_file import TomlFile, nearest_name
 
 if TYPE_CHECKING:
     import numpy as np

@@ -21,7 +21,7 @@ from toolchain.deployment import (
     deployment_text,
     load_deployment,
 )
-from toolchain.deployment.deployment_hash import with_hash
+from toolchain.deployment.deployment import with_hash
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.model import Model
 from toolchain.outputs.output_files import (

@@ -4,8 +4,10 @@ A model is checked with its build options, a deployment with the codes of its im
 exact: a frame with an impossible reading ends as `impossible` on the machine, and a dead line never counts.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -14,12 +16,9 @@ from pcie_shim.programming_file import Image
 from toolchain.building.build import assemble, check_agreement, read_images
 from toolchain.building.machine import MachinePlan, partition_lines, plan_machine
 from toolchain.building.options import BuildOptions
-from toolchain.checks.checked_machine import CheckedMachine
 from toolchain.checks.codes import code_findings, loss_findings
-from toolchain.checks.finding import Check, Finding, Severity, error, warning
+from toolchain.checks.finding import Check, CheckedMachine, Finding, Severity, error, note, warning
 from toolchain.checks.generators import generator_findings
-from toolchain.checks.sources import source_findings
-from toolchain.checks.variables import variable_findings
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 from toolchain.models.model import Model
@@ -109,3 +108,112 @@ def _files(directory: Path, deployment: Deployment, images: Sequence[Image]) -> 
 def _sorted(findings: Iterable[Finding]) -> list[Finding]:
     order = list(Severity)
     return sorted(findings, key=lambda finding: order.index(finding.severity))
+
+
+def variable_findings(deployment: Deployment) -> Iterator[Finding]:
+    """Find variables with mistakes, and variables with the same path."""
+    yield from _same_readings(deployment)
+    yield from _ranges(deployment)
+
+
+def _same_readings(deployment: Deployment) -> Iterator[Finding]:
+    # A bare name as a path is searched for like the name itself.
+    paths = Counter((variable.source, variable.path or variable.name) for variable in deployment.variables)
+    for (source, path), count in paths.items():
+        if count > 1:
+            names = [
+                variable.name
+                for variable in deployment.variables
+                if (variable.source, variable.path or variable.name) == (source, path)
+            ]
+            yield warning(
+                Check.SAME_READING,
+                " and ".join(names),
+                f"they all have the path {path}",
+                "give each its own path, in the model or with 'toolchain regenerate deployment --path'",
+            )
+
+
+def _ranges(deployment: Deployment) -> Iterator[Finding]:
+    """Find ranges of readings that don't fit the addresses."""
+    for variable in deployment.variables:
+        needed = variable.values.bit_length()
+        if needed < variable.bits:
+            yield note(
+                Check.ADDRESS_BITS,
+                variable.name,
+                (
+                    f"its {variable.values} values and the missing reading fit {needed} address bits, but it has "
+                    f"{variable.bits}: its memory is {2 ** (variable.bits - needed)} times as deep as needed"
+                ),
+                f"use --bits {variable.name}={needed}",
+            )
+        if variable.period is not None and variable.period > variable.values:
+            yield warning(
+                Check.RANGE,
+                variable.name,
+                (
+                    f"its readings wrap around after {variable.period} steps, but only {variable.values} are served: those from "
+                    f"{variable.offset + variable.values * variable.step:g} on are out of range"
+                ),
+                f"give it {variable.period} values, or a period of {variable.values}",
+            )
+        if variable.period is not None and variable.period < variable.values:
+            yield warning(
+                Check.RANGE,
+                variable.name,
+                (
+                    f"its readings wrap around after {variable.period} steps, so that the last "
+                    f"{variable.values - variable.period} of its {variable.values} values never occur"
+                ),
+                f"give it {variable.period} values, or a period of {variable.values}",
+            )
+        if variable.on_range == "missing" and variable.on_missing == "error":
+            yield warning(
+                Check.RANGE,
+                variable.name,
+                "a reading out of range is a missing one (on_range), and a missing one is an error (on_missing)",
+                'use on_missing="missing", or on_range="clamp" or "error"',
+            )
+
+
+_WITHOUT_HEADER: Final = frozenset(
+    f"geometry_msgs/{name}"
+    for name in (
+        "Accel", "Point", "Point32", "Polygon", "Pose", "Pose2D", "PoseWithCovariance", "Quaternion", "Transform",
+        "Twist", "TwistWithCovariance", "Vector3", "Wrench",
+    )
+)  # fmt: skip
+"""Types without a header in a package whose other types have one; those of std_msgs never have one."""
+_LEAST_TOLERANCE_S: Final = 0.005
+"""Below this, the receipts of two messages that were sent together hardly ever pair."""
+
+
+def source_findings(deployment: Deployment) -> Iterator[Finding]:
+    """Find topics that are paired by receipt, because their messages have no header."""
+    if len(deployment.sources) < 2:
+        return
+    bare = [source.topic for source in deployment.sources if not _may_have_header(source.type)]
+    if not bare:
+        return
+    topics = " and ".join(bare)
+    about = f"messages on {topics} have no header, so they are paired by time of receipt"
+    if deployment.tolerance_s < _LEAST_TOLERANCE_S:
+        yield warning(
+            Check.PAIRING,
+            topics,
+            f"{about}; with a tolerance of {deployment.tolerance_s:g} s they rarely form a frame",
+            "build with a --tolerance of at least the network's delay, or publish types with a header",
+        )
+    elif len(bare) < len(deployment.sources):
+        yield note(
+            Check.PAIRING,
+            topics,
+            f"{about}, and the other topics by the robot's clock",
+            "synchronise both clocks to well within the tolerance (NTP, chrony), or publish types with a header",
+        )
+
+
+def _may_have_header(type_name: str) -> bool:
+    package, _, name = type_name.replace("/msg/", "/").partition("/")
+    return package != "std_msgs" and f"{package}/{name}" not in _WITHOUT_HEADER

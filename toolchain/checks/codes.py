@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from machines.parameters import PriorMode, SensorMode
 from toolchain.building.options import BuildOptions
 from toolchain.building.quantise import Quantised
-from toolchain.checks.checked_machine import CheckedMachine
-from toolchain.checks.finding import Check, Finding, error, note, warning
+from toolchain.checks.finding import Check, CheckedMachine, Finding, error, note, warning
 from toolchain.deployment import Deployment, Dimension, Scale, Variable
 
 _MOST_RANGES: Final = 4

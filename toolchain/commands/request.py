@@ -19,7 +19,7 @@ from toolchain.flag_values import key_values, names_in
 from toolchain.models.case_study import load_model, model_path
 from toolchain.models.model import Model
 from toolchain.networks import is_network, read_network
-from toolchain.outputs.rng_table import LENGTH, read_table
+from toolchain.outputs.mif import LENGTH, read_table
 
 if TYPE_CHECKING:
     from toolchain.building.options import SourcesFile

@@ -1,8 +1,15 @@
 """The deployment: everything for the services that follows from the model."""
 
-from toolchain.deployment.deployment import FILE_NAME, REPLICA, Deployment, DeploymentFile
-from toolchain.deployment.deployment_hash import deployment_hash
-from toolchain.deployment.load import load_deployment
+from toolchain.deployment.deployment import (
+    FILE_NAME,
+    REPLICA,
+    Deployment,
+    DeploymentFile,
+    deployment_hash,
+    deployment_text,
+    load_deployment,
+    write_deployment,
+)
 from toolchain.deployment.sections import (
     Board,
     Dimension,
@@ -16,7 +23,6 @@ from toolchain.deployment.sections import (
     WrittenPrior,
     parse_interface,
 )
-from toolchain.deployment.write import deployment_text, write_deployment
 
 __all__ = [
     "FILE_NAME",

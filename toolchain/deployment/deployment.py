@@ -1,25 +1,33 @@
-"""The deployment: everything that follows from the model, checked as a whole (thesis 3.3, 3.4)."""
+"""The deployment: everything that follows from the model, checked as a whole, with its hash and its file (thesis 3.3, 3.4)."""
 
+import hashlib
+import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Final, Literal, Self
+from typing import Any, Final, Literal, Self
 
+import tomli_w
 from pydantic import Field, model_validator
 
 from machines.parameters import PriorMode, SensorMode
-from toolchain.deployment.fields import Choice, Name, Sequence, names_differ
+from toolchain.bounded_files import TomlFile, whole_file
 from toolchain.deployment.sections import (
     Board,
+    Choice,
     Dimension,
     MachineSection,
+    Name,
     Output,
     Queue,
     Section,
+    Sequence,
     Source,
     Variable,
     WrittenPrior,
+    names_differ,
 )
+from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 
 FORMAT: Final = 1
 FILE_NAME: Final = "deployment.toml"
@@ -148,3 +156,134 @@ class Deployment(DeploymentFile):
     def output_uri(self, output: Output) -> str:
         """Return the rosbridge server on which an output is published."""
         return output.uri or self.sources[0].uri
+
+
+def deployment_hash(deployment: DeploymentFile) -> str:
+    """Return the SHA-256 (hexadecimal) of the part of a deployment that follows from the model.
+
+    URIs, endpoints and the like are left out: a deployment remains valid for another robot, but not after an
+    edit that contradicts its tables.
+    """
+    content = deployment.model_dump(
+        mode="json",
+        exclude={
+            "hash": True,
+            "sources": {"__all__": {"uri", "compression", "topic_bytes"}},
+            "boards": {"__all__": {"endpoint"}},
+            "outputs": {"__all__": {"uri"}},
+        },
+    )
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def with_hash(deployment: Deployment) -> Deployment:
+    """Return a deployment with the hash of its content."""
+    return deployment.replace(hash=deployment_hash(deployment))
+
+
+_FORMER_KEYS: Final = ("integrity", "integrity_frames")
+"""Keys that earlier versions wrote or read, and that did not enter the hash."""
+
+
+def load_deployment(directory: Path, *, images: bool = True, edited: bool = False) -> Deployment:
+    """Read and check a deployment.
+
+    Args:
+        directory: The folder written by `toolchain build`.
+        images: True to read the images and compare their hashes; without them, a process starts without
+            NumPy.
+        edited: True to accept an edited `deployment.toml`, whose hash does not match its content.
+
+    Raises:
+        DeploymentError: The deployment is absent, not TOML, or has a wrong key or value.
+        DeploymentVersionError: Another format.
+        DamagedDeploymentError: `deployment.toml` or an image has changed since the build; the sentence
+            contains the file and both hashes.
+    """
+    directory = Path(directory)
+    path = directory / FILE_NAME
+    if directory.is_file():
+        raise DeploymentError(
+            f"{directory} is a file; give the folder written by 'toolchain build', here perhaps {directory.parent}"
+        )
+    if not path.is_file():
+        raise DeploymentError(
+            f"{directory} does not contain a deployment: {path} does not exist; create one with 'toolchain build'"
+        )
+    toml = TomlFile.read(path, DeploymentError)
+    version = toml.tables.get("format")
+    if version != FORMAT or isinstance(version, bool):
+        found = "has no key 'format'" if version is None else f"is of format {version!r}"
+        raise DeploymentVersionError(
+            f"{path} {found}, and this version reads format {FORMAT}: build it again with 'toolchain build'"
+        )
+    for key in _FORMER_KEYS:
+        if key in toml.tables:
+            raise toml.mistake(
+                (key,), f"'{key}' belonged to a check of the boards that was removed; delete this line"
+            )
+    file = toml.validated(DeploymentFile)
+    computed = deployment_hash(file)
+    if computed != file.hash and not edited:
+        raise DamagedDeploymentError(
+            f"{path} is not as it was built: its hash is {computed[:16]}, "
+            f"but it names {file.hash[:16] or 'none'}; only URIs, endpoints, compression and topic_bytes may be edited: "
+            "build it again with 'toolchain build', or keep the edit with 'toolchain regenerate deployment'"
+        )
+    deployment = Deployment(**dict(file), directory=directory)
+    if images:
+        _check_images(deployment)
+    return deployment
+
+
+def _check_images(deployment: Deployment) -> None:
+    # Here, not above, because a subscriber loads a deployment without NumPy.
+    from pcie_shim.errors import DamagedImageError, PcieShimError
+    from pcie_shim.programming_file import read_image
+
+    for index, board in enumerate(deployment.boards):
+        path = deployment.image_path(index)
+        if not path.is_file():
+            raise DamagedDeploymentError(
+                f"{path}, the image of board {index}, does not exist: build it again with 'toolchain build'"
+            )
+        try:
+            image = read_image(path)
+        except DamagedImageError as reason:
+            raise DamagedDeploymentError(str(reason)) from reason
+        except PcieShimError as reason:
+            raise DeploymentError(str(reason)) from reason
+        if image.image_hash != board.image_hash:
+            raise DamagedDeploymentError(
+                f"{path} is another board's or another build's image: its hash is {image.image_hash[:16]}, "
+                f"{deployment.path} names {board.image_hash[:16]}"
+            )
+
+
+_TOML_HEADER: Final = """\
+# Written by `toolchain build`. URIs and endpoints may be changed here; the rest belongs to the boards' images
+# and is guarded by the hash: change the model and build again.
+"""
+
+
+def write_deployment(directory: Path, deployment: Deployment) -> Deployment:
+    """Write `deployment.toml` with its hash atomically, and return the written deployment."""
+    written = with_hash(deployment.replace(directory=Path(directory)))
+    with whole_file(written.path, DeploymentError) as partial:
+        partial.write_text(deployment_text(written), encoding="utf-8")
+    return written
+
+
+def deployment_text(deployment: DeploymentFile) -> str:
+    """Return the text of `deployment.toml`: the same deployment gives the same bytes."""
+    content: dict[str, Any] = deployment.model_dump(mode="json", exclude_none=True)
+    aliases = {name: field.validation_alias for name, field in type(deployment).model_fields.items()}
+    plain = {key: value for key, value in content.items() if not isinstance(value, list | dict)}
+    parts = [_TOML_HEADER + tomli_w.dumps(plain)]
+    for key, value in content.items():
+        heading = str(aliases[key] or key)
+        if isinstance(value, dict):
+            parts.append(f"[{heading}]\n" + tomli_w.dumps(value))
+        elif isinstance(value, list):
+            parts.extend(f"[[{heading}]]\n" + tomli_w.dumps(item) for item in value)
+    return "\n".join(parts)

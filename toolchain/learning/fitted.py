@@ -13,12 +13,9 @@ import tomli_w
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
-from toolchain.deployment.fields import Sequence
-from toolchain.deployment.sections import Section
+from toolchain.bounded_files import TomlFile, open_regular, whole_file
+from toolchain.deployment.sections import Section, Sequence
 from toolchain.errors import ModelError
-from toolchain.files.bounded_file import open_regular
-from toolchain.files.toml_file import TomlFile
-from toolchain.files.whole_file import whole_file
 from toolchain.models.conditional import normal_table, wrapped_normal_table
 from toolchain.models.model import Known, Model, Normal
 

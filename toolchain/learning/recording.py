@@ -16,8 +16,8 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, Final, TextIO
 
+from toolchain.bounded_files import open_regular
 from toolchain.errors import BuildError, ModelError
-from toolchain.files.bounded_file import open_regular
 from toolchain.flag_values import key_values
 
 MAX_ROWS: Final = 2_000_000

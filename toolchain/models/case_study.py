@@ -11,8 +11,8 @@ from pathlib import Path
 from types import ModuleType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from toolchain.bounded_files import nearest_name
 from toolchain.errors import ModelError, ToolchainError
-from toolchain.files.toml_file import nearest_name
 from toolchain.models.joint import Question
 from toolchain.models.model import Model
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from toolchain.deployment import Dimension, Variable
-from toolchain.deployment.fields import NAME_MAX
+from toolchain.deployment.sections import NAME_MAX
 from toolchain.errors import ModelError
 
 MAX_LINES: Final = 2**24

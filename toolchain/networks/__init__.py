@@ -8,8 +8,8 @@ import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
+from toolchain.bounded_files import read_bounded
 from toolchain.errors import ModelError, NetworkFileError
-from toolchain.files.bounded_file import read_bounded
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,7 +1,8 @@
 """Memory initialisation files (MIF), the text in which an FPGA's memories get their contents (thesis 3.2).
 
 Files are written in one canonical form, with one hexadecimal entry per line, and read in every form of
-Quartus: five radices, runs (`A : D0 D1;`), ranges (`[A0..A1] : D;`) and both kinds of comments.
+Quartus: five radices, runs (`A : D0 D1;`), ranges (`[A0..A1] : D;`) and both kinds of comments. The random
+numbers of `rng = table` are generated, or read from a user's MIF.
 """
 
 import re
@@ -10,8 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NoReturn
 
-from toolchain.errors import MifError
-from toolchain.files.bounded_file import read_bounded
+import numpy as np
+from numpy.typing import NDArray
+
+from machines.bm1 import BM1Machine
+from machines.rng import GOLDEN, mix
+from toolchain.bounded_files import read_bounded
+from toolchain.errors import BuildError, MifError
 
 MOST_BYTES: Final = 1 << 30
 """Maximum size of a file in bytes."""
@@ -231,3 +237,33 @@ class _Reader:
 
 def _short(word: str) -> str:
     return word if len(word) <= 40 else word[:40] + "..."
+
+
+LENGTH: Final = 1 << 16
+"""Length of a generated table: a multiple of every number of codes."""
+
+
+def table_length(machine: BM1Machine) -> int:
+    """Return the length of a machine's table of random numbers, or of a generated one if it has none."""
+    return LENGTH if machine.rng_table is None else machine.rng_table.size
+
+
+def random_table(prob_bits: int) -> NDArray[np.uint32]:
+    """Return numbers of `prob_bits` bits in a random order, uint32[65536], all equally frequent.
+
+    The probability of every code is therefore exact over the whole table. The order is always the same, from
+    splitmix64.
+    """
+    keys = mix(np.arange(1, LENGTH + 1, dtype=np.uint64) * np.uint64(GOLDEN))
+    numbers: NDArray[np.uint32] = (np.argsort(keys, kind="stable") % (1 << prob_bits)).astype(np.uint32)
+    return numbers
+
+
+def read_table(path: Path) -> NDArray[np.uint32]:
+    """Return the random numbers in a user's MIF, uint32[length], or raise a MifError or BuildError."""
+    mif = read_mif(path)
+    if mif.width > 32:
+        raise BuildError(
+            f"{path} has words of {mif.width} bits; expected random numbers of at most 32, the codes' or more"
+        )
+    return np.array(mif.words, dtype=np.uint32)

@@ -29,8 +29,7 @@ from toolchain.building.machine import plan_machine
 from toolchain.checks.check import check_deployment, check_model
 from toolchain.deployment import REPLICA, Deployment, Scale, Stop, Variable, load_deployment
 from toolchain.deployment.address import to_address
-from toolchain.deployment.address_array import MISSING, to_addresses
-from toolchain.deployment.written_codes import written_prior
+from toolchain.deployment.address_array import MISSING, to_addresses, written_prior
 from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError, ValueOutOfRangeError
 from toolchain.models.model import Known, Model, PriorSelect, dimension, exact_posterior
 

@@ -20,7 +20,7 @@ from toolchain.building.machine import plan_machine
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Variable, WrittenPrior, load_deployment
 from toolchain.deployment.address import to_address
-from toolchain.deployment.written_codes import written_prior
+from toolchain.deployment.address_array import written_prior
 from toolchain.errors import BuildError, DeploymentError, ModelError, ReadingError
 from toolchain.models.distribution import table
 from toolchain.models.joint import JointDistribution

@@ -9,7 +9,7 @@ from bridge.fields import parse_path
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.building.options import read_sources
 from toolchain.deployment import Variable, deployment_hash, load_deployment, write_deployment
-from toolchain.deployment.fields import MESSAGE_PATH
+from toolchain.deployment.sections import MESSAGE_PATH
 from toolchain.errors import BuildError
 
 MODEL = """

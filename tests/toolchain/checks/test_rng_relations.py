@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from machines.parameters import RngKind
 from machines.rng import LFSR
-from toolchain.checks.rng_relations import relations
+from toolchain.checks.generators import relations
 
 
 def numbers(kind, seeds, cycles, steps):
@@ -80,5 +80,5 @@ def test_too_many_groups_are_not_all_looked_at(monkeypatch):
     lfsr = LFSR(RngKind.LFSR32)
     seeds = lfsr.seeds(np.arange(40 * 4, dtype=np.uint64)).reshape(40, 4)
     assert relations(RngKind.LFSR32, seeds, 8).groups == 40
-    monkeypatch.setattr("toolchain.checks.rng_relations._MOST_PAIRS", 32 * 31 // 2 * 7)
+    monkeypatch.setattr("toolchain.checks.generators._MOST_PAIRS", 32 * 31 // 2 * 7)
     assert relations(RngKind.LFSR32, seeds, 8).groups == 7

@@ -3,8 +3,8 @@
 import pytest
 
 from tests.toolchain.deployments import boat
+from toolchain.checks.check import source_findings
 from toolchain.checks.finding import Check, Severity
-from toolchain.checks.sources import source_findings
 from toolchain.deployment import Source, Variable
 
 

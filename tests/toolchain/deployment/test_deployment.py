@@ -31,7 +31,7 @@ from toolchain.deployment import (
     load_deployment,
     write_deployment,
 )
-from toolchain.deployment.fields import MESSAGE_PATH
+from toolchain.deployment.sections import MESSAGE_PATH
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 from toolchain.models.model import Known, Model, dimension
 

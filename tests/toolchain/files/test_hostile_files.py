@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from tests.toolchain.running import refused_within
+from toolchain.bounded_files import read_bounded
 from toolchain.building.options import read_sources
 from toolchain.deployment import load_deployment
 from toolchain.errors import BuildError, DeploymentError, MifError, ModelError, NetworkFileError
-from toolchain.files.bounded_file import read_bounded
 from toolchain.learning.fitted import read_fit
 from toolchain.learning.recording import read_recording
 from toolchain.models.case_study import load_model

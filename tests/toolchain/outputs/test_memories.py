@@ -20,8 +20,7 @@ from toolchain.building.machine import plan_machine
 from toolchain.deployment import load_deployment
 from toolchain.models.conditional import normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
-from toolchain.outputs.mif import read_mif
-from toolchain.outputs.rng_table import random_table
+from toolchain.outputs.mif import random_table, read_mif
 
 KINDS = [
     {},

@@ -13,7 +13,7 @@ from machines.encode import decode_code
 from toolchain.analysis.accuracy.emulation import Inputs
 from toolchain.deployment import Dimension, Scale, Variable
 from toolchain.deployment.address import to_address
-from toolchain.deployment.written_codes import written_codes
+from toolchain.deployment.address_array import written_codes
 from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.learning.recording import read_recording, reading_columns
 from toolchain.models.model import Known, Model, PriorSelect

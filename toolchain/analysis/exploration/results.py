@@ -8,8 +8,8 @@ from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from toolchain.bounded_files import read_bounded
 from toolchain.errors import BuildError
-from toolchain.files.bounded_file import read_bounded
 
 MAX_FILE_BYTES: Final = 1 << 28
 

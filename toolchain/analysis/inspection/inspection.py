@@ -29,7 +29,7 @@ from toolchain.building.quantise import ColumnLoss, quantise
 from toolchain.deployment import Deployment, Scale
 from toolchain.errors import BuildError, DeploymentError
 from toolchain.models.model import Model
-from toolchain.outputs.rng_table import table_length
+from toolchain.outputs.mif import table_length
 
 Progress = Callable[[int], AbstractContextManager[Callable[[str], None]]]
 

@@ -11,7 +11,7 @@ from pcie_shim.programming_file import interface_room
 from toolchain.analysis.resources.estimate import Pcie, estimate
 from toolchain.building.machine import partition_lines
 from toolchain.errors import BuildError
-from toolchain.outputs.rng_table import LENGTH
+from toolchain.outputs.mif import LENGTH
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,7 +15,7 @@ from machines.bm1 import Start, addressed_codes
 from machines.encode import decode_code
 from toolchain.analysis.accuracy.emulation import one_replica
 from toolchain.analysis.resources.logic import logic_of
-from toolchain.outputs.rng_table import table_length
+from toolchain.outputs.mif import table_length
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from toolchain.analysis.resources.logic import Logic, logic_of
 from toolchain.analysis.resources.table_memories import MLAB_ALMS, MLAB_SHARE, Memories, place_memories
 from toolchain.errors import BuildError
-from toolchain.outputs.rng_table import LENGTH
+from toolchain.outputs.mif import LENGTH
 
 if TYPE_CHECKING:
     from machines.parameters import BM1Parameters

@@ -14,7 +14,7 @@ from machines.parameters import BM1Parameters, PriorMode, RngKind
 from pcie_shim.programming_file import interface_words
 from toolchain.errors import BuildError
 from toolchain.outputs.memories import generators
-from toolchain.outputs.rng_table import LENGTH
+from toolchain.outputs.mif import LENGTH
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -10,7 +10,7 @@ from machines.parameters import PriorMode, SensorMode
 from pcie_shim.programming_file import interface_words
 from toolchain.analysis.resources.logic import WORD_BITS, state_bits
 from toolchain.outputs.memories import generators
-from toolchain.outputs.rng_table import LENGTH
+from toolchain.outputs.mif import LENGTH
 
 if TYPE_CHECKING:
     from machines.parameters import BM1Parameters

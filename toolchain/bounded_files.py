@@ -1,23 +1,82 @@
-"""Reading of TOML files into pydantic models; errors give file, line and the nearest valid name."""
+"""Files of bounded size and depth: read with errors that name file and line, written as a whole."""
 
 from __future__ import annotations
 
 import difflib
+import os
 import re
+import stat
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
-
-from toolchain.files.bounded_file import read_bounded
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
     from toolchain.errors import ToolchainError
+
+
+_PIECE: Final = 1 << 18
+
+
+def open_regular(path: Path, error: type[ToolchainError], most: int | None = None) -> BinaryIO:
+    """Open a regular file for reading, because a FIFO or a device could block forever or never end.
+
+    Raises:
+        error: The file is missing, cannot be read, is not a regular file, or has more than `most` bytes.
+    """
+    try:
+        number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # otherwise, opening a FIFO waits for a writer
+    except OSError as reason:
+        raise error(f"{path} cannot be read: {reason.strerror or reason}") from None
+    state = os.fstat(number)
+    if stat.S_ISREG(state.st_mode) and (most is None or state.st_size <= most):
+        return os.fdopen(number, "rb")
+    os.close(number)
+    if not stat.S_ISREG(state.st_mode):
+        raise error(f"{path} is not a regular file")
+    raise error(f"{path} has more than {most} bytes, the maximum")
+
+
+def read_bounded(path: Path, most: int, error: type[ToolchainError]) -> bytes:
+    """Return the content of a regular file of at most `most` bytes, or raise the error."""
+    try:
+        with open_regular(path, error, most) as file:
+            pieces, size = [], 0
+            while size <= most and (
+                piece := file.read(_PIECE)
+            ):  # read(most) would allocate that much at once
+                pieces.append(piece)
+                size += len(piece)
+    except OSError as reason:
+        raise error(f"{path} cannot be read: {reason.strerror or reason}") from None
+    if size > most:  # it has grown, or is a file in /proc, which reports the size 0
+        raise error(f"{path} has more than {most} bytes, the maximum")
+    return b"".join(pieces)
+
+
+@contextmanager
+def whole_file(path: Path, error: type[ToolchainError]) -> Iterator[Path]:
+    """Yield the path of a partial file, which replaces the file at the end of the block.
+
+    If the partial file is removed in the block, the file does not change.
+    """
+    partial = path.with_name(path.name + ".part")
+    try:
+        yield partial
+        if partial.exists():
+            partial.replace(path)
+    except OSError as reason:
+        raise error(f"{path} cannot be written: {reason.strerror or reason}") from None
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
+
 
 Model = TypeVar("Model", bound=BaseModel)
 

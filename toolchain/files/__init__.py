@@ -1,1 +1,0 @@
-"""Bounded reading and atomic writing of files."""
