@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from casestudies.boat.geometry import BEACONS, map_grid
-from casestudies.boat.shares import Part, StageShare
+from casestudies.boat.shares import StageKind, StageShare
 from casestudies.grid import Grid
 from casestudies.truths import Instance, Truth
 from posteriors.posterior import Posterior
@@ -17,10 +17,10 @@ POSITIONS_SHOWN: Final = 4
 """Number of positions in figure 4.4, as in the thesis."""
 
 _PART_COLOURS: Final = {
-    Part.ROSBRIDGE: "#4477aa",
-    Part.HOST: "#bbbbbb",
-    Part.REGISTERS: "#ccbb44",
-    Part.COMPUTING: "#ee6677",
+    StageKind.ROSBRIDGE: "#4477aa",
+    StageKind.HOST: "#bbbbbb",
+    StageKind.REGISTERS: "#ccbb44",
+    StageKind.COMPUTING: "#ee6677",
 }
 _TRUTH_COLOUR: Final = "#ff4d4d"
 _DPI: Final = 130
@@ -108,7 +108,7 @@ def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> Non
     axes.set_xlabel("mean time a frame, in ms")
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(axis="y", length=0)
-    parts = [part for part in Part if any(stage.part is part for stage in shares)]
+    parts = [part for part in StageKind if any(stage.part is part for stage in shares)]
     figure.legend(
         [axes.barh([0], [0], color=_PART_COLOURS[part]) for part in parts],
         [

@@ -9,7 +9,7 @@ from typing import Final
 from casestudies.truths import Instance
 
 
-class Part(StrEnum):
+class StageKind(StrEnum):
     """The parts of the system that the thesis measured, and the host's sockets, which it did not measure."""
 
     ROSBRIDGE = "rosbridge"
@@ -23,7 +23,7 @@ class StageShare:
     """One stage of a frame: its mean over the frames that report it, and its share of all stages."""
 
     name: str
-    part: Part
+    part: StageKind
     mean_us: float
     share: float
 
@@ -40,13 +40,13 @@ def _rosbridge_out(instance: Instance) -> float | None:
     return instance.posterior.rosbridge_out_us if instance.posterior else None
 
 
-_STAGES: Final[tuple[tuple[str, Part, Callable[[Instance], float | None]], ...]] = (
-    ("rosbridge in", Part.ROSBRIDGE, _reported("rosbridge_in")),
-    ("local hops", Part.HOST, _reported("local_hops")),
-    ("register writes", Part.REGISTERS, _reported("register_writes")),
-    ("computing", Part.COMPUTING, _reported("compute")),
-    ("register reads", Part.REGISTERS, _reported("reads")),
-    ("rosbridge out", Part.ROSBRIDGE, _rosbridge_out),
+_STAGES: Final[tuple[tuple[str, StageKind, Callable[[Instance], float | None]], ...]] = (
+    ("rosbridge in", StageKind.ROSBRIDGE, _reported("rosbridge_in")),
+    ("local hops", StageKind.HOST, _reported("local_hops")),
+    ("register writes", StageKind.REGISTERS, _reported("register_writes")),
+    ("computing", StageKind.COMPUTING, _reported("compute")),
+    ("register reads", StageKind.REGISTERS, _reported("reads")),
+    ("rosbridge out", StageKind.ROSBRIDGE, _rosbridge_out),
 )
 
 
@@ -57,7 +57,7 @@ def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
     `/bm/frame`.
     """
     published = [instance for instance in instances if instance.posterior is not None]
-    means: list[tuple[str, Part, float]] = []
+    means: list[tuple[str, StageKind, float]] = []
     for name, part, time_of in _STAGES:
         known = [time for time in map(time_of, published) if time is not None]
         if known:

@@ -15,7 +15,7 @@ from toolchain.models.model import cell_centres, fuse, interval
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reading:
+class LandmarkReading:
     """A reading of one landmark: metres and radians (absolute, any turn), or None if it was not seen."""
 
     range_m: float | None = None
@@ -24,7 +24,7 @@ class Reading:
 
 def unquantised_posterior(
     landmarks: Sequence[Landmark],
-    readings: Sequence[Reading],
+    readings: Sequence[LandmarkReading],
     *,
     width: int = 32,
     height: int = 32,

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
+from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source, Variable
 
 BOAT = {
     "name": "boat",
@@ -14,7 +14,7 @@ BOAT = {
     "searched": (Dimension(label="y", size=4, offset=-3.0, step=2.0), Dimension(label="x", size=3)),
     "machine": MachineSection(lines=12),
     "boards": tuple(
-        Board(image=f"boards/board{at}.bm", image_hash=str(at) * 64, line_offset=6 * at, lines=6)
+        BoardSection(image=f"boards/board{at}.bm", image_hash=str(at) * 64, line_offset=6 * at, lines=6)
         for at in (0, 1)
     ),
 }

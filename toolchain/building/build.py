@@ -30,7 +30,7 @@ from toolchain.building.quantise import Quantised, quantise
 from toolchain.building.report import REPORT_NAME, build_report
 from toolchain.deployment import (
     FILE_NAME,
-    Board,
+    BoardSection,
     Deployment,
     MachineSection,
     Output,
@@ -187,7 +187,7 @@ def describe(plan: MachinePlan, layout: BoardLayout, images: Sequence[Image]) ->
             ),
             prior=options.written_prior,
             boards=tuple(
-                Board(
+                BoardSection(
                     image=f"boards/board{index}.bm",
                     image_hash=image.image_hash,
                     line_offset=block.offset,

@@ -93,7 +93,7 @@ def whole_machine(plan: MachinePlan, quantised: Quantised) -> BM1Machine:
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class LineBlock:
     """The lines of one board: `lines` of them from `offset` on."""
 
     offset: int
@@ -105,7 +105,7 @@ class Block:
         return self.offset + self.lines
 
 
-def partition_lines(lines: int, count: int) -> tuple[Block, ...]:
+def partition_lines(lines: int, count: int) -> tuple[LineBlock, ...]:
     """Return the blocks of `lines` lines on `count` boards, in order; the first `lines` mod `count` are one longer."""
     if not 1 <= count <= lines:
         raise BuildError(
@@ -113,7 +113,7 @@ def partition_lines(lines: int, count: int) -> tuple[Block, ...]:
         )
     shorter, longer = divmod(lines, count)
     return tuple(
-        Block(board * shorter + min(board, longer), shorter + (board < longer)) for board in range(count)
+        LineBlock(board * shorter + min(board, longer), shorter + (board < longer)) for board in range(count)
     )
 
 
@@ -141,7 +141,7 @@ _MOST_SEEDS: Final = 1 << 23
 class BoardLayout:
     """The lines of each board, and the common interface."""
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[LineBlock, ...]
     """Blocks of lines by board; the first one is one of the largest."""
     interface: tuple[int, int]
     """Inputs and results of the boards' registers."""

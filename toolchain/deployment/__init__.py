@@ -11,7 +11,7 @@ from toolchain.deployment.deployment import (
     write_deployment,
 )
 from toolchain.deployment.sections import (
-    Board,
+    BoardSection,
     Dimension,
     MachineSection,
     Output,
@@ -27,7 +27,7 @@ from toolchain.deployment.sections import (
 __all__ = [
     "FILE_NAME",
     "REPLICA",
-    "Board",
+    "BoardSection",
     "Deployment",
     "DeploymentFile",
     "Dimension",

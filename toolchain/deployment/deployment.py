@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from machines.parameters import PriorMode, SensorMode
 from toolchain.bounded_files import TomlFile, whole_file
 from toolchain.deployment.sections import (
-    Board,
+    BoardSection,
     Choice,
     Dimension,
     MachineSection,
@@ -48,7 +48,7 @@ class DeploymentFile(Section):
     searched: Sequence[Dimension] = Field(min_length=1)
     machine: MachineSection
     prior: WrittenPrior | None = Field(default=None, exclude_if=lambda prior: prior is None)
-    boards: Sequence[Board] = Field(validation_alias="board", min_length=1)
+    boards: Sequence[BoardSection] = Field(validation_alias="board", min_length=1)
     outputs: Sequence[Output] = Field(default=(Output(),), validation_alias="output")
 
     @model_validator(mode="after")

@@ -304,7 +304,7 @@ class WrittenPrior(Section):
     on_missing: Literal["error", "model"] = "error"
 
 
-class Board(Section):
+class BoardSection(Section):
     """`[[board]]`: one board of the mini-cluster, its image and its lines of the machine."""
 
     image: str

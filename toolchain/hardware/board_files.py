@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from pcie_shim.programming_file import Image
-from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
+from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source, Variable
 from toolchain.hardware.sources import PARAMETERS
 from toolchain.outputs.memories import Memory, memories
 from toolchain.outputs.vhdl_parameters import parameters_vhd
@@ -66,5 +66,7 @@ def _deployment(image: Image) -> Deployment:
             sensor_mode=parameters.sensor_mode,
             replicas=parameters.replicas,
         ),
-        boards=(Board(image="boards/board0.bm", image_hash=image.image_hash, line_offset=0, lines=total),),
+        boards=(
+            BoardSection(image="boards/board0.bm", image_hash=image.image_hash, line_offset=0, lines=total),
+        ),
     )

@@ -39,7 +39,7 @@ _TO_SIGMA: Final = 1.4826
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Truth:
+class TrueCells:
     """The true position in each usable row."""
 
     rows: NDArray[np.int64]
@@ -68,7 +68,7 @@ class Support:
     """Number of readings that are not values of the variable."""
 
 
-def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> Truth:
+def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> TrueCells:
     """Return the true position in each of `rows` rows; `columns` are the true values by label."""
     places = np.array(
         [[_position(dimension, value) for value in columns[dimension.label]] for dimension in model.searched]
@@ -79,7 +79,7 @@ def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> 
         inside = np.all((cells >= 0) & (cells < sizes), axis=0)
     cells = cells[:, inside].astype(np.int64)
     lines = np.ravel_multi_index(tuple(cells), tuple(int(size) for size in sizes[:, 0]))
-    return Truth(
+    return TrueCells(
         rows=np.flatnonzero(inside),
         lines=np.asarray(lines, dtype=np.int64),
         within=places[:, inside] - cells,
@@ -89,7 +89,7 @@ def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> 
 
 def fit_model(
     model: Model,
-    truth: Truth,
+    truth: TrueCells,
     readings: Mapping[str, Sequence[object]],
     recordings: Sequence[FittedRecording],
     options: FitOptions,
@@ -134,7 +134,7 @@ def _position(dimension: Dimension, value: object) -> float:
 
 def _normals(
     model: Model,
-    truth: Truth,
+    truth: TrueCells,
     readings: Mapping[str, tuple[Known, Sequence[object]]],
     options: FitOptions,
 ) -> tuple[list[Support], list[FittedVariable]]:
@@ -205,7 +205,7 @@ def mixture(
 
 
 def _residuals(
-    model: Model, known: Known, truth: Truth, values: Sequence[object]
+    model: Model, known: Known, truth: TrueCells, values: Sequence[object]
 ) -> tuple[NDArray[np.float64], Support]:
     """Return reading minus expectation at the true position, for every row with a reading."""
     slopes = mean_slopes(model, known)
@@ -226,7 +226,7 @@ def _number(value: object) -> float:
 
 
 def _counted(
-    known: Known, truth: Truth, values: Sequence[object], options: FitOptions
+    known: Known, truth: TrueCells, values: Sequence[object], options: FitOptions
 ) -> tuple[NDArray[np.float64], Support]:
     variable = known.as_variable().model_copy(update={"on_missing": "missing"})
     counts = np.zeros(known.table.shape)
@@ -249,7 +249,7 @@ def _counted(
     return table, _support(known.name, np.array(used, dtype=np.int64), refused)
 
 
-def _counted_prior(model: Model, truth: Truth, options: FitOptions) -> NDArray[np.float64]:
+def _counted_prior(model: Model, truth: TrueCells, options: FitOptions) -> NDArray[np.float64]:
     """Return P(S), float64[lines], from the number of rows in each cell."""
     if model.prior_select is not None:
         raise ModelError(

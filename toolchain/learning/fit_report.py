@@ -16,7 +16,7 @@ from toolchain.deployment.address import to_address
 from toolchain.errors import BuildError, ModelError, ReadingError
 from toolchain.flag_values import key_values
 from toolchain.learning import FitMethod, FitOptions
-from toolchain.learning.fit import LEAST_READINGS, Support, Truth, fit_model, locate
+from toolchain.learning.fit import LEAST_READINGS, Support, TrueCells, fit_model, locate
 from toolchain.learning.fitted import Fit, FittedRecording, apply_fit, write_fit
 from toolchain.learning.recording import Recording, read_recording, reading_columns
 from toolchain.models.case_study import load_model
@@ -144,7 +144,7 @@ def _comparison(
 
 
 def _posteriors(
-    model: Model, truth: Truth, readings: Mapping[str, Sequence[object]]
+    model: Model, truth: TrueCells, readings: Mapping[str, Sequence[object]]
 ) -> list[NDArray[np.float64] | None]:
     """Return the exact posterior of each row with a truth; None if its readings are impossible in the model."""
     found: list[NDArray[np.float64] | None] = []
@@ -156,7 +156,7 @@ def _posteriors(
     return found
 
 
-def _scores(model: Model, truth: Truth, found: Sequence[NDArray[np.float64] | None]) -> Iterator[str]:
+def _scores(model: Model, truth: TrueCells, found: Sequence[NDArray[np.float64] | None]) -> Iterator[str]:
     """Yield accuracy, distance and surprise; distances only between numbers, not between names of states."""
     lines = truth.lines.tolist()
     right = sum(
@@ -193,7 +193,7 @@ def _scores(model: Model, truth: Truth, found: Sequence[NDArray[np.float64] | No
 
 
 def _confusions(
-    name: str, model: Model, truth: Truth, found: Sequence[NDArray[np.float64] | None]
+    name: str, model: Model, truth: TrueCells, found: Sequence[NDArray[np.float64] | None]
 ) -> Iterator[str]:
     """Yield the confusion matrix of each searched dimension with named states."""
     sizes = tuple(dimension.size for dimension in model.searched)

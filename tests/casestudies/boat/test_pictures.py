@@ -7,7 +7,7 @@ import pytest
 from matplotlib.image import imread
 
 from casestudies.boat.pictures import draw_positions, draw_shares, far_apart, posterior_grid
-from casestudies.boat.shares import Part, stage_shares
+from casestudies.boat.shares import StageKind, stage_shares
 from casestudies.truths import Instance, Truth
 from posteriors.frame_report import FrameReport, StageTimes
 from posteriors.posterior import Posterior
@@ -137,7 +137,7 @@ class TestShares:
         ]
         assert [stage.mean_us for stage in shares] == [150, 300, 75, 900, 75, 500]
         assert sum(stage.share for stage in shares) == pytest.approx(1)
-        assert shares[3].part is Part.COMPUTING
+        assert shares[3].part is StageKind.COMPUTING
         assert shares[3].share == pytest.approx(900 / 2000)
 
     def test_stages_that_nobody_told_are_left_out(self):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from casestudies.mrclam.fusion import Reading, unquantised_posterior
+from casestudies.mrclam.fusion import LandmarkReading, unquantised_posterior
 from casestudies.mrclam.landmarks import Landmark, read_landmarks
 from casestudies.mrclam.model import model
 from casestudies.mrclam.recording import area_grid
@@ -47,12 +47,12 @@ def sight(random, x, y, *, outlier=None):
     readings = []
     for place, landmark in enumerate(LANDMARKS):
         if place == random.integers(0, 6):
-            readings.append(Reading())
+            readings.append(LandmarkReading())
             continue
         range_m = math.dist((x, y), (landmark.x, landmark.y)) + random.normal(0, 0.25)
         bearing = math.atan2(landmark.y - y, landmark.x - x) + random.normal(0, 0.12)
         readings.append(
-            Reading(range_m=abs(range_m) + (5.0 if place == outlier else 0.0), bearing_rad=bearing)
+            LandmarkReading(range_m=abs(range_m) + (5.0 if place == outlier else 0.0), bearing_rad=bearing)
         )
     return readings
 
@@ -113,7 +113,11 @@ def test_a_floor_that_codes_cannot_represent_is_reported(path):
 def test_unquantised_fusion_is_density_and_floor_at_the_centres(x, y, range_m, bearing_rad, floor):
     landmark = Landmark(1, x, y)
     found = unquantised_posterior(
-        [landmark], [Reading(range_m=range_m, bearing_rad=bearing_rad)], width=5, height=4, floor=floor
+        [landmark],
+        [LandmarkReading(range_m=range_m, bearing_rad=bearing_rad)],
+        width=5,
+        height=4,
+        floor=floor,
     )
     expected = []
     for line in range(20):

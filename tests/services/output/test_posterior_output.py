@@ -22,7 +22,7 @@ from services.output.axes import Axis, axes_of
 from services.output.posterior_file import open_result_file, record
 from services.output.posterior_lines import line
 from services.output.posterior_picture import ROWS, in_colour, picture
-from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source
+from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source
 
 HASH = "0" * 64
 
@@ -36,7 +36,7 @@ def deployment(*searched: Dimension) -> Deployment:
         source=[Source(uri="ws://robot:9090", topic="/t", type="a/B")],
         searched=list(searched),
         machine=MachineSection(lines=lines),
-        board=[Board(image="boards/board0.bm", image_hash=HASH, line_offset=0, lines=lines)],
+        board=[BoardSection(image="boards/board0.bm", image_hash=HASH, line_offset=0, lines=lines)],
     )
 
 

@@ -13,7 +13,7 @@ from services.pipeline.frames import (
     StampGap,
     WaitingFrames,
 )
-from toolchain.deployment import Board, Deployment, Dimension, MachineSection, Source, Variable
+from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source, Variable
 from toolchain.deployment.sections import WrittenPrior
 
 HASH = "0" * 64
@@ -26,7 +26,7 @@ def deployment(*variables: Variable, sources: int = 1, tolerance_s: float = 0.05
         variable=list(variables),
         searched=[Dimension(label="x", size=4)],
         machine=MachineSection(lines=4),
-        board=[Board(image="boards/board0.bm", image_hash=HASH, line_offset=0, lines=4)],
+        board=[BoardSection(image="boards/board0.bm", image_hash=HASH, line_offset=0, lines=4)],
         tolerance_s=tolerance_s,
     )
 

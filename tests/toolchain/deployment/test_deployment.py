@@ -19,7 +19,7 @@ from tests.toolchain.running import OPTIONS
 from toolchain.building.build import build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.deployment import (
-    Board,
+    BoardSection,
     Dimension,
     MachineSection,
     Output,
@@ -112,7 +112,7 @@ def deployments(draw):
         ),
         machine=MachineSection(lines=lines, stop=draw(st.sampled_from(list(Stop)))),
         boards=tuple(
-            Board(image=f"boards/{i}.bm", image_hash="a" * 64, line_offset=start, lines=end - start)
+            BoardSection(image=f"boards/{i}.bm", image_hash="a" * 64, line_offset=start, lines=end - start)
             for i, (start, end) in enumerate(zip(starts, [*cuts, lines], strict=True))
         ),
     )
@@ -275,7 +275,7 @@ def test_no_bytes_get_past(tmp_path_factory, content):
 
 def test_objects_are_checked_like_files():
     with pytest.raises(ValidationError, match="expected 0"):
-        boat(boards=(Board(image="b.bm", image_hash="0" * 64, line_offset=1, lines=11),))
+        boat(boards=(BoardSection(image="b.bm", image_hash="0" * 64, line_offset=1, lines=11),))
 
 
 @pytest.fixture

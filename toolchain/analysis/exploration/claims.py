@@ -223,7 +223,7 @@ class FaultyMachine:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class DrawnFrame:
     """A frame's codes, uint16[columns, lines], likelihoods, float64[sensors, lines], and bank."""
 
     codes: NDArray[np.uint16]
@@ -243,19 +243,19 @@ class Faults:
         self._machine.reseed(seed)
         self._random = np.random.default_rng([seed, 1])
 
-    def streams(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
+    def streams(self, frame: DrawnFrame, rate: float) -> NDArray[np.float64] | None:
         """Flip the bit of a cell in a cycle."""
         return self._counted(frame, frame.codes, stream_rate=rate)
 
-    def numbers(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
+    def numbers(self, frame: DrawnFrame, rate: float) -> NDArray[np.float64] | None:
         """Flip a bit of a random number, which a whole column uses."""
         return self._counted(frame, frame.codes, number_rate=rate)
 
-    def tables(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
+    def tables(self, frame: DrawnFrame, rate: float) -> NDArray[np.float64] | None:
         """Flip a bit of a code, for the whole frame."""
         return self._counted(frame, _flipped(frame.codes, CODE_BITS, rate, self._random))
 
-    def fixed_point(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
+    def fixed_point(self, frame: DrawnFrame, rate: float) -> NDArray[np.float64] | None:
         """Multiply the codes in 8 bits with an exponent common to all lines; flip a bit of a factor or product."""
         product = np.full(frame.codes.shape[1], 2**CODE_BITS - 1, dtype=np.uint16)
         for row in frame.codes:
@@ -267,7 +267,7 @@ class Faults:
         total = int(product.sum())
         return product / total if total else None
 
-    def floating_point(self, frame: Frame, rate: float) -> NDArray[np.float64] | None:
+    def floating_point(self, frame: DrawnFrame, rate: float) -> NDArray[np.float64] | None:
         """Multiply float32s; flip a bit of a factor or of a product."""
         product = np.ones(frame.likelihoods.shape[1], dtype=np.float32)
         with np.errstate(all="ignore"):  # flipped exponents overflow
@@ -281,7 +281,12 @@ class Faults:
         return posterior if np.isfinite(posterior).all() else None
 
     def _counted(
-        self, frame: Frame, codes: NDArray[np.uint16], *, stream_rate: float = 0.0, number_rate: float = 0.0
+        self,
+        frame: DrawnFrame,
+        codes: NDArray[np.uint16],
+        *,
+        stream_rate: float = 0.0,
+        number_rate: float = 0.0,
     ) -> NDArray[np.float64] | None:
         counts, _ = self._machine.counts(
             codes,
@@ -295,7 +300,7 @@ class Faults:
         return counts / total if total else None
 
 
-KINDS: Final[dict[str, Callable[[Faults, Frame, float], NDArray[np.float64] | None]]] = {
+KINDS: Final[dict[str, Callable[[Faults, DrawnFrame, float], NDArray[np.float64] | None]]] = {
     "machine: stream bits": Faults.streams,
     "machine: bits of random numbers": Faults.numbers,
     "machine: table bits": Faults.tables,
@@ -305,10 +310,10 @@ KINDS: Final[dict[str, Callable[[Faults, Frame, float], NDArray[np.float64] | No
 """The compared ways, by their names in the picture."""
 
 
-def frames_of(model: Model, machine: BM1Machine, readings: Readings) -> list[Frame]:
+def frames_of(model: Model, machine: BM1Machine, readings: Readings) -> list[DrawnFrame]:
     """Return the frames of some readings."""
     return [
-        Frame(
+        DrawnFrame(
             codes=np.stack(
                 [machine.prior[0], *(table[at] for table, at in zip(machine.tables, addresses, strict=True))]
             ),

@@ -84,7 +84,7 @@ COSTS: Final[Mapping[Of, Cost]] = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Part:
+class LogicPart:
     """A part of a machine: its name, units of look-up tables, and flip-flops."""
 
     name: str
@@ -106,7 +106,7 @@ class Part:
 class Logic:
     """The logic of a machine, without memories."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[LogicPart, ...]
 
     @property
     def aluts(self) -> float:
@@ -152,11 +152,11 @@ def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH) -> Logic:
     control = _BOARD_REGISTERS + 2 * p.counter_bits + (WORD_BITS + several * CYCLE_BITS if several else 0)
     return Logic(
         (
-            Part(name="cells", counts={Of.CODE_BIT: cells * p.prob_bits}, registers=held * p.prob_bits),
-            Part(name="counters", counts={Of.COUNTER_BIT: counters}, registers=counters),
+            LogicPart(name="cells", counts={Of.CODE_BIT: cells * p.prob_bits}, registers=held * p.prob_bits),
+            LogicPart(name="counters", counts={Of.COUNTER_BIT: counters}, registers=counters),
             _generators(p, table_length),
             _inputs(p),
-            Part(
+            LogicPart(
                 name="control",
                 counts={Of.BOARD: 1, Of.REPLICA: several},
                 registers=control + p.replicas * _REPLICA_BITS,
@@ -165,16 +165,16 @@ def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH) -> Logic:
     )
 
 
-def _generators(p: BM1Parameters, table_length: int) -> Part:
+def _generators(p: BM1Parameters, table_length: int) -> LogicPart:
     """Return the generators, and the logic that loads their seeds (bm1_generators)."""
     count, width = generators(p), state_bits(p, table_length)
     lfsrs = {Of.STATE_BIT: count * width, Of.STEP: count * p.steps_per_clock}
     counts = lfsrs if p.rng.lfsr_bits else {Of.PLACE_BIT: count * width}
     loading = _index_bits(p.rng_banks * count) + _index_bits(count + 1) + 2
-    return Part(name="generators", counts=counts, registers=count * width + loading)
+    return LogicPart(name="generators", counts=counts, registers=count * width + loading)
 
 
-def _inputs(p: BM1Parameters) -> Part:
+def _inputs(p: BM1Parameters) -> LogicPart:
     """Return the words that the host writes for a frame (bm1_words): readings, prior addresses of replicas, codes."""
     inputs, results = interface_words(p)
     sensor_bits = sum(p.sensor_bits) * inputs // max(p.sensors, 1)
@@ -191,7 +191,7 @@ def _inputs(p: BM1Parameters) -> Part:
         words + bits + 2 * _index_bits(words) + 2 + (WORD_BITS if words <= _FEW_WORDS else 0)
         for words, bits in blocks
     )
-    return Part(
+    return LogicPart(
         name="inputs",
         counts={Of.WORD: sum(words for words, _ in blocks), Of.MEMORY: len(blocks)},
         registers=registers + place_bits,
