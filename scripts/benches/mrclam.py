@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from casestudies.mrclam.fusion import Reading, unquantised_posterior
+from casestudies.mrclam.fusion import LandmarkReading, unquantised_posterior
 from casestudies.mrclam.landmarks import Landmark, read_landmarks
 from casestudies.mrclam.model import model
 from casestudies.mrclam.player import median_distance, play
@@ -71,9 +71,9 @@ def by_hand_distances(
     for frame in frames:
         seen = {sighting.landmark: sighting for sighting in frame.sightings}
         readings = [
-            Reading(range_m=seen[each.number].range_m, bearing_rad=seen[each.number].bearing_rad)
+            LandmarkReading(range_m=seen[each.number].range_m, bearing_rad=seen[each.number].bearing_rad)
             if each.number in seen
-            else Reading()
+            else LandmarkReading()
             for each in landmarks
         ]
         posterior = unquantised_posterior(landmarks, readings, width=cells, height=cells)

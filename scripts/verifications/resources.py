@@ -22,7 +22,7 @@ from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, Sen
 from scripts.running.flags import ScriptParser
 from scripts.verifications.installation import install_programs
 from services.errors import SettingsError
-from toolchain.analysis.resources.logic import COSTS, WORST_ERROR, Of, logic_of
+from toolchain.analysis.logic import COSTS, WORST_ERROR, Of, logic_of
 
 _CELL, _THRESHOLD, _WRITTEN = SensorMode.CELL, SensorMode.THRESHOLD, PriorMode.WRITTEN
 

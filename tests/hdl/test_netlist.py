@@ -6,7 +6,7 @@ import pytest
 
 from hdl.test.netlist import synthesised
 from hdl.test.project import HDL, BM1Parameters, RngKind, SensorMode, image_of_parameters, run_tool
-from toolchain.analysis.resources.logic import WORST_ERROR, logic_of
+from toolchain.analysis.logic import WORST_ERROR, logic_of
 
 pytestmark = pytest.mark.thorough
 needs_ghdl = pytest.mark.skipif(

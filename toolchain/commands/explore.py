@@ -15,10 +15,10 @@ from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
 
 if TYPE_CHECKING:
-    from toolchain.analysis.accuracy.readings import Readings
-    from toolchain.analysis.exploration.claims import Course
-    from toolchain.analysis.exploration.results import Point
-    from toolchain.analysis.exploration.sweep import Sweep
+    from toolchain.analysis.claims import Course
+    from toolchain.analysis.readings import Readings
+    from toolchain.analysis.results import Point
+    from toolchain.analysis.sweep import Sweep
     from toolchain.models.model import Model
 
 Kind = TypeVar("Kind", bound=StrEnum)
@@ -111,12 +111,11 @@ def _run_sweep(
     path: Path, flags: SweepFlags, readings: ReadingFlags, count: int, results: Path, plot: Path | None
 ) -> None:
     """Run the sweep, store every point in the results file, and print the points, even after an interruption."""
-    from toolchain.analysis.accuracy.readings import check_columns
-    from toolchain.analysis.exploration.pictures import check_pictures_possible, draw_sweep
-    from toolchain.analysis.exploration.results import Results, pareto
-    from toolchain.analysis.exploration.sweep import Frames, run_sweep, run_task, tasks, with_resources
-    from toolchain.analysis.exploration.sweep_table import table
-    from toolchain.analysis.resources.device import device_named
+    from toolchain.analysis.logic import device_named
+    from toolchain.analysis.pictures import check_pictures_possible, draw_sweep
+    from toolchain.analysis.readings import check_columns
+    from toolchain.analysis.results import Results, pareto, table
+    from toolchain.analysis.sweep import Frames, run_sweep, run_task, tasks, with_resources
     from toolchain.commands.request import read_model
 
     if plot is not None:
@@ -161,7 +160,7 @@ def _run_sweep(
 
 def _recorded(model: "Model", flags: ReadingFlags) -> "Callable[[int], Readings] | None":
     """Return a function that reads a number of rows of the recording, if there is one."""
-    from toolchain.analysis.accuracy.readings import recorded_readings
+    from toolchain.analysis.readings import recorded_readings
 
     path = flags.readings
     if path is None:
@@ -170,7 +169,7 @@ def _recorded(model: "Model", flags: ReadingFlags) -> "Callable[[int], Readings]
 
 
 def _sweep(flags: SweepFlags) -> "Sweep":
-    from toolchain.analysis.exploration.sweep import Sweep
+    from toolchain.analysis.sweep import Sweep
 
     if flags.partitions < 1 or flags.max_cycles < 1 or flags.banks < 1:
         raise BuildError("--partitions, --max-cycles and --banks are numbers from 1")
@@ -214,9 +213,9 @@ def _name_of(point: "Point") -> str:
 
 
 def _run_claims(directory: Path, *, frames: int, seed: int) -> None:
-    from toolchain.analysis.accuracy.readings import check_frames
-    from toolchain.analysis.exploration.claims import experiments, run_claims
-    from toolchain.analysis.exploration.pictures import check_pictures_possible, draw_claims
+    from toolchain.analysis.claims import experiments, run_claims
+    from toolchain.analysis.pictures import check_pictures_possible, draw_claims
+    from toolchain.analysis.readings import check_frames
 
     figures, picture = directory / "claims.json", directory / "claims.png"
     check_pictures_possible()

@@ -53,10 +53,9 @@ def inspect(
     `toolchain inspect build/mrclam --readings DATA/ds1_robot3.csv --reading 'range_*=range_*_m' --reading
     'bearing_*=bearing_*_rad'`
     """
-    from toolchain.analysis.inspection.inspection import InspectOptions, inspect_deployment
-    from toolchain.analysis.inspection.report import as_json, report
-    from toolchain.analysis.resources.device import device_named
-    from toolchain.analysis.resources.estimate import Pcie
+    from toolchain.analysis.inspection import InspectOptions, as_json, inspect_deployment, inspection_report
+    from toolchain.analysis.logic import device_named
+    from toolchain.analysis.resources import Pcie
     from toolchain.commands.request import read_model
     from toolchain.deployment import load_deployment
 
@@ -78,4 +77,4 @@ def inspect(
     deployment = load_deployment(directory)
     read = None if model is None else read_model(model, flags, bits)
     found = inspect_deployment(deployment, read, options, progress)
-    typer.echo(as_json(found) if json else report(found), nl=False)
+    typer.echo(as_json(found) if json else inspection_report(found), nl=False)

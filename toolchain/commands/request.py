@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from machines.parameters import ADDRESS_BITS_MAX, RngKind
-from toolchain.analysis.resources.boards_needed import boards_needed
-from toolchain.analysis.resources.device import device_named
+from toolchain.analysis.logic import device_named
+from toolchain.analysis.resources import boards_needed
 from toolchain.building.machine import MachinePlan
 from toolchain.building.options import BuildOptions
 from toolchain.deployment import parse_interface

@@ -6,10 +6,9 @@ import pytest
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters
 from tests.toolchain.corridor import corridor, machine_of
-from toolchain.analysis.accuracy.emulation import EmulatedBoards
-from toolchain.analysis.accuracy.intervals import bootstrap, share_of_frames
-from toolchain.analysis.accuracy.measurement import _difference, _line_probabilities, measure
-from toolchain.analysis.accuracy.readings import MISSING, Readings, sample_readings
+from toolchain.analysis.accuracy import _difference, _line_probabilities, bootstrap, measure, share_of_frames
+from toolchain.analysis.emulation import EmulatedBoards
+from toolchain.analysis.readings import MISSING, Readings, sample_readings
 from toolchain.building.machine import split
 from toolchain.deployment import Stop
 from toolchain.errors import ModelError

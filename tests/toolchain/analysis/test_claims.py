@@ -7,9 +7,8 @@ import pytest
 
 from machines.bm1 import Start, addressed_codes
 from machines.reference import ReferenceBM1
-from toolchain.analysis.accuracy.readings import sample_readings
-from toolchain.analysis.exploration import claims
-from toolchain.analysis.exploration.claims import (
+from toolchain.analysis import claims
+from toolchain.analysis.claims import (
     KINDS,
     Faults,
     FaultyMachine,
@@ -18,7 +17,8 @@ from toolchain.analysis.exploration.claims import (
     machine_of,
     run_claims,
 )
-from toolchain.analysis.exploration.pictures import draw_claims
+from toolchain.analysis.pictures import draw_claims
+from toolchain.analysis.readings import sample_readings
 from toolchain.models.model import exact_posterior
 
 

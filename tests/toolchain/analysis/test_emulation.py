@@ -5,7 +5,7 @@ import pytest
 from machines.bm1 import Start, StopReason, first_slice
 from machines.reference import ReferenceBM1
 from tests.toolchain.corridor import corridor, machine_of
-from toolchain.analysis.accuracy.emulation import EmulatedBoards, joined
+from toolchain.analysis.emulation import EmulatedBoards, joined
 from toolchain.building.machine import split
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError

@@ -17,10 +17,10 @@ from machines.parameters import RngKind, SensorMode
 from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.corridor import corridor
 from tests.toolchain.running import assert_refused, done, toolchain
-from toolchain.analysis.exploration.pictures import check_pictures_possible
-from toolchain.analysis.exploration.results import Point, Results, pareto
-from toolchain.analysis.exploration.sweep import Frames, Sweep, run_sweep, run_task, tasks
-from toolchain.analysis.resources.device import DEVICES
+from toolchain.analysis.logic import DEVICES
+from toolchain.analysis.pictures import check_pictures_possible
+from toolchain.analysis.results import Point, Results, pareto
+from toolchain.analysis.sweep import Frames, Sweep, run_sweep, run_task, tasks
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
 from toolchain.models.model import Known, Model, dimension
@@ -299,6 +299,6 @@ def test_ctrl_c_keeps_what_is_done(case):
 
 
 def test_a_file_of_results_that_does_not_end_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("toolchain.analysis.exploration.results.MAX_FILE_BYTES", 1000)
+    monkeypatch.setattr("toolchain.analysis.results.MAX_FILE_BYTES", 1000)
     with pytest.raises(BuildError, match="not a regular file"):
         Results(Path("/dev/zero"))

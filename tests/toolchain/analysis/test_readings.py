@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.toolchain.corridor import corridor, machine_of
-from toolchain.analysis.accuracy.readings import (
+from toolchain.analysis.readings import (
     MISSING,
     model_of_codes,
     reading_columns,

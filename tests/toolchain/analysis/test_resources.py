@@ -5,10 +5,8 @@ from dataclasses import replace
 import pytest
 
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
-from toolchain.analysis.resources.boards_needed import boards_needed
-from toolchain.analysis.resources.device import DEVICES, device_named
-from toolchain.analysis.resources.estimate import Pcie, estimate
-from toolchain.analysis.resources.logic import logic_of
+from toolchain.analysis.logic import DEVICES, device_named, logic_of
+from toolchain.analysis.resources import Pcie, boards_needed, estimate
 from toolchain.errors import BuildError
 
 D8 = DEVICES["proce-v-d8"]

@@ -17,13 +17,11 @@ from machines.parameters import RngKind, SensorMode
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
 from tests.toolchain.running import OPTIONS, TARGET, contents, done, toolchain
-from toolchain.analysis.accuracy.emulation import EmulatedBoards, one_replica
-from toolchain.analysis.accuracy.measurement import measure
-from toolchain.analysis.accuracy.readings import readings_of_lines, sample_readings
-from toolchain.analysis.resources.boards_needed import boards_needed
-from toolchain.analysis.resources.device import DEVICES
-from toolchain.analysis.resources.estimate import estimate
-from toolchain.analysis.resources.logic import logic_of
+from toolchain.analysis.accuracy import measure
+from toolchain.analysis.emulation import EmulatedBoards, one_replica
+from toolchain.analysis.logic import DEVICES, logic_of
+from toolchain.analysis.readings import readings_of_lines, sample_readings
+from toolchain.analysis.resources import boards_needed, estimate
 from toolchain.building.build import BuildError, assemble, build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.checks.check import check_deployment, check_model

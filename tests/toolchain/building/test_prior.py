@@ -14,7 +14,7 @@ from machines.parameters import PriorMode
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
 from tests.toolchain.running import OPTIONS
-from toolchain.analysis.accuracy.emulation import joined
+from toolchain.analysis.emulation import joined
 from toolchain.building.build import build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.building.quantise import quantise

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from tests.toolchain.running import TARGET, assert_refused, done, toolchain
-from toolchain.analysis.inspection.report import _unit
+from toolchain.analysis.inspection import _with_unit
 from toolchain.deployment import load_deployment
 
 
@@ -108,9 +108,9 @@ def test_a_build_on_a_device_takes_its_own_number_of_boards(case):
 
 
 def test_units():
-    assert _unit(20.48e-6, "s") == "20.5 us"
-    assert _unit(100e6, "Hz") == "100 MHz"
-    assert _unit(1e-3, "s") == "1 ms"
-    assert _unit(1.0, "s") == "1 s"
-    assert _unit(0.0, "s") == "0 s"
-    assert _unit(3e-15, "J") == "0.003 pJ"
+    assert _with_unit(20.48e-6, "s") == "20.5 us"
+    assert _with_unit(100e6, "Hz") == "100 MHz"
+    assert _with_unit(1e-3, "s") == "1 ms"
+    assert _with_unit(1.0, "s") == "1 s"
+    assert _with_unit(0.0, "s") == "0 s"
+    assert _with_unit(3e-15, "J") == "0.003 pJ"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from machines.bm1 import BM1Machine
 from machines.encode import decode_code
-from toolchain.analysis.accuracy.emulation import Inputs
+from toolchain.analysis.emulation import Inputs
 from toolchain.deployment import Dimension, Scale, Variable
 from toolchain.deployment.address import to_address
 from toolchain.deployment.address_array import written_codes

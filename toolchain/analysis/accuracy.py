@@ -2,7 +2,7 @@
 
 Three posteriors of each frame are compared: of the model (float64), of the codes (float64), and of the
 machine (counts). Codes compared with the model show the quantisation loss, the machine compared with its
-codes the sampling loss.
+codes the sampling loss. Means over frames have confidence intervals.
 """
 
 import math
@@ -16,11 +16,51 @@ from numpy.typing import NDArray
 from machines.bm1 import BM1Machine, Start, addressed_codes
 from machines.encode import decode_code
 from machines.parameters import RngReset
-from toolchain.analysis.accuracy.emulation import EmulatedBoards, Inputs, inputs_of_boards
-from toolchain.analysis.accuracy.intervals import Interval, bootstrap, bootstrap_rows, share_of_frames
-from toolchain.analysis.accuracy.readings import Readings
+from toolchain.analysis.emulation import EmulatedBoards, Inputs, inputs_of_boards
+from toolchain.analysis.readings import Readings
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.model import Model, exact_posterior, fuse
+
+RESAMPLES: Final = 1000
+LEVEL: Final = 0.95
+"""Level of all confidence intervals."""
+
+_NORMAL_95: Final = 1.959964
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A value and its 95 % confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]]) -> Interval:
+    """Return a statistic over frames (the first axis) with its percentile bootstrap interval over whole frames."""
+    chosen = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
+    drawn = np.asarray(values)[chosen].reshape(RESAMPLES, -1)
+    low, high = np.quantile(statistic(drawn, axis=1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2]).tolist()
+    return Interval(float(statistic(values.reshape(-1), axis=0)), low, high)
+
+
+def bootstrap_rows(rows: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], float]) -> Interval:
+    """Return a statistic of a table's rows with its percentile bootstrap interval; whole rows are drawn."""
+    chosen = np.random.default_rng(0).integers(0, len(rows), (RESAMPLES, len(rows)))
+    low, high = np.quantile(
+        [statistic(rows[each]) for each in chosen], [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
+    ).tolist()
+    return Interval(statistic(rows), low, high)
+
+
+def share_of_frames(share: float, frames: int) -> Interval:
+    """Return a share of frames with its Wilson interval, which is valid even if all frames agree."""
+    square = _NORMAL_95**2 / frames
+    middle = (share + square / 2) / (1 + square)
+    half = _NORMAL_95 / (1 + square) * math.sqrt(share * (1 - share) / frames + square / (4 * frames))
+    return Interval(share, max(0.0, middle - half), min(1.0, middle + half))
+
 
 EXPECTED_COUNT: Final = 5.0
 """Minimum expected count of lines with z-scores, because lower counts are not approximately normal."""

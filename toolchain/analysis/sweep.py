@@ -10,12 +10,12 @@ from typing import Final
 
 from machines.bm1 import BM1Machine
 from machines.parameters import RngKind, SensorMode
-from toolchain.analysis.accuracy.emulation import EmulatedBoards, one_replica
-from toolchain.analysis.accuracy.measurement import measure
-from toolchain.analysis.accuracy.readings import Readings, check_frames, readings_of_lines, sample_readings
-from toolchain.analysis.exploration.results import Point
-from toolchain.analysis.resources.device import Device
-from toolchain.analysis.resources.estimate import Pcie, estimate
+from toolchain.analysis.accuracy import measure
+from toolchain.analysis.emulation import EmulatedBoards, one_replica
+from toolchain.analysis.logic import Device
+from toolchain.analysis.readings import Readings, check_frames, readings_of_lines, sample_readings
+from toolchain.analysis.resources import Pcie, estimate
+from toolchain.analysis.results import Point
 from toolchain.building.machine import (
     MachinePlan,
     board_layout,

@@ -5,8 +5,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from toolchain.analysis.exploration.claims import Claims
-from toolchain.analysis.exploration.results import Point
+from toolchain.analysis.claims import Claims
+from toolchain.analysis.results import Point
 from toolchain.errors import BuildError
 
 _DPI: Final = 75

@@ -17,8 +17,8 @@ from machines.bm1 import BM1Machine
 from machines.encode import decode_code
 from machines.parameters import BM1Parameters
 from machines.rng import random_numbers
-from toolchain.analysis.accuracy.emulation import EmulatedBoards
-from toolchain.analysis.accuracy.readings import Readings, sample_readings
+from toolchain.analysis.emulation import EmulatedBoards
+from toolchain.analysis.readings import Readings, sample_readings
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Stop
 from toolchain.models.conditional import normal

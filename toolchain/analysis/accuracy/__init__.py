@@ -1,1 +1,0 @@
-"""Measurement of the accuracy of a machine's posteriors on readings."""

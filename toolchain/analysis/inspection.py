@@ -1,0 +1,425 @@
+"""Inspection of a deployment: losses, accuracy, cycles, resources and energy, as text or as a JSON object."""
+
+import json
+import math
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from machines.bm1 import BM1Machine
+from machines.parameters import SensorMode
+from toolchain.analysis.accuracy import Accuracy, Difference, Interval, measure
+from toolchain.analysis.emulation import EmulatedBoards, joined, one_replica
+from toolchain.analysis.logic import Device
+from toolchain.analysis.readings import (
+    Readings,
+    check_columns,
+    check_frames,
+    model_of_codes,
+    readings_of_lines,
+    recorded_readings,
+    sample_readings,
+)
+from toolchain.analysis.resources import ASSUMPTIONS, Energy, Estimate, Pcie, energy, estimate
+from toolchain.building.build import read_images
+from toolchain.building.quantise import ColumnLoss, quantise
+from toolchain.building.report import loss_heading, many_sentence
+from toolchain.deployment import Deployment, Scale
+from toolchain.errors import BuildError, DeploymentError
+from toolchain.models.model import Model
+from toolchain.outputs.mif import table_length
+
+Progress = Callable[[int], AbstractContextManager[Callable[[str], None]]]
+
+FRAMES: Final = 200
+BANKS: Final = 4
+SLOW_FRAMES: Final = 20
+"""Number of frames for slow machines: with one generator per cell, or without LFSRs."""
+LEAST_FRAMES: Final = 20
+SLOW_LEAST_FRAMES: Final = 3
+"""Minimum number of frames of slow machines with replicas."""
+SLOW_BANKS: Final = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectOptions:
+    """The readings for a deployment, and the hardware for the estimate of its costs.
+
+    Attributes:
+        recording: Recorded readings, or None to draw them.
+        columns: `NAME=COLUMN`s of the recording.
+        tolerance_s: Maximum time in seconds between a row and messages of other topics in a bag.
+        frames: Maximum number of frames; None for 200, or 20 if only the slow kernel supports the machine;
+            fewer with replicas.
+        banks: Number of seed sets for each frame; None for 4, or 1 for a slow machine.
+        seed: Seed of drawn readings.
+        clock_hz: Clock frequency of the boards.
+        device: FPGA of the boards.
+        pcie: The kind of PCIe controller.
+    """
+
+    recording: Path | None
+    columns: tuple[str, ...]
+    tolerance_s: float
+    frames: int | None
+    banks: int | None
+    seed: int
+    clock_hz: float
+    device: Device
+    pcie: Pcie
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inspection:
+    """Results of an inspection."""
+
+    deployment: Deployment
+    machine: BM1Machine
+    losses: tuple[ColumnLoss, ...] | None
+    readings: Readings
+    accuracy: Accuracy
+    resources: tuple[Estimate, ...]
+    energy: Energy
+    clock_hz: float
+
+
+def inspect_deployment(
+    deployment: Deployment, model: Model | None, options: InspectOptions, progress: Progress
+) -> Inspection:
+    """Run the machine of a deployment on readings, and estimate its costs, or raise a ToolchainError."""
+    machines = machines_of(deployment)
+    whole = joined(machines)
+    losses = None if model is None else _losses(deployment, whole, model)
+    readings = _readings(deployment, whole, model, options)
+    section = deployment.machine
+    boards = EmulatedBoards(
+        [one_replica(machine) for machine in machines],
+        target_count=section.target_count,
+        max_cycles=section.max_cycles,
+        stop=section.stop,
+    )
+    resources = tuple(
+        estimate(
+            machine.parameters,
+            options.device,
+            pcie=options.pcie,
+            table_length=table_length(machine),
+        )
+        for machine in machines
+    )
+    banks = options.banks or (SLOW_BANKS if _is_slow(whole) else BANKS)
+    with progress(len(readings)) as advance:
+        accuracy = measure(
+            boards,
+            readings,
+            model,
+            banks=banks,
+            replicas=section.replicas,
+            advance=lambda: advance("frames"),
+        )
+    return Inspection(
+        deployment=deployment,
+        machine=whole,
+        losses=losses,
+        readings=readings,
+        accuracy=accuracy,
+        resources=resources,
+        energy=energy(machines, readings),
+        clock_hz=options.clock_hz,
+    )
+
+
+def machines_of(deployment: Deployment) -> tuple[BM1Machine, ...]:
+    """Return the machines in the programming files of a deployment."""
+    from pcie_shim.errors import PcieShimError
+
+    try:
+        return tuple(image.machine for image in read_images(deployment))
+    except PcieShimError as reason:
+        raise DeploymentError(str(reason)) from reason
+
+
+def _losses(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[ColumnLoss, ...]:
+    """Return the quantisation loss of the model, after checking that its codes are those of the deployment."""
+    if model.lines == deployment.machine.lines and len(model.known) == whole.parameters.sensors:
+        quantised = quantise(
+            model,
+            prob_bits=whole.parameters.prob_bits,
+            scale=Scale(deployment.machine.scale),
+            sensor_mode=deployment.machine.sensor_mode,
+        )
+        pairs = zip((quantised.prior, *quantised.tables), (whole.prior, *whole.tables), strict=True)
+        if all(np.array_equal(ours, theirs) for ours, theirs in pairs):
+            return quantised.losses
+    raise BuildError(
+        f"{deployment.directory} was not built from the model {model.name} with these settings: its codes differ; give "
+        "the same --set and --bits as for the build, or build it again"
+    )
+
+
+def _readings(
+    deployment: Deployment, whole: BM1Machine, model: Model | None, options: InspectOptions
+) -> Readings:
+    replicas = deployment.machine.replicas
+    frames = options.frames
+    if frames is None:
+        slow = _is_slow(whole)
+        usual, least = (SLOW_FRAMES, SLOW_LEAST_FRAMES) if slow else (FRAMES, LEAST_FRAMES)
+        frames = max(least, usual // replicas)
+    check_frames(frames)
+    mode = deployment.machine.sensor_mode
+    check_columns(options.recording, options.columns)
+    if options.recording is not None:
+        if mode is not SensorMode.COLUMN:
+            raise BuildError(
+                f"--readings {options.recording}: a recording's columns are numbers, and this machine reads arrays of one "
+                "number per line; omit it to draw readings"
+            )
+        return recorded_readings(
+            options.recording,
+            deployment.variables,
+            options.columns,
+            frames=frames * replicas,
+            tolerance_s=options.tolerance_s,
+        )
+    if model is None and mode is SensorMode.THRESHOLD:
+        raise BuildError(
+            "the inputs of this machine are probabilities, so it has no tables for drawing readings; give the model "
+            "with --model"
+        )
+    source = "the model" if model is not None else "the codes"
+    if model is None:
+        model = model_of_codes(deployment.name, deployment.searched, deployment.variables, whole)
+    of_each = f" of readings for {replicas} replicas," if replicas > 1 else ""
+    drawn = sample_readings(
+        model,
+        frames * replicas,
+        seed=options.seed,
+        source=f"{frames} frames{of_each} drawn from {source} (seed {options.seed})",
+    )
+    if mode is SensorMode.COLUMN:
+        return drawn
+    return readings_of_lines(drawn, model, whole, scale=Scale(deployment.machine.scale), seed=options.seed)
+
+
+def _is_slow(machine: BM1Machine) -> bool:
+    return not machine.parameters.shared or machine.parameters.rng.lfsr_bits is None
+
+
+def inspection_report(found: Inspection) -> str:
+    """Return the inspection as sentences and tables."""
+    parts = [
+        _machine_part(found),
+        _loss_part(found),
+        f"Readings: {found.readings.source}"
+        + ("" if found.accuracy.banks == 1 else f", each with {found.accuracy.banks} sets of seeds")
+        + ".",
+        _time_part(found),
+        _accuracy_part(found),
+        _resource_part(found),
+        _energy_part(found),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _machine_part(found: Inspection) -> str:
+    deployment, p = found.deployment, found.machine.parameters
+    machine = deployment.machine
+    grid = " x ".join(f"{each.label} {each.size}" for each in deployment.searched)
+    boards = len(deployment.boards)
+    lines = sorted({board.lines for board in deployment.boards}, reverse=True)
+    split = "" if boards == 1 else f" of {' or '.join(map(str, lines))} lines each"
+    rows = [
+        (
+            f"Deployment {deployment.name} ({deployment.hash[:16]}): {machine.lines} lines ({grid}), {p.sensors} sensor "
+            f"columns and the prior, on {boards} board{'s' if boards > 1 else ''}{split}."
+        ),
+        (
+            f"Codes of {p.prob_bits} bits (scale = {machine.scale}), counters of {p.counter_bits} "
+            f"bits, {p.rng} {'one per column' if p.shared else 'one per cell'} with {p.steps_per_clock} steps per clock and "
+            f"{p.rng_banks} bank{'s' if p.rng_banks > 1 else ''}; stops at a count of {machine.target_count} or after "
+            f"{machine.max_cycles} cycles, stop = {machine.stop}."
+        ),
+        *([many] if (many := many_sentence(machine).strip()) else []),
+    ]
+    names = [variable.name for variable in deployment.sensors]
+    width = max([6, *map(len, names)])
+    rows.append(f"  {'column':{width}}  address bits  values  codes 0  all ones")
+    select = deployment.prior_select
+    tables = [("prior", p.prior_bits, select.values if select else 1, found.machine.prior)]
+    tables += [
+        (variable.name, bits, variable.values, table)
+        for variable, bits, table in zip(
+            deployment.sensors, p.sensor_bits, found.machine.tables, strict=p.has_tables
+        )
+    ]
+    for name, bits, values, table in tables:
+        served = table[:values]
+        rows.append(
+            f"  {name:{width}}  {bits:12d}  {values:6d}  {(served == 0).mean():7.0%}  {(served == p.ones_code).mean():8.0%}"
+        )
+    return "\n".join(rows)
+
+
+def _loss_part(found: Inspection) -> str:
+    if found.losses is None:
+        return "Lost by quantising: as report.txt says, which the build wrote; give the model with --model to compare."
+    width = max(6, *(len(loss.name) for loss in found.losses))
+    rows = [
+        loss_heading(found.machine.parameters.sensor_mode),
+        f"  {'column':{width}}       mass         KL",
+    ]
+    rows += [f"  {loss.name:{width}}  {loss.mass:9.2e}  {loss.kl_bits:9.2e}" for loss in found.losses]
+    return "\n".join(rows)
+
+
+def _time_part(found: Inspection) -> str:
+    cycles = found.accuracy.cycles
+    rows = [
+        f"Cycles of a frame, and time at {_with_unit(found.clock_hz, 'Hz')} (the boards' computing alone: no link, no ROS):",
+        "            cycles        time",
+    ]
+    for name, count in (
+        ("median", cycles.median.value),
+        ("95 %", cycles.percentile_95.value),
+        ("worst", float(cycles.worst)),
+    ):
+        rows.append(f"  {name:6}  {count:10,.0f}  {_with_unit(count / found.clock_hz, 's'):>10}")
+    counted = "posteriors" if found.deployment.machine.replicas > 1 else "frames"
+    rows.append(
+        f"  {found.accuracy.overflow:.0%} of runs end with an overflow; without a posterior: {found.accuracy.without:.1%} of "
+        f"runs (in {found.accuracy.impossible:.1%} of {counted} no line can count)."
+    )
+    if found.deployment.machine.replicas > 1:
+        replicas = found.deployment.machine.replicas
+        rows.append(
+            f"  A frame has {replicas} posteriors and ends with the last of them: {cycles.median.value / replicas:,.1f} cycles per posterior "
+            "in the median."
+        )
+    return "\n".join(rows)
+
+
+def _accuracy_part(found: Inspection) -> str:
+    accuracy = found.accuracy
+    rows = [
+        f"Accuracy over {accuracy.frames} frames (means with 95 % intervals; frames are resampled, banks within them are not):",
+        "                                       total variation               KL, bits             same MAP",
+    ]
+    for name, difference in (
+        ("the machine against the model", accuracy.machine),
+        ("  of that, by quantising alone", accuracy.quantising),
+        ("the machine against its codes", accuracy.sampling),
+    ):
+        if difference is not None:
+            rows.append(f"  {name:34}{_shown_difference(difference)}")
+    if accuracy.machine is None:
+        rows.append("  Give the model with --model for the quantisation loss.")
+    if accuracy.z is not None:
+        z = accuracy.z
+        rows.append(
+            f"  z-scores of {z.counts:,} counts from {z.draws:,} draws of random numbers, {z.cycles:,} cycles each, against equation 2.1: root mean square "
+            f"{_shown_interval(z.rms, '.2f')} (1 is ideal), mean {_shown_interval(z.mean, '.2f')}, beyond 3: {z.beyond_three:.2%} "
+            "(0.27 % is normal)."
+        )
+    return "\n".join(rows)
+
+
+def _shown_difference(difference: Difference) -> str:
+    return (
+        f"{_shown_interval(difference.total_variation, '.4f'):>21}  {_shown_interval(difference.kl_bits, '.4f'):>21}"
+        f"  {_shown_interval(difference.map_agreement, '.0%'):>19}"
+    )
+
+
+def _shown_interval(interval: Interval, form: str) -> str:
+    return f"{interval.value:{form}} ({interval.low:{form}}..{interval.high:{form}})"
+
+
+def _resource_part(found: Inspection) -> str:
+    largest = max(found.resources, key=lambda each: each.alms)
+    device = largest.device
+    rows = [
+        f"Resources of a board's {device.title}, estimated (calibrated on yosys, never compiled by the vendor's tool):",
+        "  part           ALMs  registers",
+    ]
+    rows += [f"  {part.name:10} {part.alms:8,.0f} {part.registers:10,.0f}" for part in largest.logic.parts]
+    memories = largest.memories
+    if memories.logic_tables:
+        rows.append(
+            f"  tables     {memories.alms:8,.0f}             {memories.logic_tables:,} tables in {memories.mlabs:,} memory LABs"
+        )
+    low, high = largest.pcie_alms
+    controller = (
+        "hard: no logic; of logic it would take 8,000 to 30,000 logic elements"
+        if largest.pcie is Pcie.HARD
+        else f"soft: {low:,.0f} to {high:,.0f} ALMs (8,000 to 30,000 logic elements)"
+    )
+    rows += [
+        f"  together   {largest.alms:8,.0f} {largest.logic.registers:10,.0f}   {largest.alm_share:.0%} of {device.alms:,} ALMs",
+        (
+            f"  Table memories: {memories.table_bits:,} bits in {memories.blocks:,} of {device.blocks:,} M20K blocks "
+            f"({largest.block_share:.0%}). PCIe controller {controller}."
+        ),
+        "  It fits: up to 80 % of each can be used."
+        if largest.fits
+        else f"  It does not fit: {largest.why_not}; use more --partitions.",
+    ]
+    return "\n".join(rows)
+
+
+def _energy_part(found: Inspection) -> str:
+    median = found.accuracy.cycles.median.value
+    dynamic, static = found.energy.frame_j(median, found.clock_hz)
+    rows = [
+        (
+            f"Energy of a frame of {median:,.0f} cycles, a toggle-count model, not a measurement: {_with_unit(dynamic, 'J')} for toggles "
+            f"({found.energy.toggles:,.0f} per cycle on all boards) and {_with_unit(static, 'J')} for leakage while it runs. It assumes:"
+        ),
+    ]
+    rows += [f"  - {assumption}" for assumption in ASSUMPTIONS]
+    return "\n".join(rows)
+
+
+def as_json(found: Inspection) -> str:
+    """Return the inspection as one JSON object."""
+    cycles = found.accuracy.cycles.median.value
+    dynamic, static = found.energy.frame_j(cycles, found.clock_hz)
+    content = {
+        "deployment": found.deployment.name,
+        "hash": found.deployment.hash,
+        "lines": found.machine.parameters.lines,
+        "columns": found.machine.parameters.columns,
+        "boards": len(found.deployment.boards),
+        "replicas": found.deployment.machine.replicas,
+        "readings": found.readings.source,
+        "clock_hz": found.clock_hz,
+        "losses": None if found.losses is None else [asdict(loss) for loss in found.losses],
+        "accuracy": asdict(found.accuracy),
+        "resources": [
+            {
+                "alms": each.alms,
+                "registers": each.logic.registers,
+                "table_bits": each.memories.table_bits,
+                "blocks": each.memories.blocks,
+                "memory_labs": each.memories.mlabs,
+                "pcie_alms": list(each.pcie_alms),
+                "fits": each.fits,
+            }
+            for each in found.resources
+        ],
+        "energy_model": {"toggles_a_cycle": found.energy.toggles, "dynamic_j": dynamic, "static_j": static},
+    }
+    return json.dumps(content) + "\n"
+
+
+def _with_unit(value: float, unit: str) -> str:
+    """Return a value with an SI prefix so that 1 to 999 precede the point."""
+    if value <= 0:
+        return f"0 {unit}"
+    prefixes = ("p", "n", "u", "m", "", "k", "M", "G")
+    power = max(-4, min(3, math.floor(math.log10(value) / 3 + 1e-12)))
+    return f"{value / 1000.0**power:.3g} {prefixes[power + 4]}{unit}"

@@ -1,1 +1,0 @@
-"""Inspection of a deployment: machine, loss, accuracy, resources and energy."""

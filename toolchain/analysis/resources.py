@@ -1,0 +1,256 @@
+"""Resources and energy of a BM1 on the FPGAs of its boards, and the number of boards that it needs.
+
+Tables are memories, so that their content can be changed without a new compilation. Nothing here was measured on a
+board: logic is estimated, and energy counts toggles of nets, which all cost the same, and states its assumptions.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.bm1 import Start, addressed_codes
+from machines.encode import decode_code
+from machines.parameters import SensorMode
+from pcie_shim.programming_file import interface_room
+from toolchain.analysis.emulation import one_replica
+from toolchain.analysis.logic import MLAB_ALMS, MLAB_SHARE, Logic, Memories, logic_of, place_memories
+from toolchain.building.machine import partition_lines
+from toolchain.errors import BuildError
+from toolchain.outputs.mif import LENGTH, table_length
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from machines.bm1 import BM1Machine
+    from machines.parameters import BM1Parameters
+    from toolchain.analysis.logic import Device
+    from toolchain.analysis.readings import Readings
+
+
+SOFT_PCIE_ELEMENTS: Final = (8_000, 30_000)
+"""Minimum and maximum number of logic elements of a soft PCIe controller (thesis 2.3)."""
+
+ELEMENTS_PER_ALM: Final = 2.65
+"""Number of logic elements per ALM according to the vendor."""
+
+
+class Pcie(StrEnum):
+    """The kind of PCIe controller."""
+
+    HARD = "hard"
+    """A block of the device, as in the thesis: no logic."""
+    SOFT = "soft"
+    """Logic: 8,000 to 30,000 elements."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Estimate:
+    """Resources of a machine on an FPGA; `pcie_alms` are the minimum and maximum of the PCIe controller."""
+
+    device: Device
+    logic: Logic
+    memories: Memories
+    pcie: Pcie
+    pcie_alms: tuple[float, float]
+
+    @property
+    def alms(self) -> float:
+        """All ALMs: logic, registers that don't fit into its ALMs, tables, and the largest PCIe controller."""
+        logic = max(self.logic.alms, self.logic.registers / self.device.registers_per_alm)
+        return logic + self.memories.alms + self.pcie_alms[1]
+
+    @property
+    def alm_share(self) -> float:
+        """Share of the device's ALMs."""
+        return self.alms / self.device.alms
+
+    @property
+    def block_share(self) -> float:
+        """Share of the device's memory blocks."""
+        return self.memories.blocks / self.device.blocks
+
+    @property
+    def mlab_share(self) -> float:
+        """Share of the device's memory LABs."""
+        return self.memories.mlabs * MLAB_ALMS / (self.device.alms * MLAB_SHARE)
+
+    @property
+    def fits(self) -> bool:
+        """True if the machine can be placed and routed."""
+        return self.why_not == ""
+
+    @property
+    def why_not(self) -> str:
+        """The insufficient resource, as a clause; empty if the machine fits."""
+        usable = self.device.usable
+        if self.memories.blocks > usable * self.device.blocks:
+            return f"it takes {self.memories.blocks:,} memory blocks, and there are {self.device.blocks:,}"
+        if self.alm_share > usable:
+            return f"it takes {self.alms:,.0f} ALMs, and {usable * self.device.alms:,.0f} of {self.device.alms:,} can be used"
+        if self.mlab_share > 1:
+            mlabs = self.device.alms * MLAB_SHARE / MLAB_ALMS
+            return f"its tables take {self.memories.mlabs:,} memory LABs, and there are {mlabs:,.0f}"
+        return ""
+
+
+def estimate(
+    parameters: BM1Parameters,
+    device: Device,
+    *,
+    pcie: Pcie = Pcie.HARD,
+    table_length: int = LENGTH,
+) -> Estimate:
+    """Return the resources of a machine on a device, or raise a BuildError if it lacks a part."""
+    if pcie is Pcie.HARD and not device.hard_pcie:
+        raise BuildError(f"{device.title} has no hard PCIe controller; use --soft-pcie")
+    soft = tuple(elements / ELEMENTS_PER_ALM for elements in SOFT_PCIE_ELEMENTS)
+    return Estimate(
+        device=device,
+        logic=logic_of(parameters, table_length=table_length),
+        memories=place_memories(parameters, device, table_length),
+        pcie=pcie,
+        pcie_alms=(0.0, 0.0) if pcie is Pcie.HARD else (soft[0], soft[1]),
+    )
+
+
+def boards_needed(
+    parameters: BM1Parameters,
+    device: Device,
+    *,
+    largest_lines: int = 4096,
+    pcie: Pcie = Pcie.HARD,
+    table_length: int = LENGTH,
+) -> tuple[int, str]:
+    """Return the minimum number of boards for a machine, and the reason as a sentence, or raise a BuildError."""
+
+    def on(lines: int) -> Estimate:
+        return estimate(replace(parameters, lines=lines), device, pcie=pcie, table_length=table_length)
+
+    room = interface_room(parameters)
+    largest_lines = min(largest_lines, room[1] // parameters.replicas)
+    if parameters.sensor_mode is not SensorMode.COLUMN and parameters.sensors:
+        largest_lines = min(largest_lines, room[0] // (parameters.replicas * parameters.sensors))
+    most = _most_lines(lambda lines: on(lines).fits, min(parameters.lines, largest_lines))
+    if most == 0 and largest_lines == 0:
+        raise BuildError(
+            f"not even one line of {parameters.replicas} replicas fits the register map: it has room for {room[0]} inputs "
+            f"and {room[1]} results; use fewer --replicas"
+        )
+    if most == 0:
+        raise BuildError(
+            f"not even one line fits a {device.title}: {on(1).why_not}; use narrower tables or another device"
+        )
+    count = math.ceil(parameters.lines / most)
+    largest = partition_lines(parameters.lines, count)[0].lines
+    took = on(largest)
+    share = f"{took.alms:,.0f} ALMs ({took.alm_share:.0%}) and {took.memories.blocks:,} memory blocks ({took.block_share:.0%})"
+    if count == 1:
+        return 1, f"All {parameters.lines} lines fit one {device.title}: {share}."
+    if largest_lines < parameters.lines and on(largest_lines).fits:
+        reason = f"the register map has room for {largest_lines} lines per board"
+    else:
+        reason = f"on one {device.title} {on(parameters.lines).why_not}"
+    boards = f"{count} boards" if count > 2 else "two boards"
+    return count, (
+        f"{parameters.lines} lines need {boards}: {reason}; {largest} lines per board take {share}. An estimate, not a "
+        "compilation."
+    )
+
+
+def _most_lines(fits: Callable[[int], bool], highest: int) -> int:
+    """Return the maximum number of lines that fit, 0 to `highest`, by bisection."""
+    low, high = 0, highest + 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if fits(middle):
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+CORE_VOLTAGE: Final = 0.9
+"""Core voltage of a Stratix V in volts."""
+NET_CAPACITANCE: Final = 1.2e-12
+"""Assumed capacitance of a net with its routing, in farads."""
+TOGGLE_J: Final = 0.5 * NET_CAPACITANCE * CORE_VOLTAGE**2
+CLOCK_J: Final = 0.05e-12
+"""Assumed energy for the clock of a register per cycle, in joules."""
+COMPARATOR_ACTIVITY: Final = 0.25
+"""Assumed toggles per cycle of a look-up table or a carry inside a comparator."""
+STATIC_W: Final = 2.0
+"""Assumed leakage power of an FPGA, in watts."""
+
+ASSUMPTIONS: Final = (
+    (
+        f"a toggle of a net costs C V^2 / 2 with C = {NET_CAPACITANCE * 1e12:g} pF and V = {CORE_VOLTAGE:g} V, that is "
+        f"{TOGGLE_J * 1e12:.2f} pJ"
+    ),
+    f"a register's clock costs {CLOCK_J * 1e12:g} pJ per cycle",
+    "a random bit toggles every other cycle, at every cell that it reaches",
+    f"nets inside a comparator toggle {COMPARATOR_ACTIVITY:g} times per cycle",
+    "a cell's bit of probability p toggles 2 p (1 - p) times, a counter twice and its comparison once for each count",
+    f"an FPGA leaks {STATIC_W:g} W; memories and the PCIe link are not included",
+)
+_FRAMES: Final = 50
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Energy:
+    """The energy model for all boards together.
+
+    Attributes:
+        toggles: Number of toggles per cycle.
+        cycle_j: Energy per cycle without leakage, in joules.
+        static_w: Leakage power in watts.
+    """
+
+    toggles: float
+    cycle_j: float
+    static_w: float
+
+    def frame_j(self, cycles: float, clock_hz: float) -> tuple[float, float]:
+        """Return the energy of a frame in joules: for toggles, and for leakage."""
+        return cycles * self.cycle_j, cycles / clock_hz * self.static_w
+
+
+def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
+    """Return the energy model for all boards; activity is averaged over the first 50 frames of readings."""
+    toggles = clocked = 0.0
+    ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
+    for machine, end in zip(machines, ends, strict=True):
+        p = machine.parameters
+        logic = logic_of(p, table_length=table_length(machine))
+        parts = {part.name: part for part in logic.parts}
+        generators = parts["generators"]
+        cells = p.replicas * p.lines * p.columns
+        toggles += (generators.registers + generators.aluts) / 2
+        toggles += cells * p.prob_bits / 2
+        toggles += parts["cells"].aluts * COMPARATOR_ACTIVITY
+        toggles += p.replicas * _stream_toggles(one_replica(machine), readings, slice(end - p.lines, end))
+        clocked += sum(parts[each].registers for each in ("generators", "counters", "inputs", "control"))
+    return Energy(
+        toggles=toggles,
+        cycle_j=toggles * TOGGLE_J + clocked * CLOCK_J,
+        static_w=len(machines) * STATIC_W,
+    )
+
+
+def _stream_toggles(machine: BM1Machine, readings: Readings, lines: slice) -> float:
+    """Toggles of cells, ANDs, counters and their comparators, averaged over frames."""
+    width = machine.parameters.prob_bits
+    found = []
+    for frame in range(min(len(readings), _FRAMES)):
+        addresses, row = readings.of_machine(frame, machine)
+        own = addresses if isinstance(addresses, tuple) else addresses[:, lines]
+        start = Start(addresses=own, prior_address=row, target_count=1, max_cycles=1)
+        chances = decode_code(addressed_codes(machine, start), width)
+        line = np.prod(chances, axis=0)
+        bits = float((2 * chances * (1 - chances)).sum())
+        found.append(bits + float((2 * line * (1 - line)).sum()) + 3 * float(line.sum()))
+    return float(np.mean(found))

@@ -1,1 +1,0 @@
-"""Estimates of the FPGA resources and the energy of a machine."""
