@@ -11,6 +11,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
+from terminal.flags import Flag
 from terminal.logs import LogFormat, use_log_format
 from toolchain.deployment.sections import TOPIC_BYTES_MAX, TOPIC_BYTES_MIN
 
@@ -18,6 +19,7 @@ SHORTEST_S, LONGEST_S = 0.001, 86_400.0
 """Minimum and maximum timeout in seconds."""
 Seconds = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 ENV_PREFIX = "BM_"
+_DEPLOYMENTS = "the deployment's"
 ROBOT = "robot:"
 """Prefix of a URI that names a robot instead of an address."""
 
@@ -27,62 +29,99 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
 
-    deployment: Path | None = Field(default=None, description="folder written by `toolchain build`")
-    uri: str | None = Field(default=None, description="rosbridge server, instead of that of the deployment")
+    # --- what is computed, and for whom ---
+    deployment: Annotated[Path | None, Flag(("--deployment", "-d"), "DIR")] = Field(
+        default=None, description="Folder written by `toolchain build`."
+    )
+    uri: Annotated[str | None, Flag(metavar="ws://HOST:PORT|robot:NAME", otherwise=_DEPLOYMENTS)] = Field(
+        default=None, description="rosbridge server of readings and results."
+    )
+    ca: Annotated[Path | None, Flag(metavar="FILE", otherwise="the system's")] = Field(
+        default=None, description="Certificates (PEM) that sign the certificate of a wss:// server."
+    )
     ros_version: Literal["auto", "1", "2"] = Field(
-        default="auto", description="spelling of time stamps and types"
+        default="auto", description="Spelling of stamps and types: that of ROS 1 or 2."
     )
-    queue: Literal["latest", "all"] | None = Field(
-        default=None, description="readings that wait while a frame is computed"
-    )
-    stop: Literal["slices", "own"] | None = Field(default=None, description="when the boards stop")
-    boards: Annotated[tuple[str, ...], NoDecode] = Field(
-        default=(), description="endpoints of running boards, comma-separated, or the folder of their sockets"
-    )
-    ca: Path | None = Field(
+    queue: Annotated[Literal["latest", "all"] | None, Flag(otherwise=_DEPLOYMENTS)] = Field(
         default=None,
-        description="certificates (PEM) that sign that of a wss:// server; the system's without it",
+        description="Readings that wait while a frame is computed: the latest, or all in order, up to 256.",
     )
-    key_file: Path | None = Field(default=None, description="file with the key that boards over TCP share")
-    subscriber: str = Field(default="", description="endpoint of a running subscriber")
-    publisher: str = Field(default="", description="endpoint of a running publisher")
-    pcie_app: str = Field(default="", description="endpoint of a running pcie-app")
-    connect_timeout: Seconds = Field(default=10, description="seconds to reach the rosbridge server")
-    first_data_timeout: Seconds = Field(default=30, description="seconds until the first reading")
-    peer_timeout: Seconds = Field(default=10, description="seconds to reach a local process or a board")
-    board_timeout: Seconds = Field(
-        default=5, description="seconds a board may take beyond max_cycles at its speed"
-    )
-    stop_timeout: Seconds = Field(default=5, description="grace period in seconds for processes to exit")
-    restart_window: Seconds = Field(
-        default=60, description="seconds within which three restarts of a process are allowed"
-    )
-    seen_timeout: Seconds = Field(default=2, description="seconds until a result is seen on the wire")
-
     message_bytes: int = Field(
-        default=16 << 20, ge=1 << 10, le=1 << 28, description="largest message of a topic, in bytes"
+        default=16 << 20,
+        ge=1 << 10,
+        le=1 << 28,
+        description="Largest message of a topic, in bytes; a larger one ends the connection.",
     )
-    topic_bytes: int | None = Field(
+    topic_bytes: Annotated[int | None, Flag(otherwise=_DEPLOYMENTS)] = Field(
         default=None,
         ge=TOPIC_BYTES_MIN,
         le=TOPIC_BYTES_MAX,
-        description="largest message of each topic that is read, in bytes",
+        description="Largest message of each topic that is read, in bytes; larger ones are discarded and counted.",
     )
+
+    # --- the boards ---
+    boards: Annotated[
+        tuple[str, ...], NoDecode, Flag(metavar="ENDPOINT,...|unix:DIR/", otherwise=_DEPLOYMENTS)
+    ] = Field(
+        default=(),
+        description="Running boards, comma-separated in the order of the partitions, or the folder of `board --directory`.",
+    )
+    stop: Annotated[Literal["slices", "own"] | None, Flag(otherwise=_DEPLOYMENTS)] = Field(
+        default=None, description="When boards stop: slices (together) or own (each independently)."
+    )
+    key_file: Annotated[Path | None, Flag(metavar="FILE")] = Field(
+        default=None, description="File with the key that boards over TCP and their hosts share."
+    )
+
+    # --- the processes of a run ---
+    subscriber: str = Field(
+        default="", description="Endpoint of a running subscriber (see `master --connect`)."
+    )
+    publisher: str = Field(
+        default="", description="Endpoint of a running publisher (see `master --connect`)."
+    )
+    pcie_app: str = Field(default="", description="Endpoint of a running pcie-app (see `master --connect`).")
     fused: bool = Field(
-        default=False, description="subscriber, publisher and pcie-app inside the master's process"
+        default=False,
+        description="Run subscriber, publisher and pcie-app inside the master's process: fewer hops, the same results.",
     )
-    run_directory: Path | None = Field(default=None, description="folder of the processes' status sockets")
+    run_directory: Annotated[
+        Path | None,
+        Flag(("--run-directory", "--directory"), "DIR", "the private folder of this user's run"),
+    ] = Field(default=None, description="Folder of the processes' status sockets.")
+
+    # --- timeouts, in seconds ---
+    connect_timeout: Seconds = Field(default=10, description="Seconds to reach the rosbridge server.")
+    first_data_timeout: Seconds = Field(
+        default=30, description="Seconds until the first reading (listen: the first result)."
+    )
+    peer_timeout: Seconds = Field(default=10, description="Seconds to reach a local process or a board.")
+    board_timeout: Seconds = Field(
+        default=5, description="Seconds that a board may take beyond the time for max_cycles at its speed."
+    )
+    seen_timeout: Seconds = Field(default=2, description="Seconds until a result must be seen on the wire.")
+    stop_timeout: Seconds = Field(
+        default=5, description="Seconds in which processes must exit after SIGTERM."
+    )
+    restart_window: Seconds = Field(
+        default=60,
+        description="Seconds within which three restarts of a process, or three frames that fail on boards, are allowed.",
+    )
     ready_timeout: Seconds = Field(
-        default=10, description="seconds without a frame after which a process is not ready"
+        default=10, description="Seconds without a frame after which a process is not ready."
     )
-    metrics: str = Field(
+
+    # --- what a process reports ---
+    metrics: Annotated[str, Flag(metavar="[HOST:]PORT")] = Field(
         default="",
-        description="address [HOST:]PORT for metrics, on loopback without a host",
+        description="Serve metrics for Prometheus, on loopback without a host; a master uses the next ports for its processes.",
     )
-    log_level: Literal["debug", "info", "warning"] = Field(
-        default="info", description="log level; debug logs one line per frame"
+    log_level: Literal["info", "warning", "debug"] = Field(
+        default="info", description="Log level; debug logs one line per frame."
     )
-    log_format: LogFormat = Field(default=LogFormat.TEXT, description="lines on standard error")
+    log_format: LogFormat = Field(
+        default=LogFormat.TEXT, description="Lines on standard error: text, or JSON objects."
+    )
 
     @field_validator("deployment", "ca", "key_file", "run_directory", mode="before")
     @classmethod

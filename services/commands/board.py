@@ -5,7 +5,7 @@ import sys
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -16,17 +16,15 @@ from services.boards.hardware import Engine, SimulatedHardware
 from services.boards.processes import BoardProcesses, serve_one
 from services.commands import flags as options
 from services.errors import SettingsError
-from services.settings import Settings, load_settings
+from services.settings import Settings
 from services.sockets.reporting import check_metrics
 from services.sockets.serving import deployment_for, endpoint_from
 from services.supervision.child import RESTARTS
-from services.supervision.parent import end_with_parent, leave_private_directory
+from services.supervision.parent import leave_private_directory
 from terminal.command_line import CommandLine
 from terminal.logs import PARENT_VARIABLE, name_process
 from terminal.output import say
 from terminal.signals import check_signals, stopped_error
-
-_SEVERAL: Final = "Several boards"
 
 app = CommandLine(
     help="Emulate boards of the mini-cluster. They start blank; pcie-app or the loader programs them.\n\n"
@@ -36,7 +34,9 @@ app = CommandLine(
 
 
 @app.command(help=app.info.help)
+@options.with_settings("deployment", "key_file", "metrics", "log_format")
 def board(
+    settings: Settings,
     listen: options.Listen = None,
     engine: Annotated[
         Engine,
@@ -48,39 +48,23 @@ def board(
     index: Annotated[int, typer.Option(min=0, help="Number of the board, for its messages.")] = 0,
     boards: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            max=64,
-            help="Number of boards to run.",
-            show_default="that of the deployment",
-            rich_help_panel=_SEVERAL,
-        ),
+        typer.Option(min=1, max=64, help="Number of boards to run.", show_default="that of the deployment"),
     ] = None,
-    deployment: options.Deployment = None,
     directory: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of their sockets: board0.sock, board1.sock, ...",
-            metavar="DIR",
-            rich_help_panel=_SEVERAL,
+            help="Of several boards: folder of their sockets board0.sock, board1.sock, ...", metavar="DIR"
         ),
     ] = None,
     restarts: Annotated[
         int,
         typer.Option(
-            min=0,
-            help="Maximum number of restarts within BM_RESTART_WINDOW (60 s).",
-            rich_help_panel=_SEVERAL,
+            min=0, help="Of several boards: maximum number of restarts within BM_RESTART_WINDOW (60 s)."
         ),
     ] = RESTARTS,
-    key_file: options.KeyFile = None,
     insecure: options.Insecure = False,
-    metrics: options.Metrics = None,
-    log_format: options.LogFormat = None,
 ) -> int:
     """Emulate boards of the mini-cluster."""
-    end_with_parent()
-    settings = load_settings(deployment=deployment, key_file=key_file, metrics=metrics, log_format=log_format)
     check_metrics(settings.metrics, insecure=insecure)
     run_directory = settings.run_directory
     if boards is None and listen is None and directory is not None:

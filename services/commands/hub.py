@@ -1,7 +1,7 @@
 """The command `hub`."""
 
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -11,14 +11,11 @@ from bridge.hub.limits import HubLimits
 from services.commands import flags as options
 from services.errors import SettingsError
 from services.hub_process import serve
-from services.settings import load_settings
+from services.settings import Settings
 from services.sockets.reporting import check_metrics
-from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.one_line import shown
 from terminal.signals import run_async
-
-_ACCESS: Final = "Access"
 
 app = CommandLine(
     help="Serve rosbridge without ROS: topics, services, actions, parameters and rosapi.\n\n`hub --port 9090`\n\n"
@@ -28,7 +25,9 @@ app = CommandLine(
 
 
 @app.command(help=app.info.help)
+@options.with_settings("run_directory", "metrics", "log_format")
 def hub(
+    settings: Settings,
     host: Annotated[str, typer.Option(help="Address to listen on.", metavar="ADDRESS")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 9090,
     ros_version: Annotated[
@@ -36,24 +35,21 @@ def hub(
     ] = "1",
     tls_cert: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Certificate of the hub (PEM), to serve wss://.", rich_help_panel=_ACCESS
-        ),
+        typer.Option(metavar="FILE", help="Certificate of the hub (PEM), to serve wss://."),
     ] = None,
     tls_key: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Private key of the certificate (PEM).", rich_help_panel=_ACCESS),
+        typer.Option(metavar="FILE", help="Private key of the certificate (PEM)."),
     ] = None,
     token_file: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Accepted client tokens, one per line.", rich_help_panel=_ACCESS),
+        typer.Option(metavar="FILE", help="Accepted client tokens, one per line."),
     ] = None,
     origin: Annotated[
         list[str] | None,
         typer.Option(
             metavar="ORIGIN",
             help="Web page that may connect, such as https://robot.example, in addition to those of this machine ('null': pages opened from a file); repeat for more.",
-            rich_help_panel=_ACCESS,
         ),
     ] = None,
     message_bytes: Annotated[
@@ -75,18 +71,10 @@ def hub(
     ] = None,
     insecure: Annotated[
         bool,
-        typer.Option(
-            "--insecure",
-            help="Permit a non-loopback address without TLS and tokens.",
-            rich_help_panel=_ACCESS,
-        ),
+        typer.Option("--insecure", help="Permit a non-loopback address without TLS and tokens."),
     ] = False,
-    metrics: options.Metrics = None,
-    log_format: options.LogFormat = None,
 ) -> int:
     """Serve rosbridge without ROS."""
-    end_with_parent()
-    settings = load_settings(metrics=metrics, log_format=log_format)
     check_metrics(settings.metrics, insecure=insecure)
     access = _access_policy(tls_cert, tls_key, token_file, origin or [])
     if not is_loopback(host) and not insecure and (access.tls is None or not access.tokens):

@@ -12,7 +12,7 @@ from services.errors import SettingsError
 from services.output.listener import show_frames
 from services.output.posterior_file import open_result_file
 from services.output.posterior_lines import drawing, print_json, print_line
-from services.settings import LONGEST_S, load_settings
+from services.settings import LONGEST_S, Settings
 from services.sockets.serving import deployment_for
 from terminal.command_line import CommandLine
 from terminal.signals import run_async
@@ -26,17 +26,15 @@ app = CommandLine(
 
 
 @app.command(help=app.info.help)
+@options.with_settings(
+    *("uri", "ca", "deployment", "first_data_timeout", "connect_timeout", "ros_version", "log_format")
+)
 def listen(
-    uri: options.Uri = None,
-    ca: options.Ca = None,
-    deployment: options.Deployment = None,
+    settings: Settings,
     topic: Annotated[
         str | None,
         typer.Option(
-            help="Topic of the posteriors.",
-            show_default="the deployment's, or /BMresults",
-            metavar="TOPIC",
-            rich_help_panel=options.SERVER,
+            help="Topic of the posteriors.", show_default="the deployment's, or /BMresults", metavar="TOPIC"
         ),
     ] = None,
     count: options.Count = None,
@@ -57,24 +55,12 @@ def listen(
             max=LONGEST_S,
             help="Exit after this many seconds without a result.",
             show_default="it waits",
-            rich_help_panel=options.TIMEOUTS,
         ),
     ] = None,
-    first_data_timeout: options.FirstDataTimeout = None,
-    connect_timeout: options.ConnectTimeout = None,
-    ros_version: options.RosVersion = None,
 ) -> int:
     """Print, draw or save the posteriors of a running stack."""
     if as_json and plot:
         raise SettingsError("--json and --plot both use standard output: give one of them")
-    settings = load_settings(
-        uri=uri,
-        ca=ca,
-        deployment=deployment,
-        first_data_timeout=first_data_timeout,
-        connect_timeout=connect_timeout,
-        ros_version=ros_version,
-    )
     loaded = deployment_for(settings) if settings.deployment is not None else None
     output = loaded.outputs[0] if loaded is not None else None
     server = settings.uri or (

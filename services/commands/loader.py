@@ -8,9 +8,8 @@ import typer
 from pcie_shim.host.loader import program
 from services.commands import flags as options
 from services.errors import SettingsError
-from services.settings import load_settings
+from services.settings import Settings
 from services.sockets.serving import board_endpoint, board_endpoints, deployment_for
-from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.output import say, say_if_slow
 
@@ -24,31 +23,23 @@ app = CommandLine(
 
 
 @app.command(help=app.info.help)
+@options.with_settings("deployment", "boards", "peer_timeout", "key_file", "log_format")
 def loader(
+    context: typer.Context,
+    settings: Settings,
     image: Annotated[
         Path | None, typer.Argument(help="Programming file (boards/*.bm of a deployment).")
     ] = None,
     endpoint: Annotated[str | None, typer.Argument(help="The board's endpoint.", metavar="ENDPOINT")] = None,
-    deployment: options.Deployment = None,
-    boards: options.Boards = None,
-    peer_timeout: options.PeerTimeout = None,
-    key_file: options.KeyFile = None,
 ) -> int:
     """Program one board, or all boards of a deployment."""
-    end_with_parent()
-    settings = load_settings(
-        deployment=deployment,
-        boards=boards,
-        peer_timeout=peer_timeout,
-        key_file=key_file,
-    )
     if image is None:
         loaded = deployment_for(settings, images=True)
         images = [loaded.image_path(index) for index in range(len(loaded.boards))]
         endpoints = board_endpoints(settings, loaded)
         if twice := next((each for at, each in enumerate(endpoints) if each in endpoints[:at]), None):
             raise SettingsError(f"{twice} is named twice, and a board holds one image: name each board once")
-    elif deployment is not None or boards is not None:
+    elif context.params["deployment"] is not None or context.params["boards"] is not None:  # as flags
         raise SettingsError("-d and --boards program all boards of a deployment: omit them, or the image")
     elif endpoint is None:
         raise SettingsError(

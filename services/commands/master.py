@@ -9,10 +9,9 @@ import typer
 from services.commands import flags as options
 from services.errors import SettingsError
 from services.master.run import run_master
-from services.settings import Settings, endpoint_in, load_settings
+from services.settings import Settings, endpoint_in
 from services.sockets.reporting import check_metrics
 from services.sockets.serving import board_endpoints, deployment_for
-from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.errors import ExitCode
 from terminal.output import say
@@ -27,13 +26,16 @@ app = CommandLine(
 
 
 @app.command(help=app.info.help)
+@options.with_settings(
+    *("deployment", "uri", "ca", "boards", "queue", "stop", "ros_version", "message_bytes", "topic_bytes"),
+    *("connect_timeout", "first_data_timeout", "peer_timeout", "board_timeout", "stop_timeout", "key_file"),
+    *("fused", "metrics", "log_level", "log_format"),
+)
 def master(
+    settings: Settings,
     once: Annotated[bool, typer.Option("--once", help="Compute the first complete frame and exit.")] = False,
     loop: Annotated[bool, typer.Option("--loop", help="Run until Ctrl-C, or --count.")] = False,
     count: options.Count = None,
-    deployment: options.Deployment = None,
-    uri: options.Uri = None,
-    ca: options.Ca = None,
     connect: Annotated[
         Path | None,
         typer.Option(
@@ -41,30 +43,7 @@ def master(
             metavar="DIR",
         ),
     ] = None,
-    boards: options.Boards = None,
-    queue: options.Queue = None,
-    stop: options.Stop = None,
-    ros_version: options.RosVersion = None,
-    message_bytes: options.MessageBytes = None,
-    topic_bytes: options.TopicBytes = None,
-    connect_timeout: options.ConnectTimeout = None,
-    first_data_timeout: options.FirstDataTimeout = None,
-    peer_timeout: options.PeerTimeout = None,
-    board_timeout: options.BoardTimeout = None,
-    stop_timeout: options.StopTimeout = None,
-    key_file: options.KeyFile = None,
-    fused: Annotated[
-        bool | None,
-        options.setting(
-            "fused",
-            "Run subscriber, publisher and pcie-app inside this process: fewer hops, the same results.",
-            "--fused",
-        ),
-    ] = None,
-    metrics: options.Metrics = None,
     insecure: options.Insecure = False,
-    log_level: options.LogLevel = None,
-    log_format: options.LogFormat = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per result.")] = False,
     plot: Annotated[bool, typer.Option("--plot", help="Draw the newest posterior in the terminal.")] = False,
     print_config: Annotated[
@@ -75,37 +54,15 @@ def master(
     ] = False,
 ) -> int:
     """Move readings to the boards and posteriors back to the robot."""
-    end_with_parent()
-    connected = {}
     if connect is not None:
         if not connect.is_dir():
             raise SettingsError(
                 f"--connect {connect} is not a folder; name the one with the sockets of the running services"
             )
-        for name in ("subscriber", "publisher", "pcie-app"):
-            connected[name.replace("-", "_")] = str(endpoint_in(connect, name))
-    settings = load_settings(
-        deployment=deployment,
-        uri=uri,
-        ca=ca,
-        boards=boards,
-        queue=queue,
-        stop=stop,
-        ros_version=ros_version,
-        message_bytes=message_bytes,
-        topic_bytes=topic_bytes,
-        connect_timeout=connect_timeout,
-        first_data_timeout=first_data_timeout,
-        peer_timeout=peer_timeout,
-        board_timeout=board_timeout,
-        stop_timeout=stop_timeout,
-        key_file=key_file,
-        fused=fused,
-        metrics=metrics,
-        log_level=log_level,
-        log_format=log_format,
-        **connected,
-    )
+        services = {"subscriber": "subscriber", "publisher": "publisher", "pcie_app": "pcie-app"}
+        settings = settings.model_copy(
+            update={setting: str(endpoint_in(connect, name)) for setting, name in services.items()}
+        )
     if print_config:
         print(orjson.dumps(settings.model_dump(mode="json"), option=orjson.OPT_INDENT_2).decode())
         return ExitCode.DONE

@@ -9,10 +9,9 @@ from services.commands import flags as options
 from services.pipeline.pcie_app import ROLE, PcieApp
 from services.pipes.lines import require_pipe
 from services.pipes.pcie_app import compute_lines
-from services.settings import load_settings
+from services.settings import Settings
 from services.sockets.reporting import check_metrics, serve_status_in_thread
 from services.sockets.serving import board_endpoints, deployment_for, own_endpoint
-from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 
 app = CommandLine(
@@ -24,13 +23,13 @@ app = CommandLine(
 
 
 @app.command(help=app.info.help)
+@options.with_settings(
+    *("deployment", "boards", "stop", "peer_timeout", "board_timeout", "key_file"),
+    *("metrics", "log_level", "log_format"),
+)
 def pcie_app(
-    deployment: options.Deployment = None,
-    boards: options.Boards = None,
+    settings: Settings,
     listen: options.Listen = None,
-    stop: options.Stop = None,
-    peer_timeout: options.PeerTimeout = None,
-    board_timeout: options.BoardTimeout = None,
     reprogram: Annotated[
         bool,
         typer.Option(
@@ -38,25 +37,9 @@ def pcie_app(
             help="Program boards that hold another image, instead of refusing them.",
         ),
     ] = False,
-    key_file: options.KeyFile = None,
     insecure: options.Insecure = False,
-    metrics: options.Metrics = None,
-    log_level: options.LogLevel = None,
-    log_format: options.LogFormat = None,
 ) -> int:
     """Drive the boards of a mini-cluster."""
-    end_with_parent()
-    settings = load_settings(
-        deployment=deployment,
-        boards=boards,
-        stop=stop,
-        peer_timeout=peer_timeout,
-        board_timeout=board_timeout,
-        key_file=key_file,
-        metrics=metrics,
-        log_level=log_level,
-        log_format=log_format,
-    )
     loaded = deployment_for(settings, images=True)
     deployed = DeployedBoards(settings, loaded, board_endpoints(settings, loaded), reprogram=reprogram)
     if listen is not None:

@@ -1,16 +1,13 @@
 """The command `publisher`."""
 
-from typing import Annotated
-
 from services.commands import flags as options
 from services.pipeline.publisher import Publisher
 from services.pipeline.result_topics import ROLE
 from services.pipes.lines import require_pipe
 from services.pipes.publisher import publish_lines
-from services.settings import load_settings
+from services.settings import Settings
 from services.sockets.reporting import check_metrics
 from services.sockets.serving import deployment_for, listening, own_endpoint
-from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.signals import run_async
 
@@ -23,34 +20,12 @@ app = CommandLine(
 
 
 @app.command(help=app.info.help)
-def publisher(
-    deployment: options.Deployment = None,
-    uri: options.Uri = None,
-    ca: options.Ca = None,
-    listen: options.Listen = None,
-    ros_version: options.RosVersion = None,
-    connect_timeout: options.ConnectTimeout = None,
-    seen_timeout: Annotated[
-        float | None, options.seconds("seen_timeout", "Until a result must be seen on the wire.")
-    ] = None,
-    insecure: options.Insecure = False,
-    metrics: options.Metrics = None,
-    log_level: options.LogLevel = None,
-    log_format: options.LogFormat = None,
-) -> int:
+@options.with_settings(
+    *("deployment", "uri", "ca", "ros_version", "connect_timeout", "seen_timeout"),
+    *("metrics", "log_level", "log_format"),
+)
+def publisher(settings: Settings, listen: options.Listen = None, insecure: options.Insecure = False) -> int:
     """Publish posteriors over rosbridge."""
-    end_with_parent()
-    settings = load_settings(
-        deployment=deployment,
-        uri=uri,
-        ca=ca,
-        ros_version=ros_version,
-        connect_timeout=connect_timeout,
-        seen_timeout=seen_timeout,
-        metrics=metrics,
-        log_level=log_level,
-        log_format=log_format,
-    )
     loaded = deployment_for(settings)
     if listen is not None:
         check_metrics(settings.metrics, insecure=insecure)

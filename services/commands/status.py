@@ -1,6 +1,5 @@
 """The command `status`."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -8,7 +7,7 @@ import typer
 from services.commands import flags as options
 from services.errors import SettingsError
 from services.output.status_screen import show
-from services.settings import load_settings
+from services.settings import Settings
 from services.sockets.stack import Found, find_run
 from terminal.command_line import CommandLine
 from terminal.signals import run_async
@@ -22,17 +21,10 @@ app = CommandLine(
 
 
 @app.command(help=app.info.help)
+@options.with_settings("run_directory")
 def status(
-    directory: Annotated[
-        Path | None,
-        options.setting(
-            "run_directory",
-            "Folder with the status sockets.",
-            "--directory",
-            otherwise="that of this user's run",
-            metavar="DIR",
-        ),
-    ] = None,
+    context: typer.Context,
+    settings: Settings,
     run: options.Run = None,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Refresh every second until Ctrl-C.")] = False,
     json: Annotated[
@@ -40,9 +32,9 @@ def status(
     ] = False,
 ) -> int:
     """Show the whole stack in one screen."""
-    named = None if run is not None else load_settings(run_directory=directory).run_directory
-    if run is not None and directory is not None:
-        raise SettingsError("--run and --directory both choose a run: omit one of them")
+    named = None if run is not None else settings.run_directory
+    if run is not None and context.params["run_directory"] is not None:
+        raise SettingsError("--run and --run-directory both choose a run: omit one of them")
     if named is not None and not named.is_dir():
         raise SettingsError(
             f"{named} is not a folder; name the one with the status sockets (BM_RUN_DIRECTORY of the processes)"

@@ -1,6 +1,6 @@
 """The command `subscriber`."""
 
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 from pydantic import ValidationError
@@ -9,15 +9,12 @@ from services.commands import flags as options
 from services.errors import SettingsError
 from services.pipeline.subscriber import ROLE, Subscriber
 from services.pipes.subscriber import print_addresses, print_variables
-from services.settings import load_settings
+from services.settings import Settings
 from services.sockets.reporting import check_metrics
 from services.sockets.serving import deployment_for, listening, own_endpoint
-from services.supervision.parent import end_with_parent
 from terminal.command_line import CommandLine
 from terminal.signals import run_async
 from toolchain.deployment import Source
-
-_WITHOUT_DEPLOYMENT: Final = "Without a deployment"
 
 app = CommandLine(
     help="Extract variables from a ROS topic over rosbridge.\n\n"
@@ -29,57 +26,26 @@ app = CommandLine(
 
 
 @app.command(help=app.info.help)
+@options.with_settings(
+    *("deployment", "uri", "ca", "queue", "ros_version", "message_bytes", "topic_bytes"),
+    *("connect_timeout", "first_data_timeout", "metrics", "log_level", "log_format"),
+)
 def subscriber(
-    deployment: options.Deployment = None,
-    uri: options.Uri = None,
-    ca: options.Ca = None,
+    settings: Settings,
     topic: Annotated[
-        str | None,
-        typer.Option(help="Topic to subscribe to.", metavar="TOPIC", rich_help_panel=_WITHOUT_DEPLOYMENT),
+        str | None, typer.Option(help="Without a deployment: topic to subscribe to.", metavar="TOPIC")
     ] = None,
     type_: Annotated[
-        str | None,
-        typer.Option(
-            "--type", help="Its message type.", metavar="PACKAGE/NAME", rich_help_panel=_WITHOUT_DEPLOYMENT
-        ),
+        str | None, typer.Option("--type", help="Its message type.", metavar="PACKAGE/NAME")
     ] = None,
     variables: Annotated[
-        str,
-        typer.Option(
-            help="Names or paths; without it, print whole messages.",
-            metavar="NAME,...",
-            rich_help_panel=_WITHOUT_DEPLOYMENT,
-        ),
+        str, typer.Option(help="Names or paths; without it, print whole messages.", metavar="NAME,...")
     ] = "",
     count: options.Count = None,
     listen: options.Listen = None,
-    queue: options.Queue = None,
-    ros_version: options.RosVersion = None,
-    message_bytes: options.MessageBytes = None,
-    topic_bytes: options.TopicBytes = None,
-    connect_timeout: options.ConnectTimeout = None,
-    first_data_timeout: options.FirstDataTimeout = None,
     insecure: options.Insecure = False,
-    metrics: options.Metrics = None,
-    log_level: options.LogLevel = None,
-    log_format: options.LogFormat = None,
 ) -> int:
     """Extract variables from a ROS topic over rosbridge."""
-    end_with_parent()
-    settings = load_settings(
-        deployment=deployment,
-        uri=uri,
-        ca=ca,
-        queue=queue,
-        ros_version=ros_version,
-        message_bytes=message_bytes,
-        topic_bytes=topic_bytes,
-        connect_timeout=connect_timeout,
-        first_data_timeout=first_data_timeout,
-        metrics=metrics,
-        log_level=log_level,
-        log_format=log_format,
-    )
     if settings.deployment is not None and (value := topic or type_ or variables):
         flag = "--topic" if topic else "--type" if type_ else "--variables"
         raise SettingsError(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from toolchain.commands.flags import MESSAGES, BuildFlags, ModelPath
+from toolchain.commands.flags import BuildFlags, ModelPath
 from toolchain.deployment import Queue
 
 if TYPE_CHECKING:
@@ -21,49 +21,33 @@ def build(
     flags: BuildFlags,
     uri: Annotated[
         str,
-        typer.Option(
-            help="rosbridge server of the readings.",
-            metavar="ws://HOST:PORT|robot:NAME",
-            rich_help_panel=MESSAGES,
-        ),
+        typer.Option(help="rosbridge server of the readings.", metavar="ws://HOST:PORT|robot:NAME"),
     ] = "",
-    topic: Annotated[
-        str, typer.Option(help="Topic of the readings.", metavar="TOPIC", rich_help_panel=MESSAGES)
-    ] = "",
+    topic: Annotated[str, typer.Option(help="Topic of the readings.", metavar="TOPIC")] = "",
     message_type: Annotated[
         str,
-        typer.Option("--type", help="Type of the topic.", metavar="PACKAGE/NAME", rich_help_panel=MESSAGES),
+        typer.Option("--type", help="Type of the topic.", metavar="PACKAGE/NAME"),
     ] = "",
     sources: Annotated[
         Path | None,
         typer.Option(
             help="Instead of topic and type: a TOML file with several topics on one or more servers.",
             metavar="FILE",
-            rich_help_panel=MESSAGES,
         ),
     ] = None,
-    output: Annotated[
-        str, typer.Option(help="Topic of the posteriors.", metavar="TOPIC", rich_help_panel=MESSAGES)
-    ] = "/BMresults",
+    output: Annotated[str, typer.Option(help="Topic of the posteriors.", metavar="TOPIC")] = "/BMresults",
     prior_path: Annotated[
         str | None,
-        typer.Option(
-            help="Path of a written prior in the message.", metavar="PATH", rich_help_panel=MESSAGES
-        ),
+        typer.Option(help="Path of a written prior in the message.", metavar="PATH"),
     ] = None,
     queue: Annotated[
         Queue,
-        typer.Option(
-            help="If readings arrive too fast: keep only the latest, or all in order.",
-            rich_help_panel=MESSAGES,
-        ),
+        typer.Option(help="If readings arrive too fast: keep only the latest, or all in order."),
     ] = Queue.LATEST,
     tolerance: Annotated[
         float,
         typer.Option(
-            help="Seconds within which readings from several topics belong together.",
-            metavar="SECONDS",
-            rich_help_panel=MESSAGES,
+            help="Seconds within which readings from several topics belong together.", metavar="SECONDS"
         ),
     ] = 0.05,
 ) -> None:

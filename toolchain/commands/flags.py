@@ -1,27 +1,18 @@
 """Flags shared by several subcommands, as dataclasses that are parameters of commands (thesis 3.4)."""
 
-import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeAlias, get_type_hints
+from typing import Annotated, Any, TypeAlias, get_type_hints
 
 import typer
 
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from terminal.command_line import CommandLine
+from terminal.flags import Group, expanded
 from toolchain.building.options import OnMissing
 from toolchain.deployment import Scale, Stop
-
-MODEL: Final = "The model"
-NETWORK: Final = "The question to a network"
-BOARDS: Final = "Boards"
-TABLES: Final = "Tables of codes"
-STOPPING: Final = "Counters and stopping"
-RANDOM: Final = "Random numbers"
-MESSAGES: Final = "Readings and results"
-"""Groups of flags in `--help`."""
 
 Bits: TypeAlias = Annotated[
     list[str] | None,
@@ -29,12 +20,9 @@ Bits: TypeAlias = Annotated[
         help="Address bits of a variable's column, or of the prior it selects; repeatable.",
         show_default="the model's",
         metavar="NAME=BITS",
-        rich_help_panel=MODEL,
     ),
 ]
-MaxCycles: TypeAlias = Annotated[
-    int, typer.Option(help="Maximum number of cycles.", rich_help_panel=STOPPING)
-]
+MaxCycles: TypeAlias = Annotated[int, typer.Option(help="Maximum number of cycles.")]
 ModelPath: TypeAlias = Annotated[
     Path,
     typer.Argument(
@@ -42,7 +30,7 @@ ModelPath: TypeAlias = Annotated[
         metavar="MODEL",
     ),
 ]
-Partitions: TypeAlias = Annotated[int, typer.Option(help="Number of boards.", rich_help_panel=BOARDS)]
+Partitions: TypeAlias = Annotated[int, typer.Option(help="Number of boards.")]
 ReadingColumns: TypeAlias = Annotated[
     list[str] | None,
     typer.Option(
@@ -54,22 +42,15 @@ ReadingColumns: TypeAlias = Annotated[
 ]
 Settings: TypeAlias = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set", help="A parameter of the model; repeatable.", metavar="KEY=VALUE", rich_help_panel=MODEL
-    ),
+    typer.Option("--set", help="A parameter of the model; repeatable.", metavar="KEY=VALUE"),
 ]
 StopWhen: TypeAlias = Annotated[
     Stop,
-    typer.Option(
-        help="slices: all boards shortly after the first overflow; own: each at its own overflow.",
-        rich_help_panel=STOPPING,
-    ),
+    typer.Option(help="slices: all boards shortly after the first overflow; own: each at its own overflow."),
 ]
 TargetCount: TypeAlias = Annotated[
     int | None,
-    typer.Option(
-        help="Count that stops a machine.", show_default="the counters' maximum", rich_help_panel=STOPPING
-    ),
+    typer.Option(help="Count that stops a machine.", show_default="the counters' maximum"),
 ]
 
 
@@ -78,32 +59,20 @@ class ModelFlags:
     """Flags for reading a model: parameters of model.py, or variables of a network."""
 
     settings: Settings = None
-    searched: Annotated[
-        str, typer.Option(help="Searched variables.", metavar="A,B", rich_help_panel=NETWORK)
-    ] = ""
+    searched: Annotated[str, typer.Option(help="Searched variables.", metavar="A,B")] = ""
     known: Annotated[
         str,
-        typer.Option(
-            help="Variables with readings, in the order of the columns.",
-            metavar="A,B",
-            rich_help_panel=NETWORK,
-        ),
+        typer.Option(help="Variables with readings, in the order of the columns.", metavar="A,B"),
     ] = ""
     given: Annotated[
         list[str] | None,
-        typer.Option(
-            help="A variable with a fixed state; repeatable.", metavar="NAME=STATE", rich_help_panel=NETWORK
-        ),
+        typer.Option(help="A variable with a fixed state; repeatable.", metavar="NAME=STATE"),
     ] = None
     prior_select: Annotated[
         str,
-        typer.Option(
-            help="Variable whose readings select the prior.", metavar="NAME", rich_help_panel=NETWORK
-        ),
+        typer.Option(help="Variable whose readings select the prior.", metavar="NAME"),
     ] = ""
-    on_missing: Annotated[
-        OnMissing, typer.Option(help="Meaning of an absent reading.", rich_help_panel=NETWORK)
-    ] = OnMissing.ERROR
+    on_missing: Annotated[OnMissing, typer.Option(help="Meaning of an absent reading.")] = OnMissing.ERROR
 
     @property
     def question(self) -> list[str]:
@@ -128,7 +97,6 @@ class BuildFlags(ModelFlags):
         typer.Option(
             help="FPGA of a board: the build uses as many boards as the lines need, and gives the reason.",
             metavar="proce-v-d8",
-            rich_help_panel=BOARDS,
         ),
     ] = None
     interface: Annotated[
@@ -137,7 +105,6 @@ class BuildFlags(ModelFlags):
             help="Inputs x results of a board's registers.",
             show_default="20x1200, or the model's size if larger",
             metavar="INPUTSxRESULTS",
-            rich_help_panel=BOARDS,
         ),
     ] = None
     scale: Annotated[
@@ -145,20 +112,15 @@ class BuildFlags(ModelFlags):
         typer.Option(
             help="Part of a table that is divided by its maximum before quantising.",
             show_default="address; column if cells have their own readings",
-            rich_help_panel=TABLES,
         ),
     ] = None
-    prob_bits: Annotated[int, typer.Option(help="Bits of a code.", min=1, max=16, rich_help_panel=TABLES)] = 8
+    prob_bits: Annotated[int, typer.Option(help="Bits of a code.", min=1, max=16)] = 8
     bits: Bits = None
     prior_mode: Annotated[
         PriorMode,
-        typer.Option(
-            help="table: the prior is in the images; written: the host writes it.", rich_help_panel=TABLES
-        ),
+        typer.Option(help="table: the prior is in the images; written: the host writes it."),
     ] = PriorMode.TABLE
-    counter_bits: Annotated[
-        int, typer.Option(help="Bits of a line's counter.", min=1, max=32, rich_help_panel=STOPPING)
-    ] = 8
+    counter_bits: Annotated[int, typer.Option(help="Bits of a line's counter.", min=1, max=32)] = 8
     target_count: TargetCount = None
     max_cycles: MaxCycles = 2**17
     stop: StopWhen = Stop.SLICES
@@ -167,57 +129,38 @@ class BuildFlags(ModelFlags):
         typer.Option(
             help="Generators: lfsr8, lfsr16, lfsr24 or lfsr32; table: of random numbers; ideal: only in emulation.",
             metavar="KIND",
-            rich_help_panel=RANDOM,
         ),
     ] = RngKind.LFSR32
     rng_table: Annotated[
         Path | None,
         typer.Option(
-            help="With --rng table: the random numbers; without it, they are generated.",
-            metavar="MIF",
-            rich_help_panel=RANDOM,
+            help="With --rng table: the random numbers; without it, they are generated.", metavar="MIF"
         ),
     ] = None
-    rng_banks: Annotated[
-        int, typer.Option(help="Number of seed sets, used in turn.", rich_help_panel=RANDOM)
-    ] = 16
+    rng_banks: Annotated[int, typer.Option(help="Number of seed sets, used in turn.")] = 16
     rng_reset: Annotated[
         RngReset,
-        typer.Option(
-            help="bank: each frame restarts the generators; free: never, as in the thesis.",
-            rich_help_panel=RANDOM,
-        ),
+        typer.Option(help="bank: each frame restarts the generators; free: never, as in the thesis."),
     ] = RngReset.BANK
     shared: Annotated[
         bool,
-        typer.Option(
-            "--shared/--per-cell",
-            help="One generator per column, or one per cell.",
-            rich_help_panel=RANDOM,
-        ),
+        typer.Option("--shared/--per-cell", help="One generator per column, or one per cell."),
     ] = True
     steps_per_clock: Annotated[
         int,
         typer.Option(
-            help="Steps of a generator per cycle; 1 as in the thesis; 0: as many as are needed for fresh bits.",
-            rich_help_panel=RANDOM,
+            help="Steps of a generator per cycle; 1 as in the thesis; 0: as many as are needed for fresh bits."
         ),
     ] = 0
     sensor_mode: Annotated[
         SensorMode,
         typer.Option(
-            help="Input of a cell: its column's reading, its own reading (cell), or its probability (threshold).",
-            rich_help_panel=TABLES,
+            help="Input of a cell: its column's reading, its own reading (cell), or its probability (threshold)."
         ),
     ] = SensorMode.COLUMN
     replicas: Annotated[
         int,
-        typer.Option(
-            help="Number of machines on each board, which share the generators.",
-            min=1,
-            max=256,
-            rich_help_panel=BOARDS,
-        ),
+        typer.Option(help="Number of machines on each board, which share the generators.", min=1, max=256),
     ] = 1
 
 
@@ -243,36 +186,18 @@ def add_commands(app: CommandLine, *commands: Callable[..., None]) -> None:
 
 
 def expand_flags(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace the dataclass parameters of a command by one parameter per field.
+    """Replace the dataclass parameters of a command by one flag per field, each of which has a default."""
+    kinds = {
+        name: each.annotation for name, each in inspect.signature(command, eval_str=True).parameters.items()
+    }
+    return expanded(command, {name: _group(kind) for name, kind in kinds.items() if is_dataclass(kind)})
 
-    Typer reads the flags of a command from its signature, so this changes the signature. Every field of such
-    a dataclass has a default.
-    """
-    parameters: list[inspect.Parameter] = []
-    groups: dict[str, type[Any]] = {}
-    for parameter in inspect.signature(command, eval_str=True).parameters.values():
-        kind = parameter.annotation
-        if not (isinstance(kind, type) and is_dataclass(kind)):
-            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
-            continue
-        groups[parameter.name] = kind
-        hints = get_type_hints(kind, include_extras=True)
-        parameters += [
-            inspect.Parameter(
-                field.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=field.default,
-                annotation=hints[field.name],
-            )
-            for field in fields(kind)
-        ]
 
-    @functools.wraps(command)
-    def run(**values: Any) -> None:
-        for name, kind in groups.items():
-            values[name] = kind(**{field.name: values.pop(field.name) for field in fields(kind)})
-        command(**values)
-
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # inspect.signature() reads it
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    return run
+def _group(kind: Any) -> Group:
+    hints = get_type_hints(kind, include_extras=True)
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    flags = [
+        inspect.Parameter(each.name, keyword, default=each.default, annotation=hints[each.name])
+        for each in fields(kind)
+    ]
+    return Group(flags, kind)
