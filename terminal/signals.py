@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Coroutine
 from types import TracebackType
-from typing import Any
+from typing import Any, Final
 
 import uvloop
 
@@ -19,6 +19,9 @@ _ENDS = {
     signal.SIGTERM: (ExitCode.TERMINATED, "asked to end (SIGTERM)"),
     signal.SIGHUP: (ExitCode.HANGUP, "the terminal was closed (SIGHUP)"),
 }
+
+ENDING_SIGNALS: Final = frozenset(_ENDS)
+"""The signals that end a process."""
 
 _received: list[int] = []
 

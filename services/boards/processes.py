@@ -1,12 +1,13 @@
 """Processes of emulated boards: a single one, or a mini-cluster forked from a process with loaded kernels."""
 
+import asyncio
 import contextlib
 import os
-import select
 import signal
-import sys
 import time
+from collections import deque
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final, NoReturn
 
@@ -18,17 +19,18 @@ from services.errors import BoardFailedError, SettingsError
 from services.settings import Settings, endpoint_in
 from services.sockets.reporting import STUCK_S, serve_status_in_thread, shifted
 from services.sockets.status import BoardStatus, ProcessStatus
-from services.supervision.child import describe_exit
-from services.supervision.parent import end_with_parent, outlive_parent
+from services.supervision.child import ForkedChild, end_all
+from services.supervision.parent import outlive_parent
 from services.supervision.service_manager import ServiceManager
-from terminal.errors import StoppedError, exit_code_of
 from terminal.logs import PARENT_VARIABLE, name_process
-from terminal.output import say, say_error
+from terminal.output import say
 from terminal.private_directory import remove_stale_sockets
-from terminal.signals import check_signals
+from terminal.signals import check_signals, run_async
 
 _ENDING_TIME: Final = 5.0
 """Seconds in which boards of a killed process of the same master end, even if they are stopped for a moment."""
+_STOPPING_S: Final = 2.0
+"""Seconds after which a board that does not end is killed."""
 _LISTENS: Final = 128
 """Added to the number of a board whose sign says that it listens; otherwise it only lives."""
 
@@ -106,7 +108,7 @@ def _await_free(endpoint: Endpoint, limit: float) -> None:
 
 
 class BoardProcesses:
-    """Boards 0 to n-1, each in a process forked from this one."""
+    """Boards 0 to n-1, each in a child forked from this process, so that all of them share its loaded kernels."""
 
     def __init__(
         self,
@@ -116,106 +118,98 @@ class BoardProcesses:
         settings: Settings,
         hardware: SimulatedHardware | None = None,
     ) -> None:
+        """Store the folder of the sockets, and how often boards may be restarted within `restart_window`."""
         self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
-        self._restarts = restarts
-        self._restart_window = settings.restart_window
-        self._run_directory = settings.run_directory
-        self._metrics = settings.metrics
+        self._settings = settings
         self._hardware = hardware
-        self._reports = PARENT_VARIABLE not in os.environ  # a master monitors its boards itself
-        self._manager = ServiceManager()  # here, because a service manager hears only its own child
+
+        # one for all boards: the limit of restarts concerns them together
+        self._ends: deque[float] = deque(maxlen=restarts + 1)
+        self._children = [
+            ForkedChild(f"board {at}", partial(self._serve, at), ends=self._ends) for at in range(count)
+        ]
+
+        # False under a master, which watches its boards itself
+        self._reports = PARENT_VARIABLE not in os.environ
+
+        # here, because a service manager hears only its own child
+        self._manager = ServiceManager()
+
+        # Boards write their number into this pipe: plus _LISTENS when their sockets listen, and every second while they
+        # are not stuck. `_heard` has the monotonic time of the last sign of each.
         self._signs, self._write_sign = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._heard = [0.0] * count
         self._listening: set[int] = set()
+
+        # True once all boards have listened at the same time, which is reported once
         self._announced = False
-        self._started: dict[int, int] = {}
-        self._starts = [0] * count
-        self._ends: list[float] = []
 
     def run(self) -> NoReturn:
-        """Keep the boards running until a signal raises here, or boards exit too often (BoardFailedError)."""
+        """Keep the boards running until a signal ends this process, or boards exit too often (BoardFailedError)."""
         from machines import warm_up
 
         # children share these pages, because four imports of numba would take 1.6 s
         warm_up()
         for endpoint in self._endpoints:
             _await_free(endpoint, 0.0 if self._reports else _ENDING_TIME)
+        run_async(self._run())
+        raise AssertionError("boards run until a signal or an error")
+
+    async def _run(self) -> None:
+        asyncio.get_running_loop().add_reader(self._signs, self._take_signs)
+        keepers = [asyncio.create_task(self._keep(at)) for at in range(len(self._children))]
         try:
-            for at in range(len(self._endpoints)):
-                self._fork(at)
             while True:
-                check_signals()
-                self._wait()
+                ended, _ = await asyncio.wait(keepers, timeout=1, return_when=asyncio.FIRST_COMPLETED)
+                for keeper in ended:
+                    keeper.result()
                 self._report()
         finally:
             self._manager.stopping()
-            self._end_all()
+            for keeper in keepers:
+                keeper.cancel()
+            await end_all(self._children, _STOPPING_S)
+            self._remove_sockets()
 
-    def _wait(self) -> None:
-        """Handle signs and exits of boards, for at most a second."""
-        poll = select.poll()
-        poll.register(self._signs, select.POLLIN)
-        with contextlib.ExitStack() as descriptors:
-            for pid in self._started:
-                descriptor = os.pidfd_open(pid)
-                descriptors.callback(os.close, descriptor)
-                poll.register(descriptor, select.POLLIN)
-            poll.poll(1000)
-        with contextlib.suppress(BlockingIOError):
-            for sign in os.read(self._signs, 1 << 12):
-                self._hear(sign % _LISTENS, listens=sign >= _LISTENS)
-        for pid in list(self._started):
-            ended, status = os.waitpid(pid, os.WNOHANG)
-            if ended:
-                self._ended(self._started.pop(pid), os.waitstatus_to_exitcode(status))
+    async def _keep(self, at: int) -> None:
+        """Start a board, and restart it until boards have ended too often."""
+        child = self._children[at]
+        while True:
+            self._heard[at] = time.monotonic()
+            await child.start()
+            await child.wait()
+            self._listening.discard(at)
+            window = self._settings.restart_window
+            if not child.may_restart(window):
+                ends = len(self._ends)
+                often = f", {ends} exits of boards within {window:g} s" if ends > 1 else ""
+                raise BoardFailedError(f"{child.failure()}{often}")
+            say(f"{child.failure()}; restarting it")
 
-    def _report(self) -> None:
-        """Tell the service manager how many boards listen, and that none of them is stuck."""
-        count, now = len(self._endpoints), time.monotonic()
-        self._manager.report(
-            f"{len(self._listening)} of {count} boards listen",
-            ready=len(self._listening) == count,
-            alive=all(now - heard < STUCK_S for heard in self._heard),
+    def _serve(self, at: int) -> int:
+        """Serve a board in its process, and return the exit code."""
+        name_process(f"board{at}")
+        ended_by = serve_one(
+            self._endpoints[at],
+            at,
+            self._settings.run_directory,
+            board=None if self._hardware is None else self._hardware.board(at),
+            metrics=shifted(self._settings.metrics, at),
+            restarts=self._children[at].restarts,
+            on_ready=lambda: self._sign(_LISTENS + at),
+            on_alive=lambda: self._sign(at),
         )
+        return 128 + ended_by if ended_by else 0
 
-    def _tell(self, sign: int) -> None:
+    def _sign(self, sign: int) -> None:
         """Write a sign of a board, in its process; the parent reads them all the time."""
         with contextlib.suppress(OSError):
             os.write(self._write_sign, bytes([sign]))
 
-    def _fork(self, at: int) -> None:
-        parent = os.getpid()
-        self._starts[at] += 1
-        self._heard[at] = time.monotonic()
-        pid = os.fork()
-        if pid:
-            self._started[pid] = at
-            return
-        code = 1
-        try:
-            os.environ[PARENT_VARIABLE] = str(parent)
-            name_process(f"board{at}")
-            end_with_parent()
-            ended_by = serve_one(
-                self._endpoints[at],
-                at,
-                self._run_directory,
-                board=None if self._hardware is None else self._hardware.board(at),
-                metrics=shifted(self._metrics, at),
-                restarts=self._starts[at] - 1,
-                on_ready=lambda: self._tell(_LISTENS + at),
-                on_alive=lambda: self._tell(at),
-            )
-            code = 128 + ended_by if ended_by else 0
-        except StoppedError as stopped:
-            code = stopped.exit_code
-        except BaseException as error:  # the child must never continue in the code of its parent
-            code = exit_code_of(error)
-            say_error(f"board {at}: {error}")
-        finally:
-            with contextlib.suppress(Exception):
-                sys.stderr.flush()
-            os._exit(code)
+    def _take_signs(self) -> None:
+        for sign in os.read(self._signs, 1 << 12):
+            self._hear(sign % _LISTENS, listens=sign >= _LISTENS)
+        self._report()
 
     def _hear(self, at: int, *, listens: bool) -> None:
         """Take a sign of a board, and print that all boards are ready, or that one is back."""
@@ -234,45 +228,21 @@ class BoardProcesses:
         else:
             say(f"{len(self._endpoints)} boards listen at {self._endpoints[0]} ... {self._endpoints[-1]}")
 
-    def _ended(self, at: int, code: int) -> None:
-        self._listening.discard(at)
-        now = time.monotonic()
-        self._ends = [each for each in self._ends if now - each <= self._restart_window] + [now]
-        if len(self._ends) > self._restarts:
-            often = (
-                f", {len(self._ends)} exits of boards within {self._restart_window:g} s"
-                if self._restarts
-                else ""
-            )
-            raise BoardFailedError(f"board {at} {describe_exit(code)}{often}")
-        say(f"board {at} {describe_exit(code)}; restarting it")
-        self._fork(at)
+    def _report(self) -> None:
+        """Tell the service manager how many boards listen, and that none of them is stuck."""
+        count, now = len(self._endpoints), time.monotonic()
+        self._manager.report(
+            f"{len(self._listening)} of {count} boards listen",
+            ready=len(self._listening) == count,
+            alive=all(now - heard < STUCK_S for heard in self._heard),
+        )
 
-    def _end_all(self) -> None:
-        for pid in self._started:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGTERM)
-        deadline = time.monotonic() + 2
-        while self._started and time.monotonic() < deadline:
-            with contextlib.suppress(ChildProcessError):
-                pid, _ = os.waitpid(-1, os.WNOHANG)
-                self._started.pop(pid, None)
-                if not pid:
-                    time.sleep(0.005)
-                continue
-            break
-        for pid in self._started:
-            with contextlib.suppress(ProcessLookupError, ChildProcessError):
-                os.kill(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)  # its sockets accept connections until it has exited
-        for at in range(len(self._endpoints)):
-            self._remove_sockets(self._endpoints[at])
-        if self._run_directory is not None:
+    def _remove_sockets(self) -> None:
+        """Remove the sockets that killed boards have left behind."""
+        for endpoint in self._endpoints:
+            for each in (endpoint, endpoint.programming):
+                with contextlib.suppress(OSError):
+                    Path(each.path).unlink()
+        if self._settings.run_directory is not None:
             outlive_parent()
-            remove_stale_sockets(self._run_directory)
-
-    def _remove_sockets(self, endpoint: Endpoint) -> None:
-        # a killed board leaves its socket files behind
-        for each in (endpoint, endpoint.programming):
-            with contextlib.suppress(OSError):
-                Path(each.path).unlink()
+            remove_stale_sockets(self._settings.run_directory)

@@ -14,15 +14,16 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 import msgspec
 
 from services.errors import ReportedError, StackError
-from services.supervision.parent import DIRECTORY_VARIABLE
-from terminal.errors import ExitCode
+from services.supervision.parent import DIRECTORY_VARIABLE, end_with_parent
+from terminal.errors import ExitCode, StoppedError, exit_code_of
 from terminal.logs import PARENT_VARIABLE
-from terminal.output import ERROR_DESCRIPTOR, relay
+from terminal.output import ERROR_DESCRIPTOR, relay, say_error
+from terminal.signals import ENDING_SIGNALS, raise_on_signals
 
 RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 """Environment variable with the folder of status sockets (the setting `run_directory`)."""
@@ -100,16 +101,24 @@ class _Pipe:
 class Child:
     """A child process. The error that it reports is stored, and its lines are forwarded."""
 
-    def __init__(self, name: str, command: list[str], *, directory: Path | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        command: list[str],
+        *,
+        directory: Path | None = None,
+        ends: deque[float] | None = None,
+    ) -> None:
+        """Store the command; `ends`, one longer than the permitted restarts, may be shared with other children."""
         self.name = name
         self._command = command
         self._directory = directory
         # Of the last start: the process, its pipes (standard error and error reports), and its last report.
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: asyncio.subprocess.Process | _Forked | None = None
         self._pipes: list[_Pipe] = []
         self._error = ""
-        # Times of the last restarts (monotonic, s), whose number within a window is limited, and their number.
-        self._restarts: deque[float] = deque(maxlen=RESTARTS + 1)
+        # Times of the last ends (monotonic, s), whose number within a window is limited, and the number of restarts.
+        self._ends: deque[float] = deque(maxlen=RESTARTS + 1) if ends is None else ends
         self.restarts = 0
 
     async def start(self) -> None:
@@ -131,15 +140,7 @@ class Child:
             if not environment.get(RUN_DIRECTORY_VARIABLE):
                 environment[RUN_DIRECTORY_VARIABLE] = str(self._directory)
         try:
-            self._process = await asyncio.create_subprocess_exec(
-                *self._command,
-                stdin=asyncio.subprocess.DEVNULL,
-                stdout=asyncio.subprocess.DEVNULL,
-                stderr=lines.writer,
-                pass_fds=(reports.writer,),
-                env=environment,
-                start_new_session=True,
-            )
+            self._process = await self._spawn(environment, lines.writer)
         except OSError as error:
             raise StackError(
                 f"cannot start {self.name} ({self._command[0]}): {error.strerror or error}; install rosbayes into this environment"
@@ -151,6 +152,17 @@ class Child:
     def _take_report(self, line: str) -> None:
         with contextlib.suppress(msgspec.MsgspecError):
             self._error = _decoder.decode(line).error
+
+    async def _spawn(self, environment: dict[str, str], lines: int) -> "asyncio.subprocess.Process | _Forked":
+        return await asyncio.create_subprocess_exec(
+            *self._command,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=lines,
+            pass_fds=(int(environment[ERROR_DESCRIPTOR]),),
+            env=environment,
+            start_new_session=True,
+        )
 
     @property
     def pid(self) -> int:
@@ -185,8 +197,8 @@ class Child:
         """Count a restart; return whether the limit within `window` seconds permits it."""
         now = time.monotonic()
         self.restarts += 1
-        self._restarts.append(now)
-        return sum(1 for at in self._restarts if now - at <= window) <= RESTARTS
+        self._ends.append(now)
+        return sum(1 for at in self._ends if now - at <= window) < (self._ends.maxlen or 0)
 
     def terminate(self) -> None:
         """Send SIGTERM to the process."""
@@ -205,6 +217,69 @@ class Child:
         """Stop reading from an exited process."""
         for pipe in self._pipes:
             pipe.close()
+
+
+class ForkedChild(Child):
+    """A child that is forked from this process, whose loaded modules it shares, and runs a function."""
+
+    def __init__(self, name: str, run: Callable[[], int], *, ends: deque[float]) -> None:
+        """Store the function, whose result is the exit code."""
+        super().__init__(name, [name], ends=ends)
+        self._run = run
+
+    async def _spawn(self, environment: dict[str, str], lines: int) -> "_Forked":
+        # Until the child has handlers of its own, a signal would reach the event loop of this process instead.
+        signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
+        pid = os.fork()
+        if not pid:
+            self._run_forked(environment, lines)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
+        return _Forked(pid)
+
+    def _run_forked(self, environment: dict[str, str], lines: int) -> NoReturn:
+        """Run the function in the child, which must never continue in the code of its parent."""
+        code: int = ExitCode.BUG
+        try:
+            os.setsid()
+            os.dup2(lines, 2)
+            os.environ.update(environment)
+            signal.set_wakeup_fd(-1)
+            raise_on_signals()
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
+            end_with_parent()
+            code = self._run()
+        except StoppedError as stopped:
+            code = stopped.exit_code
+        except BaseException as error:
+            code = exit_code_of(error)
+            say_error(f"{self.name}: {error}")
+        finally:
+            os._exit(code)
+
+
+class _Forked:
+    """A forked process, with the interface of `asyncio.subprocess.Process` as far as `Child` uses it."""
+
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self.returncode: int | None = None
+        self._ended = asyncio.Event()
+        self._descriptor = os.pidfd_open(pid)
+        asyncio.get_running_loop().add_reader(self._descriptor, self._take_exit)
+
+    def _take_exit(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._descriptor)
+        os.close(self._descriptor)
+        _, status = os.waitpid(self.pid, 0)
+        self.returncode = os.waitstatus_to_exitcode(status)
+        self._ended.set()
+
+    async def wait(self) -> None:
+        await self._ended.wait()
+
+    def send_signal(self, number: signal.Signals) -> None:
+        # the number cannot be another process's, because this one was not waited for
+        os.kill(self.pid, number)
 
 
 async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:

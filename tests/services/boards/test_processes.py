@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import time
+from collections import deque
 from pathlib import Path
 
 import psutil
@@ -19,6 +20,7 @@ from services.boards.processes import BoardProcesses
 from services.errors import BoardFailedError, SettingsError
 from services.settings import Settings
 from services.sockets.reporting import STUCK_S
+from services.supervision.child import ForkedChild
 from tests.patience import PROCESS_PATIENCE, PRODUCT_LIMITS
 
 BOARD = str(Path(sys.executable).parent / "board")
@@ -149,18 +151,57 @@ def test_a_stuck_board_is_no_sign_of_life_of_its_parent(tmp_path, monkeypatch):
     assert reports == [(True, True), (True, False), (True, True)]
 
 
-def test_boards_may_end_seldom(tmp_path, monkeypatch):
-    now, forked = [100.0], []
-    monkeypatch.setattr(processes.time, "monotonic", lambda: now[0])
+async def test_boards_may_end_seldom_and_their_limit_is_common(tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+
+    class Ending(ForkedChild):
+        """A board that ends with exit code 1, each time after so many seconds."""
+
+        exit_code = 1
+
+        def __init__(self, *seconds):
+            super().__init__("a board", int, ends=boards._ends)
+            self.seconds = list(seconds)
+
+        async def start(self):
+            pass
+
+        async def wait(self):
+            now[0] += self.seconds.pop(0)
+
     boards = BoardProcesses(tmp_path, 2, 1, Settings(restart_window=5))
-    monkeypatch.setattr(boards, "_fork", forked.append)
-    boards._ended(0, 1)
-    now[0] += 5.1
-    boards._ended(1, 1)
-    assert forked == [0, 1]
-    now[0] += 5.0
-    with pytest.raises(BoardFailedError, match="exit code 1, 2 exits of boards within 5 s$"):
-        boards._ended(0, 1)
+    boards._children = [Ending(1, 5.1, 5.0), Ending(5.1, 5.0)]
+    for at in range(2):
+        with pytest.raises(BoardFailedError, match="exit code 1, 2 exits of boards within 5 s$"):
+            await boards._keep(at)
+        assert boards._children[at].seconds == []
+
+
+@pytest.mark.process
+async def test_a_forked_child_says_why_it_failed_and_shares_what_is_loaded(capfd):
+    def fail():
+        os.write(2, f"Ctrl-C reaches it: {os.getpgrp() != os.getpid()}\n".encode())
+        raise SettingsError(f"no luck with {shared}")
+
+    shared = {"loaded": 1}
+    child = ForkedChild("board 7", fail, ends=deque(maxlen=1))
+    await child.start()
+    await child.wait()
+    assert (child.exit_code, child.is_running) == (2, False)
+    assert str(child.failure()) == "board 7: no luck with {'loaded': 1}"
+    assert capfd.readouterr().err == "Ctrl-C reaches it: False\n"
+    assert not child.may_restart(60.0)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+async def test_signals_reach_a_forked_child_alone(number, code):
+    child = ForkedChild("board 7", lambda: signal.pause() or 0, ends=deque(maxlen=1))
+    await child.start()
+    os.kill(child.pid, number)
+    await child.wait()
+    assert child.exit_code == code
 
 
 def test_boards_of_a_killed_process_have_time_to_end(tmp_path, monkeypatch):
