@@ -13,12 +13,10 @@ infinity received.
 """
 
 import contextlib
-import gc
 import itertools
 import logging
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from math import inf
 from typing import Any, Final
 
@@ -43,8 +41,6 @@ from bridge.stamps import stamp
 log = logging.getLogger(__name__)
 
 _OPERATION_WORK: Final = 20
-_LARGE: Final = 64 * 1024
-"""Bytes from which a message is handled without collections of garbage."""
 _LEVELS: Final = {"info": True, "warning": True, "error": True, "none": False}
 """Levels of `set_level`, and whether they include the hub's status messages, which are all errors."""
 _LOG_ERROR: Final = {1: 8, 2: 40}
@@ -78,6 +74,8 @@ class Broker:
         self._client_numbers = itertools.count(1)
         rosapi = Rosapi(self.graph, self.limits, self.definitions, wall_clock)
         self._dispatcher = Dispatcher(self.limits)
+        self.take_ready = self._dispatcher.take_ready
+        """Returns the clients that have output or must be closed, if they were not returned before."""
         self._topics = Topics(self.graph, self.limits, self._dispatcher, self.definitions, self._refuse)
         self._actions = Actions(self.graph, self.limits, self._dispatcher, self.definitions)
         self._calls = Calls(
@@ -114,7 +112,7 @@ class Broker:
     @property
     def deadline(self) -> float:
         """When `wake` may have something to do (monotonic seconds), infinity for never."""
-        return min(self._calls.deadline, self._dispatcher.deadline, self._fragment_deadline)
+        return self._dispatcher.deadline
 
     def connect(self, address: str) -> Client:
         """Admit a client from `address`, after checking `full`."""
@@ -180,19 +178,13 @@ class Broker:
         while number < len(messages):
             if outbox.undroppable and outbox.congested:
                 break
-            number = self._topics.publish_known(client, messages, number, now, _LARGE)
+            number = self._topics.publish_known(client, messages, number, now)
             if number == len(messages) or dispatcher.work > TURN_WORK:
                 break
-            data = messages[number]
             try:
-                if len(data) > _LARGE:
-                    with _garbage_collection_paused():
-                        if not self._topics.publish_known(client, [data], 0, now, len(data)):
-                            self.receive(client, data, now)
-                else:
-                    self.receive(client, data, now)
+                self.receive(client, messages[number], now)
             except DefinitionsPendingError as error:
-                messages[number] = error.data or data
+                messages[number] = error.data or messages[number]
                 break
             number += 1
         return number
@@ -225,7 +217,7 @@ class Broker:
 
     def wake(self, now: float) -> None:
         """Release throttled messages, fail calls and drop incomplete messages that are due at `now`."""
-        self._dispatcher.release(now)
+        throttle_deadline = self._dispatcher.release(now)
         self._calls.expire(now)
         if now >= self._fragment_deadline:
             for client in list(self._reassembling):
@@ -233,10 +225,7 @@ class Broker:
                     client.fragments.expire(now)
                 self._note_fragments(client)
             self._fragment_deadline = min(map(_fragment_deadline, self._reassembling), default=inf)
-
-    def take_ready(self) -> list[Client]:
-        """Return the clients that have output or must be closed, if they were not returned before."""
-        return self._dispatcher.take_ready()
+        self._dispatcher.deadline = min(throttle_deadline, self._calls.deadline, self._fragment_deadline)
 
     def _take_fragment(self, client: Client, operation: Operation, now: float) -> None:
         if client.fragments is None:
@@ -247,8 +236,7 @@ class Broker:
             self._note_fragments(client)
         if message is not None:
             try:
-                with _garbage_collection_paused():
-                    self._perform(client, message, now, is_whole=False)
+                self._perform(client, message, now, is_whole=False)
             except DefinitionsPendingError:
                 raise DefinitionsPendingError(message) from None
 
@@ -257,6 +245,7 @@ class Broker:
         if client.fragments:
             self._reassembling.add(client)
             self._fragment_deadline = min(self._fragment_deadline, client.fragments.deadline)
+            self._dispatcher.schedule(self._fragment_deadline)
         else:
             self._reassembling.discard(client)
 
@@ -295,22 +284,6 @@ class Broker:
         if self._ros_version == 2:
             return {"stamp": time_, **message}
         return {"header": {"seq": 0, "stamp": time_, "frame_id": ""}, **message, "topics": []}
-
-
-@contextmanager
-def _garbage_collection_paused() -> Iterator[None]:
-    """Collect no garbage while a large message is handled.
-
-    A megabyte of empty arrays is parsed into 300,000 lists. Collections during that visit them several times,
-    which takes four times as long as parsing, and never find any garbage.
-    """
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
 
 
 def _fragment_deadline(client: Client) -> float:

@@ -120,6 +120,8 @@ class Topic:
 
     name: str
     """Absolute."""
+    largest: int
+    """Maximum bytes of a message as JSON, so that it fits into an operation of the largest size."""
     type: str = ""
     """Type as this hub's ROS version writes it; empty until a client names it."""
     advertisements: dict[Client, Advertisement] = field(default_factory=dict)

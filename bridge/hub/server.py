@@ -44,8 +44,6 @@ _TURN_MESSAGES: Final = 32
 """Number of queued messages or fragments written to one client before other tasks get their turn."""
 _SLICE_BYTES: Final = 4 * 1024
 """One client's share of a turn (see `WebSocketTransport`)."""
-_RETAINED_BYTES: Final = 4 * 1024 * 1024
-"""Half of the freed memory that the process retains for the next messages."""
 _SWEEP: Final = 1.0
 """Seconds between two checks for silent and stuck clients."""
 _CLOSE_TIMEOUT: Final = 2.0
@@ -91,7 +89,6 @@ async def serve_hub(
         )
     access = access or AccessPolicy()
     hub = _Hub(limits or HubLimits(), access, ros_version, loopback=is_loopback(host))
-    _retain_memory()
     loop = asyncio.get_running_loop()
     try:
         server = await loop.create_server(
@@ -124,15 +121,6 @@ async def serve_hub(
         await hub.close()
 
 
-def _retain_memory() -> None:
-    """Make the C library retain the memory of large messages for the next ones.
-
-    glibc returns memory after each burst and acquires it again page by page, which takes a fifth of the hub's
-    time with messages of 17 kB. After a block of this size has been freed, it retains twice as many bytes.
-    """
-    bytes(_RETAINED_BYTES)
-
-
 class _Hub:
     """The broker, its connections and its timers."""
 
@@ -142,6 +130,7 @@ class _Hub:
         self.limits = limits
         self.loopback = loopback
         self.broker = Broker(limits, ros_version=ros_version)
+        self._take_ready = self.broker.take_ready
         self.access = access
         self.connections: set[_Connection] = set()
         self.handshakes: dict[_Connection, None] = {}  # in the order of their beginning
@@ -228,12 +217,13 @@ class _Hub:
 
     def serve(self) -> None:
         """Write the clients' output, and schedule the broker's next deadline."""
-        for client in self.broker.take_ready():
+        for client in self._take_ready():
             connection = self._by_client.get(client)
             if connection is not None:
                 connection.flush()
-        if self.broker.deadline != self._timer_deadline:
-            self._set_timer(self.broker.deadline)
+        deadline = self.broker.deadline
+        if deadline != self._timer_deadline:
+            self._set_timer(deadline)
 
     def _set_timer(self, deadline: float) -> None:
         if self._timer is not None:
@@ -359,7 +349,7 @@ class _Connection(WebSocketTransport):
     def flush(self) -> None:
         """Write as much of the client's queue as the socket accepts, in one piece if it is small."""
         client = self._client
-        if client is None or not self.is_open or self.is_closing:
+        if client is None or not self.is_open:
             return
         if client.close_reason:
             self._give_up(client.close_reason)
@@ -370,7 +360,8 @@ class _Connection(WebSocketTransport):
             self.send(payloads)
         if outbox.wire is None or not outbox.empty:
             self._flush_backlog(outbox)
-        self.proceed()
+        if self._interrupted is not None:
+            self.proceed()
 
     def _flush_backlog(self, outbox: Outbox) -> None:
         """Write one turn's share of the queue, and the rest after other tasks have had their turn."""

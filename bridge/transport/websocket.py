@@ -7,7 +7,6 @@ malformed frame or the beginning of the closing handshake, it reads everything.
 """
 
 import asyncio
-import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -21,9 +20,6 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 
 from bridge.transport import frames
-
-QUICK_FRAMES = os.environ.get("ROSBAYES_QUICK_FRAMES", "1") != "0"
-"""True if new connections read and write whole messages without the library; 0 disables this."""
 
 MESSAGE_BYTES_HEADER: Final = "Rosbridge-Message-Bytes"
 """Header of the hub's handshake: maximum size in bytes of the messages that it accepts."""
@@ -71,7 +67,6 @@ class WebSocketTransport(asyncio.Protocol):
         self._in_handshake = True
         self._handshake_tail = b""
         self._quick = False
-        self._quick_writes = QUICK_FRAMES
         self._rest = bytearray()
         self._wanted = 0
         self._fragments: bytearray | None = None
@@ -126,25 +121,16 @@ class WebSocketTransport(asyncio.Protocol):
 
     def send(self, messages: Sequence[bytes]) -> None:
         """Write messages to an open connection: JSON as text, a server's CBOR as binary."""
-        if self._quick_writes:
-            data = self._encode(messages)
-            if self._held is not None:
-                self._held.append(data)
-            elif self._transport is not None:
-                self._transport.write(data)
-            return
-        for message in messages:
-            if self._is_server and message[:1] != b"{":
-                self._protocol.send_binary(message)
-            else:
-                self._protocol.send_text(message)
-        self._flush()
+        data = self._encode(messages)
+        if self._held is not None:
+            self._held.append(data)
+        elif self._transport is not None:
+            self._transport.write(data)
 
     def count_unread(self, size: int) -> None:
         """Count bytes that the peer has caused, and end the connection if it reads none of very many."""
         self._unread = self._unread + size if self.paused else 0
         if self.never_reads:
-            self.is_open = False
             self.abort()
 
     @property
@@ -164,6 +150,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     def abort(self) -> None:
         """End the connection at once."""
+        self.is_open = False
         if self._transport is not None:
             self._transport.abort()
 
@@ -231,7 +218,7 @@ class WebSocketTransport(asyncio.Protocol):
             message = frames.only_message(data, masked=self._is_server, largest=self._max_size)
             if message is not None:  # the usual case, except in bursts
                 self.messages_received([message])
-                if self._postponed or self.is_blocked:
+                if self._postponed:
                     self._interrupt(b"", 0)
                 return
         elif self._in_handshake:
@@ -277,7 +264,7 @@ class WebSocketTransport(asyncio.Protocol):
         at = end + len(_END_OF_HEADERS) - len(before)
         self._in_handshake = False
         self._give_library(data[:at])
-        self._quick = QUICK_FRAMES and self.is_open
+        self._quick = self.is_open
         if at < len(data):
             self._read_turn(data, at)
 

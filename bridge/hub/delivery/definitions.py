@@ -83,7 +83,6 @@ class Definitions:
         self._missing = False
         self._typed: dict[str, _Convert] = {}
         self._types = Types(self._field_types, _DEFAULTS, _TIMES, ros_version, wall_clock)
-        self._fillers: dict[str, Filler | None] = {}
         self._texts: dict[str, str] = {}
 
     def load(self) -> None:
@@ -128,13 +127,11 @@ class Definitions:
             DefinitionsPendingError: The definitions are being loaded.
         """
         self.require()
-        if type_name not in self._fillers:
-            try:
-                _store, known = self._known(type_name)
-            except BridgeError:
-                return None
-            self._fillers[type_name] = Filler(self._types, known)
-        return self._fillers[type_name]
+        try:
+            _store, known = self._known(type_name)
+        except BridgeError:
+            return None
+        return self._types.filler(known)
 
     def fillers(self, type_name: str, kind: Literal["srv", "action"]) -> dict[str, Filler]:
         """Return the fillers of the parts of a service or an action, such as `Request`, without unknown parts.

@@ -26,6 +26,7 @@ class Dispatcher:
         self._ready: list[Client] = []
         self.throttled: set[Client] = set()
         self.deadline = inf
+        """When the broker must be woken at the latest (monotonic seconds): for a throttle, a call or a fragment."""
         self.work = 0
         """Units of work in the current turn (see `bridge.hub.broker.TURN_WORK`)."""
 
@@ -69,30 +70,32 @@ class Dispatcher:
 
     def offer(self, client: Client, lane: Lane, payload: bytes, now: float) -> None:
         """Queue a message that newer messages of its lane may replace."""
-        outbox = client.outbox
-        outbox.offer(lane, payload, now)
-        if outbox.deadline != inf:
+        client.outbox.offer(lane, payload, now)
+        if lane.throttle:
             self.schedule_release(client)
         if not client.is_ready:
-            self.mark_ready(client)
+            client.is_ready = True
+            self._ready.append(client)
+
+    def schedule(self, deadline: float) -> None:
+        """Have the broker woken at `deadline`, or earlier."""
+        self.deadline = min(self.deadline, deadline)
 
     def schedule_release(self, client: Client) -> None:
         """Schedule the release of a client's held messages."""
         deadline = client.outbox.deadline
         if deadline != inf:
             self.throttled.add(client)
-            self.deadline = min(self.deadline, deadline)
+            self.schedule(deadline)
 
-    def release(self, now: float) -> None:
-        """Queue the messages that throttles admit at `now`."""
-        if now < self.deadline:
-            return
+    def release(self, now: float) -> float:
+        """Queue the messages that throttles admit at `now`, and return when others are due."""
         for client in [client for client in self.throttled if client.outbox.deadline <= now]:
             client.outbox.release(now)
             self.mark_ready(client)
             if client.outbox.deadline == inf:
                 self.throttled.discard(client)
-        self.deadline = min((client.outbox.deadline for client in self.throttled), default=inf)
+        return min((client.outbox.deadline for client in self.throttled), default=inf)
 
     def send_status(self, client: Client, sentence: str, operation_id: object, now: float) -> None:
         """Send a status message about an error, and drop the oldest of a client that does not read."""

@@ -5,14 +5,16 @@ rosbridge_library/internal/message_conversion.py): an absent field has the messa
 `std_msgs/Header` without one is the time of receipt. So is that of an absent header, as the specification says
 (ROSBRIDGE_PROTOCOL.md, 3.3.3). Unlike the reference server, the hub does not check present values.
 
-Each message is filled by a function that is compiled for its type. A message that only lacks outermost fields, as most
-do, keeps its own JSON, and the JSON of these fields is appended.
+    {"op":"publish","topic":"/t","msg":{"data":[1.5]}}                                     as received
+    {"op":"publish","topic":"/t","msg":{"data":[1.5],"layout":{"dim":[],"data_offset":0}}} as forwarded
+
+A message that only lacks outermost fields, as most do, keeps its own JSON: the JSON of these fields, its *tail*, takes
+the place of the last two braces. Only a message with an incomplete part is written again.
 """
 
-import itertools
 from base64 import b64encode
 from collections.abc import Callable, Container, Mapping
-from typing import Any, Final, Literal, NoReturn
+from typing import Any, Final, Literal
 
 import orjson
 
@@ -22,65 +24,114 @@ from bridge.stamps import stamp
 RosVersion = Literal[1, 2]
 FieldTypes = Mapping[str, tuple[str, int]]
 """The types of a message's fields or of their elements, and their lengths: -1 for a scalar, 0 for any."""
-Fill = Callable[[dict[str, Any], int], bytes | None]
-"""Fills the absent fields of a message in place; a value of another type than its field's stays.
-
-Args:
-    message: The message.
-    room: Bytes by which its parts may grow.
-
-Returns:
-    What to put in place of the last two braces of an operation that ends with the message, both as JSON. It is empty
-    if nothing was absent, and None if the message must be written again.
-
-Raises:
-    RefusedError: They would grow by more.
-"""
 
 HEADER: Final = "std_msgs/msg/Header"
 _TIME: Final = {1: ("secs", "nsecs"), 2: ("sec", "nanosec")}
-_TIME_SIZE: Final = len('"nanosec":0000000000,')
-_CLOSING: Final = b"}}"
-_TAILS: Final = 32
-"""Maximum number of tails that are kept for one type."""
+_KNOWN: Final = 32
+"""Number of combinations of absent fields that are remembered for one type."""
 _ONE: Final = {("geometry_msgs/msg/Quaternion", "w"): 1.0}
 """The only field of the common ROS 2 messages whose default is not zero."""
+
+
+_Parts = tuple[tuple[str, "Filler", bool], ...]
+"""The fields of a message that are messages, or arrays of messages, and whether they are arrays."""
+
+_Absent = tuple[dict[str, Any], bytes, _Parts]
+"""The absent fields of a message and their defaults, which must not be changed; their tail; the present parts."""
 
 
 class Filler:
     """The fields of one message type, and their defaults."""
 
     def __init__(self, types: "Types", name: str) -> None:
-        """Prepare the defaults of a known type."""
-        # The stamp of a header and the fields of a time have no constant defaults, so they are filled as in a part.
-        is_like_part = name == HEADER or name in types.times or not types.fields(name)
-        self._defaults = {} if is_like_part else types.defaults(name)
-        self._headers: frozenset[str] = frozenset() if is_like_part else types.headers(name)
-        self._tails = {0: b""}
-        """By the number of the absent fields (see `_compiled_fill`)."""
-        self.fill: Fill = _compiled_fill(types, name, self._tails, self._tail, like_part=is_like_part)
+        """Prepare a known type and, recursively, the types of its fields."""
+        self._defaults = types.defaults(name)
+        # The defaults that differ from message to message: stamps, and the other ROS version's fields of a time.
+        self._varying = types.varying(name)
+        self.parts: _Parts = tuple(
+            (field, types.filler(element), length >= 0)
+            for field, (element, length) in types.fields(name).items()
+            if types.has_fields(element)
+        )
+        # By the present fields. A publisher repeats the same few, so most messages are filled without a look at
+        # single fields.
+        self._known: dict[tuple[str, ...], _Absent] = {}
+        # A message with as many fields as its type is complete. If it has unknown fields in place of absent ones,
+        # the reference server refuses it; here its subscribers see what is wrong. Only the fields of a time may
+        # replace each other, so its number of fields says nothing.
+        self.count = -1 if name in types.times else len(self._defaults)
 
     def named(self, values: list[Any]) -> dict[str, Any]:
         """Return the message with these values in the order of the fields, as arguments of services may be given."""
         return dict(zip(self._defaults, values, strict=False))
 
-    def _tail(self, absent: int, message: dict[str, Any]) -> bytes:
-        """Return the JSON of the fields that were absent, and keep it if it has no time of receipt."""
-        fields = {field: message[field] for bit, field in enumerate(self._defaults) if absent >> bit & 1}
-        was_empty = absent >> len(self._defaults)
-        tail = b"" if was_empty else b","
-        tail += orjson.dumps(fields)[1:-1] + _CLOSING
-        if self._headers.isdisjoint(fields):
-            if len(self._tails) == _TAILS:
-                del self._tails[
-                    next(reversed(self._tails))
-                ]  # one of a rare message rather than of the first ones
-            self._tails[absent] = tail
-        return tail
+    def fill(self, message: dict[str, Any], room: int) -> bytes | None:
+        """Fill the absent fields of a message in place; a value of another type than its field's stays.
+
+        Args:
+            message: The message.
+            room: Bytes by which its parts may grow.
+
+        Returns:
+            What to put in place of the last two braces of an operation that ends with the message, both as JSON. It
+            is empty if nothing was absent, and None if the message must be written again.
+
+        Raises:
+            RefusedError: They would grow by more.
+        """
+        if len(message) == self.count:
+            return None if self.parts and _fill_parts(self.parts, message, room) else b""
+        absent, tail, parts = self._known.get(tuple(message)) or self._look_up(message)
+        is_grown = parts and _fill_parts(parts, message, room)
+        message.update(absent)
+        return None if is_grown else tail
+
+    def fill_part(self, message: dict[str, Any], room: int) -> int:
+        """Fill a message inside another one, and return the bytes by which it grew, or raise a RefusedError."""
+        grown = _fill_parts(self.parts, message, room)
+        if len(message) != self.count:
+            absent, tail, _parts = self._known.get(tuple(message)) or self._look_up(message)
+            message.update(absent)
+            grown += len(tail)
+            # Checked at each message of an array: a megabyte of `{}` could become a gigabyte.
+            if grown > room:
+                raise RefusedError("a message is too large with the default values of its absent fields")
+        return grown
+
+    def _look_up(self, message: dict[str, Any]) -> _Absent:
+        """Return what a message lacks, and remember it."""
+        varying, defaults = self._varying, self._defaults
+        absent = {
+            field: varying[field](message) if field in varying else default
+            for field, default in defaults.items()
+            if field not in message
+        }
+        tail = b"%b%b}}" % (b"," if message else b"", orjson.dumps(absent)[1:-1]) if absent else b""
+        parts = tuple(part for part in self.parts if part[0] in message)
+        # Unknown fields can have any number and length, so a message with one is not remembered.
+        if message.keys() <= defaults.keys() and varying.keys().isdisjoint(absent):
+            if len(self._known) >= _KNOWN:
+                self._known.clear()
+            self._known[tuple(message)] = absent, tail, parts
+        return absent, tail, parts
+
+
+def _fill_parts(parts: _Parts, message: dict[str, Any], room: int) -> int:
+    """Fill the messages inside a message, and return the number of bytes by which they grew."""
+    grown = 0
+    for field, filler, is_array in parts:
+        part = message.get(field)
+        if is_array:
+            for item in part if type(part) is list else ():
+                if type(item) is dict:
+                    grown += filler.fill_part(item, room - grown)
+        elif type(part) is dict and (filler.parts or len(part) != filler.count):
+            grown += filler.fill_part(part, room - grown)
+    return grown
 
 
 class Types:
-    """Defaults and filling functions of the types of one ROS version."""
+    """Defaults and fillers of the types of one ROS version."""
 
     def __init__(
         self,
@@ -105,19 +156,33 @@ class Types:
         self._ros_version = ros_version
         self._wall_clock = wall_clock
         self._defaults: dict[str, dict[str, Any]] = {}
+        self._fillers: dict[str, Filler] = {}
 
-    def new_header(self) -> dict[str, Any]:
-        """Return a `std_msgs/Header` with the current time."""
-        return self.defaults(HEADER) | {"stamp": self.new_stamp()}
+    def filler(self, name: str) -> Filler:
+        """Return the filler of a known type."""
+        if name not in self._fillers:
+            self._fillers[name] = Filler(self, name)
+        return self._fillers[name]
 
-    def new_stamp(self) -> dict[str, int]:
-        """Return the current time in the form of the ROS version."""
-        return stamp(self._wall_clock(), self._ros_version)
+    def varying(self, name: str) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        """Return the fields of a type whose defaults depend on the time of receipt or on the message's other fields."""
 
-    def headers(self, name: str) -> frozenset[str]:
-        """Return the fields of a message that are headers."""
-        fields = self._field_types(name).items()
-        return frozenset(field for field, (element, length) in fields if element == HEADER and length < 0)
+        def now(_message: object) -> dict[str, int]:
+            return stamp(self._wall_clock(), self._ros_version)
+
+        def of_other_version(field: str) -> Callable[[dict[str, Any]], int]:
+            return lambda message: given if type(given := message.get(field)) is int else 0
+
+        if name in self.times:
+            own, other = _TIME[self._ros_version], _TIME[3 - self._ros_version]
+            return {field: of_other_version(theirs) for field, theirs in zip(own, other, strict=True)}
+        if name == HEADER:
+            return {"stamp": now}
+        return {
+            field: lambda message: self.defaults(HEADER) | {"stamp": now(message)}
+            for field, kind in self._field_types(name).items()
+            if kind == (HEADER, -1)
+        }
 
     def defaults(self, name: str) -> dict[str, Any]:
         """Return the default of a message, which must not be changed."""
@@ -154,89 +219,3 @@ class Types:
     def has_fields(self, name: str) -> bool:
         """Return whether a type is neither a basic one nor an empty message."""
         return name not in self._scalars and bool(self.fields(name))
-
-    def other_field(self, name: str, field: str) -> str | None:
-        """Return the field of the other ROS version for a field of a time, and None for other types."""
-        if name not in self.times:
-            return None
-        return dict(zip(_TIME[self._ros_version], _TIME[3 - self._ros_version], strict=True))[field]
-
-
-def _compiled_fill(
-    types: Types,
-    name: str,
-    tails: Mapping[int, bytes],
-    new_tail: Callable[[int, dict[str, Any]], bytes],
-    *,
-    like_part: bool,
-) -> Fill:
-    """Return the function that fills messages of a type.
-
-    It runs for every message, most of which have complete parts, and takes a fifth of the time of a loop over the
-    fields.
-
-    Args:
-        types: All types.
-        name: The type.
-        tails: What to put in place of the last two braces of an operation, by the number of the absent fields: a bit
-            each, and one more if the message is empty. Their size is limited by the type.
-        new_tail: Returns the same for a message that was filled.
-        like_part: Whether the message is filled like a part, so that it must be written again.
-    """
-    lines = ["def fill(m0, room):", " left = room"]
-    if not like_part:
-        lines.append(f" absent = 0 if m0 else {1 << len(types.fields(name))}")
-    numbers = itertools.count(1)
-    namespace: dict[str, Any] = {
-        "new_stamp": types.new_stamp,
-        "new_header": types.new_header,
-        "tails": tails,
-        "new_tail": new_tail,
-        "refuse": _refuse,
-    }
-
-    def add_fields(part: str, message: str, indent: str) -> None:
-        """Add the lines that fill a dictionary."""
-        defaults = types.defaults(part)
-        for bit, (field, (element, length)) in enumerate(types.fields(part).items()):
-            default = f"d{next(numbers)}"
-            namespace[default] = defaults[field]
-            size = len(orjson.dumps({field: defaults[field]})) - 1
-            other = types.other_field(part, field)
-            if other is not None:
-                size, default = _TIME_SIZE, f"t if type(t := {message}.get({other!r})) is int else 0"
-            elif part == HEADER and field == "stamp":
-                default = "new_stamp()"
-            elif element == HEADER and length < 0:
-                default = "new_header()"
-            count = f"left -= {size}" if like_part or message != "m0" else f"absent |= {1 << bit}"
-            lines.append(f"{indent}if {field!r} not in {message}:")
-            lines.append(f"{indent} {message}[{field!r}] = {default}; {count}")
-            if types.has_fields(element):
-                lines.append(f"{indent}else:")
-                add_value(element, length, f"{message}[{field!r}]", indent + " ")
-
-    def add_value(element: str, length: int, value: str, indent: str) -> None:
-        """Add the lines that fill a value, if it is a dictionary, or a list of them if that is its type."""
-        inner = f"m{next(numbers)}"
-        lines.append(f"{indent}{inner} = {value}")
-        if length >= 0:
-            lines.append(f"{indent}for {inner} in {inner} if type({inner}) is list else ():")
-            indent += " "
-            lines.append(f"{indent}if left < 0: refuse()")
-        lines.append(f"{indent}if type({inner}) is dict:")
-        add_fields(element, inner, indent + " ")
-
-    add_fields(name, "m0", " ")
-    if like_part:
-        lines.append(" tail = b''")
-    else:
-        lines += [" try: tail = tails[absent]", " except KeyError: tail = new_tail(absent, m0)"]
-    lines += [" if left == room: return tail", " if left < 0: refuse()"]
-    exec("\n".join(lines), namespace)  # noqa: S102 - the names of fields are those of installed definitions
-    fill: Fill = namespace["fill"]
-    return fill
-
-
-def _refuse() -> NoReturn:
-    raise RefusedError("a message is too large with the default values of its absent fields")

@@ -141,6 +141,7 @@ class Calls:
             heapq.heapify(self._deadlines)
         else:
             heapq.heappush(self._deadlines, (deadline, key))
+        self._dispatcher.schedule(deadline)
 
     def respond(self, client: Client, operation: Operation, _now: float) -> None:
         """Perform `service_response`."""

@@ -72,6 +72,8 @@ class Topics:
         self._dispatcher = dispatcher
         self._definitions = definitions
         self._refuse = refuse
+        self._room = limits.message_bytes
+        self._depth = limits.depth - 1  # without the operation around a message
 
     def leave(self, client: Client) -> None:
         """Remove a disconnected client."""
@@ -136,9 +138,7 @@ class Topics:
                 data = data[: data.rindex(b"}")] + tail[:-1]
             self.distribute(topic, parsed, data, now)
 
-    def publish_known(
-        self, client: Client, messages: Sequence[bytes], first: int, now: float, largest: int
-    ) -> int:
+    def publish_known(self, client: Client, messages: Sequence[bytes], first: int, now: float) -> int:
         """Perform `publish` operations with known envelopes: only their messages are parsed, and forwarded as received.
 
         Args:
@@ -146,15 +146,14 @@ class Topics:
             messages: Any received data.
             first: The index of the first one to perform.
             now: Monotonic seconds.
-            largest: Maximum bytes of a message to perform.
 
         Returns:
-            The index of the first one that was not performed: it is larger, must be parsed in full, or exceeds a turn.
+            The index of the first one that was not performed: it must be parsed in full, or exceeds a turn.
         """
         advertisement = client.last_published
         if advertisement is None:
             return first
-        dispatcher, room, depth = self._dispatcher, self._limits.message_bytes, self._limits.depth - 1
+        dispatcher, room, depth = self._dispatcher, self._room, self._depth
         topic, filler, envelope = advertisement.topic, advertisement.filler, advertisement.envelope
         begin = len(envelope)
         for index in range(first, len(messages)):
@@ -168,7 +167,7 @@ class Topics:
                 client.last_published = advertisement
                 topic, filler, envelope = advertisement.topic, advertisement.filler, advertisement.envelope
                 begin = len(envelope)
-            if data[-1] != BRACE or len(data) > largest:
+            if data[-1] != BRACE:
                 return index
             message = data[begin:-1]
             try:
@@ -207,15 +206,16 @@ class Topics:
     ) -> None:
         """Deliver a message, which is in `payload` as JSON, after a prefix and before a brace."""
         size = len(payload) - len(prefix) - 1
+        dispatcher = self._dispatcher
         # Rewriting can lengthen a message (1e15 becomes 1000000000000000.0).
-        if len(topic.name) + size + AROUND > self._limits.message_bytes:
+        if size > topic.largest:
             raise RefusedError(
                 f"the message for {topic.name} has more than {self._limits.message_bytes} bytes"
             )
         if topic.latching:
             room = self._limits.latched_bytes - self._graph.latched_bytes + len(topic.latched or b"")
             self._graph.latch(topic, payload[len(prefix) : -1] if size <= room else None)
-        self._dispatcher.work += _MESSAGE_WORK + 2 * len(topic.subscriptions)
+        dispatcher.work += _MESSAGE_WORK + 2 * len(topic.subscriptions)
         # Subscribers that use the same name for the topic share one payload.
         message: Message | None = None
         for subscription in topic.subscriptions.values():
@@ -223,7 +223,12 @@ class Topics:
                 if subscription.prefix != prefix:
                     payload = subscription.prefix + payload[len(prefix) :]
                     prefix = subscription.prefix
-                self._dispatcher.offer(subscription.client, subscription.lane, payload, now)
+                client, lane = subscription.client, subscription.lane
+                client.outbox.offer(lane, payload, now)
+                if lane.throttle:
+                    dispatcher.schedule_release(client)
+                if not client.is_ready:
+                    dispatcher.mark_ready(client)
             else:
                 message = message or self._message(topic, payload[len(prefix) : -1], parsed)
                 self._deliver_encoded(subscription, message, now)
@@ -327,7 +332,7 @@ class Topics:
             checked_name(name)
             if len(self._graph.topics) >= self._limits.topics:
                 raise RefusedError(f"the hub already has {self._limits.topics} topics")
-            topic = self._graph.topics[key] = Topic(key)
+            topic = self._graph.topics[key] = Topic(key, self._limits.message_bytes - len(key) - AROUND)
         topic.type = known or type_name or ""
         return topic
 

@@ -26,8 +26,6 @@ from bridge.qos import Qos
 from tests.bridge.hub.sockets import running_hub
 from tests.patience import PATIENCE
 
-pytestmark = pytest.mark.usefixtures("either_reader")
-
 SCAN = {
     "header": {"frame_id": "laser"},
     "angle_min": -1.5,

@@ -2,8 +2,6 @@
 
 import asyncio
 import socket
-import subprocess
-import sys
 from contextlib import AsyncExitStack
 
 import pytest
@@ -16,7 +14,7 @@ from bridge.hub.errors import HubError
 from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
 from tests.bridge.hub.sockets import RawClient, client, running_hub
-from tests.patience import PATIENCE, PROCESS_PATIENCE
+from tests.patience import PATIENCE
 
 
 @pytest.mark.parametrize("size", [0, 60, 80, 100, 200, 65_400, 65_500, 65_600, 200_000, (1 << 20) - 60])
@@ -146,27 +144,6 @@ def test_the_loop_is_left_as_it_was() -> None:
     port = asyncio.run(life())
     with socket.socket() as sock, pytest.raises(ConnectionRefusedError):
         sock.connect(("127.0.0.1", port))
-
-
-@pytest.mark.thorough
-def test_memory_of_large_messages_is_retained() -> None:
-    """Without `_retain_memory` each burst costs a page fault for most of its pages."""
-    code = """
-import resource
-from bridge.hub.server import _retain_memory
-_retain_memory()
-def faults(): return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-def burst(): [bytearray(17_000) for _ in range(200)]
-burst()
-before = faults()
-for _ in range(100):
-    burst()
-print(faults() - before)
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, check=True, timeout=PROCESS_PATIENCE
-    )
-    assert int(done.stdout) < 10_000
 
 
 async def test_a_delayed_hub_closes_no_client() -> None:

@@ -3,14 +3,11 @@
 import asyncio
 from typing import Any
 
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 
 from tests.bridge.hub.sockets import RawClient, client, running_hub
-
-pytestmark = pytest.mark.usefixtures("either_reader")
 
 
 @given(

@@ -150,7 +150,7 @@ cuts = st.lists(st.integers(1, 300) | st.integers(1, 5), max_size=60)
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @pytest.mark.asyncio(loop_factories=["asyncio"])
 async def test_client_reads_any_stream_as_the_library_does(
-    plain: None, either_reader: None, stream: bytes, cuts: list[int], idle: int, apart: bool, closed: int
+    plain: None, stream: bytes, cuts: list[int], idle: int, apart: bool, closed: int
 ) -> None:
     """After every piece: the same messages, the same answers, the same state, the same reason.
 

@@ -17,8 +17,6 @@ import pytest
 from bridge.client import State, connect
 from tests.bridge.client.tcp_service import tcp_service
 
-pytestmark = pytest.mark.usefixtures("either_reader")
-
 _GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 
 
