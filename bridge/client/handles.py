@@ -9,7 +9,7 @@ from math import inf
 from typing import Any, Final, Self
 
 from bridge.client.protocol.events import ServiceRequested
-from bridge.client.protocol.subscription_options import Delivery
+from bridge.client.protocol.subscriptions import Delivery
 from bridge.client.session import Message, Session, State
 from bridge.codecs.message_check import MessageCheck
 from bridge.errors import (
@@ -124,14 +124,13 @@ class Subscription(Handle):
         self._number = session.core.subscriptions.subscribe(
             topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length, delivery=delivery
         )
-        session.receivers[self._number] = self._receive
-        session.watchers[self._number] = self
+        session.readers[self._number] = self
         self._left_out = session.why_left_out() if session.core.subscriptions.has_left_out(topic) else ""
-        session.on_blind.add(self._add_blind_seconds)
         self._register()
         session.watch_silence()
 
-    def _receive(self, message: Message) -> None:
+    def receive(self, message: Message) -> None:
+        """Queue a message."""
         queue = self._queue
         if self._blind:
             message = message._replace(blind_seconds=self._blind)
@@ -154,7 +153,8 @@ class Subscription(Handle):
         self._left_out = reason
         self._wake()
 
-    def _add_blind_seconds(self, seconds: float) -> None:
+    def add_blind_seconds(self, seconds: float) -> None:
+        """Count time without a connection, after a reconnection."""
         seconds = min(seconds, time.monotonic() - self._begun)
         self._blind += seconds
         self.blind_seconds += seconds
@@ -288,8 +288,7 @@ class Subscription(Handle):
         self._wake()
 
     def _withdraw(self) -> None:
-        del self._session.receivers[self._number], self._session.watchers[self._number]
-        self._session.on_blind.discard(self._add_blind_seconds)
+        del self._session.readers[self._number]
         self._session.core.subscriptions.unsubscribe(self._number)
 
 

@@ -15,7 +15,6 @@ from ssl import SSLContext
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from bridge.client.actions import ActionServer, Goal, GoalHandler
-from bridge.client.graph import NodeDetails, Params, ask_definitions, ask_names, ask_node, ask_text
 from bridge.client.handles import (
     PUBLISH_QUEUE_SIZE,
     QUEUE_SIZE,
@@ -26,9 +25,17 @@ from bridge.client.handles import (
 )
 from bridge.client.protocol import ClientCore, Compression, Delivery, RosVersion
 from bridge.client.protocol.events import StatusReceived
+from bridge.client.rosapi import (
+    NodeDetails,
+    Params,
+    TypeChecks,
+    ask_definitions,
+    ask_names,
+    ask_node,
+    ask_text,
+)
 from bridge.client.route import Path, make_route, shown
 from bridge.client.session import Session, State, StateCallback
-from bridge.client.type_checks import TypeChecks
 from bridge.client.websocket import Limits, check_uri
 from bridge.codecs.cbor_codec import Arrays
 from bridge.codecs.json_codec import MAX_SIZE

@@ -25,7 +25,7 @@ from bridge.client.protocol.events import (
     MessageReceived,
     ServiceRequested,
     StatusReceived,
-    Unusable,
+    UnusableReceived,
 )
 from bridge.client.route import Route
 from bridge.client.websocket import CLOSE_TIMEOUT, Limits, Loss, WebSocket, open_websocket
@@ -75,8 +75,27 @@ StateCallback = Callable[[State, str], None]
 Server = Callable[[ServiceRequested], Coroutine[Any, Any, None]]
 
 
+# What a session hands events to. The handles import this module, so it cannot import them.
+
+
+class Reader(Protocol):
+    """One subscription."""
+
+    def receive(self, message: "Message") -> None:
+        """Queue a message."""
+
+    def discard(self) -> None:
+        """Count a message above the topic's limit."""
+
+    def leave_out(self, reason: str) -> None:
+        """End, because a message of the topic was too large for the connection."""
+
+    def add_blind_seconds(self, seconds: float) -> None:
+        """Count time without a connection, after a reconnection."""
+
+
 class GoalReceiver(Protocol):
-    """Receiver of the events of one action goal."""
+    """Sender of one action goal."""
 
     def receive(self, event: GoalFeedback | GoalEnded) -> None:
         """Handle an event of the goal."""
@@ -93,16 +112,6 @@ class GoalExecutor(Protocol):
 
     def lost(self) -> None:
         """Give up the goals of a lost connection."""
-
-
-class TopicWatcher(Protocol):
-    """Subscription that is told about messages that it does not get."""
-
-    def discard(self) -> None:
-        """Count a message above the topic's limit."""
-
-    def leave_out(self, reason: str) -> None:
-        """End, because the topic's messages are too large for the connection."""
 
 
 class Message(NamedTuple):
@@ -142,21 +151,13 @@ class Message(NamedTuple):
 class Session:
     """The connection of a client, over its successive WebSockets.
 
-    Attributes:
-        uri: URI of the server, without secrets.
-        core: The protocol state: advertisements, subscriptions, services and calls.
-        state: State of the connection.
-        reconnections: Number of completed reconnections.
-        last_error: Reason of the lost connection or of the last failed attempt.
-        unusable: Number of unusable messages received.
-        statuses: Latest status messages of the server, newest last.
-        receivers: Callbacks for messages, by number of the subscription.
-        watchers: Subscriptions by their numbers.
-        on_blind: Callbacks for the seconds without connection, after a reconnection.
-        servers: Handlers of requests, by service of this client.
-        action_servers: Servers of goals, by action of this client.
-        goals: Receivers of events, by id of the goal.
-        on_closed: Callbacks for the final close.
+    It owns the clocks and the socket, and moves bytes between socket and `core`, which owns the meaning:
+
+        handle  ->  core  ->  flush  ->  WebSocket  ->  server
+        handle  <-  _take  <-  core  <-  WebSocket  <-  server
+
+    A published message takes the short way: it is encoded by the core, and goes to the socket at once, in its turn.
+    Everything happens in the event loop's thread; between two `await`s nothing changes but by the code itself.
     """
 
     def __init__(
@@ -171,45 +172,77 @@ class Session:
         retry: bool = False,
     ) -> None:
         self.uri = shown_uri
-        self.core = core
-        self.state = State.CONNECTING
-        self.reconnections = 0
-        self.last_error = ""
-        self.unusable = 0
-        self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
-        self._status_at = 0.0
-        self._lost_at = 0.0
-        self._status_count = 0
-        self.receivers: dict[int, Callable[[Message], None]] = {}
-        self.watchers: dict[int, TopicWatcher] = {}
-        self.on_blind: set[Callable[[float], None]] = set()
-        self.servers: dict[str, Server] = {}
-        self.action_servers: dict[str, GoalExecutor] = {}
-        self.goals: dict[str, GoalReceiver] = {}
-        self.on_closed: set[Callable[[], object]] = set()
+        """URI of the server, without secrets."""
         self._parsed_uri = uri
         self._route = route
-        self._retry = retry
-        self._blind_since = 0.0
         self._limits = limits
+        self._retry = retry
+        self.core = core
+        """The protocol state: what the program wants, and what waits for an answer."""
+
+        # State. `_set_state` alone changes `state`, and replaces the event, which wakes those who wait for a change.
+        self.state = State.CONNECTING
+        self._state_changed = asyncio.Event()
         self._on_state = on_state
+        # Set by `open`: the thread of the event loop, which alone may call. None before, when no loop runs yet.
         self._entered = False
         self._thread: int | None = None
+
+        # The connection. There is a WebSocket exactly while the state is CONNECTED, and shortly before and after that.
         self._websocket: WebSocket | None = None
         self._connected_at = 0.0
-        self._delay = FIRST_DELAY
-        self._reconnecting: asyncio.Task[None] | None = None  # the last one, done or not
+        self._lost_at = 0.0
+        # When the lost connection was heard last, from which on messages may be missing.
+        self._blind_since = 0.0
+        self.reconnections = 0
+        """Number of completed reconnections."""
+        self.last_error = ""
+        """Reason of the lost connection or of the last failed attempt; it is kept after a reconnection."""
+
+        # Reconnecting: one task from a loss to the next connection, then done. `_pause` is its present sleep, which
+        # `reconnect_now` cuts short; `_delay` is the next one, which doubles until a connection was steady.
+        self._reconnecting: asyncio.Task[None] | None = None
         self._pause: asyncio.Future[None] | None = None
+        self._delay = FIRST_DELAY
+
+        # Silent subscriptions. The timer runs while a topic is untyped and silent, or typed and silent on an open
+        # connection; the task asks rosapi about the latter, at most one at a time.
         self._retry_timer: asyncio.TimerHandle | None = None
         self._renewal_delay = SILENCE
         self._looking: asyncio.Task[None] | None = None
-        self._largest_sent = 0
-        self._burst = 0
-        self._turn = asyncio.Lock()  # fair: first in, first out
+
+        # Sending. While the socket is full, or somebody waits already, senders wait in order: the lock is fair, and
+        # `_waiting` counts them, so that no later message overtakes them.
+        self._turn = asyncio.Lock()
         self._waiting = 0
-        self._serving: set[asyncio.Task[None]] = set()
+        # Messages since a publisher last let other tasks run, which a full speed loop would starve.
+        self._burst = 0
+        # Size of the largest message on this connection: what a server closes with code 1009 was at most that.
+        self._largest_sent = 0
+
+        # Whom the core's numbers, names and ids mean. Each entry is made with its operation, and removed by its handle
+        # or by the event that ends it; `_fail_calls` empties calls and goals with the connection.
+        self.readers: dict[int, Reader] = {}
+        """By number of the subscription."""
+        self.servers: dict[str, Server] = {}
+        """By absolute name of the service."""
+        self.action_servers: dict[str, GoalExecutor] = {}
+        """By absolute name of the action."""
+        self.goals: dict[str, GoalReceiver] = {}
+        """By id of the goal."""
         self._calls: dict[str, asyncio.Future[CallAnswered]] = {}
-        self._state_changed = asyncio.Event()
+        # Tasks of requests to services; held here, because the event loop holds tasks only weakly.
+        self._serving: set[asyncio.Task[None]] = set()
+        self.on_closed: set[Callable[[], object]] = set()
+        """Callbacks of the handles that are open, for the final close."""
+
+        # For error messages: a program that gets no answer should see what the server said meanwhile.
+        self.unusable = 0
+        """Number of unusable messages received."""
+        self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
+        """Latest status messages of the server, newest last."""
+        self._status_at = 0.0
+        self._status_count = 0
 
     # Opening, losing, closing
 
@@ -285,8 +318,8 @@ class Session:
         self._connected_at = time.monotonic()
         if self.state is State.RECONNECTING:
             self.reconnections += 1
-            for callback in self.on_blind:
-                callback(self._connected_at - self._blind_since)
+            for reader in self.readers.values():
+                reader.add_blind_seconds(self._connected_at - self._blind_since)
         self._largest_sent = 0
         if websocket.largest_accepted is not None:
             self.core.wire.limit(websocket.largest_accepted)
@@ -326,7 +359,7 @@ class Session:
         subscriptions = self.core.subscriptions
         numbers = subscriptions.leave_out(topic)
         for number in numbers:
-            self.watchers[number].leave_out(self.why_left_out())
+            self.readers[number].leave_out(self.why_left_out())
         if numbers:
             return f"; it was one of {topic}, which is left out"
         largest, size = subscriptions.largest
@@ -422,7 +455,7 @@ class Session:
 
     def must_wait(self) -> bool:
         """Return whether a message must wait for its turn; raise an error without a connection."""
-        if get_ident() != self._thread:  # `check_thread` without its call
+        if get_ident() != self._thread:  # `check_thread` without its call, for each message that is published
             self.check_thread()
         return self._connected().paused or self._waiting > 0
 
@@ -435,9 +468,9 @@ class Session:
         return websocket
 
     def send_now(self, data: bytes) -> None:
-        """Write a message to the socket; raise an error without a connection."""
-        wire = self.core.wire
-        self._connected().send((data,) if wire.fragment_size is None else wire.pieces(data))
+        """Write a message to the socket, after `must_wait` or `wait_turn` has found one, without another `await`."""
+        wire, websocket = self.core.wire, self._websocket or self._connected()
+        websocket.send((data,) if wire.fragment_size is None else wire.pieces(data))
         if len(data) > self._largest_sent:  # noqa: PLR1730 - `max` takes ten times as long
             self._largest_sent = len(data)
 
@@ -557,7 +590,7 @@ class Session:
     def _take(self, messages: list[bytes]) -> None:
         received_ns, received_monotonic_ns = time.time_ns(), time.monotonic_ns()
         now = received_monotonic_ns * 1e-9
-        receive, receivers = self.core.receive, self.receivers
+        receive, readers = self.core.receive, self.readers
         for data in messages:
             event = receive(data, now)
             if type(event) is MessageReceived:
@@ -565,7 +598,7 @@ class Session:
                 # The constructor of a named tuple takes three times as long.
                 message = tuple.__new__(Message, (topic, msg, received_ns, received_monotonic_ns, 0.0))
                 for number in subscriptions:
-                    receivers[number](message)
+                    readers[number].receive(message)
             else:
                 self._take_other(event)
 
@@ -573,7 +606,7 @@ class Session:
         match event:
             case MessageDiscarded():
                 for number in event.subscriptions:
-                    self.watchers[number].discard()
+                    self.readers[number].discard()
                 if event.count & (event.count - 1) == 0:
                     _log.warning(
                         "a message of %s has %d bytes, more than its limit of %d, and was discarded; %d so far",
@@ -601,7 +634,7 @@ class Session:
                 if self._status_count <= KEPT_STATUSES or self._status_count & (self._status_count - 1) == 0:
                     level = logging.WARNING if event.level in {"error", "warning"} else logging.INFO
                     _log.log(level, "%s reports (%.20s): %.500s", self.uri, event.level, event.text)
-            case Unusable():
+            case UnusableReceived():
                 self.unusable += 1
                 # Only the 1st, 2nd, 4th, 8th ..., so that a faulty server does not fill the log (as for
                 # statuses).

@@ -36,6 +36,8 @@ _COUNTED: Final = 4096
 """Size in bytes up to which counting a character is faster than searching for each occurrence."""
 _HOPS: Final = 64
 """Number of occurrences of one character to check before searching for the whole word."""
+_SMALL: Final = 6
+"""Number of bytes for each level up to which the size of a message can show that it is not too deep."""
 _N: Final = ord("n")
 """The first byte of `null`; testing for a number is ten times as fast as for a byte string."""
 _NO_BRACKETS: Final = bytes(byte for byte in range(256) if byte not in b"[]{}")
@@ -95,6 +97,11 @@ def is_deeper(data: bytes | str, limit: int) -> bool:
         return False
     if isinstance(data, str):
         data = data.encode("utf-8", "surrogatepass")
+    if len(data) < _SMALL * limit:
+        # A level of an array takes two bytes, and one of an object five (`{"":}`), but for the innermost one (`{}`).
+        arrays = data.count(b"[")
+        if arrays + (len(data) - 2 * arrays + 3) // 5 <= limit:
+            return False
     if not _has_more_brackets(data, limit):
         return False
     if b"\\" in data:

@@ -213,7 +213,10 @@ class WebSocketTransport(asyncio.Protocol):
                 return
             begun = bytes(rest)
             rest.clear()
-            data, at = begun + data[at:], 0
+            # The frame alone, because copying what follows it would take longer than reading that.
+            end = self._read(begun, 0)
+            if end < len(begun):  # interrupted, or no longer quick
+                data, at = begun[end:] + data[at:], 0
         elif self._quick and self._fragments is None:
             message = frames.only_message(data, masked=self._is_server, largest=self._max_size)
             if message is not None:  # the usual case, except in bursts

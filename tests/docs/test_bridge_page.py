@@ -16,10 +16,8 @@ import pytest
 from websockets.asyncio.client import connect as plain_connect
 
 from bridge.client import actions, connect, handles, session, websocket
-from bridge.client.protocol.actions import MAX_SERVED_GOALS
-from bridge.client.protocol.calls import MAX_CALLS
-from bridge.client.protocol.goals import MAX_GOALS
-from bridge.client.protocol.services import MAX_REQUESTS
+from bridge.client.protocol.actions import MAX_GOALS, MAX_SERVED_GOALS
+from bridge.client.protocol.services import MAX_CALLS, MAX_REQUESTS
 from bridge.codecs import fragments, json_codec
 from bridge.hub.access import AccessPolicy
 from tests.bridge.hub.sockets import running_hub

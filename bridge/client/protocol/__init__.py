@@ -1,14 +1,29 @@
-"""The rosbridge client as a state machine without sockets and clocks: objects in, events and bytes out.
+"""The rosbridge client as a state machine without sockets and clocks: bytes and times in, events and bytes out.
 
-It stores the client's advertisements, subscriptions and services, so that `ClientCore.restore` can repeat
-them on a new connection.
+A connection, as the core sees it (`->` is what `ClientCore.data_to_send` returns, `<-` what `ClientCore.receive` gets):
+
+    restore()            ->  {"op": "advertise", "id": "advertise:/cmd:1", "topic": "/cmd", "type": "p/Cmd", ...}
+                         ->  {"op": "advertise_service", "service": "/stop", "type": "p/Stop"}
+                         ->  {"op": "subscribe", "id": "subscribe:/pose:2", "topic": "/pose", "throttle_rate": 0, ...}
+    MessageReceived      <-  {"op": "publish", "topic": "/pose", "msg": {...}}
+    publish()            ->  {"op": "publish", "topic": "/cmd", "msg": {...}}
+    calls.send()         ->  {"op": "call_service", "id": "call_service:/add:3", "service": "/add", "args": {...}}
+    CallAnswered         <-  {"op": "service_response", "id": "call_service:/add:3", "values": {...}, "result": true}
+    ServiceRequested     <-  {"op": "call_service", "id": 7, "service": "/stop", "args": {}}
+    services.answer()    ->  {"op": "service_response", "id": 7, "service": "/stop", "values": {}, "result": true}
+    unsubscribe()        ->  {"op": "unsubscribe", "id": "subscribe:/pose:2", "topic": "/pose"}
+    lost()                   calls, goals and requests are gone; advertisements and subscriptions wait for restore()
+
+There is no handshake of rosbridge, and no confirmation: a server that refuses an operation sends a status at most, so
+what a program wants is state here, which is sent again on each new connection. A message may also be CBOR, or be wrapped
+in fragments or a PNG. Goals of actions go the way of calls, with feedback in between.
 
 Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite), and
 the deviations of servers from it (`docs/reference/rosbridge-differences.md`).
 """
 
 from bridge.client.protocol.client_core import ClientCore
-from bridge.client.protocol.subscription_options import Compression, Delivery
+from bridge.client.protocol.subscriptions import Compression, Delivery
 from bridge.client.protocol.wire import RosVersion
 
 __all__ = ["ClientCore", "Compression", "Delivery", "RosVersion"]

@@ -1,24 +1,109 @@
-"""Actions that a client serves (ROS 2), and the goals that it executes."""
+"""Actions of ROS 2: the active goals of a client, and the actions that it serves.
+
+send_action_goal (id)      ->  server      server  ->  send_action_goal (id)
+cancel_action_goal (id)    ->                      ->  cancel_action_goal (id)
+action_feedback (id) ...  <-                      <-   action_feedback (id) ...
+action_result (id)        <-                      <-   action_result (id)
+"""
 
 from collections.abc import Mapping
 from typing import Any, Final
 
-from bridge.client.protocol.events import CancelRequested, GoalRequested, GoalStatus, Unusable
+from bridge.client.protocol.events import (
+    CancelRequested,
+    GoalEnded,
+    GoalFeedback,
+    GoalRequested,
+    GoalStatus,
+    UnusableReceived,
+)
 from bridge.client.protocol.wire import Wire
-from bridge.codecs.json_codec import excerpt
-from bridge.errors import TypeConflictError
+from bridge.codecs.json_codec import excerpt, text_of
+from bridge.errors import SlowPeerError, TypeConflictError
 from bridge.names import absolute, check_name, ros2_type
 
+MAX_GOALS: Final = 100
+"""Maximum number of active goals."""
 MAX_SERVED_GOALS: Final = 64
 """Maximum number of goals that this client executes; more are aborted."""
 
 
-class Actions:
+class PendingGoals:
+    """Actions of the active goals, by id on the wire."""
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+        # Names by id: events with another id are late, or nobody's, and are ignored. At most `MAX_GOALS`.
+        self._actions: dict[str, str] = {}
+
+    def __len__(self) -> int:
+        return len(self._actions)
+
+    def send(self, action: str, type_name: str, goal: Mapping[str, Any], *, feedback: bool) -> str:
+        """Send a goal (see `bridge.client.Ros.send_goal`), and return its id in events."""
+        check_name(action)
+        if len(self._actions) >= MAX_GOALS:
+            raise SlowPeerError(f"{MAX_GOALS} goals are active, so none was sent to {action}")
+        identity = f"send_action_goal:{action}:{self._wire.number()}"
+        self._wire.write(
+            op="send_action_goal",
+            id=identity,
+            action=action,
+            action_type=ros2_type(type_name, "action"),
+            args=goal,
+            feedback=feedback,
+        )
+        self._actions[identity] = action
+        return identity
+
+    def cancel(self, goal: str) -> None:
+        """Ask the server to cancel a goal; its end shows whether it did. No effect after the end of the goal."""
+        action = self._actions.get(goal)
+        if action is not None:
+            self._wire.write(op="cancel_action_goal", id=goal, action=action)
+
+    def forget(self, goal: str) -> None:
+        """Ignore further events of a goal."""
+        self._actions.pop(goal, None)
+
+    def lost(self) -> None:
+        """Drop the goals of a lost connection, because servers forget their senders."""
+        self._actions.clear()
+
+    def receive(
+        self, operation: dict[str, Any], data: bytes | str
+    ) -> GoalFeedback | GoalEnded | UnusableReceived | None:
+        """Handle an event of a goal; return None if the goal is unknown."""
+        goal = operation.get("id")
+        if not isinstance(goal, str):
+            return UnusableReceived(f"an action's message without the id of a goal arrived: {excerpt(data)}")
+        if goal not in self._actions:
+            return None
+        values = operation.get("values")
+        if operation["op"] == "action_feedback":
+            return GoalFeedback(goal, {} if values is None else values)
+        del self._actions[goal]
+        if operation.get("result", True) is False:
+            return GoalEnded(goal, ok=False, status=GoalStatus.UNKNOWN, values=text_of(values))
+        status = operation.get("status", GoalStatus.SUCCEEDED.value)
+        known = type(status) is int and status in GoalStatus.__members__.values()
+        return GoalEnded(
+            goal,
+            ok=True,
+            status=GoalStatus(status) if known else GoalStatus.UNKNOWN,
+            values={} if values is None else values,
+        )
+
+
+class ServedActions:
     """Types of the actions by name, and the executed goals by their ids on the wire."""
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
+        # By absolute name; what `restore` repeats.
         self._types: dict[str, str] = {}
+        # Names of the actions by the goal's id, which the hub makes unique. Only goals of this connection, because
+        # servers forget who executes a goal.
         self._goals: dict[str, str] = {}
 
     def restore(self) -> None:
@@ -70,19 +155,19 @@ class Actions:
 
     def receive(
         self, operation: dict[str, Any], data: bytes | str
-    ) -> GoalRequested | CancelRequested | Unusable | None:
+    ) -> GoalRequested | CancelRequested | UnusableReceived | None:
         """Handle a goal or its cancellation; return None if it was refused here, or has ended."""
         goal, action, args = operation.get("id"), operation.get("action"), operation.get("args")
         if not isinstance(goal, str) or not isinstance(action, str):
-            return Unusable(f"a goal without an action or an id arrived: {excerpt(data)}")
+            return UnusableReceived(f"a goal without an action or an id arrived: {excerpt(data)}")
         if operation["op"] == "cancel_action_goal":
             served = self._goals.get(goal)
             return None if served is None else CancelRequested(served, goal)
         if goal in self._goals:
-            return Unusable(f"a goal with the id of another arrived: {excerpt(data)}")
+            return UnusableReceived(f"a goal with the id of another arrived: {excerpt(data)}")
         key = absolute(action)
         full = len(self._goals) >= MAX_SERVED_GOALS
-        self._goals[goal] = key
+        self._goals[goal] = key  # also if it is refused, because `end` only answers goals that it knows
         if key not in self._types:
             self.end(goal, GoalStatus.ABORTED, f"action {excerpt(action)} is not served here")
         elif full:

@@ -6,12 +6,10 @@ Nothing is collected without a connection.
 
 from typing import Any
 
-from bridge.client.protocol.actions import Actions
-from bridge.client.protocol.calls import Calls
-from bridge.client.protocol.events import Event, StatusReceived, Unusable
-from bridge.client.protocol.goals import Goals
+from bridge.client.protocol.actions import PendingGoals, ServedActions
+from bridge.client.protocol.events import Event, StatusReceived, UnusableReceived
 from bridge.client.protocol.publications import Publications
-from bridge.client.protocol.services import Services
+from bridge.client.protocol.services import PendingCalls, ServedServices
 from bridge.client.protocol.subscriptions import Subscriptions
 from bridge.client.protocol.wire import RosVersion, Wire
 from bridge.codecs import cbor_codec, png
@@ -23,16 +21,8 @@ from bridge.errors import DecodeError
 class ClientCore:
     """State of a rosbridge client.
 
-    Numbers of advertisements, subscriptions and tickets are never reused.
-
-    Attributes:
-        wire: The outbox.
-        publications: The advertised topics.
-        subscriptions: The subscribed topics.
-        calls: The pending service calls.
-        goals: The active goals.
-        services: The services of this client.
-        actions: The actions of this client.
+    Numbers of advertisements, subscriptions and tickets are never reused, so that an event that is handled late cannot
+    reach something newer.
     """
 
     def __init__(
@@ -46,12 +36,16 @@ class ClientCore:
         self.wire = wire = Wire(
             ros_version=ros_version, max_size=max_size, max_depth=max_depth, fragment_size=fragment_size
         )
+        # What the program wants until it withdraws it: `restore` repeats it on each connection.
         self.publications = Publications(wire)
         self.subscriptions = Subscriptions(wire)
-        self.calls = Calls(wire)
-        self.goals = Goals(wire)
-        self.services = Services(wire)
-        self.actions = Actions(wire)
+        self._receive_known = self.subscriptions.receive_known
+        self.services = ServedServices(wire)
+        self.actions = ServedActions(wire)
+        # What waits for an answer of the server: `lost` drops it, as it drops requests and goals to the two above.
+        self.calls = PendingCalls(wire)
+        self.goals = PendingGoals(wire)
+        # Parts of messages of this connection, bounded in number, size and age.
         self._fragments = Reassembler(max_size=max_size)
 
     @property
@@ -82,26 +76,25 @@ class ClientCore:
         """Empty the outbox, and return its messages in order."""
         return self.wire.take()
 
-    def receive(self, data: bytes | str, now: float) -> Event | None:
+    def receive(self, data: bytes, now: float) -> Event | None:
         """Return the event in a WebSocket message of any content; `now` is in monotonic seconds.
 
         It is None for requests that were refused here, and for messages of topics or calls that no longer
         exist.
         """
-        if type(data) is bytes:
-            subscriptions = self.subscriptions
-            if subscriptions.envelopes:
-                event = subscriptions.receive_known(data)
-                if event is not None:
-                    return event
-            if subscriptions.binary and data[:1] >= b"\x80":  # a CBOR map begins like this, but JSON does not
-                return self._receive_cbor(data, now)
+        # Nearly every message is one of a topic that was heard before.
+        event = self._receive_known(data)
+        if event is not None:
+            return event
+        # A CBOR map begins like this, but JSON does not. Without a subscription as CBOR none is expected.
+        if self.subscriptions.binary and data[:1] >= b"\x80":
+            return self._receive_cbor(data, now)
         try:
             operation = self._decode(data)
             if operation.get("op") in ("fragment", "png"):
                 return self._receive_wrapped(operation, now)
         except DecodeError as error:
-            return Unusable(str(error))
+            return UnusableReceived(str(error))
         return self._receive_plain(operation, now, data)
 
     def _decode(self, data: bytes | str) -> dict[str, Any]:
@@ -116,13 +109,14 @@ class ClientCore:
                 arrays="numpy" if self.subscriptions.numpy else "list",
             )
         except DecodeError as error:
-            return Unusable(str(error))
+            return UnusableReceived(str(error))
         if operation.get("op") == "publish":
             return self.subscriptions.receive(operation, now, data, from_cbor=True)
-        return Unusable(f"a CBOR message other than publish arrived: {excerpt(data)}")
+        return UnusableReceived(f"a CBOR message other than publish arrived: {excerpt(data)}")
 
     def _receive_wrapped(self, operation: dict[str, Any], now: float) -> Event | None:
         """Handle a fragment or a PNG, which contain a message, possibly nested."""
+        # Servers send a PNG in fragments; more layers are made only by somebody who means harm.
         wrapped = ["fragment", "png"]
         data: bytes | str | None = None
         while (op := operation.get("op")) in wrapped:
@@ -158,6 +152,6 @@ class ClientCore:
             case "send_action_goal" | "cancel_action_goal":
                 return self.actions.receive(operation, data)
             case str():
-                return Unusable(f"a message with an unknown op arrived: {excerpt(data)}")
+                return UnusableReceived(f"a message with an unknown op arrived: {excerpt(data)}")
             case _:
-                return Unusable(f"a message without an op arrived: {excerpt(data)}")
+                return UnusableReceived(f"a message without an op arrived: {excerpt(data)}")

@@ -51,7 +51,7 @@ class StatusReceived:
 
 
 @dataclass(frozen=True, slots=True)
-class Unusable:
+class UnusableReceived:
     """An unusable message, with the reason as a sentence."""
 
     reason: str
@@ -114,5 +114,5 @@ Event = (
     | GoalEnded
     | GoalRequested
     | CancelRequested
-    | Unusable
+    | UnusableReceived
 )

@@ -16,17 +16,23 @@ from bridge.qos import Qos
 class _Advertised:
     """One topic on the wire, for one or more advertisements of this client."""
 
+    # As the first advertisement asked; all others must agree, but for the queue, which is ROS's affair.
     topic: str
     type: str
     latch: bool
     queue_size: int
     qos: Qos | None
     wire_id: str
-    prefix: bytes  # start of its messages on the wire, which end with a brace
+    prefix: bytes
+    """Start of its messages on the wire, which end with a brace; the envelope is the same for all of them."""
     holders: set[int] = field(default_factory=set)
-    check: MessageCheck | None = None  # of its type, once that is known
-    unchecked: set[int] = field(default_factory=set)  # holders whose first message the check has still to see
-    latched: bytes | None = None  # the last message, repeated after a reconnection
+    """Numbers of the advertisements; never empty while the topic is advertised."""
+    check: MessageCheck | None = None
+    """The check of its type; None until `Publications.define` knows it, and for ever if nobody does."""
+    unchecked: set[int] = field(default_factory=set)
+    """The holders whose first message the check has still to see; empty without a check."""
+    latched: bytes | None = None
+    """The last message of a latched topic, because a server forgets it with the connection."""
 
 
 class Publications:
@@ -34,7 +40,9 @@ class Publications:
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
+        # By type in the form of ROS 1; empty definitions for a type that nobody knows, which is not asked for again.
         self._definitions: dict[str, Definitions] = {}
+        # By absolute name, and by the number that `advertise` has returned; several numbers share an entry.
         self._advertised: dict[str, _Advertised] = {}
         self._advertisements: dict[int, _Advertised] = {}
 
@@ -114,7 +122,11 @@ class Publications:
         advertised = self._advertisements[advertisement]
         prefix = advertised.prefix
         try:
-            if advertised.check is not None and advertisement in advertised.unchecked:
+            if (
+                advertised.unchecked
+                and advertised.check is not None
+                and advertisement in advertised.unchecked
+            ):
                 advertised.check(msg)
                 advertised.unchecked.discard(advertisement)
             body = encode(

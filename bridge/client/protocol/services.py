@@ -1,24 +1,77 @@
-"""Services of a client, and pending requests to them."""
+"""Services: the pending calls of a client, and the services that it serves.
+
+call_service (id)       ->  server      server  ->  call_service (id)
+service_response (id)  <-                      <-   service_response (id)
+"""
 
 from collections.abc import Mapping
 from typing import Any, Final
 
-from bridge.client.protocol.events import ServiceRequested, Unusable
+from bridge.client.protocol.events import CallAnswered, ServiceRequested, UnusableReceived
 from bridge.client.protocol.wire import Wire
-from bridge.codecs.json_codec import excerpt
-from bridge.errors import TypeConflictError
+from bridge.codecs.json_codec import excerpt, text_of
+from bridge.errors import SlowPeerError, TypeConflictError
 from bridge.names import absolute, check_name, split_type
 
+MAX_CALLS: Final = 1000
+"""Maximum number of pending calls."""
 MAX_REQUESTS: Final = 64
 """Maximum number of pending requests; more are refused."""
 
 
-class Services:
+class PendingCalls:
+    """The pending calls, by id on the wire."""
+
+    def __init__(self, wire: Wire) -> None:
+        self._wire = wire
+        # The ids: an answer with another one is late, or nobody's, and is ignored. At most `MAX_CALLS`.
+        self._waiting: set[str] = set()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def send(self, service: str, args: Mapping[str, Any]) -> str:
+        """Call a service, unless `MAX_CALLS` calls are pending; return the id for its `CallAnswered`."""
+        check_name(service)
+        if len(self._waiting) >= MAX_CALLS:
+            raise SlowPeerError(f"{MAX_CALLS} service calls are pending, so {service} is not called")
+        call = f"call_service:{service}:{self._wire.number()}"
+        self._wire.write(op="call_service", id=call, service=service, args=args)
+        self._waiting.add(call)
+        return call
+
+    def forget(self, call: str) -> None:
+        """Stop waiting for an answer; a late one is ignored."""
+        self._waiting.discard(call)
+
+    def lost(self) -> None:
+        """Drop the calls of a lost connection."""
+        self._waiting.clear()
+
+    def receive(self, operation: dict[str, Any], data: bytes | str) -> CallAnswered | UnusableReceived | None:
+        """Handle an answer; return None if no call waits for it."""
+        call = operation.get("id")
+        if not isinstance(call, str):
+            return UnusableReceived(f"a service_response without the id of a call arrived: {excerpt(data)}")
+        if call not in self._waiting:
+            return None
+        self._waiting.discard(call)
+        values = operation.get("values")
+        # Some servers omit `result` on success.
+        if operation.get("result", True) is False:
+            return CallAnswered(call, ok=False, values=text_of(values))
+        return CallAnswered(call, ok=True, values={} if values is None else values)
+
+
+class ServedServices:
     """Types of the services by name, and requests by ticket; tickets are never reused."""
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
+        # By absolute name; what `restore` repeats.
         self._types: dict[str, str] = {}
+        # Name and id on the wire by ticket. The id is the caller's, of any JSON type, and two callers may use the same,
+        # so the program gets a ticket. Only requests of this connection: an answer to another server has no meaning.
         self._requests: dict[int, tuple[str, Any]] = {}
 
     def __contains__(self, service: str) -> bool:
@@ -74,13 +127,15 @@ class Services:
         self._wire.write(op="service_response", service=service, result=ok, **answer, **identity)
         del self._requests[ticket]
 
-    def receive(self, operation: dict[str, Any], data: bytes | str) -> ServiceRequested | Unusable | None:
+    def receive(
+        self, operation: dict[str, Any], data: bytes | str
+    ) -> ServiceRequested | UnusableReceived | None:
         """Handle a request; return None if it was refused here."""
         service = operation.get("service")
         args = operation.get("args")
         wire_id = operation.get("id")
         if not isinstance(service, str) or not isinstance(wire_id, str | int | None):
-            return Unusable(
+            return UnusableReceived(
                 f"a call_service without a service or with an invalid id arrived: {excerpt(data)}"
             )
         ticket = self._wire.number()

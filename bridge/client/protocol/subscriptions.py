@@ -6,19 +6,22 @@ Some servers deliver a first message twice, or not at all, to a client that subs
 import sys
 from dataclasses import dataclass, field
 from operator import itemgetter
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import orjson
 
-from bridge.client.protocol.events import MessageDiscarded, MessageReceived, Unusable
-from bridge.client.protocol.subscription_options import Delivery
-from bridge.client.protocol.wire import RosVersion, Wire
+from bridge.client.protocol.events import MessageDiscarded, MessageReceived, UnusableReceived
+from bridge.client.protocol.wire import RosVersion, Wire, check_fragment_size
 from bridge.codecs.arrays import with_arrays, with_lists
+from bridge.codecs.cbor_codec import Arrays
 from bridge.codecs.envelope import BRACE, envelope_of, topic_of
 from bridge.codecs.json_codec import excerpt, is_deeper
 from bridge.errors import OptionError, TypeConflictError
 from bridge.names import absolute, check_name, same_type, split_type
+from bridge.qos import Qos
 from bridge.stamps import ros_version_of_message
+
+Compression = Literal["none", "png", "cbor", "cbor-raw"]
 
 _OF_ENVELOPE: Final = 3
 """Keys of an operation with a recognisable envelope: op, topic and msg."""
@@ -26,13 +29,47 @@ _ENVELOPES: Final = 8
 """Maximum number of envelopes tried for one topic, because some servers never repeat one."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Delivery:
+    """Delivery of messages, shared by all subscriptions of a client to one topic.
+
+    Attributes:
+        compression: `cbor` for long arrays, `cbor-raw` for only the serialised bytes, `png` for ROS 1 servers
+            over slow networks. Many servers ignore an unknown value and send JSON.
+        arrays: Python type of arrays of numbers, regardless of the encoding.
+        fragment_size: Maximum number of characters in a fragment; None for whole messages. Servers apply the
+            last value that a client requested to everything they send to it.
+        qos: Quality of service in ROS 2.
+        max_bytes: Maximum size of a message in bytes; larger ones are discarded. None for that of the connection.
+    """
+
+    compression: Compression = "none"
+    arrays: Arrays = "list"
+    fragment_size: int | None = None
+    qos: Qos | None = None
+    max_bytes: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, choices in (("compression", get_args(Compression)), ("arrays", get_args(Arrays))):
+            if getattr(self, name) not in choices:
+                raise OptionError(f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}")
+        check_fragment_size(self.fragment_size)
+        if self.max_bytes is not None and (type(self.max_bytes) is not int or self.max_bytes < 1):
+            raise OptionError(
+                f"max_bytes must be a whole number of at least 1, or None, not {self.max_bytes!r}"
+            )
+        if self.compression == "cbor-raw" and self.arrays == "numpy":
+            raise OptionError("cbor-raw has bytes instead of arrays: omit arrays")
+
+
 @dataclass(slots=True)
 class _Wanted:
-    """Options of one subscription; `due` is the time at which its throttle admits the next message."""
+    """Options of one subscription."""
 
     throttle_rate: int
     queue_length: int
     due: float = 0.0
+    """Time at which its throttle admits the next message; used only if it is slower than that of the topic."""
 
 
 @dataclass(slots=True)
@@ -41,21 +78,34 @@ class _Subscribed:
 
     topic: str
     type: str | None
+    """The first type that a subscription names; None while none does, and the server chooses."""
     delivery: Delivery
     wire_id: str
     max_size: int
     wanted: dict[int, _Wanted] = field(default_factory=dict)
+    """The subscriptions by number; never empty while the topic is subscribed to."""
+
+    # What the server was asked for last, from `combine`: it follows `wanted` at each change of that.
     throttle_rate: int = 0
     queue_length: int = 0
     all_numbers: tuple[int, ...] = ()
+    """The keys of `wanted`, ready for the event of a message, which nearly always goes to all of them."""
     has_throttled: bool = False
+    """Whether a subscription wants fewer messages than the server sends, so that each must be asked."""
+
+    # About the present connection; `restore` sets them back.
     has_messages: bool = False
+    """Whether a message has arrived, after which a silent topic is a topic without news."""
     renewals: int = 0
-    as_json: bool = False
-    """True if the subscription requests JSON instead of CBOR."""
+
     envelopes_tried: int = 0
+    """Number of envelopes learnt or refused; at `_ENVELOPES` the search ends."""
+
+    # These outlive a connection: the next one has the same server, and the same messages.
+    as_json: bool = False
+    """Whether the subscription requests JSON instead of CBOR, because CBOR brought nothing."""
     largest: int = 0
-    """Size of its largest message so far."""
+    """Size of its largest message so far, at most `max_size`: only a larger one is compared with the limits."""
     discarded: int = 0
     left_out: bool = False
     """True after a message that was too large for the connection: the topic is not subscribed to again."""
@@ -69,10 +119,13 @@ class _Subscribed:
         self.has_throttled = any(w.throttle_rate > self.throttle_rate for w in self.wanted.values())
         return before != (self.throttle_rate, self.queue_length)
 
-    def discard(self, topic: str, size: int) -> MessageDiscarded:
-        """Count a message above the limit."""
-        self.discarded += 1
-        return MessageDiscarded(topic, size, self.max_size, self.discarded, self.all_numbers)
+    def measure(self, topic: str, size: int) -> MessageDiscarded | None:
+        """Compare the size of a message with the topic's limit; return the event if it is above."""
+        if size > self.max_size:
+            self.discarded += 1
+            return MessageDiscarded(topic, size, self.max_size, self.discarded, self.all_numbers)
+        self.largest = max(self.largest, size)
+        return None
 
     def receivers(self, now: float) -> tuple[int, ...]:
         """Return the numbers of the subscriptions that receive a message at `now`."""
@@ -104,22 +157,28 @@ _UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, Delivery(), "", s
 class Subscriptions:
     """All subscriptions of a client.
 
-    Attributes:
-        seen_version: ROS version of the server according to header stamps in its messages.
-        binary: Whether any topic is subscribed as CBOR.
-        numpy: Whether any topic is subscribed with NumPy arrays.
-        envelopes: The known envelopes of messages.
+    The way of a message is the busiest of the client: `receive_known` reads it if it begins with the envelope of an
+    earlier one, and `receive` if not, from the parsed operation. Everything that a message does not change is worked
+    out when subscriptions change, and both rely on it.
     """
 
     def __init__(self, wire: Wire) -> None:
-        self.seen_version: RosVersion | None = None
-        self.binary = False
-        self.numpy = False
-        self.envelopes: dict[bytes, _Known] = {}
-        self._known = _UNKNOWN  # the last of these
         self._wire = wire
+        # By absolute name, and by the number that `subscribe` has returned; several numbers share an entry.
         self._subscribed: dict[str, _Subscribed] = {}
         self._subscriptions: dict[int, _Subscribed] = {}
+        self.seen_version: RosVersion | None = None
+        """ROS version of the server according to header stamps in its messages; the first one decides."""
+        # From the deliveries of all topics, so that a message is asked only if it may matter (`_note_deliveries`).
+        self.binary = False
+        """Whether any topic is subscribed as CBOR."""
+        self.numpy = False
+        """Whether any topic is subscribed with NumPy arrays."""
+        self.envelopes: dict[bytes, _Known] = {}
+        """The known envelopes of messages; emptied when subscriptions or the connection change."""
+        # The last of these that was used: the next message is most likely one of the same topic. Never one that is
+        # not in `envelopes`, except for the placeholder.
+        self._known = _UNKNOWN
 
     def restore(self) -> None:
         """Subscribe to everything on a new connection."""
@@ -147,7 +206,8 @@ class Subscriptions:
         if type_name is not None:
             split_type(type_name)
         for name, value in (("throttle_rate", throttle_rate), ("queue_length", queue_length)):
-            if type(value) is not int or value < 0:  # servers silently drop a subscription with a float here
+            # Servers silently drop a subscription with a float here, and `True` is not meant.
+            if type(value) is not int or value < 0:
                 raise OptionError(
                     f"{name} of topic {topic} must be a whole number of at least 0, not {value!r}"
                 )
@@ -270,6 +330,7 @@ class Subscriptions:
         if subscribed is None or subscribed.has_messages:
             return False
         subscribed.renewals += 1
+        # The first renewal is for quality of service, so only the second one is for the encoding.
         gives_up_cbor = (
             subscribed.renewals > 1 and subscribed.delivery.compression == "cbor" and not subscribed.as_json
         )
@@ -280,22 +341,23 @@ class Subscriptions:
 
     def receive_known(self, data: bytes) -> MessageReceived | MessageDiscarded | None:
         """Handle a message with a known envelope; return None if `receive` has to handle it."""
-        known = self._known
-        if not data.startswith(known.envelope):
+        envelope, size, topic, subscribed = self._known
+        if not data.startswith(envelope):
             found = self.envelopes.get(envelope_of(data))
             if found is None:
                 return None
-            self._known = known = found
-        subscribed = known.subscribed
+            self._known = found
+            envelope, size, topic, subscribed = found
+        # Only what `receive` would do too: whatever needs a closer look is left to it.
         if len(data) > subscribed.largest:
             if len(data) > self._wire.max_size:
                 return None
-            subscribed.largest = len(data)
-        if len(data) > subscribed.max_size:
-            return subscribed.discard(known.topic, len(data))
+            discarded = subscribed.measure(topic, len(data))
+            if discarded is not None:
+                return discarded
         if data[-1] != BRACE or subscribed.has_throttled:
             return None
-        message = data[known.size : -1]
+        message = data[size:-1]
         try:
             msg = orjson.loads(message)
         except orjson.JSONDecodeError:
@@ -305,7 +367,7 @@ class Subscriptions:
         if self.numpy and subscribed.delivery.arrays == "numpy":
             msg = with_arrays(msg)
         # The constructor of a named tuple takes three times as long.
-        return tuple.__new__(MessageReceived, (known.topic, msg, subscribed.all_numbers))
+        return tuple.__new__(MessageReceived, (topic, msg, subscribed.all_numbers))
 
     def _learn_envelope(self, data: bytes, topic: str, subscribed: _Subscribed) -> None:
         """Remember the envelope of a topic's messages if it identifies the next one."""
@@ -324,7 +386,7 @@ class Subscriptions:
 
     def receive(
         self, operation: dict[str, Any], now: float, data: bytes | str, *, from_cbor: bool = False
-    ) -> MessageReceived | MessageDiscarded | Unusable | None:
+    ) -> MessageReceived | MessageDiscarded | UnusableReceived | None:
         """Handle a publish, decoded from `data` (from CBOR with arrays according to `numpy`).
 
         None if it is not subscribed, or throttled.
@@ -332,13 +394,14 @@ class Subscriptions:
         topic = operation.get("topic")
         msg = operation.get("msg")
         if type(topic) is not str or type(msg) is not dict:
-            return Unusable(f"a publish without a topic or a message object arrived: {excerpt(data)}")
+            return UnusableReceived(f"a publish without a topic or a message object arrived: {excerpt(data)}")
         subscribed = self._subscribed.get(topic) or self._subscribed.get(absolute(topic))
         if subscribed is None:
             return None
         if not subscribed.has_messages:
             subscribed.has_messages = True
             self.seen_version = self.seen_version or ros_version_of_message(msg)
+        # A message out of CBOR, a fragment or a PNG has no envelope in `data`.
         if (
             type(data) is bytes
             and len(operation) == _OF_ENVELOPE
@@ -346,12 +409,13 @@ class Subscriptions:
             and subscribed.envelopes_tried < _ENVELOPES
         ):
             self._learn_envelope(data, topic, subscribed)
-        subscribed.largest = max(subscribed.largest, len(data))
-        if len(data) > subscribed.max_size:
-            return subscribed.discard(topic, len(data))
+        discarded = subscribed.measure(topic, len(data))
+        if discarded is not None:
+            return discarded
         receivers = subscribed.receivers(now)
         if not receivers:
             return None
+        # Once a topic wants arrays, the CBOR of all topics is read with arrays, because the topic is not known before.
         if self.numpy:
             if subscribed.delivery.arrays == "list":
                 msg = with_lists(msg) if from_cbor else msg

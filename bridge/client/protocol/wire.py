@@ -4,9 +4,9 @@ from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Any, Final, Literal
 
-from bridge.client.protocol.subscription_options import check_fragment_size
 from bridge.codecs.fragments import split
 from bridge.codecs.json_codec import encode
+from bridge.errors import OptionError
 from bridge.names import Kind, ros1_type, ros2_type
 
 RosVersion = Literal[1, 2]
@@ -16,30 +16,26 @@ SMALLEST_LIMIT: Final = 2048
 
 
 class Wire:
-    """The outbox for all parts of a client's core.
-
-    Attributes:
-        connected: Whether messages are stored; without a connection they are dropped, because `restore`
-            repeats them.
-        ros_version: ROS version of the server, None while unknown.
-        fragment_size: Maximum number of characters in a message before `pieces` splits it; None for no limit.
-        max_size: Maximum size of a message in bytes.
-        sendable: Maximum size of an outbound message, which the server may limit further.
-        max_depth: Maximum nesting of a message.
-        number: Function that returns a new number at each call.
-    """
+    """The outbox for all parts of a client's core, and what they must know of the connection."""
 
     def __init__(
         self, *, ros_version: RosVersion | None, max_size: int, max_depth: int, fragment_size: int | None
     ) -> None:
         check_fragment_size(fragment_size)
-        self.connected = False
-        self.ros_version: RosVersion | None = ros_version
-        self.fragment_size = fragment_size
-        self.max_size = self.sendable = max_size
-        self.max_depth = max_depth
         self._outbox: list[bytes] = []
+        self.connected = False
+        """Whether messages are stored; without a connection they are dropped, because `restore` repeats them."""
+        self.ros_version: RosVersion | None = ros_version
+        """ROS version of the server, as configured or detected; None while unknown."""
         self.number: Callable[[], int] = count(1).__next__
+        """Function that returns a new number at each call, for ids on the wire and for handles of the program."""
+        # Limits that the program has chosen, in both directions.
+        self.fragment_size = fragment_size
+        """Maximum number of characters in a message before `pieces` splits it; None for no limit."""
+        self.max_size = max_size
+        self.max_depth = max_depth
+        self.sendable = max_size
+        """Maximum size of an outbound message in bytes: `max_size`, or what is known of the server's limit if less."""
 
     def type_name(self, name: str, kind: Kind = "msg") -> str:
         """Return a type name in the server's ROS version, or if unknown in ROS 1, which all servers accept."""
@@ -75,3 +71,9 @@ class Wire:
         if self.fragment_size is None or len(data) <= self.fragment_size:
             return (data,)
         return tuple(split(data, self.fragment_size, f"fragment:{self.number()}"))
+
+
+def check_fragment_size(size: int | None) -> None:
+    """Raise an error for a fragment size that is neither None nor a positive integer."""
+    if size is not None and (type(size) is not int or size < 1):
+        raise OptionError(f"fragment_size must be a whole number of at least 1, or None, not {size!r}")

@@ -4,7 +4,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from bridge.client import Ros, connect, session, type_checks
+from bridge.client import Ros, connect, rosapi, session
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 
@@ -12,7 +12,7 @@ from tests.patience import PATIENCE
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Accept an answer of rosapi however late a busy machine gives it."""
-    for module in (type_checks, session):
+    for module in (rosapi, session):
         monkeypatch.setattr(module, "_ROSAPI_TIMEOUT", PATIENCE / 2)
 
 

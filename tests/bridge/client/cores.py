@@ -17,4 +17,4 @@ def sent(core: ClientCore) -> list[dict[str, Any]]:
 
 
 def tell(core: ClientCore, now: float = 0.0, **operation: Any) -> Any:
-    return core.receive(json.dumps(operation), now)
+    return core.receive(json.dumps(operation).encode(), now)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bridge.client import connect
-from bridge.client.graph import NodeDetails
+from bridge.client.rosapi import NodeDetails
 from bridge.codecs.message_check import FieldType
 from bridge.errors import EncodeError, ParamError, ServiceError
 from tests.bridge.hub.sockets import running_hub

@@ -16,15 +16,14 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from bridge.client.protocol import ClientCore, Delivery
-from bridge.client.protocol.calls import MAX_CALLS
 from bridge.client.protocol.events import (
     CallAnswered,
     MessageReceived,
     ServiceRequested,
     StatusReceived,
-    Unusable,
+    UnusableReceived,
 )
-from bridge.client.protocol.services import MAX_REQUESTS
+from bridge.client.protocol.services import MAX_CALLS, MAX_REQUESTS
 from bridge.codecs import png
 from bridge.errors import (
     EncodeError,
@@ -329,7 +328,7 @@ def test_what_is_unusable_says_so(data):
     core = connected()
     core.subscriptions.subscribe("/a", delivery=Delivery(compression="cbor"))
     event = core.receive(data, 0.0)
-    assert isinstance(event, Unusable)
+    assert isinstance(event, UnusableReceived)
     assert 10 < len(event.reason) < 300
 
 
@@ -339,7 +338,7 @@ def test_nonsense_after_the_known_envelopes_were_forgotten():
     core.receive(b'{"op":"publish","topic":"/a","msg":{}}', 0.0)
     assert core.subscriptions.envelopes
     for nonsense in (b"\xff", b"\xff" * 20 + b"}"):
-        assert isinstance(core.receive(nonsense, 0.0), Unusable)
+        assert isinstance(core.receive(nonsense, 0.0), UnusableReceived)
 
 
 def test_a_known_envelope_around_nonsense():
@@ -350,7 +349,7 @@ def test_a_known_envelope_around_nonsense():
         assert core.receive(envelope + body, 0.0) == MessageReceived("/a", msg, (number,))
         assert core.subscriptions.envelopes
     for body in (b"3}", b"{}", b"{}}}", b'{"a":' * 64 + b"1" + b"}" * 65):
-        assert isinstance(core.receive(envelope + body, 0.0), Unusable)
+        assert isinstance(core.receive(envelope + body, 0.0), UnusableReceived)
 
 
 # Any sequence of wishes, losses and messages
@@ -454,7 +453,7 @@ class Wishes(RuleBasedStateMachine):
     @rule(topic=st.sampled_from([*TOPICS, "/c"]), step=st.sampled_from([0.0, 0.05, 0.2, 2.0]))
     def message(self, topic: str, step: float) -> None:
         self.now += step
-        event = self.core.receive(json.dumps({"op": "publish", "topic": topic, "msg": {}}), self.now)
+        event = self.core.receive(json.dumps({"op": "publish", "topic": topic, "msg": {}}).encode(), self.now)
         assert event is None or isinstance(event, MessageReceived)
         received = [] if event is None else list(event.subscriptions)
         assert len(set(received)) == len(received)

@@ -12,8 +12,14 @@ import numpy as np
 import pytest
 
 from bridge.client.protocol import ClientCore, Delivery
-from bridge.client.protocol.events import GoalEnded, GoalFeedback, GoalStatus, MessageReceived, Unusable
-from bridge.client.protocol.goals import MAX_GOALS
+from bridge.client.protocol.actions import MAX_GOALS
+from bridge.client.protocol.events import (
+    GoalEnded,
+    GoalFeedback,
+    GoalStatus,
+    MessageReceived,
+    UnusableReceived,
+)
 from bridge.codecs import cbor_codec
 from bridge.codecs.fragments import split
 from bridge.errors import OptionError, SlowPeerError
@@ -98,12 +104,12 @@ def test_topics_of_one_client_that_want_it_differently():
 def test_cbor_that_nobody_asked_for_is_not_read():
     core = connected()
     number = core.subscriptions.subscribe("/a", "p/T")
-    assert isinstance(core.receive(in_cbor({}), 0.0), Unusable)
+    assert isinstance(core.receive(in_cbor({}), 0.0), UnusableReceived)
     core.subscriptions.unsubscribe(number)
     number = core.subscriptions.subscribe("/a", "p/T", delivery=CBOR)
     assert isinstance(core.receive(in_cbor({}), 0.0), MessageReceived)
     core.subscriptions.unsubscribe(number)
-    assert isinstance(core.receive(in_cbor({}), 0.0), Unusable)
+    assert isinstance(core.receive(in_cbor({}), 0.0), UnusableReceived)
 
 
 def test_fragments_of_a_lost_connection_do_not_count():
@@ -202,5 +208,5 @@ def test_goals_are_bounded_and_forgotten_with_the_connection():
     core.lost()
     core.restore()
     assert tell(core, op="action_result", id=goals[1], values={}) is None
-    assert isinstance(tell(core, op="action_result", values={}), Unusable)
-    assert isinstance(tell(core, op="action_feedback", id=5, values={}), Unusable)
+    assert isinstance(tell(core, op="action_result", values={}), UnusableReceived)
+    assert isinstance(tell(core, op="action_feedback", id=5, values={}), UnusableReceived)
