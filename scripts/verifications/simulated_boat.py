@@ -58,14 +58,16 @@ class SimulatedBoat:
     def _failure(self, folder: Path) -> str | None:
         deployment = folder / "boat"
         source = ("--uri", "ws://localhost:9090", "--topic", "/boat", "--type", "boat_msgs/Sensors")
-        boat = Path(__file__).parents[2] / "casestudies" / "boat"
+        root = Path(__file__).parents[2]
+        boat = root / "casestudies" / "boat"
         command = [str(_BIN / "toolchain"), "build", str(boat), "-o", str(deployment), "--partitions", "4"]
         subprocess.run([*command, *source], check=True, capture_output=True, timeout=_COMPILING_S)
         images = [read_image(deployment / "boards" / f"board{at}.bm") for at in range(4)]
         frames = _frames(images[BOARD], self._frames)
         endpoints = [f"unix:{folder}/boards/board{at}.sock" for at in range(4)]
         simulated = f"unix:{folder}/simulated.sock"
-        hardware = ("--engine", self._engine, "-d", str(deployment), "--index", str(BOARD))
+        engine = ("--engine", self._engine, "--hardware", str(root / "build" / "hardware"))
+        hardware = (*engine, "-d", str(deployment), "--index", str(BOARD))
         with (
             _board("--boards", "4", "--directory", str(folder / "boards")),
             _board(*hardware, "--listen", simulated),

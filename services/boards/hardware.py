@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from enum import StrEnum
+from pathlib import Path
 
 from pcie_shim.board.rtl_board import RtlBoard
 from pcie_shim.board.simulation import Simulation
@@ -25,11 +26,12 @@ class Engine(StrEnum):
 class SimulatedHardware:
     """The simulator of an engine, and the boards that use it."""
 
-    def __init__(self, engine: Engine, images: Mapping[int, Image]) -> None:
+    def __init__(self, engine: Engine, folder: Path, images: Mapping[int, Image]) -> None:
         """Choose the simulator (for `rtl` Verilator if it is installed, otherwise GHDL), and compile the images.
 
         Args:
             engine: Not `EMULATED`.
+            folder: Folder of compiled hardware.
             images: Images with which boards will be programmed, by the numbers of the boards, as far as known.
 
         Raises:
@@ -37,6 +39,7 @@ class SimulatedHardware:
             SimulationError: An image cannot be compiled.
         """
         self._images = images
+        self._folder = folder
         self._is_any = engine is Engine.RTL
         if self._is_any:
             self._simulator = Simulator.GHDL if missing(Simulator.VERILATOR.tools) else Simulator.VERILATOR
@@ -67,7 +70,7 @@ class SimulatedHardware:
 
     def _compiled(self, image: Image) -> Compiled:
         try:
-            return compiled(image, self._simulator, say)
+            return compiled(image, self._simulator, self._folder, say)
         except HardwareToolError as error:
             if not self._is_any or self._simulator is Simulator.GHDL:
                 raise SimulationError(str(error)) from error

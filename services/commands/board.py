@@ -45,6 +45,12 @@ def board(
             "rtl is verilator if it is installed, otherwise ghdl.",
         ),
     ] = Engine.EMULATED,
+    hardware: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder into which --engine compiles the hardware of each image, once.", metavar="DIR"
+        ),
+    ] = None,
     index: Annotated[int, typer.Option(min=0, help="Number of the board, for its messages.")] = 0,
     boards: Annotated[
         int | None,
@@ -86,15 +92,15 @@ def board(
             raise SettingsError(
                 f"--directory {directory} can be entered by other users, who could replace the boards' sockets: run chmod 700 {directory}"
             )
-        hardware = _hardware(engine, settings, range(boards))
-        BoardProcesses(directory, boards, restarts, settings, hardware).run()
+        simulated = _simulated(engine, hardware, settings, range(boards))
+        BoardProcesses(directory, boards, restarts, settings, simulated).run()
     name_process(f"board{index}")
     from machines import warm_up
 
     warm_up()
     check_signals()
     endpoint = _endpoint(listen or "", settings.key_file, insecure=insecure)
-    hardware = _hardware(engine, settings, (index,))
+    simulated = _simulated(engine, hardware, settings, (index,))
 
     def on_ready() -> None:
         if PARENT_VARIABLE not in os.environ:  # a master monitors its boards itself
@@ -104,7 +110,7 @@ def board(
         endpoint,
         index,
         run_directory,
-        board=None if hardware is None else hardware.board(index),
+        board=None if simulated is None else simulated.board(index),
         metrics=settings.metrics,
         on_ready=on_ready,
     )
@@ -113,12 +119,18 @@ def board(
     return 0
 
 
-def _hardware(engine: Engine, settings: Settings, boards: Collection[int]) -> SimulatedHardware | None:
+def _simulated(
+    engine: Engine, folder: Path | None, settings: Settings, boards: Collection[int]
+) -> SimulatedHardware | None:
     """Return the simulated hardware, compiled for the deployment if one is given; None for emulated boards."""
     if engine is Engine.EMULATED:
         return None
+    if folder is None:
+        raise SettingsError(
+            f"--engine {engine} needs --hardware DIR, a folder into which the hardware is compiled"
+        )
     images = images_of(deployment_for(settings)) if settings.deployment is not None else []
-    return SimulatedHardware(engine, {at: image for at, image in enumerate(images) if at in boards})
+    return SimulatedHardware(engine, folder, {at: image for at, image in enumerate(images) if at in boards})
 
 
 def _endpoint(listen: str, key_file: Path | None, *, insecure: bool) -> Endpoint:

@@ -47,25 +47,23 @@ NOT_COMPARED = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    """A cache of compiled simulations for these tests only."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
+@pytest.fixture(scope="module")
+def compiled_into(tmp_path_factory):
+    """The folder of compiled hardware."""
+    return tmp_path_factory.mktemp("hardware")
 
 
 @contextlib.contextmanager
-def serving(folder, count=1):
+def serving(folder, compiled_into, count=1):
     """Processes of the command `board --engine ghdl`, and their endpoints."""
     endpoints = [f"unix:{folder}/board{at}.sock" for at in range(count)]
     boards = []
     try:
         for at, endpoint in enumerate(endpoints):
-            command = [str(Path(sys.executable).with_name("board")), "--engine", "ghdl", "--listen", endpoint]
+            command = [str(Path(sys.executable).with_name("board")), "--listen", endpoint, "--index", str(at)]
             boards.append(
                 subprocess.Popen(
-                    [*command, "--index", str(at)],
+                    [*command, "--engine", "ghdl", "--hardware", str(compiled_into)],
                     stderr=subprocess.PIPE,
                     text=True,
                     env=os.environ | {"BM_RUN_DIRECTORY": str(folder)},
@@ -83,14 +81,13 @@ def serving(folder, count=1):
 
 @pytest.mark.thorough
 @needs_ghdl
-def test_frames_over_the_link_are_the_same(tmp_path):
+def test_frames_over_the_link_are_the_same(tmp_path, compiled_into):
     parts = images(3, [5, 3], sensor_bits=(3, 4), prior_bits=1)
     random = np.random.default_rng(1)
     reasons = set()
-    SimulatedHardware(
-        Engine.GHDL, dict(enumerate(parts))
-    )  # programming does not wait for a compilation on a busy machine
-    with serving(tmp_path, 2) as (boards, endpoints):
+    # programming does not wait for a compilation on a busy machine
+    SimulatedHardware(Engine.GHDL, compiled_into, dict(enumerate(parts)))
+    with serving(tmp_path, compiled_into, 2) as (boards, endpoints):
         with MiniCluster.open(endpoints, parts) as cluster:
             for number in range(12):
                 addresses = [None if random.random() < 0.2 else int(random.integers(top)) for top in (7, 15)]
@@ -116,10 +113,10 @@ def test_frames_over_the_link_are_the_same(tmp_path):
 
 @pytest.mark.thorough
 @needs_ghdl
-def test_a_killed_simulation_is_an_error_of_the_board(tmp_path):
+def test_a_killed_simulation_is_an_error_of_the_board(tmp_path, compiled_into):
     part = image(never_stopping())
-    SimulatedHardware(Engine.GHDL, {0: part})
-    with serving(tmp_path) as ((board,), endpoints):
+    SimulatedHardware(Engine.GHDL, compiled_into, {0: part})
+    with serving(tmp_path, compiled_into) as ((board,), endpoints):
         with MiniCluster.open(endpoints, [part]) as cluster:
             (hardware,) = psutil.Process(board.pid).children()
             cluster.post(FrameInput(addresses=(1,), target_count=2**32 - 1, max_cycles=1 << 40))
@@ -134,10 +131,13 @@ def test_a_killed_simulation_is_an_error_of_the_board(tmp_path):
 
 @pytest.mark.thorough
 @needs_ghdl
-def test_the_simulation_ends_with_a_killed_board(tmp_path):
+def test_the_simulation_ends_with_a_killed_board(tmp_path, compiled_into):
     part = image(never_stopping())
-    SimulatedHardware(Engine.GHDL, {0: part})
-    with serving(tmp_path) as ((board,), endpoints), MiniCluster.open(endpoints, [part]) as cluster:
+    SimulatedHardware(Engine.GHDL, compiled_into, {0: part})
+    with (
+        serving(tmp_path, compiled_into) as ((board,), endpoints),
+        MiniCluster.open(endpoints, [part]) as cluster,
+    ):
         (hardware,) = psutil.Process(board.pid).children()
         cluster.post(FrameInput(addresses=(1,), target_count=2**32 - 1, max_cycles=1 << 40))
         board.kill()
@@ -145,10 +145,10 @@ def test_the_simulation_ends_with_a_killed_board(tmp_path):
         hardware.wait(PROCESS_PATIENCE)
 
 
-def both_boards(of):
+def both_boards(of, compiled_into):
     """An emulated and a simulated board with an image."""
     content = image_bytes(image(of))
-    simulated = SimulatedHardware(Engine.GHDL, {}).board(0)
+    simulated = SimulatedHardware(Engine.GHDL, compiled_into, {}).board(0)
     emulated = EmulatedBoard()
     for board in (emulated, simulated):
         deadline = time.monotonic() + PROCESS_PATIENCE
@@ -186,12 +186,12 @@ def answered(board, access, *arguments):
     ],
     ids=["plain", "written prior", "replicas of cells"],
 )
-def test_accesses_are_answered_and_refused_alike(parameters):
+def test_accesses_are_answered_and_refused_alike(parameters, compiled_into):
     of = machine(5, **parameters)
     plain = of.parameters.sensor_mode is SensorMode.COLUMN
     inputs = rm.SENSORS if plain else rm.INPUTS
     words = int(np.prod(of.parameters.input_shape))
-    emulated, simulated = both_boards(of)
+    emulated, simulated = both_boards(of, compiled_into)
     random = np.random.default_rng(2)
     places = [
         *(block.address for block in rm.BLOCKS),
@@ -235,8 +235,8 @@ def test_accesses_are_answered_and_refused_alike(parameters):
 
 @pytest.mark.thorough
 @needs_ghdl
-def test_a_running_board_is_busy_until_it_is_released():
-    emulated, simulated = both_boards(never_stopping())
+def test_a_running_board_is_busy_until_it_is_released(compiled_into):
+    emulated, simulated = both_boards(never_stopping(), compiled_into)
     with contextlib.closing(simulated):
         for board in (emulated, simulated):
             board.write(rm.TARGET_COUNT, struct.pack("<IQIIQI", 2**32 - 1, 2**40, 0, 0, 0, 1))
@@ -253,9 +253,9 @@ def test_a_running_board_is_busy_until_it_is_released():
 
 @pytest.mark.thorough
 @needs_ghdl
-def test_an_image_that_is_loaded_again_replaces_the_hardware():
+def test_an_image_that_is_loaded_again_replaces_the_hardware(compiled_into):
     first, second = image(machine(1)), image(machine(2))
-    board = SimulatedHardware(Engine.GHDL, {0: first}).board(0)
+    board = SimulatedHardware(Engine.GHDL, compiled_into, {0: first}).board(0)
     with contextlib.closing(board):
         board.prepare(first)
         for number, part in enumerate((first, second, second), start=1):
@@ -268,11 +268,11 @@ def test_an_image_that_is_loaded_again_replaces_the_hardware():
 
 @pytest.mark.thorough
 @needs_ghdl
-def test_a_machine_that_exists_only_emulated_is_refused(tmp_path):
+def test_a_machine_that_exists_only_emulated_is_refused(tmp_path, compiled_into):
     ideal = image(machine(1, rng=RngKind.IDEAL))
     with pytest.raises(SimulationError):
-        SimulatedHardware(Engine.GHDL, {0: ideal})
-    with serving(tmp_path) as (_, endpoints), pytest.raises(BoardError) as raised:
+        SimulatedHardware(Engine.GHDL, compiled_into, {0: ideal})
+    with serving(tmp_path, compiled_into) as (_, endpoints), pytest.raises(BoardError) as raised:
         MiniCluster.open(endpoints, [ideal])
     assert not isinstance(raised.value, BoardRefusedError)
     assert raised.value.exit_code == 2
@@ -281,19 +281,19 @@ def test_a_machine_that_exists_only_emulated_is_refused(tmp_path):
 @pytest.mark.parametrize("engine", ["rtl", "ghdl", "verilator"])
 def test_missing_tools_are_named(tmp_path, monkeypatch, engine):
     monkeypatch.setenv("PATH", str(tmp_path))
-    ended = invoke(app, ["--engine", engine, "--listen", f"unix:{tmp_path}/a.sock"])
+    command = ["--engine", engine, "--listen", f"unix:{tmp_path}/a.sock"]
+    assert "--hardware DIR" in invoke(app, command).stderr
+    ended = invoke(app, [*command, "--hardware", tmp_path / "hardware"])
     assert ended.exit_code == 2
     assert "apt-get install ghdl" in ended.stderr
     assert ("verilator g++" in ended.stderr.replace("make ", "")) == (engine == "verilator")
 
 
 @needs_ghdl
-def test_a_cache_of_others_is_not_used(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    (tmp_path / "rosbayes" / "hardware").mkdir(parents=True)
-    (tmp_path / "rosbayes" / "hardware").chmod(0o777)
+def test_a_folder_of_others_is_not_used(tmp_path):
+    tmp_path.chmod(0o777)
     with pytest.raises(SimulationError):
-        SimulatedHardware(Engine.GHDL, {0: image(machine(1))})
+        SimulatedHardware(Engine.GHDL, tmp_path, {0: image(machine(1))})
 
 
 @pytest.mark.thorough
@@ -302,8 +302,7 @@ def test_a_full_disk_is_an_error_of_the_board(tmp_path, monkeypatch):
     def write(*_):
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(simulation, "write_board_files", write)
     with pytest.raises(SimulationError) as raised:
-        SimulatedHardware(Engine.GHDL, {0: image(machine(1))})
+        SimulatedHardware(Engine.GHDL, tmp_path / "hardware", {0: image(machine(1))})
     assert str(tmp_path) in str(raised.value)

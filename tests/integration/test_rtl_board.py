@@ -40,9 +40,8 @@ async def test_once_is_the_same_on_simulated_hardware(stage, tmp_path):
     deployment = build(tmp_path / "small", tmp_path / "built")
     _, uri = await stage.hub()
     boards = stage.where / "b"
-    environment = {"XDG_CACHE_HOME": str(tmp_path)}
-    command = ("board", "--engine", "ghdl", "-d", str(deployment), "--directory", str(boards))
-    hardware = stage.start(*command, environment=environment)
+    engine = ("--engine", "ghdl", "--hardware", str(tmp_path / "hardware"))
+    hardware = stage.start("board", *engine, "-d", str(deployment), "--directory", str(boards))
     await hardware.says("board 0 listens")
     found = []
     async with Robot(uri) as robot:

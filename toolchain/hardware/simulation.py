@@ -1,11 +1,10 @@
-"""Simulations of a board's hardware, compiled once for each image and kept in the user's cache."""
+"""Simulations of a board's hardware, compiled once for each image into a folder that the user names."""
 
 import hashlib
 import os
 import re
 import shutil
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -18,11 +17,6 @@ from toolchain.hardware.board_files import MEMORY_FOLDER, board_memories, write_
 from toolchain.hardware.sources import HDL, SOURCES, in_order, verilog
 from toolchain.hardware.tools import HardwareToolError, missing, run_tool
 
-MOST_KEPT: Final = 64
-"""Maximum number of compiled simulations in the cache; the one that was not used for longest is removed."""
-
-_ABANDONED_S: Final = 86400.0
-"""Age at which the folder of an interrupted compilation is removed."""
 _BUILDING: Final = "building-"
 _TABLE_VHDL: Final = "simulation/bm1_table_textio.vhd"
 _BENCH_VHDL: Final = "simulation/bm1_simulated.vhd"
@@ -70,16 +64,17 @@ def check_tools(simulator: Simulator) -> None:
         )
 
 
-def compiled(image: Image, simulator: Simulator, on_compile: Callable[[str], None]) -> Compiled:
-    """Return the simulation of an image's hardware, after compiling it if it is not in the cache.
+def compiled(image: Image, simulator: Simulator, folder: Path, on_compile: Callable[[str], None]) -> Compiled:
+    """Return the simulation of an image's hardware, after compiling it if the folder does not have it yet.
 
     Args:
         image: Image of the board.
         simulator: The simulator.
+        folder: Folder of compiled hardware, which is created; nobody else may be able to change it.
         on_compile: Called with a sentence before a compilation.
 
     Raises:
-        HardwareToolError: A tool is missing or failed, the machine exists only emulated, or the cache is
+        HardwareToolError: A tool is missing or failed, the machine exists only emulated, or the folder is
             unusable.
     """
     check_tools(simulator)
@@ -87,18 +82,20 @@ def compiled(image: Image, simulator: Simulator, on_compile: Callable[[str], Non
         raise HardwareToolError(
             "rng = ideal exists only emulated: build the deployment with an LFSR or a table"
         )
-    cache = _cache()
-    kept = cache / _key(image, simulator)
     try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = folder.stat()
+        if found.st_uid != os.geteuid() or found.st_mode & 0o022:
+            raise HardwareToolError(
+                f"{folder} can be changed by other users, whose programs would run as yours: name another folder"
+            )
+        kept = folder.absolute() / _key(image, simulator)
         if not kept.is_dir():
             on_compile(f"{simulator} compiles the hardware of image {image.image_hash[:12]} (once) ...")
             _compile(image, simulator, kept)
-            _prune(cache)
-        os.utime(kept)
     except OSError as error:
         raise HardwareToolError(
-            f"{cache} cannot hold the compiled hardware ({error.strerror}): free space, "
-            "or name a folder for caches with XDG_CACHE_HOME"
+            f"{folder} cannot hold the compiled hardware ({error.strerror}): free space, or name another folder"
         ) from None
     if simulator is Simulator.VERILATOR:
         return Compiled((str(kept / _EXECUTABLE),), kept)
@@ -108,7 +105,7 @@ def compiled(image: Image, simulator: Simulator, on_compile: Callable[[str], Non
 
 
 def _compile(image: Image, simulator: Simulator, kept: Path) -> None:
-    """Compile a simulation beside its folder in the cache, so that the folder is complete from the beginning."""
+    """Compile a simulation beside its place, so that what is there is complete."""
     with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=kept.parent, ignore_cleanup_errors=True) as where:
         finished = Path(where) / "finished"
         finished.mkdir()
@@ -154,24 +151,6 @@ def _compile_verilator(image: Image, folder: Path) -> None:
         (folder / MEMORY_FOLDER / f"{memory.name}.hex").write_text(lines, "ascii")
 
 
-def _cache() -> Path:
-    """Return the folder of the compiled simulations, which only this user can change."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    cache = (Path(base) if base.startswith("/") else Path.home() / ".cache") / "rosbayes" / "hardware"
-    try:
-        cache.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = cache.stat()
-    except OSError as error:
-        raise HardwareToolError(
-            f"{cache} cannot be created ({error.strerror}): name a folder for caches with XDG_CACHE_HOME"
-        ) from None
-    if found.st_uid != os.geteuid() or found.st_mode & 0o022:
-        raise HardwareToolError(
-            f"{cache} can be changed by other users, whose programs would run as yours: name another with XDG_CACHE_HOME"
-        )
-    return cache
-
-
 def _key(image: Image, simulator: Simulator) -> str:
     """Return a name that differs if image, sources or tools differ."""
     parts = [f"{simulator} {image.image_hash} {image.partition}"]
@@ -181,15 +160,3 @@ def _key(image: Image, simulator: Simulator) -> str:
     own = [Path(__file__), *sorted((Path(__file__).parents[1] / "outputs").glob("*.py"))]
     parts += [path.read_text("utf-8") for path in [*(HDL / name for name in names), *own]]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
-
-
-def _prune(cache: Path) -> None:
-    """Remove the simulations that were not used for longest, and what interrupted compilations left."""
-    entries = sorted(cache.iterdir(), key=lambda path: path.lstat().st_mtime, reverse=True)
-    abandoned = time.time() - _ABANDONED_S
-    kept = [path for path in entries if not path.name.startswith(_BUILDING)]
-    leftover = [
-        path for path in entries if path.name.startswith(_BUILDING) and path.lstat().st_mtime < abandoned
-    ]
-    for path in [*kept[MOST_KEPT:], *leftover]:
-        shutil.rmtree(path, ignore_errors=True)
