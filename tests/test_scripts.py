@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import os
 import re
-import shutil
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -78,27 +77,3 @@ async def test_a_screen_says_what_it_waits_for_when_nothing_else_comes(terminal,
     saying.cancel()
     with contextlib.suppress(asyncio.CancelledError):
         await saying
-
-
-@pytest.mark.thorough
-def test_setting_up_an_environment_shows_that_it_goes_on(tmp_path):
-    (tmp_path / "scripts").mkdir()
-    shutil.copy(ROOT / "scripts" / "environment", tmp_path / "scripts")
-    for name in ("pyproject.toml", "requirements.lock"):
-        shutil.copy(ROOT / name, tmp_path)
-    slow = tmp_path / "python"
-    said = tmp_path / "said"
-    # it ends when something was said meanwhile
-    waits = f"until grep -q '^\\.\\.' {said}; do sleep 0.1; done"
-    slow.write_text(f'#!/bin/sh\ncase "$*" in *"-m venv"*) {waits}; exit 1 ;; esac\n')
-    slow.chmod(0o755)
-    with said.open("w") as stderr:
-        done = subprocess.run(
-            ["bash", "-c", ". scripts/environment run"],
-            cwd=tmp_path,
-            env=os.environ | {"PYTHON": str(slow)},
-            stderr=stderr,
-            timeout=PROCESS_PATIENCE,
-            check=False,
-        )
-    assert done.returncode == 2

@@ -6,7 +6,6 @@ import pytest
 
 from hdl.test.mutants import MUTANTS
 from hdl.test.project import HDL, SOURCES
-from hdl.test.random_machines import MOST_CELLS, random_case
 from hdl.test.verification import Check, formal, units
 from tests.patience import FACTOR
 
@@ -63,20 +62,3 @@ def test_every_mutant_changes_its_file_in_one_place():
     for mutant in MUTANTS:
         assert (HDL / mutant.file).read_text().count(mutant.right) == 1, mutant.name
         assert mutant.right != mutant.wrong
-
-
-def test_the_matrix_has_every_mode():
-    machines = [random_case(seed).image.machine for seed in range(60)]
-    parameters = [machine.parameters for machine in machines]
-    assert {each.rng for each in parameters} == {"lfsr8", "lfsr16", "lfsr24", "lfsr32", "table"}
-    assert {each.sensor_mode for each in parameters} == {"column", "cell", "threshold"}
-    assert {each.shared for each in parameters} == {True, False}
-    assert {each.prior_mode for each in parameters} == {"table", "written"}
-    assert {each.rng_reset for each in parameters} == {"bank", "free"}
-    assert {each.sensors for each in parameters} == set(range(7))
-    assert max(each.lines for each in parameters) == 64
-    assert {1, 2, 3, 5, 40} <= {each.replicas for each in parameters}
-    assert {1, 32} <= {each.counter_bits for each in parameters}
-    assert {1, 16} <= {each.prob_bits for each in parameters}
-    assert any(each.prior_bits for each in parameters)
-    assert all(each.replicas * each.lines * each.columns <= MOST_CELLS for each in parameters)

@@ -1,31 +1,38 @@
-"""The examples of the client's pages: each runs against a hub, with only addresses and files replaced."""
+"""The examples of the pages run, and give what is printed below them."""
 
 import asyncio
 import contextlib
+import doctest
 import io
 import json
 import re
+import shlex
 import ssl
 import sys
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.main import get_command
 from websockets.asyncio.client import connect as plain_connect
 
-from bridge.client import actions, connect, handles, session, websocket
-from bridge.client.protocol.actions import MAX_GOALS, MAX_SERVED_GOALS
-from bridge.client.protocol.services import MAX_CALLS, MAX_REQUESTS
-from bridge.codecs import fragments, json_codec
+from bridge.client import connect
 from bridge.hub.access import AccessPolicy
+from rosbayes.__main__ import app
 from tests.bridge.hub.sockets import running_hub
 from tests.certificates import issue
+from tests.docs.test_pages import PAGES, ROOT, printed
 from tests.patience import PATIENCE, PROCESS_PATIENCE
+from tests.toolchain.running import TARGET, assert_refused, toolchain
+from toolchain.building.options import read_sources
+from toolchain.deployment import Variable
+from toolchain.errors import ModelError
+from toolchain.models.case_study import load_model
 
-FOLDER = Path(__file__).parents[2] / "docs/how-to"
-GUIDE = "\n".join(path.read_text() for path in sorted(FOLDER.glob("bridge*.md")))
+# The client's pages, each example against a hub, with only addresses and files replaced
+
+GUIDE = "\n".join(text for name, text in sorted(PAGES.items()) if name.startswith("docs/how-to/bridge"))
 EXAMPLES = dict(
     re.findall(r"^###? ([^\n]+)\n(?:(?!^##).)*?^```python\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
 )
@@ -181,26 +188,132 @@ def test_no_example_is_left_out():
     assert len(EXAMPLES) == GUIDE.count("```python")
 
 
-@pytest.mark.parametrize(
-    ("row", "size"),
-    [
-        ("messages that wait in a subscription", str(handles.QUEUE_SIZE)),
-        ("publications of a topic that wait", str(handles.PUBLISH_QUEUE_SIZE)),
-        ("bytes that wait in the socket", f"{websocket.WRITE_LIMIT >> 10} KiB"),
-        ("a message, both ways", f"{json_codec.MAX_SIZE >> 20} MiB"),
-        ("nesting of objects and arrays", str(json_codec.MAX_DEPTH)),
-        ("incomplete fragmented messages", str(fragments.MAX_SETS)),
-        ("fragments of one message", str(fragments.MAX_FRAGMENTS)),
-        ("waiting for the next fragment", f"{fragments.MAX_AGE:g} s"),
-        ("calls that wait for answers", str(MAX_CALLS)),
-        ("active goals", str(MAX_GOALS)),
-        ("goals that this client executes", str(MAX_SERVED_GOALS)),
-        ("feedback that waits in a goal", str(actions.FEEDBACK_QUEUE_SIZE)),
-        ("concurrent requests to services of this client", str(MAX_REQUESTS)),
-        ("the closing handshake", f"{websocket.CLOSE_TIMEOUT:g} s"),
-        ("status messages kept", str(session.KEPT_STATUSES)),
-    ],
+# README and the page about machines
+
+
+def test_the_notebook_of_readme_runs(tmp_path, monkeypatch, capsys):
+    (text,) = [
+        each
+        for each in re.findall(r"^```python\n(.*?)^```", PAGES["README.md"], re.MULTILINE | re.DOTALL)
+        if "build/boat" in each
+    ]
+    (line,) = [
+        each for each in printed(PAGES["README.md"]) if each.startswith("toolchain build casestudies/boat")
+    ]
+    words = [str(ROOT / word) if word.startswith("casestudies") else word for word in shlex.split(line)[1:]]
+    monkeypatch.chdir(tmp_path)
+    command = get_command(app).resolve_command(None, ["toolchain"])[1]
+    command.main(words, standalone_mode=False)
+    capsys.readouterr()
+    exec(text, {})  # noqa: S102 - the page's own program
+    assert capsys.readouterr().out.startswith("('y', 'x') (32, 32)")
+
+
+def test_the_examples_of_machines():
+    # Fences would be taken for output.
+    text = PAGES["docs/reference/machines.md"].replace("```python\n", "\n").replace("```\n", "\n")
+    test = doctest.DocTestParser().get_doctest(text, {}, "machines.md", "machines.md", 0)
+    assert len(test.examples) > 8
+    report = []
+    doctest.DocTestRunner(verbose=False).run(test, out=report.append)
+    assert not report, "".join(report)
+
+
+# The toolchain's pages
+
+DEPLOYMENT, MODELS, TOOLCHAIN = (
+    PAGES[f"docs/{name}.md"] for name in ("reference/deployment", "how-to/models", "reference/toolchain")
 )
-def test_the_table_of_limits_is_true(row, size):
-    (found,) = re.findall(rf"^\| {row}[^|]*\| ([^|]+) \|", GUIDE, re.MULTILINE)
-    assert found == size
+
+
+def test_the_example_is_a_model(tmp_path):
+    example = re.search(r"```python\n(.*?)```", TOOLCHAIN, re.DOTALL)[1]
+    (tmp_path / "model.py").write_text(example)
+    model = load_model(tmp_path, {"cells": "7"})
+    assert model.lines == 7
+    assert [known.name for known in model.known] == ["range", "door"]
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", MODELS, re.DOTALL)
+
+
+def use_fit(path, printed):
+    """Change a model as a page prints it: imports and the head of `model()` before its `...`, and its last line."""
+    imports, signature, last = re.fullmatch(
+        r"(.*?)\n\n\n(def .*?\n)    \.\.\.\n(.*)", printed, re.DOTALL
+    ).groups()
+    text = path.read_text()
+    for old, new in ((r"def model\(.*\n", signature), (r"    return joint\.ask\(.*\n", last)):
+        text, found = re.subn(old, lambda _, new=new: new, text)
+        assert found == 1
+    path.write_text(text.replace("\nimport numpy", f"\n{imports}\nimport numpy", 1))
+
+
+def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    models = tmp_path / "models"
+    for name in ("mymodel", "boiler"):
+        (models / name).mkdir(parents=True)
+    for name, language in (("garden.bif", "bif"), ("mymodel/walks.csv", "csv")):
+        (text,) = blocks(language)
+        (models / name).write_text(text)
+    boiler, fitting = blocks("python")
+    (models / "boiler" / "model.py").write_text(boiler)
+    commands = re.findall(r"^    (toolchain .*)$", MODELS, re.MULTILINE)
+    assert len(commands) == 8
+    for command in commands:
+        if "fit=" in command:
+            use_fit(models / "mymodel" / "model.py", fitting)
+        result = toolchain(*shlex.split(command)[1:])
+        assert result.exit_code == 0, f"{command}\n{result.stderr}"
+    fitted = load_model(models / "mymodel", {"fit": "models/mymodel/walks.toml"})
+    assert fitted.known[0].normal.sigma.max() < 0.2
+
+
+def test_the_boiler_is_a_question_with_the_printed_refusal(tmp_path):
+    example, _ = blocks("python")
+    (tmp_path / "model.py").write_text(example)
+    model = load_model(tmp_path, {"gauge_sigma": "0.3"})
+    assert [dimension.label for dimension in model.searched] == ["pressure", "inside"]
+    (tmp_path / "model.py").write_text(example.replace("searched=[pressure, inside]", "searched=[pressure]"))
+    with pytest.raises(ModelError) as caught:
+        load_model(tmp_path, {})
+    assert f"error: {caught.value}\n" in MODELS
+
+
+def test_the_sources_of_the_deployment_page(tmp_path):
+    (example,) = re.findall(r"^```toml\n(.*?)^```", DEPLOYMENT, re.MULTILINE | re.DOTALL)
+    (tmp_path / "sources.toml").write_text(example)
+    file = read_sources(tmp_path / "sources.toml", "ws://robot:9090")
+    names = ("ahead", "colour", "left", "near", "turn")
+    placed = file.place(tuple(Variable(name=name, bits=3, values=4) for name in names))
+    assert [(each.source, each.path) for each in placed] == [
+        (1, "ranges[0]"),
+        (3, "data[2]"),
+        (1, "ranges[90]"),
+        (0, "range"),
+        (2, "angular_velocity.z"),
+    ]
+    assert file.sources[1].uri == "ws://lidar-computer:9090"
+
+
+@pytest.mark.parametrize("mode", ["cell", "threshold"])
+def test_inspect_explains_the_disparity_model(tmp_path, mode):
+    (example,) = re.findall(r"```python\n(# disparity/model\.py.*?)```", TOOLCHAIN, re.DOTALL)
+    model, out = tmp_path / "disparity", tmp_path / "out"
+    model.mkdir()
+    (model / "model.py").write_text(example)
+    built = toolchain("build", model, "-o", out, *TARGET, "--sensor-mode", mode, "--replicas", 3)
+    assert built.exit_code == 0, built.output
+    looked = toolchain("inspect", out, "--frames", 5)
+    if mode == "threshold":
+        assert_refused(looked, "--model")
+    else:
+        assert looked.exit_code == 0, looked.output
+        assert "5 frames of readings for 3 replicas, drawn from" in looked.stdout
+    named = toolchain("inspect", out, "--frames", 5, "--model", model, "--json")
+    assert named.exit_code == 0, named.output
+    # lines that all read the same would have nothing to be wrong about
+    assert 0.001 < json.loads(named.stdout)["accuracy"]["machine"]["total_variation"]["value"] < 0.1
+    assert_refused(toolchain("inspect", out, "--readings", tmp_path / "r.csv"), "r.csv")
