@@ -18,7 +18,7 @@ SCRIPTS = sorted(path for path in (ROOT / "scripts").iterdir() if path.is_file()
 
 
 PARTS = {
-    "bench": ("bridge", "cycle", "load", "loop", "mrclam"),
+    "bench": ("bridge", "cycle", "load", "mrclam"),
     "verify": ("conformance", "containers", "hdl", "networks", "resources", "rosbridge"),
 }
 PAGES = [(path, part) for path in SCRIPTS for part in ("", *PARTS.get(path.name, ()))]

@@ -1,7 +1,6 @@
 """roslibpy as a client under measurement, with commands of scripts/bench bridge on standard input.
 
-It runs in roslibpy's own environment, so it does not import this project. ROSLIBPY_TRANSPORT selects the
-transport.
+It runs in roslibpy's own environment, so it does not import this project. ROSLIBPY_TRANSPORT selects the transport.
 """
 
 from __future__ import annotations
@@ -16,20 +15,15 @@ from typing import Any
 
 import roslibpy
 
-PATIENCE = 60
+LIMIT = 60
 TYPE = "std_msgs/Float64MultiArray"
 ACK_EVERY = 50
-
-
-def values_of(count: int) -> list[float]:
-    """Return numbers such as sensors measure, with all digits significant."""
-    return [(at + 1) / 7.0 for at in range(count)]
 
 
 def publish(ros: roslibpy.Ros, topic: str, values: int, count: int) -> dict[str, Any]:
     """Publish as fast as possible; the last message is marked."""
     publisher = roslibpy.Topic(ros, topic, TYPE)
-    message = roslibpy.Message({"data": values_of(values)})
+    message = roslibpy.Message({"data": [(at + 1) / 7.0 for at in range(values)]})
     for _ in range(count):
         publisher.publish(message)
     publisher.publish(roslibpy.Message({"data": [-1.0]}))
@@ -37,7 +31,7 @@ def publish(ros: roslibpy.Ros, topic: str, values: int, count: int) -> dict[str,
 
 
 def receive(ros: roslibpy.Ros, topic: str, count: int, compression: str) -> dict[str, Any]:
-    """Receive `count` messages, and print their number from time to time."""
+    """Receive `count` messages, and acknowledge some."""
     heard, acks = threading.Event(), roslibpy.Topic(ros, topic + "/heard", TYPE)
     seen = [0, 0.0]
 
@@ -51,53 +45,47 @@ def receive(ros: roslibpy.Ros, topic: str, count: int, compression: str) -> dict
 
     roslibpy.Topic(ros, topic, TYPE, queue_length=1000, compression=compression).subscribe(on_message)
     ros.get_time()
-    print_answer("ready")
-    if not heard.wait(PATIENCE):
+    print_answer({"ready": True})
+    if not heard.wait(LIMIT):
         raise TimeoutError(f"{seen[0]} of {count} messages came")
     return {"sum": seen[1]}
 
 
 def round_trip(ros: roslibpy.Ros, topic: str, values: int, count: int, compression: str) -> dict[str, Any]:
-    """Publish and receive one message after the other, and print the microseconds of each."""
+    """Publish and receive one message after the other, and return the microseconds of each."""
     back: queue.SimpleQueue[Any] = queue.SimpleQueue()
     publisher = roslibpy.Topic(ros, topic, TYPE)
     listener = roslibpy.Topic(ros, topic, TYPE, compression=compression)
     publisher.advertise()
     listener.subscribe(back.put)
     ros.get_time()
-    data, times = values_of(values), []
+    data, times = [(at + 1) / 7.0 for at in range(values)], []
     for _ in range(count):
         started = time.perf_counter_ns()
         publisher.publish(roslibpy.Message({"data": data}))
-        back.get(timeout=PATIENCE)
+        back.get(timeout=LIMIT)
         times.append((time.perf_counter_ns() - started) / 1e3)
     listener.unsubscribe()
     publisher.unadvertise()
     return {"us": times}
 
 
-def print_answer(answer: object) -> None:
+COMMANDS: dict[str, Callable[..., dict[str, Any]]]
+COMMANDS = {"publish": publish, "receive": receive, "round_trip": round_trip}
+
+
+def print_answer(answer: dict[str, Any]) -> None:
     """Print one line of JSON."""
     print(json.dumps(answer), flush=True)
 
 
-def main() -> None:
-    """Execute the command in each line until end of file."""
+if __name__ == "__main__":
     host, port = sys.argv[1].removeprefix("ws://").split(":")
     ros = roslibpy.Ros(host, int(port))
-    ros.run(PATIENCE)
-    print_answer("connected")
-    do: dict[str, Callable[..., dict[str, Any]]] = {
-        "publish": publish,
-        "receive": receive,
-        "round_trip": round_trip,
-    }
+    ros.run(LIMIT)
+    print_answer({"connected": True})
     for line in sys.stdin:
         command, cpu = json.loads(line), time.process_time()
-        answer = do[command.pop("do")](ros, **command)
+        answer = COMMANDS[command.pop("do")](ros, **command)
         print_answer(answer | {"cpu_s": time.process_time() - cpu})
     ros.terminate()
-
-
-if __name__ == "__main__":
-    main()

@@ -19,7 +19,7 @@ import socket
 import struct
 import threading
 from collections import defaultdict
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import tornado.httpserver
 import tornado.ioloop
@@ -51,19 +51,22 @@ class Layout(Message):
     """std_msgs/MultiArrayLayout."""
 
     fields: ClassVar[dict[str, str]] = {"dim": "Dimension[]", "data_offset": "uint32"}
+    data_offset: int
 
 
 class Float64MultiArray(Message):
     """std_msgs/Float64MultiArray."""
 
     fields: ClassVar[dict[str, str]] = {"layout": "Layout", "data": "float64[]"}
+    layout: Layout
+    data: list[float]
 
 
 TYPES: dict[str, type[Message]] = {"Dimension": Dimension, "Layout": Layout}
 PYTHON_TYPES = {"string": (str,), "uint32": (int,), "float64": (int, float)}
 
 
-def filled(message: Message, values: dict[str, Any]) -> Message:
+def filled(message: Any, values: dict[str, Any]) -> Any:
     """Return a message filled from JSON, or raise an error for a value that does not fit its type."""
     for name, value in values.items():
         setattr(message, name, fitting(message.fields[name], value))
@@ -85,24 +88,7 @@ def taken_out(value: Any) -> Any:
     """Return a message's content for JSON."""
     if isinstance(value, Message):
         return {name: taken_out(getattr(value, name)) for name in value.fields}
-    if isinstance(value, list):
-        return [taken_out(item) for item in value]
-    return value
-
-
-def serialised(message: Any) -> bytes:
-    """Return a Float64MultiArray (without dimensions) as ROS 1 sends it."""
-    data = message.data
-    body = struct.pack(f"<III{len(data)}d", 0, message.layout.data_offset, len(data), *data)
-    return struct.pack("<I", len(body)) + body
-
-
-def deserialised(body: bytes) -> Message:
-    """Return the message in these bytes."""
-    message: Any = Float64MultiArray()
-    _, message.layout.data_offset, count = struct.unpack_from("<III", body)
-    message.data = list(struct.unpack_from(f"<{count}d", body, 12))
-    return cast("Message", message)
+    return [taken_out(item) for item in value] if isinstance(value, list) else value
 
 
 subscribers: dict[str, list[socket.socket]] = defaultdict(list)
@@ -132,31 +118,32 @@ class Connection(tornado.websocket.WebSocketHandler):  # type: ignore[misc]  # t
         return True
 
     def work(self) -> None:
-        """Perform the operation in each message."""
-        while (message := self.incoming.get()) is not None:
-            self.perform(json.loads(message))
-
-    def perform(self, operation: dict[str, Any]) -> None:
-        """Perform one of the operations used in measurements."""
-        if operation["op"] == "publish":
-            data = serialised(filled(Float64MultiArray(), operation["msg"]))
-            with lock:
-                those = list(subscribers[operation["topic"]])
-            for each in those:
-                each.sendall(data)
-        elif operation["op"] == "subscribe":
-            mine, theirs = socket.socketpair()
-            with lock:
-                subscribers[operation["topic"]].append(theirs)
-            threading.Thread(target=self.listen, args=(mine, operation["topic"]), daemon=True).start()
-        elif operation["op"] == "call_service":
-            self.send({"op": "service_response", "id": operation.get("id"), "values": {}, "result": True})
+        """Perform the operations used in measurements."""
+        while (text := self.incoming.get()) is not None:
+            operation = json.loads(text)
+            if operation["op"] == "publish":
+                message: Float64MultiArray = filled(Float64MultiArray(), operation["msg"])
+                count = len(message.data)  # as ROS 1 sends it, without dimensions
+                body = struct.pack(f"<III{count}d", 0, message.layout.data_offset, count, *message.data)
+                with lock:
+                    those = list(subscribers[operation["topic"]])
+                for each in those:
+                    each.sendall(struct.pack("<I", len(body)) + body)
+            elif operation["op"] == "subscribe":
+                mine, theirs = socket.socketpair()
+                with lock:
+                    subscribers[operation["topic"]].append(theirs)
+                threading.Thread(target=self.listen, args=(mine, operation["topic"]), daemon=True).start()
+            elif operation["op"] == "call_service":
+                self.send({"op": "service_response", "id": operation.get("id"), "values": {}, "result": True})
 
     def listen(self, source: socket.socket, topic: str) -> None:
         """Forward the messages of a topic."""
         reader = source.makefile("rb")
         while size := reader.read(4):
-            message = deserialised(reader.read(struct.unpack("<I", size)[0]))
+            body, message = reader.read(struct.unpack("<I", size)[0]), Float64MultiArray()
+            _, message.layout.data_offset, count = struct.unpack_from("<III", body)
+            message.data = list(struct.unpack_from(f"<{count}d", body, 12))
             self.send({"op": "publish", "topic": topic, "msg": taken_out(message)})
 
     def send(self, operation: dict[str, Any]) -> None:
@@ -174,8 +161,7 @@ async def main() -> None:
     sockets = tornado.netutil.bind_sockets(0, "127.0.0.1")
     server = tornado.httpserver.HTTPServer(tornado.web.Application([(r"/.*", Connection)]))
     server.add_sockets(sockets)
-    port = sockets[0].getsockname()[1]
-    print(f"ws://127.0.0.1:{port}", flush=True)
+    print(f"ws://127.0.0.1:{sockets[0].getsockname()[1]}", flush=True)
     await asyncio.Event().wait()
 
 

@@ -39,7 +39,7 @@ def home() -> Path:
     return (Path(cache) if cache else Path.home() / ".cache") / "rosbayes" / "engine"
 
 
-def copy_project(folder: Path, wheels: Path) -> None:
+def copy_project(folder: Path) -> None:
     """Copy the image's sources: the files known to git, and the wheels, because builds here have no network."""
     shutil.rmtree(folder, ignore_errors=True)
     listed = subprocess.run(
@@ -47,48 +47,34 @@ def copy_project(folder: Path, wheels: Path) -> None:
         cwd=ROOT,
         stdout=subprocess.PIPE,
         check=True,
-        timeout=60,
+        timeout=60 * FACTOR,
     ).stdout.decode()
     for name in filter(None, listed.split("\0")):
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(ROOT / name, folder / name)
-    shutil.copytree(wheels, folder / "wheelhouse", copy_function=_link)
-    (folder / "compose.override.yaml").write_text(json.dumps(override(), indent=1) + "\n")
-
-
-def _link(source: str, target: str) -> None:
-    """Link a file instead of copying it, if both are on the same file system."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
-
-
-def override(board_timeout: float = 5 * FACTOR) -> dict[str, object]:
-    """Return a second compose file (JSON is YAML) with limits that a slow machine does not reach."""
+    shutil.copytree(home() / "wheels", folder / "wheelhouse")
+    # JSON is YAML; limits that a slow machine does not reach
     limits = {name: f"{limit:g}" for name, limit in PRODUCT_LIMITS.items()}
-    limits |= {"BM_BOARD_TIMEOUT": f"{board_timeout:g}", "BM_READY_TIMEOUT": f"{10 * FACTOR:g}"}
-    starts = {each: f"{(1 if each == 'hub' else 3) * FACTOR:g}s" for each in PROBED}
-    return {
-        "services": {
-            each: {
-                "stop_grace_period": f"{STOP_GRACE:g}s",
-                "environment": limits,
-                "healthcheck": PROBE | {"start_interval": starts[each]},
-            }
-            for each in PROBED
+    limits |= {"BM_BOARD_TIMEOUT": f"{5 * FACTOR:g}", "BM_READY_TIMEOUT": f"{10 * FACTOR:g}"}
+    services = {
+        name: {
+            "stop_grace_period": f"{STOP_GRACE:g}s",
+            "environment": limits,
+            "healthcheck": PROBE | {"start_interval": f"{(1 if name == 'hub' else 3) * FACTOR:g}s"},
         }
+        for name in PROBED
     }
+    (folder / "compose.override.yaml").write_text(json.dumps({"services": services}))
 
 
-def fetch_wheels(folder: Path) -> None:
+def fetch_wheels() -> None:
     """Download the wheels of the lock file, with hashes checked, for the image's Python.
 
     Raises:
         DownloadError: pip cannot download them.
     """
-    lock = ROOT / "requirements.lock"
+    folder, lock = home() / "wheels", ROOT / "requirements.lock"
     made = folder / ".made"
     stamp = hashlib.sha256(lock.read_bytes()).hexdigest()
     if made.exists() and made.read_text() == stamp:

@@ -14,7 +14,7 @@ import uvloop
 
 from bridge.client import Ros, connect
 
-PATIENCE = 60
+LIMIT = 60
 TYPE = "std_msgs/Float64MultiArray"
 ACK_EVERY = 50
 
@@ -36,16 +36,16 @@ async def publish(ros: Ros, topic: str, values: int, count: int) -> dict[str, An
 
 
 async def receive(ros: Ros, topic: str, count: int, compression: Any) -> dict[str, Any]:
-    """Receive `count` messages, and print their number from time to time."""
+    """Receive `count` messages, and acknowledge some."""
     acks = await ros.advertise(topic + "/heard", TYPE)
     arrays: Any = "numpy" if compression == "cbor" else "list"
     listener = ros.subscribe(
         topic, TYPE, queue_length=1000, queue_size=1000, compression=compression, arrays=arrays
     )
     await ros.call("/rosapi/get_time")
-    print_answer("ready")
+    print_answer({"ready": True})
     total, seen = 0.0, 0
-    async with asyncio.timeout(PATIENCE):
+    async with asyncio.timeout(LIMIT):
         async for message in listener:
             total += message.msg["data"][-1]
             seen += 1
@@ -57,7 +57,7 @@ async def receive(ros: Ros, topic: str, count: int, compression: Any) -> dict[st
 
 
 async def round_trip(ros: Ros, topic: str, values: int, count: int, compression: Any) -> dict[str, Any]:
-    """Publish and receive one message after the other, and print the microseconds of each."""
+    """Publish and receive one message after the other, and return the microseconds of each."""
     publisher = await ros.advertise(topic, TYPE)
     arrays: Any = "numpy" if compression == "cbor" else "list"
     listener = ros.subscribe(topic, TYPE, compression=compression, arrays=arrays)
@@ -66,29 +66,26 @@ async def round_trip(ros: Ros, topic: str, values: int, count: int, compression:
     for _ in range(count):
         started = time.perf_counter_ns()
         await publisher.publish(message)
-        await listener.next(PATIENCE)
+        await listener.next(LIMIT)
         times.append((time.perf_counter_ns() - started) / 1e3)
     await listener.close()
     await publisher.close()
     return {"us": times}
 
 
-def print_answer(answer: object) -> None:
+def print_answer(answer: dict[str, Any]) -> None:
     """Print one line of JSON."""
     print(json.dumps(answer), flush=True)
 
 
 async def main() -> None:
     """Execute the command in each line until end of file."""
-    do: dict[str, Callable[..., Awaitable[dict[str, Any]]]] = {
-        "publish": publish,
-        "receive": receive,
-        "round_trip": round_trip,
-    }
+    do: dict[str, Callable[..., Awaitable[dict[str, Any]]]]
+    do = {"publish": publish, "receive": receive, "round_trip": round_trip}
     lines = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
     async with connect(sys.argv[1]) as ros:
-        print_answer("connected")
+        print_answer({"connected": True})
         while line := await lines.readline():
             command, cpu = json.loads(line), time.process_time()
             answer = await do[command.pop("do")](ros, **command)
