@@ -28,9 +28,9 @@ from rich.console import Console
 from rich.table import Table
 
 from scripts.benches.bare import advertise, bare, publish, settled, soon, subscribe
-from scripts.verifications.installation import install_roslibpy
 from scripts.running.flags import ScriptParser, output_file
 from scripts.running.processes import Process, run_script
+from scripts.verifications.installation import install_roslibpy
 from services.errors import StackError
 
 SIDES = Path(__file__).with_name("bridge_sides")

@@ -188,11 +188,8 @@ def robot(stack: Stack) -> Iterator[None]:
     """Run a boat with a rosbridge server outside the project, as on another machine."""
     here = f"ws://127.0.0.1:{ROBOT_PORT}"
     server = ["hub", "--host", "0.0.0.0", "--insecure", "--port", str(ROBOT_PORT)]  # noqa: S104 - the engine's own network
-    boat = {
-        f"robot-{part}": [f"boat-{part}", "--uri", here, "--connect-timeout", "600"]
-        for part in ("normaliser", "simulator")
-    }
-    with containers(stack, {"robot-hub": server, **boat}):
+    boat = {f"robot-{part}": [f"boat-{part}", "--uri", here] for part in ("normaliser", "simulator")}
+    with containers(stack, {"robot-hub": server, **boat}, "--env", "BM_CONNECT_TIMEOUT=600"):
         yield
 
 

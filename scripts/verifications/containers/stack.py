@@ -168,7 +168,8 @@ class Stack:
 
     @contextlib.contextmanager
     def cleared(self, **variables: str) -> Iterator[None]:
-        """Set variables within the context; save the logs of a failure, and remove the project."""
+        """Remove the project and set variables; at the end, save the logs of a failure and remove it again."""
+        self.down()
         self.variables |= variables
         try:
             yield
