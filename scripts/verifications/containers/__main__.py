@@ -174,6 +174,7 @@ def check_healthy(stack: Stack) -> None:
 @contextlib.contextmanager
 def containers(stack: Stack, commands: dict[str, list[str]], *options: str) -> Iterator[None]:
     """Run containers outside the compose project, in the network of their machine."""
+    stack.docker("rm", "--force", *commands, check=False)  # those of a run that was ended
     try:
         for name, command in commands.items():
             run = ("run", "--detach", "--init", "--name", name, "--network", "host", *options, "rosbayes")
