@@ -10,9 +10,10 @@ from services.pipeline.pcie_app import ROLE, PcieApp
 from services.pipes.lines import require_pipe
 from services.pipes.pcie_app import compute_lines
 from services.settings import Settings
-from services.sockets.reporting import check_metrics, serve_status_in_thread
-from services.sockets.serving import board_endpoints, deployment_for, own_endpoint
+from services.sockets.reporting import check_metrics
+from services.sockets.serving import board_endpoints, deployment_for, listening, own_endpoint
 from terminal.command_line import CommandLine
+from terminal.signals import run_async
 
 app = CommandLine(
     help="Drive the boards of a mini-cluster.\n\n"
@@ -44,10 +45,7 @@ def pcie_app(
     deployed = DeployedBoards(settings, loaded, board_endpoints(settings, loaded), reprogram=reprogram)
     if listen is not None:
         check_metrics(settings.metrics, insecure=insecure)
-        pcie = PcieApp(deployed, own_endpoint(listen, insecure=insecure), settings.log_level)
-        with serve_status_in_thread(
-            settings.run_directory, ROLE, pcie.status, metrics=settings.metrics, is_alive=pcie.is_alive
-        ):
-            return pcie.serve()
+        link = listening(own_endpoint(listen, insecure=insecure), ROLE, loaded)
+        return run_async(PcieApp(settings, deployed, link).run())
     require_pipe(ROLE, "readings")
     return compute_lines(deployed, loaded.machine.rng_banks)

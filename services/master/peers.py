@@ -386,9 +386,7 @@ class Peers:
     def _awaited(self, peer: Peer) -> Awaited | None:
         settings = self._settings
         if not peer.greeted:
-            # pcie-app sends its hello when the boards are open
-            opening = self._compiling_time if peer.role == "pcie-app" else 0.0
-            return Awaited("greet", peer.since, settings.peer_timeout + opening)
+            return Awaited("greet", peer.since, settings.peer_timeout)
         if not peer.ready:
             boards = len(self._deployment.boards)
             limit = settings.connect_timeout + boards * settings.peer_timeout + self._compiling_time

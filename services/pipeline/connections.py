@@ -1,6 +1,5 @@
-"""Connections to the rosbridge servers of a deployment, and reports of failures to the master."""
+"""Connections to the rosbridge servers of a deployment."""
 
-import asyncio
 import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -9,12 +8,6 @@ from typing import Any
 from bridge.client import Ros, State, connect
 from bridge.discovery import announced_uri
 from services.settings import Settings
-from services.sockets.records import Trouble
-from services.sockets.serving import Link
-from terminal.errors import ExitCode, exit_code_of
-
-_REPORT_ATTEMPTS = 100
-_REPORT_INTERVAL = 0.02
 
 OnState = Callable[[str, State, str], None]
 """Callback with the URI of a server, the new state of its connection, and the reason."""
@@ -58,14 +51,3 @@ def reconnect_now(rosbridges: Mapping[str, Ros]) -> None:
     """Try at once to reach the servers that are away: another service has reached one."""
     for ros in rosbridges.values():
         ros.reconnect_now()
-
-
-async def report_failure(link: Link, error: BaseException) -> None:
-    """Send the error that ends a service to its master; a bug is only printed by the service itself."""
-    code = exit_code_of(error)
-    if code == ExitCode.BUG or not isinstance(error, Exception):
-        return
-    for _ in range(_REPORT_ATTEMPTS):  # a master that was started with us may still be connecting
-        if link.send(Trouble(code, str(error))):
-            return
-        await asyncio.sleep(_REPORT_INTERVAL)

@@ -1,217 +1,201 @@
-"""pcie-app, the only process that drives boards (thesis 3.2, figure 3.3).
+"""pcie-app, the only service that drives boards (thesis 3.2, figure 3.3).
 
-One blocking thread serves the master and all boards: it posts the readings and the start of a frame to every
-board, collects the counts, and returns the result.
+    master ──Frame──▶ posted ──the last board is done──────▶ FrameResult ──▶ master
+                        └──a board fails──▶ lost boards are found ──▶ FrameFailed ──▶ master
+
+One frame is on the boards at a time. Slow work (opening boards, finding lost ones, recovering them) runs in a
+thread, and no frame is posted meanwhile.
 """
 
-import selectors
-import socket
+import asyncio
+import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TypeVar
 
-from pcie_shim.endpoint import Endpoint, listen, remove_listener
 from pcie_shim.errors import BoardError, PcieShimError
 from pcie_shim.host.frame import FrameOutput
 from services.boards.deployed import TICK, DeployedBoards
 from services.boards.frames import frame_failed, result_record
-from services.errors import LocalSocketError, OtherPeerError
-from services.sockets.local_socket import BlockingRecordSocket, check_hello, own_hello
-from services.sockets.records import (
-    AnyRecord,
-    Frame,
-    LossReason,
-    Notice,
-    Ready,
-    Record,
-    Trouble,
-)
-from services.sockets.reporting import STUCK_S
-from services.sockets.serving import outdated
+from services.settings import Settings
+from services.sockets.records import AnyRecord, Frame, LossReason, Notice, Ready, Record
+from services.sockets.reporting import serve_status
+from services.sockets.serving import MakeLink, report_failure
 from services.sockets.status import FrameCounts, ProcessStatus, reasons, seconds_since
-from terminal.errors import ExitCode, exit_code_of
 from terminal.logs import get_logger
-from terminal.signals import check_signals
 
 ROLE = "pcie-app"
-
-
-class Progress:
-    """Counts of frames for the status, and their log lines."""
-
-    def __init__(self, boards: DeployedBoards, log_level: str) -> None:
-        self._boards = boards
-        self._logs_frames = log_level == "debug"
-        self._log = get_logger(ROLE, log_level)
-        self._computed = 0
-        self._last: tuple[int, int, FrameOutput] | None = None
-        self.asked = 0
-        self.failed = 0
-        self.ready: Ready | None = None
-
-    def computed(self, number: int, output: FrameOutput) -> None:
-        """Count and log a computed frame."""
-        self._computed += 1
-        self._last = (number, time.monotonic_ns(), output)
-        if self._logs_frames:
-            self._log.debug(
-                "computed",
-                frame=number,
-                cycles=max(board.cycles for board in output.boards),
-                compute_us=output.compute_ns // 1000,
-            )
-
-    def status(self) -> ProcessStatus:
-        """Return the status of this process; may be called from another thread."""
-        number, tick, output = self._last or (0, 0, None)
-        gone = next(iter(dict(self._boards.gone).items()), None)
-        if self.ready is None:
-            why = "waiting for the boards to be opened and programmed"
-        elif gone is not None:
-            why = gone[1]  # the sentence names the board
-        else:
-            why = self.ready.sentence
-        return ProcessStatus(
-            ready=self.ready is not None and gone is None,
-            why=why,
-            deployment=self._boards.deployment.hash,
-            boards=self._boards.status(output),
-            frames=FrameCounts(
-                received=self.asked,
-                completed=self._computed,
-                lost=reasons({LossReason.FAILED: self.failed}),
-                last_number=number or None,
-                last_age_s=seconds_since(tick),
-            ),
-        )
+Result = TypeVar("Result")
 
 
 class PcieApp:
-    """Service for one master at a time over a local socket."""
+    """Service that computes the frames of a master."""
 
-    def __init__(self, boards: DeployedBoards, endpoint: Endpoint, log_level: str = "info") -> None:
+    def __init__(self, settings: Settings, boards: DeployedBoards, link: MakeLink) -> None:
+        self._settings = settings
         self._boards = boards
-        self._deployment = boards.deployment
-        self._endpoint = endpoint
-        self._where = f"{ROLE} at {endpoint}"
-        self._master: BlockingRecordSocket | None = None
-        self._greeted = False
-        self._progress = Progress(boards, log_level)
-        self._selector = selectors.DefaultSelector()
-        self._turned = 0.0
+        self._link = link(self._take)
+        self._logs_frames = settings.log_level == "debug"
+        self._log = get_logger(ROLE, settings.log_level)
+        # Number of the frame on the boards, and of the master that sent it: the result is for no later master.
+        self._posted: tuple[int, int] | None = None
+        # A frame that came while the boards were busy. A master waits for its result before it sends another one,
+        # so the busy frame is that of a former master, or boards are being searched.
+        self._next: Frame | None = None
+        # While boards are searched after a failure. It and `DeployedBoards.recover` never run together.
+        self._searching: asyncio.Task[None] | None = None
+        # The descriptor on whose bytes `_collect` is called: that of the last board that is still running.
+        self._watched: int | None = None
+        # The error of a callback, which ends the service at the next tick.
+        self._error: PcieShimError | None = None
+        # For the status: the sentence once the boards are open, counts of frames, and the last computed one with its time.
+        self._opened = ""
+        self._asked = self._computed = self._failed = 0
+        self._last: tuple[int, int, FrameOutput] | None = None
 
-    def serve(self) -> int:
-        """Serve until a signal raises in this thread.
+    async def run(self) -> int:
+        """Serve until cancelled.
 
         Raises:
             PcieShimError: The boards cannot be opened, or a board came back with another image.
             OutdatedError: A master uses the current content of the folder, and this service an earlier one.
         """
-        listener = listen(self._endpoint)
-        listener.setblocking(False)
-        self._selector.register(listener, selectors.EVENT_READ)
-        try:
+        settings = self._settings
+        status = serve_status(settings.run_directory, ROLE, self.status, metrics=settings.metrics)
+        async with self._link, status:
             try:
-                self._progress.ready = Ready(self._boards.open())
+                self._opened = await _in_thread(self._boards.open)
+                self._link.keep(Ready(self._opened))
                 while True:
-                    check_signals()
-                    self._turned = time.monotonic()
-                    self._poll(listener, TICK)
-                    self._recover_boards()
+                    await asyncio.sleep(TICK)
+                    if self._error is not None:
+                        raise self._error
+                    if self._posted is not None and self._boards.is_late:
+                        self._collect()
+                    elif self._boards.gone and self._searching is None:
+                        for board in await _in_thread(self._boards.recover):
+                            self._link.send(Notice("info", f"board {board} is back, programmed"))
             except PcieShimError as error:
-                self._report(listener, Trouble(exit_code_of(error), str(error)))
+                await report_failure(self._link, error)
                 raise
-        finally:
-            self._boards.close()
-            if self._master is not None:
-                self._master.close()
-            remove_listener(self._endpoint, listener)
-
-    def _poll(self, listener: socket.socket, timeout: float) -> None:
-        """Handle what arrives within `timeout` seconds."""
-        for key, _ in self._selector.select(timeout):
-            if key.fileobj is listener:
-                self._accept(listener)
-            else:
-                self._receive()
-
-    def _accept(self, listener: socket.socket) -> None:
-        connection = BlockingRecordSocket(listener.accept()[0], self._where)
-        if self._master is not None:
-            connection.send(Trouble(ExitCode.USAGE, f"the {self._where} serves another master already"))
-            connection.close()
-            return
-        self._master = connection
-        self._greeted = False
-        self._selector.register(connection, selectors.EVENT_READ)
-        connection.send(own_hello(ROLE, self._deployment.hash))
-
-    def _drop(self) -> None:
-        if self._master is not None:
-            self._selector.unregister(self._master)
-            self._master.close()
-            self._master = None
-
-    def _send(self, record: Record) -> None:
-        if self._master is not None and self._greeted and not self._master.send(record):
-            self._drop()
-
-    def _report(self, listener: socket.socket, trouble: Trouble) -> None:
-        # a master that was started with us may still be connecting
-        deadline = time.monotonic() + 2
-        while not self._greeted and time.monotonic() < deadline:
-            self._poll(listener, 0.05)
-        self._send(trouble)
-
-    def _receive(self) -> None:
-        master = self._master
-        if master is None:
-            return
-        try:
-            records = master.receive()
-            if records is None:
-                self._drop()
-                return
-            for record in records:
-                if not self._greeted:
-                    self._greet(record)
-                elif isinstance(record, Frame):  # other records do not concern boards
-                    self._compute(record)
-        except (LocalSocketError, OtherPeerError) as error:
-            master.send(Trouble(error.exit_code, str(error)))
-            self._drop()
-
-    def _greet(self, record: AnyRecord) -> None:
-        try:
-            check_hello(record, "master", self._deployment.hash, self._where)
-        except OtherPeerError as error:
-            if (reason := outdated(self._deployment, record)) is None:
-                raise
-            if self._master is not None:
-                self._master.send(Trouble(error.exit_code, str(error)))
-            raise reason from error
-        self._greeted = True
-        if self._progress.ready is not None:
-            self._send(self._progress.ready)
+            finally:
+                self._unwatch()
+                if self._searching is not None:
+                    self._searching.cancel()
+                self._boards.close()
 
     def status(self) -> ProcessStatus:
-        """Return the status of this process; called from the thread of the status socket."""
-        return self._progress.status()
+        """Return the status of this process."""
+        number, tick, output = self._last or (0, 0, None)
+        gone = next(iter(dict(self._boards.gone).values()), "")  # the sentence names the board
+        return ProcessStatus(
+            ready=bool(self._opened) and not gone,
+            why=gone or self._opened or "waiting for the boards to be opened and programmed",
+            deployment=self._boards.deployment.hash,
+            boards=self._boards.status(output),
+            frames=FrameCounts(
+                received=self._asked,
+                completed=self._computed,
+                lost=reasons({LossReason.FAILED: self._failed}),
+                last_number=number or None,
+                last_age_s=seconds_since(tick),
+            ),
+        )
 
-    def is_alive(self) -> bool:
-        """Return whether the boards' thread makes progress; opening the boards has its own limits."""
-        return not self._turned or time.monotonic() - self._turned < STUCK_S
+    # --- a frame -------------------------------------------------------------------------------
 
-    def _compute(self, frame: Frame) -> None:
-        progress = self._progress
-        progress.asked += 1
+    def _take(self, record: AnyRecord) -> None:
+        if isinstance(record, Frame):  # other records do not concern boards
+            self._next = record
+            self._post_next()
+
+    def _post_next(self) -> None:
+        frame = self._next
+        if frame is None or self._posted is not None or self._searching is not None:
+            return
+        self._next = None
+        self._posted = frame.number, self._link.masters
+        self._asked += 1
         try:
-            output = self._boards.run(frame)
+            self._boards.post(frame)
         except BoardError as error:
-            progress.failed += 1
-            self._send(frame_failed(frame.number, error))
+            self._fail(error)
+        except PcieShimError as error:
+            self._error = error
         else:
-            self._send(result_record(frame.number, output))
-            progress.computed(frame.number, output)
+            self._watch()
 
-    def _recover_boards(self) -> None:
-        for board in self._boards.recover():
-            self._send(Notice("info", f"board {board} is back, programmed"))
+    def _watch(self) -> None:
+        """Collect when the awaited board has sent bytes."""
+        awaited = self._boards.awaited
+        if awaited != self._watched:
+            self._unwatch()
+            if awaited is not None:
+                asyncio.get_running_loop().add_reader(awaited, self._collect)
+                self._watched = awaited
+
+    def _unwatch(self) -> None:
+        if self._watched is not None:
+            asyncio.get_running_loop().remove_reader(self._watched)
+            self._watched = None
+
+    def _collect(self) -> None:
+        if self._posted is None:
+            # a board that sends unexpected data is closing its link, which the next frame detects
+            self._unwatch()
+            return
+        try:
+            output = self._boards.collect()
+        except BoardError as error:
+            self._fail(error)
+            return
+        if output is None:
+            self._watch()
+            return
+        (number, master), self._posted = self._posted, None
+        self._computed += 1
+        self._last = (number, time.monotonic_ns(), output)
+        if self._logs_frames:
+            cycles = max(board.cycles for board in output.boards)
+            self._log.debug("computed", frame=number, cycles=cycles, compute_us=output.compute_ns // 1000)
+        self._answer(master, result_record(number, output))
+        self._post_next()
+
+    def _fail(self, error: BoardError) -> None:
+        """Search for other lost boards, so that several deaths at once fail one frame, and then report it."""
+        if self._posted is None:
+            return
+        (number, master), self._posted = self._posted, None
+        self._failed += 1
+        self._unwatch()
+
+        async def search() -> None:
+            try:
+                await _in_thread(lambda: self._boards.find_lost_boards(error))
+            finally:
+                self._searching = None
+            self._answer(master, frame_failed(number, error))
+            self._post_next()
+
+        self._searching = asyncio.ensure_future(search())
+
+    def _answer(self, master: int, record: Record) -> None:
+        """Send the result of a frame, unless its master is gone: the next one counts frames from 1 too."""
+        if master == self._link.masters:
+            self._link.send(record)
+
+
+async def _in_thread(work: Callable[[], Result]) -> Result:
+    """Run slow work in a thread that does not delay the end of the process."""
+    done: Future[Result] = Future()
+    done.set_running_or_notify_cancel()  # from now on, cancelling the waiter does not cancel it
+
+    def run() -> None:
+        try:
+            done.set_result(work())
+        except BaseException as error:
+            done.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return await asyncio.wrap_future(done)

@@ -9,7 +9,7 @@ import msgspec
 
 from bridge.client import State
 from bridge.errors import BridgeError
-from services.pipeline.connections import reconnect_now, report_failure
+from services.pipeline.connections import reconnect_now
 from services.pipeline.delivery import CHECK_INTERVAL, SETTLED_TIME, NotReceivableError, refusals
 from services.pipeline.result_topics import RESULTS_DEPTH, ROLE, ResultTopics
 from services.settings import Settings
@@ -23,7 +23,7 @@ from services.sockets.records import (
     Rosbridge,
 )
 from services.sockets.reporting import serve_status
-from services.sockets.serving import MakeLink
+from services.sockets.serving import MakeLink, report_failure
 from services.sockets.status import (
     FrameCounts,
     ProcessStatus,

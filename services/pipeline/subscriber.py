@@ -10,7 +10,7 @@ import msgspec
 from bridge.client import Message, Ros, State, Subscription
 from bridge.errors import BridgeError, NoMessageError, TopicLeftOutError
 from services.errors import RosbridgeLostError, VariableError
-from services.pipeline.connections import connect_all, reconnect_now, report_failure
+from services.pipeline.connections import connect_all, reconnect_now
 from services.pipeline.timed_frames import TimedFrames
 from services.pipeline.unpublished import report_unpublished
 from services.settings import Settings
@@ -26,7 +26,7 @@ from services.sockets.records import (
     Unusable,
 )
 from services.sockets.reporting import serve_status
-from services.sockets.serving import MakeLink
+from services.sockets.serving import MakeLink, report_failure
 from services.sockets.status import (
     FrameCounts,
     ProcessStatus,

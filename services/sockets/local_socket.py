@@ -7,11 +7,9 @@ I/O; it has an asyncio wrapper and a blocking one.
 from __future__ import annotations
 
 import asyncio
-import socket
 import struct
-import time
 from collections.abc import Callable
-from typing import Self, cast
+from typing import cast
 
 import msgspec
 
@@ -164,61 +162,3 @@ async def open_connection(endpoint: Endpoint, make: Callable[[], RecordProtocol]
     else:
         _, protocol = await loop.create_connection(make, endpoint.host, endpoint.port)
     return protocol
-
-
-class BlockingRecordSocket:
-    """A local connection for a process with one blocking thread."""
-
-    def __init__(self, sock: socket.socket, where: str, *, send_timeout: float = 10.0) -> None:
-        self._sock = sock
-        self._where = where
-        self._splitter = RecordSplitter(where)
-        self._send_timeout = send_timeout
-        no_delay(sock)
-        sock.setblocking(False)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def fileno(self) -> int:
-        """Return the descriptor, for selectors."""
-        return self._sock.fileno()
-
-    def receive(self) -> list[AnyRecord] | None:
-        """Return the records received so far, possibly none; None when the peer has closed."""
-        try:
-            data = self._sock.recv(1 << 16)
-        except (BlockingIOError, InterruptedError):
-            return []
-        except OSError:
-            return None
-        return self._splitter.feed(data) if data else None
-
-    def send(self, record: Record) -> bool:
-        """Write a whole record; return False if the peer is gone or has not read for `send_timeout` seconds."""
-        left = memoryview(encode_record(record))
-        deadline = time.monotonic() + self._send_timeout
-        while left:
-            try:
-                left = left[self._sock.send(left) :]
-            except BlockingIOError:
-                if time.monotonic() > deadline:
-                    return False
-                self._sock.setblocking(True)
-                self._sock.settimeout(max(0.001, deadline - time.monotonic()))
-                try:
-                    left = left[self._sock.send(left) :]
-                except OSError:
-                    return False
-                finally:
-                    self._sock.setblocking(False)
-            except OSError:
-                return False
-        return True
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._sock.close()

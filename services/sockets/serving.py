@@ -1,4 +1,11 @@
-"""The service side of a local socket, which listens and serves one master at a time."""
+"""The service side of a local socket, which listens and serves one master at a time.
+
+master ──connects──▶ service   a second one is refused with `Trouble`
+◀───Hello────           role, version, deployment
+────Hello───▶           another one of these is refused with `Trouble`
+◀─Notice, Ready         what was said before, and the states that last
+◀──records──▶
+"""
 
 import asyncio
 import socket
@@ -14,7 +21,7 @@ from services.errors import OtherPeerError, OutdatedError, SettingsError
 from services.settings import Settings
 from services.sockets.local_socket import RecordProtocol, check_hello, own_hello
 from services.sockets.records import AnyRecord, Hello, Notice, Record, Trouble
-from terminal.errors import ExitCode
+from terminal.errors import ExitCode, exit_code_of
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 
@@ -22,10 +29,15 @@ GREETING_TIME = 5.0
 """Seconds in which a client must send its hello before another may connect."""
 MAX_UNSAID = 4
 """Maximum number of the latest messages for the user that are stored for the next master."""
+_REPORT_ATTEMPTS = 100
+_REPORT_INTERVAL = 0.02
 
 
 class Link(Protocol):
     """The connection of a service to its master: over a local socket, or inside the same process."""
+
+    masters: int = 1
+    """Number of masters that have greeted so far."""
 
     @property
     def has_master(self) -> bool:
@@ -72,13 +84,19 @@ class MasterLink(Link):
         self._endpoint = endpoint
         self._role = role
         self._deployment = deployment
-        self._service: asyncio.Task[Any] | None = None
-        self._outdated: OutdatedError | None = None
         self._on_record = on_record
-        self._master: RecordProtocol | None = None
-        self._greeted = False
+        # From `__aenter__` on.
         self._server: asyncio.Server | None = None
         self._listener: socket.socket | None = None
+        # The task of the service, which is cancelled when a master requires the new deployment in its folder, and the
+        # error that then replaces the cancellation.
+        self._service: asyncio.Task[Any] | None = None
+        self._outdated: OutdatedError | None = None
+        # The connection that is served, and whether its hello has arrived; records go only to a greeted master.
+        self._master: RecordProtocol | None = None
+        self._greeted = False
+        self.masters = 0
+        # For the next master: the last record of each lasting state, and messages that nobody has received.
         self._last: dict[type[Record], Record] = {}
         self._unsaid: deque[Notice] = deque(maxlen=MAX_UNSAID)
 
@@ -142,6 +160,7 @@ class MasterLink(Link):
                     self._service.cancel()
                 raise
             self._greeted = True
+            self.masters += 1
             for each in (*self._unsaid, *self._last.values()):
                 protocol.send(each)
             self._unsaid.clear()
@@ -181,6 +200,17 @@ class MasterLink(Link):
 def listening(endpoint: Endpoint, role: str, deployment: Deployment) -> MakeLink:
     """Return the function that creates a link over a local socket at this endpoint."""
     return lambda on_record: MasterLink(endpoint, role, deployment, on_record)
+
+
+async def report_failure(link: Link, error: BaseException) -> None:
+    """Send the error that ends a service to its master; a bug is only printed by the service itself."""
+    code = exit_code_of(error)
+    if code == ExitCode.BUG or not isinstance(error, Exception):
+        return
+    for _ in range(_REPORT_ATTEMPTS):  # a master that was started with us may still be connecting
+        if link.send(Trouble(code, str(error))):
+            return
+        await asyncio.sleep(_REPORT_INTERVAL)
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:

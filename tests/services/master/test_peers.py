@@ -117,16 +117,13 @@ async def test_a_peer_that_does_not_answer_in_time_is_cut_off(peers, events, own
     await asyncio.wait_for(watching, PATIENCE)
 
 
-@pytest.mark.parametrize(
-    ("role", "own_boards", "greet", "ready"),
-    [("pcie-app", False, 0.2, 10.8), ("subscriber", True, 0.2, 70.8), ("pcie-app", True, 60.2, 70.8)],
-)
-async def test_boards_that_compile_give_services_more_time(peers, events, role, own_boards, greet, ready):
-    peer = Peer(role, endpoint_from("unix:/x", ""), None)
+@pytest.mark.parametrize(("own_boards", "ready"), [(False, 10.8), (True, 70.8)])
+async def test_boards_that_compile_give_services_more_time(peers, events, own_boards, ready):
+    peer = Peer("pcie-app", endpoint_from("unix:/x", ""), None)
     peer.since = 7.0
     peers._boards = Process() if own_boards else None
     events.pending = Awaited("answer frame 3", 1.0, 0.2)
-    for limit in (greet, ready):
+    for limit in (0.2, ready):
         awaited = peers._awaited(peer)
         assert (awaited.since, awaited.limit) == (7.0, pytest.approx(limit))
         peer.greeted, peer.ready = True, peer.greeted

@@ -4,8 +4,6 @@ encode_record --bytes--> [split anywhere] --> RecordSplitter --> records
 """
 
 import contextlib
-import socket
-from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import msgspec
@@ -16,14 +14,12 @@ from hypothesis import strategies as st
 from services.errors import LocalSocketError, OtherPeerError
 from services.sockets.local_socket import (
     MAX_RECORD,
-    BlockingRecordSocket,
     RecordSplitter,
     check_hello,
     encode_record,
     own_hello,
 )
 from services.sockets.records import VERSION, Frame, FrameResult, Hello, Notice
-from tests.patience import PATIENCE
 
 
 def raw(value) -> msgspec.Raw:
@@ -99,28 +95,3 @@ def test_a_wrong_greeting_is_refused_with_the_expected_one(record, names):
         check_hello(record, "subscriber", "abc", "here")
     assert [name for name in names if name not in str(refused.value)] == []
     check_hello(own_hello("subscriber", "abc"), "subscriber", "abc", "here")
-
-
-def test_the_blocking_socket_sends_large_records_whole():
-    ours, theirs = socket.socketpair()
-    record = FrameResult(1, raw(bytes(3_000_000)), 0, 0, 0, 0)
-
-    def read() -> list:
-        splitter = RecordSplitter("us")
-        return [each for data in iter(lambda: theirs.recv(65536), b"") for each in splitter.feed(data)]
-
-    with ThreadPoolExecutor(1) as pool:
-        reading = pool.submit(read)
-        with BlockingRecordSocket(ours, "them") as sender:
-            assert sender.receive() == []
-            assert sender.send(record)
-        assert reading.result(PATIENCE) == [record]
-    theirs.close()
-
-
-def test_the_blocking_socket_notices_a_peer_that_does_not_read_and_one_that_closes():
-    ours, theirs = socket.socketpair()
-    with BlockingRecordSocket(ours, "them", send_timeout=0.05) as sender:
-        assert not sender.send(FrameResult(1, raw(bytes(4_000_000)), 0, 0, 0, 0))
-        theirs.close()
-        assert sender.receive() is None
