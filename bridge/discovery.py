@@ -99,6 +99,8 @@ async def discover(
             if robot is not None:
                 from_name[robot.name] = robot
 
+        # The browser names robots; each is then asked for its address, all at the same time, because one that has just
+        # left does not answer.
         browser = AsyncServiceBrowser(zeroconf.zeroconf, SERVICE_TYPE, handlers=[on_change])
         asking: set[asyncio.Task[None]] = set()
         try:
@@ -148,6 +150,7 @@ def find_uri(uri: str) -> str:
     """Return the same as `announced_uri`, for a caller that does not await, even inside an event loop."""
     if not uri.startswith(ROBOT):
         return uri
+    # A loop of its own, because `asyncio.run` refuses to run inside another one.
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(lambda: asyncio.run(announced_uri(uri))).result()
 
@@ -180,6 +183,7 @@ async def announced(
     async with _zeroconf(interfaces) as zeroconf:
         from zeroconf.asyncio import AsyncServiceInfo
 
+        # zeroconf would rename this one silently, and clients would look for a name that nobody has.
         if await _ask(zeroconf, f"{name}.{SERVICE_TYPE}", _TAKEN_TIME) is not None:
             raise DiscoveryError(
                 f"another rosbridge server on this network is already called {name}: choose another name"
@@ -196,6 +200,7 @@ async def announced(
             server=f"{own_name}.local.",
             parsed_addresses=addresses,
         )
+        # The machine's own responder (Avahi) answers on the same port, and for the same host name.
         await (await zeroconf.async_register_service(info, cooperating_responders=True))
         try:
             yield
@@ -270,11 +275,13 @@ def _robot(info: AsyncServiceInfo) -> Robot | None:
     """Return the robot in an announcement; None if the announcement is unusable."""
     name = info.name.removesuffix(f".{SERVICE_TYPE}")
     properties = info.decoded_properties
+    # IPv4 first: robots announce link-local addresses of IPv6 too, which need a zone.
     addresses = sorted(info.parsed_addresses(), key=lambda address: (":" in address, address))
     tls = properties.get("tls") == "1"
     # A certificate contains a name, rarely an address.
     host = (info.server or "").rstrip(".") if tls else addresses[0] if addresses else ""
     path = properties.get("path") or "/"
+    # Anybody on the network may announce anything, and the URI goes to logs and into a request.
     if not name or not name.isprintable() or not host or not 1 <= (info.port or 0) <= _LAST_PORT:
         return None
     if _PATH.fullmatch(path) is None or (tls and _HOST.fullmatch(host) is None):

@@ -19,6 +19,7 @@ _TOPIC = re.compile(r"[~/]?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
 _EDGE_NAME_SIZE = 1024
 
 
+# Types are compared for each subscription and each answer of rosapi, and a robot has few of them.
 @lru_cache(maxsize=_EDGE_NAME_SIZE)
 def split_type(name: str) -> tuple[str, str, str]:
     """Return the package, kind (`msg`, `srv`, `action`, or empty in the ROS 1 form) and name of a type."""
@@ -52,6 +53,7 @@ def same_type(one: str, other: str) -> bool:
         package_2, kind_2, own_2 = split_type(other)
     except NameFormError:
         return False
+    # The form of ROS 1 leaves the kind open.
     return (package_1, own_1) == (package_2, own_2) and (kind_1 == kind_2 or not kind_1 or not kind_2)
 
 

@@ -27,6 +27,7 @@ def stamp_ns(time: object) -> int | None:
     """Return a time of either ROS version in nanoseconds since 1970; None if it is not a time."""
     if not isinstance(time, Mapping):
         return None
+    # A message with both pairs has the same time in both, so the first one found is enough.
     for second, nanosecond, _version in _KEYS:
         if second in time:
             seconds, nanoseconds = time[second], time.get(nanosecond, 0)

@@ -92,9 +92,11 @@ def interpolated(before: Transform, after: Transform, stamp: int) -> Transform:
     """Return the transform at a time between two: translations linearly, rotations on the shortest arc."""
     part = (stamp - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
     start, end = before.rotation, after.rotation
+    # Both signs of a quaternion are the same rotation; the nearer one gives the shorter way.
     cosine = float(start @ end)
     if cosine < 0:
         end, cosine = -end, -cosine
+    # The sine of the angle, by which the other formula divides in effect, would be nearly zero.
     if cosine > _NEARLY_PARALLEL:
         rotation = start + part * (end - start)
     else:
@@ -110,15 +112,19 @@ class _Frame:
     def __init__(self, parent: str, *, static: bool) -> None:
         self.parent = parent
         self.static = static
+        # Ordered by stamp, and no older than `HISTORY_S` before the newest; one entry if static, and never empty after
+        # the first `add`.
         self.history: list[Transform] = []
 
     def add(self, transform: Transform) -> None:
         history = self.history
+        # A static transform is valid at all times, so that only the last one counts.
         if self.static:
             history[:] = [transform]
             return
         if history and transform.stamp_ns < history[-1].stamp_ns - round(HISTORY_S * 1e9):
             history.clear()  # the clock was set back, or a recording is played again
+        # Several publishers may send a frame, so messages need not come in order.
         insort(history, transform, key=_stamp)
         oldest = history[-1].stamp_ns - round(HISTORY_S * 1e9)
         del history[: max(bisect_left(history, oldest, key=_stamp), len(history) - MAX_ENTRIES)]
@@ -127,6 +133,7 @@ class _Frame:
         history = self.history
         if self.static:
             return history[0]
+        # An exact time needs no neighbour, so that the newest transform can be used at its own time.
         index = bisect_left(history, stamp, key=_stamp)
         if index < len(history) and history[index].stamp_ns == stamp:
             return history[index]
@@ -154,7 +161,9 @@ class TransformTree:
     """
 
     def __init__(self) -> None:
+        # By name; a root, which has no parent, has no entry.
         self._frames: dict[str, _Frame] = {}
+        # The sum of the lengths of all histories, at most `MAX_TRANSFORMS`.
         self._stored = 0
         self.unusable = 0
 
@@ -173,6 +182,8 @@ class TransformTree:
                 stamp = 0 if static else stamp_ns(header["stamp"])
                 translation = _numbers(body["translation"], "xyz")
                 rotation = _numbers(body["rotation"], "xyzw")
+                # Robots send quaternions that are not quite normal, or all zeros. Clipped first, because a square may
+                # overflow.
                 norm = float(np.linalg.norm(rotation.clip(-2, 2)))
                 usable = (
                     bool((np.abs(translation) <= LARGEST).all())
@@ -194,6 +205,7 @@ class TransformTree:
         if frame is None and len(self._frames) >= MAX_FRAMES:
             self.unusable += 1
             return
+        # What is known of the way to one parent says nothing of the way to another.
         if frame is None or frame.parent != parent or frame.static != static:
             self._stored -= len(frame.history) if frame is not None else 0
             self._frames[child] = frame = _Frame(parent, static=static)
@@ -218,11 +230,13 @@ class TransformTree:
             FramesUnconnectedError: They have no common ancestor.
             ExtrapolationError: A part is not known at that time.
         """
+        # tf of ROS 1 wrote names with a slash.
         target, source = target.lstrip("/"), source.lstrip("/")
         for name in (target, source):
             if name not in self._frames and name not in self.frames:
                 known = ", ".join(self.frames[:20]) or "none"
                 raise FrameUnknownError(f"frame {name} is not known; known are {known}")
+        # Up from the source to the first frame that is also above the target, and down to that.
         up, down = self._ancestors(source), self._ancestors(target)
         below = set(down)
         common = next((name for name in up if name in below), None)

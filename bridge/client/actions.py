@@ -57,12 +57,16 @@ class Goal:
         """Send a goal (see `bridge.client.Ros.send_goal`)."""
         identity = session.core.goals.send(action, type_name, goal, feedback=feedback)
         self.action = action
-        self.lost = 0
         self._session = session
         self._identity = identity
-        self._sent_at = time.monotonic()
+        self._sent_at = time.monotonic()  # for error messages: what the server has said since
+        # From `receive` to the iterating task, if one iterates at all; so it may be full without harm.
         self._feedback: deque[dict[str, Any]] = deque(maxlen=FEEDBACK_QUEUE_SIZE)
+        self.lost = 0
+        # The task that waits for feedback or for the end, while it does.
         self._reader: asyncio.Future[None] | None = None
+        # Done once: with the end, or with the loss of the connection. Shared by all who wait for the result, so each
+        # of them shields it.
         self._ended: asyncio.Future[GoalEnded] = asyncio.get_running_loop().create_future()
         session.goals[identity] = self
         session.flush()
@@ -123,6 +127,7 @@ class Goal:
         return self
 
     async def __anext__(self) -> dict[str, Any]:
+        # Feedback that came before the end is read first, however late the reader is.
         while not self._feedback:
             if self._ended.done():
                 if (error := self._ended.exception()) is not None:
@@ -143,6 +148,7 @@ class Goal:
         return self
 
     async def __aexit__(self, *_exception: object) -> None:
+        # Whoever leaves the block early no longer wants what the robot is doing.
         try:
             if not self.done:
                 await self.cancel()
@@ -170,9 +176,12 @@ class GoalRequest:
 
     def __init__(self, values: dict[str, Any], feed_back: FeedBack, end: End) -> None:
         self.values = values
+        # To the sender; they raise if what they get does not fit the action's type.
         self._feed_back = feed_back
         self._end = end
+        # Set by the server of the action when the sender asks for it, and never cleared.
         self._canceling = asyncio.Event()
+        # True from the first end that could be sent on: one that does not fit the type leaves room for another.
         self.ended = False
 
     @property
@@ -216,6 +225,7 @@ GoalHandler = Callable[[GoalRequest], Awaitable[Mapping[str, Any] | None]]
 
 async def execute(goal: GoalRequest, handler: GoalHandler, action: str) -> None:
     """Have a handler execute a goal, which ends even if the handler fails."""
+    # The handler may have ended the goal already; then the end here has no effect.
     try:
         values = await handler(goal)
         if goal.canceling:
@@ -242,9 +252,11 @@ class ActionServer(Handle):
     def __init__(self, session: Session, name: str, type_name: str, handler: GoalHandler) -> None:
         super().__init__(session)
         self.name = name
+        # Both are set by `Ros.advertise_action`, which has to ask for the type.
         self.result_check: MessageCheck | None = None
         self.feedback_check: MessageCheck | None = None
         self._handler = handler
+        # By id. A goal is here until its handler returns, even if it has ended before.
         self._goals: dict[str, tuple[GoalRequest, asyncio.Task[None]]] = {}
         session.core.actions.advertise(name, type_name)
         session.action_servers[absolute(name)] = self

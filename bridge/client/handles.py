@@ -1,4 +1,8 @@
-"""Handles for a program: subscriptions, publications and services."""
+"""Handles for a program: subscriptions, publications and services.
+
+A handle is what the program holds of one wish. It registers with the session when it is made, and withdraws when it is
+closed; a lost connection does not end it.
+"""
 
 import asyncio
 import logging
@@ -45,6 +49,7 @@ class Handle:
         if session.state is State.CLOSED:
             raise DisconnectedError(f"the client of {session.uri} was closed: connect() makes a new one")
         self._session = session
+        # Set once, by `end`: by `close`, or by the session when the client is closed.
         self._closed = False
 
     def _register(self) -> None:
@@ -109,22 +114,32 @@ class Subscription(Handle):
     ) -> None:
         super().__init__(session)
         self.topic = topic
+        self._type = type_name
+        # From `receive` to the reader. The bound is the deque's own; the size is kept because reading it is slower.
         self._size = _check_queue_size(queue_size, topic)
+        self._queue: deque[Message] = deque(maxlen=queue_size)
         self.lost = 0
         self.discarded = 0
+
+        # Time without a connection: `_blind` is what the next message has to carry. A subscription that is younger
+        # than the connection has missed less than that was away.
         self.blind_seconds = 0.0
         self._blind = 0.0
         self._begun = time.monotonic()
-        self._type = type_name
-        self._queue: deque[Message] = deque(maxlen=queue_size)
+
+        # The one reader, while it waits for a message. The alarm wakes it at its deadline; it may ring earlier, for a
+        # reader that has been served since, and is then set again. `_rings` is when it rings.
         self._waiter: asyncio.Future[None] | None = None
-        self._deadline = inf  # of the waiting task
+        self._deadline = inf
         self._alarm: asyncio.TimerHandle | None = None
         self._rings = inf
+
+        # Registered only after the core has accepted the subscription, which may raise.
         self._number = session.core.subscriptions.subscribe(
             topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length, delivery=delivery
         )
         session.readers[self._number] = self
+        # The end of a sentence once the topic is left out, also if that was before this subscription; else empty.
         self._left_out = session.why_left_out() if session.core.subscriptions.has_left_out(topic) else ""
         self._register()
         session.watch_silence()
@@ -132,6 +147,7 @@ class Subscription(Handle):
     def receive(self, message: Message) -> None:
         """Queue a message."""
         queue = self._queue
+        # Both conditions are rare, and each message passes here: what follows from them is not worked out before.
         if self._blind:
             message = message._replace(blind_seconds=self._blind)
             self._blind = 0.0
@@ -173,6 +189,7 @@ class Subscription(Handle):
 
     async def __anext__(self) -> Message:
         queue = self._queue
+        # A loop, because another task may take the message between the wake and this task's turn.
         while not queue:
             if self._closed:
                 raise StopAsyncIteration
@@ -237,6 +254,7 @@ class Subscription(Handle):
             return queue.popleft()
         self._check_alone()
         begun = time.monotonic()
+        # Not `asyncio.timeout`, which schedules and cancels a call for each message.
         self._deadline = begun + timeout
         self._set_alarm(begun)
         try:
@@ -258,6 +276,7 @@ class Subscription(Handle):
     async def _why_silent(self, begun: float) -> str:
         """Return the end of an error's sentence: the reason why the topic has been silent."""
         session = self._session
+        # What is known here first; only then the server is asked, which may itself be the reason.
         if self.discarded:
             return f"; {self.discarded} messages of the topic were larger than its limit, and were discarded"
         if session.state is not State.CONNECTED:
@@ -311,6 +330,7 @@ class Publication(Handle):
     ) -> None:
         super().__init__(session)
         self.topic = topic
+        # Publishers of this handle that wait for their turn; at most `_size`, then a further one is an error.
         self._size = _check_queue_size(queue_size, topic)
         self._waiting = 0
         self._publications = session.core.publications
@@ -344,6 +364,7 @@ class Publication(Handle):
                 await session.wait_turn(f"a message of {self.topic}", timeout)
             finally:
                 self._waiting -= 1
+        # Encoded only now: while it waited, the publication may have been closed, or the server's limit learnt.
         session.send_now(self._encode(msg))
         if session.should_yield():
             await asyncio.sleep(0)
@@ -389,7 +410,9 @@ class Service(Handle):
     ) -> None:
         super().__init__(session)
         self.name = name
-        self.check: MessageCheck | None = None
+        self.check: MessageCheck | None = (
+            None  # set by `Ros.advertise_service`, which has to ask for the type
+        )
         self._handler = handler
         self._limit = handler_timeout
         session.core.services.advertise(name, type_name)
@@ -411,6 +434,7 @@ class Service(Handle):
         except Exception as error:
             _log.exception("the handler of service %s failed", self.name)
             values = f"{self.name} failed: {type(error).__name__}"
+        # Nothing that the handler does may leave the caller without an answer, for which it would wait for ever.
         answer = self._session.core.services.answer
         try:
             if self.check is not None and not isinstance(values, str):

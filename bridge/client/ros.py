@@ -62,8 +62,10 @@ class Ros:
 
     def __init__(self, session: Session, *, check_types: bool = True) -> None:
         self._session = session
+        # None if the program has switched the checks off.
         self._types = TypeChecks(session) if check_types else None
         self.params = Params(session)
+        # Whether anything was advertised, so that a server might drop messages when the client leaves (`close`).
         self._publishes = False
 
     async def __aenter__(self) -> Self:
@@ -396,7 +398,7 @@ class Ros:
             1 or 2; None if there is neither rosapi nor a message with a header, or after `timeout` seconds.
         """
         if self.ros_version is None:
-            # a ROS 1 server without `get_ros_version` logs an error when it is asked
+            # First what every server answers silently: a ROS 1 server without `get_ros_version` logs an error when it is asked
             ends = time.monotonic() + timeout
             version, has_rosapi = await self._ask_rosout_type(timeout)
             if version is None and has_rosapi and self.ros_version is None:
@@ -453,7 +455,7 @@ class Ros:
 
     async def service_providers(self, type: str, timeout: float = 1.0) -> list[str] | None:
         """Return the names of the nodes that serve services of a type; None without rosapi."""
-        await self.detect_ros_version()  # as for topics
+        await self.detect_ros_version()  # as in `topics_for_type`
         args = {"service": self._session.core.wire.type_name(type, "srv")}
         return await ask_names(self._session, "service_providers", args, "providers", timeout)
 

@@ -93,6 +93,7 @@ class Params:
             DisconnectedError: There is no connection.
         """
         answer = await self._ask("get_param", timeout, name=name)
+        # JSON as a text, since a service of ROS has no field of any type.
         text = answer.get("value")
         try:
             value = orjson.loads(text) if isinstance(text, str) and text else None
@@ -106,6 +107,7 @@ class Params:
 
     async def set(self, name: str, value: Any, *, timeout: float = 5.0) -> None:
         """Set a parameter; errors as for `get`, and `ParamError` if the server refuses."""
+        # The codec writes objects alone, with all its checks, so the value is cut out of one.
         text = encode({"": value}, nonfinite="refuse")[4:-1].decode()
         self._require(name, await self._ask("set_param", timeout, name=name, value=text))
 
@@ -146,9 +148,14 @@ class TypeChecks:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._asking = asyncio.Lock()  # so that calls of one service at the same time ask once
-        self._connection = -1  # number of reconnections when the following was learnt
+        # Held while the server is asked, so that calls of one service at the same time ask once.
+        self._asking = asyncio.Lock()
+        # Number of reconnections when the following was learnt: another connection may be to another server.
+        self._connection = -1
+        # Whether a question went unanswered: a server without rosapi must not delay each call by a timeout.
         self._unanswered = False
+        # Names of types by service, and checks by part and type; None for a type that the server does not know. Both
+        # are bounded, because a program may call services without end.
         self._service_types: dict[str, str] = {}
         self._parts: dict[tuple[_Part, str], MessageCheck | None] = {}
 
@@ -163,6 +170,7 @@ class TypeChecks:
             args = {"type": session.core.wire.type_name(type_name)}
             definitions = definitions_from_rosapi(await self._ask("message_details", args, _ROSAPI_TIMEOUT))
         version = session.core.ros_version
+        # In a thread, because loading rosbags takes longer than a connection should be left alone.
         if not definitions and version is not None:
             definitions = await asyncio.to_thread(bundled_definitions, type_name, version)
         publications.define(type_name, definitions)

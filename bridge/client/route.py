@@ -72,6 +72,7 @@ def make_route(
     Raises:
         OptionError: An option is invalid; the sentence names it, without secrets.
     """
+    # One place for the secret: a server that gets two would choose either.
     fields = dict(headers or {})
     authorized = any(name.lower() == "authorization" for name in fields)
     if token is not None:
@@ -98,6 +99,7 @@ def _tls(
     client_certificate: Path | tuple[Path, Path] | None,
     tls: ssl.SSLContext | None,
 ) -> ssl.SSLContext | None:
+    # An option without effect is refused: a program that gives a certificate relies on TLS.
     options = {"ca_file": ca_file, "client_certificate": client_certificate}
     given = [name for name, value in options.items() if value is not None]
     if not uri.secure:
@@ -150,11 +152,13 @@ async def connect_along(
         OSError: The connection failed.
     """
     loop = asyncio.get_running_loop()
+    # The certificate is checked against the host of the URI, also through a proxy.
     hostname = uri.host if route.tls is not None else None
     passage = None if route.proxy is None else await _connect_proxy(route.proxy, uri, shown_uri)
     if passage is None or isinstance(passage, socket):
         end: dict[str, Any] = {"sock": passage} if passage else {"host": uri.host, "port": uri.port}
         return (await loop.create_connection(factory, **end, ssl=route.tls, server_hostname=hostname))[1]
+    # An HTTP proxy gives a transport that is connected already, so the protocol is put onto it by hand.
     try:
         connection = factory()
         passage.set_protocol(connection)

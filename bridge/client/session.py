@@ -171,14 +171,15 @@ class Session:
         route: Route,
         retry: bool = False,
     ) -> None:
+        # URI of the server, without secrets.
         self.uri = shown_uri
-        """URI of the server, without secrets."""
+        # What each attempt to connect needs.
         self._parsed_uri = uri
         self._route = route
         self._limits = limits
         self._retry = retry
+        # The protocol state: what the program wants, and what waits for an answer.
         self.core = core
-        """The protocol state: what the program wants, and what waits for an answer."""
 
         # State. `_set_state` alone changes `state`, and replaces the event, which wakes those who wait for a change.
         self.state = State.CONNECTING
@@ -194,10 +195,10 @@ class Session:
         self._lost_at = 0.0
         # When the lost connection was heard last, from which on messages may be missing.
         self._blind_since = 0.0
+        # Number of completed reconnections.
         self.reconnections = 0
-        """Number of completed reconnections."""
+        # Reason of the lost connection or of the last failed attempt; it is kept after a reconnection.
         self.last_error = ""
-        """Reason of the lost connection or of the last failed attempt; it is kept after a reconnection."""
 
         # Reconnecting: one task from a loss to the next connection, then done. `_pause` is its present sleep, which
         # `reconnect_now` cuts short; `_delay` is the next one, which doubles until a connection was steady.
@@ -220,27 +221,23 @@ class Session:
         # Size of the largest message on this connection: what a server closes with code 1009 was at most that.
         self._largest_sent = 0
 
-        # Whom the core's numbers, names and ids mean. Each entry is made with its operation, and removed by its handle
-        # or by the event that ends it; `_fail_calls` empties calls and goals with the connection.
-        self.readers: dict[int, Reader] = {}
-        """By number of the subscription."""
-        self.servers: dict[str, Server] = {}
-        """By absolute name of the service."""
-        self.action_servers: dict[str, GoalExecutor] = {}
-        """By absolute name of the action."""
-        self.goals: dict[str, GoalReceiver] = {}
-        """By id of the goal."""
-        self._calls: dict[str, asyncio.Future[CallAnswered]] = {}
+        # Whom the core's numbers, absolute names and ids mean. Each entry is made with its operation, and removed by
+        # its handle or by the event that ends it; `_fail_calls` empties calls and goals with the connection.
+        self.readers: dict[int, Reader] = {}  # by number of the subscription
+        self.servers: dict[str, Server] = {}  # by name of the service
+        self.action_servers: dict[str, GoalExecutor] = {}  # by name of the action
+        self.goals: dict[str, GoalReceiver] = {}  # by id
+        self._calls: dict[str, asyncio.Future[CallAnswered]] = {}  # by id
         # Tasks of requests to services; held here, because the event loop holds tasks only weakly.
         self._serving: set[asyncio.Task[None]] = set()
+        # Callbacks of the handles that are open, for the final close.
         self.on_closed: set[Callable[[], object]] = set()
-        """Callbacks of the handles that are open, for the final close."""
 
-        # For error messages: a program that gets no answer should see what the server said meanwhile.
+        # Number of unusable messages received. They are the server's fault, and cost nobody else anything.
         self.unusable = 0
-        """Number of unusable messages received."""
+        # Latest status messages of the server, newest last, for error messages: a program that gets no answer should
+        # see what the server said meanwhile. The count is for the log, which gets fewer and fewer of them.
         self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
-        """Latest status messages of the server, newest last."""
         self._status_at = 0.0
         self._status_count = 0
 
@@ -282,13 +279,13 @@ class Session:
         self.check_thread()
         if self.state is State.CLOSED:
             return
+        # Without a WebSocket nothing is sent any more, and its end is not taken for a loss.
         websocket, self._websocket = self._websocket, None
         self.core.lost()
-        # except the current task: a service's handler may close the client
         if self._retry_timer is not None:
             self._retry_timer.cancel()
         ending = {*self._serving, *(each for each in (self._reconnecting, self._looking) if each is not None)}
-        ending -= {asyncio.current_task()}
+        ending -= {asyncio.current_task()}  # a service's handler may close the client
         for task in ending:
             task.cancel()
         self._fail_calls(f"the client of {self.uri} was closed")
@@ -320,6 +317,7 @@ class Session:
             self.reconnections += 1
             for reader in self.readers.values():
                 reader.add_blind_seconds(self._connected_at - self._blind_since)
+        # All before the state changes: whoever waits for CONNECTED may publish at once, after the advertisement.
         self._largest_sent = 0
         if websocket.largest_accepted is not None:
             self.core.wire.limit(websocket.largest_accepted)
@@ -332,7 +330,7 @@ class Session:
 
     def _lost(self, websocket: WebSocket, reason: str) -> None:
         if websocket is not self._websocket:
-            return
+            return  # this client has closed it
         self._websocket = None
         self._blind_since = websocket.last_heard
         if websocket.loss is Loss.SENT_TOO_LARGE:
@@ -381,7 +379,8 @@ class Session:
 
     async def _reconnect(self) -> None:
         while True:
-            # Up to a fifth earlier, so that the clients of a server do not all reconnect at once.
+            # Up to a fifth earlier, so that the clients of a server do not all reconnect at once. A future, because
+            # `reconnect_now` cancels the sleep alone and not this task.
             self._pause = asyncio.ensure_future(asyncio.sleep(self._delay * random.uniform(0.8, 1.0)))
             try:
                 await asyncio.wait([self._pause])
@@ -390,7 +389,7 @@ class Session:
             self._delay = min(2 * self._delay, MAX_DELAY)
             try:
                 await self._connect(min(self._limits.connect_timeout, ATTEMPT_TIMEOUT))
-            except BridgeError as error:
+            except BridgeError as error:  # as long as the server is away, so it is not worth a line each time
                 self.last_error = str(error)
                 _log.debug("reconnecting: %s", error)
             except Exception as error:
@@ -413,6 +412,7 @@ class Session:
 
     def _set_state(self, state: State, reason: str) -> None:
         self.state = state
+        # Each event is set once: a waiter that sleeps through two changes still sees that there was one.
         self._state_changed.set()
         self._state_changed = asyncio.Event()
         if self._on_state is not None:
@@ -537,6 +537,7 @@ class Session:
 
     async def _renew(self, topics: list[str]) -> None:
         """Renew the subscriptions of those topics that somebody publishes."""
+        # A topic without a publisher is rightly silent, and a subscription that works should not be interrupted.
         for topic in topics:
             answer = await self.ask_rosapi("publishers", {"topic": topic}, _ROSAPI_TIMEOUT)
             if not answer.get("publishers") or not self.is_open:
@@ -562,6 +563,7 @@ class Session:
         if self.must_wait():
             await self.wait_turn(f"a call of {service}", limit)
         begun = time.monotonic()
+        # The future is there before the call leaves, because the answer may come with the next bytes.
         call = self.core.calls.send(service, args)
         future = self._calls[call] = asyncio.get_running_loop().create_future()
         self.flush()
@@ -588,6 +590,7 @@ class Session:
     # Receiving
 
     def _take(self, messages: list[bytes]) -> None:
+        # One time for all messages that arrive together, because they have waited for each other in the socket.
         received_ns, received_monotonic_ns = time.time_ns(), time.monotonic_ns()
         now = received_monotonic_ns * 1e-9
         receive, readers = self.core.receive, self.readers

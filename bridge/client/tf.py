@@ -28,7 +28,9 @@ class Transforms:
     def __init__(self, ros: "Ros") -> None:
         self.tree = TransformTree()
         self._ros = ros
+        # Set by each message, and cleared by whoever waits before it looks again.
         self._news = asyncio.Event()
+        # One for each of the two topics, from entering to leaving; they own the subscriptions.
         self._tasks: list[asyncio.Task[None]] = []
 
     async def __aenter__(self) -> Self:

@@ -85,6 +85,7 @@ class PendingGoals:
         del self._actions[goal]
         if operation.get("result", True) is False:
             return GoalEnded(goal, ok=False, status=GoalStatus.UNKNOWN, values=text_of(values))
+        # Some servers omit the status on success, and a number beyond the enumeration is not an error of this client.
         status = operation.get("status", GoalStatus.SUCCEEDED.value)
         known = type(status) is int and status in GoalStatus.__members__.values()
         return GoalEnded(

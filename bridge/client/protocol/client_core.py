@@ -57,6 +57,7 @@ class ClientCore:
         """Start a new connection: put all registrations into the outbox, advertisements first."""
         self.wire.connected = True
         self.wire.clear()
+        # Advertisements first, so that a program that answers to messages can do so from the first one on.
         self.publications.restore()
         self.services.restore()
         self.actions.restore()

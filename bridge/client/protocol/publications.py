@@ -23,16 +23,16 @@ class _Advertised:
     queue_size: int
     qos: Qos | None
     wire_id: str
+    # Start of its messages on the wire, which end with a brace; the envelope is the same for all of them.
     prefix: bytes
-    """Start of its messages on the wire, which end with a brace; the envelope is the same for all of them."""
+    # Numbers of the advertisements; never empty while the topic is advertised.
     holders: set[int] = field(default_factory=set)
-    """Numbers of the advertisements; never empty while the topic is advertised."""
+    # The check of its type; None until `Publications.define` knows it, and for ever if nobody does.
     check: MessageCheck | None = None
-    """The check of its type; None until `Publications.define` knows it, and for ever if nobody does."""
+    # The holders whose first message the check has still to see; empty without a check.
     unchecked: set[int] = field(default_factory=set)
-    """The holders whose first message the check has still to see; empty without a check."""
+    # The last message of a latched topic, because a server forgets it with the connection.
     latched: bytes | None = None
-    """The last message of a latched topic, because a server forgets it with the connection."""
 
 
 class Publications:
@@ -50,6 +50,7 @@ class Publications:
         """Advertise everything on a new connection, and repeat the last message of latched topics."""
         for advertised in self._advertised.values():
             self._send_advertise(advertised)
+            # The new server may accept less, and would close the connection again for it.
             if advertised.latched is not None and len(advertised.latched) <= self._wire.sendable:
                 self._wire.write_bytes(advertised.latched)
 
@@ -137,6 +138,7 @@ class Publications:
             )
         except EncodeError as error:
             raise type(error)(f"a message of {advertised.topic} cannot be published: {error}") from None
+        # The body is encoded alone, and so has its own path in an error; the envelope around it is bytes already.
         data = prefix + body + b"}"
         if advertised.latch:
             advertised.latched = data

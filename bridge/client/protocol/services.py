@@ -36,6 +36,7 @@ class PendingCalls:
         if len(self._waiting) >= MAX_CALLS:
             raise SlowPeerError(f"{MAX_CALLS} service calls are pending, so {service} is not called")
         call = f"call_service:{service}:{self._wire.number()}"
+        # Writing may raise for the arguments, and then nothing waits.
         self._wire.write(op="call_service", id=call, service=service, args=args)
         self._waiting.add(call)
         return call
@@ -138,6 +139,7 @@ class ServedServices:
             return UnusableReceived(
                 f"a call_service without a service or with an invalid id arrived: {excerpt(data)}"
             )
+        # A ticket also for what is refused at once, because `answer` only answers requests that it knows.
         ticket = self._wire.number()
         self._requests[ticket] = (service, wire_id)
         if absolute(service) not in self._types:

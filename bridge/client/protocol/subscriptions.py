@@ -68,8 +68,8 @@ class _Wanted:
 
     throttle_rate: int
     queue_length: int
+    # Time at which its throttle admits the next message; used only if it is slower than that of the topic.
     due: float = 0.0
-    """Time at which its throttle admits the next message; used only if it is slower than that of the topic."""
 
 
 @dataclass(slots=True)
@@ -77,38 +77,38 @@ class _Subscribed:
     """One topic on the wire, for one or more subscriptions of this client."""
 
     topic: str
+    # The first type that a subscription names; None while none does, and the server chooses.
     type: str | None
-    """The first type that a subscription names; None while none does, and the server chooses."""
     delivery: Delivery
     wire_id: str
     max_size: int
+    # The subscriptions by number; never empty while the topic is subscribed to.
     wanted: dict[int, _Wanted] = field(default_factory=dict)
-    """The subscriptions by number; never empty while the topic is subscribed to."""
 
     # What the server was asked for last, from `combine`: it follows `wanted` at each change of that.
     throttle_rate: int = 0
     queue_length: int = 0
+    # The keys of `wanted`, ready for the event of a message, which nearly always goes to all of them.
     all_numbers: tuple[int, ...] = ()
-    """The keys of `wanted`, ready for the event of a message, which nearly always goes to all of them."""
+    # Whether a subscription wants fewer messages than the server sends, so that each must be asked.
     has_throttled: bool = False
-    """Whether a subscription wants fewer messages than the server sends, so that each must be asked."""
 
     # About the present connection; `restore` sets them back.
+    # Whether a message has arrived, after which a silent topic is a topic without news.
     has_messages: bool = False
-    """Whether a message has arrived, after which a silent topic is a topic without news."""
     renewals: int = 0
 
+    # Number of envelopes learnt or refused; at `_ENVELOPES` the search ends.
     envelopes_tried: int = 0
-    """Number of envelopes learnt or refused; at `_ENVELOPES` the search ends."""
 
     # These outlive a connection: the next one has the same server, and the same messages.
+    # Whether the subscription requests JSON instead of CBOR, because CBOR brought nothing.
     as_json: bool = False
-    """Whether the subscription requests JSON instead of CBOR, because CBOR brought nothing."""
+    # Size of its largest message so far, at most `max_size`: only a larger one is compared with the limits.
     largest: int = 0
-    """Size of its largest message so far, at most `max_size`: only a larger one is compared with the limits."""
     discarded: int = 0
+    # True after a message that was too large for the connection: the topic is not subscribed to again.
     left_out: bool = False
-    """True after a message that was too large for the connection: the topic is not subscribed to again."""
 
     def combine(self) -> bool:
         """Combine the options to the fastest rate and the longest queue; return whether these changed."""
@@ -167,15 +167,15 @@ class Subscriptions:
         # By absolute name, and by the number that `subscribe` has returned; several numbers share an entry.
         self._subscribed: dict[str, _Subscribed] = {}
         self._subscriptions: dict[int, _Subscribed] = {}
+        # ROS version of the server according to header stamps in its messages; the first one decides.
         self.seen_version: RosVersion | None = None
-        """ROS version of the server according to header stamps in its messages; the first one decides."""
         # From the deliveries of all topics, so that a message is asked only if it may matter (`_note_deliveries`).
+        # Whether any topic is subscribed as CBOR.
         self.binary = False
-        """Whether any topic is subscribed as CBOR."""
+        # Whether any topic is subscribed with NumPy arrays.
         self.numpy = False
-        """Whether any topic is subscribed with NumPy arrays."""
+        # The known envelopes of messages; emptied when subscriptions or the connection change.
         self.envelopes: dict[bytes, _Known] = {}
-        """The known envelopes of messages; emptied when subscriptions or the connection change."""
         # The last of these that was used: the next message is most likely one of the same topic. Never one that is
         # not in `envelopes`, except for the placeholder.
         self._known = _UNKNOWN

@@ -23,19 +23,20 @@ class Wire:
     ) -> None:
         check_fragment_size(fragment_size)
         self._outbox: list[bytes] = []
+        # Whether messages are stored; without a connection they are dropped, because `restore` repeats them.
         self.connected = False
-        """Whether messages are stored; without a connection they are dropped, because `restore` repeats them."""
+        # ROS version of the server, as configured or detected; None while unknown.
         self.ros_version: RosVersion | None = ros_version
-        """ROS version of the server, as configured or detected; None while unknown."""
+        # Function that returns a new number at each call, for ids on the wire and for handles of the program.
         self.number: Callable[[], int] = count(1).__next__
-        """Function that returns a new number at each call, for ids on the wire and for handles of the program."""
-        # Limits that the program has chosen, in both directions.
+        # Maximum number of characters in a message before `pieces` splits it; None for no limit.
         self.fragment_size = fragment_size
-        """Maximum number of characters in a message before `pieces` splits it; None for no limit."""
+        # Maximum size and nesting of a message in both directions, as the program has chosen them.
         self.max_size = max_size
         self.max_depth = max_depth
+        # Maximum size of an outbound message: `max_size`, or what is known of the server's limit if that is less. It
+        # only falls: what a server has refused once it will refuse again.
         self.sendable = max_size
-        """Maximum size of an outbound message in bytes: `max_size`, or what is known of the server's limit if less."""
 
     def type_name(self, name: str, kind: Kind = "msg") -> str:
         """Return a type name in the server's ROS version, or if unknown in ROS 1, which all servers accept."""
@@ -49,11 +50,13 @@ class Wire:
 
     def limit(self, size: int) -> None:
         """Refuse messages of more bytes from now on, unless they are sent in fragments."""
+        # Fragments are small whatever the message is, so the size of a refused one says nothing about messages.
         if self.fragment_size is None:
             self.sendable = min(self.sendable, max(size, SMALLEST_LIMIT))
 
     def write_bytes(self, data: bytes) -> None:
         """Write an encoded message."""
+        # Without a connection nothing waits: `restore` writes what is wanted then, and not what was wanted meanwhile.
         if self.connected:
             self._outbox.append(data)
 
