@@ -29,7 +29,7 @@ from bridge.client.protocol.events import (
 )
 from bridge.client.route import Route
 from bridge.client.websocket import CLOSE_TIMEOUT, Limits, Loss, WebSocket, open_websocket
-from bridge.codecs.envelope import topic_in
+from bridge.codecs.json_codec import topic_in
 from bridge.errors import (
     BridgeError,
     DecodeError,

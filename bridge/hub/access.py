@@ -19,7 +19,7 @@ from websockets.datastructures import MultipleValuesError
 from websockets.http11 import Request
 from websockets.typing import Origin, Subprotocol
 
-from bridge.hub.errors import HubError
+from bridge.hub.limits import HubError
 
 SUBPROTOCOL: Final = Subprotocol("rosbridge")
 """The hub's subprotocol, for clients that request one."""

@@ -25,17 +25,15 @@ import orjson
 from bridge.codecs.fragments import Reassembler
 from bridge.codecs.json_codec import decode, is_deeper
 from bridge.errors import BridgeError
-from bridge.hub.delivery.definitions import Definitions, RosVersion
-from bridge.hub.delivery.dispatcher import Dispatcher
-from bridge.hub.delivery.outbox import Outbox
-from bridge.hub.errors import DefinitionsPendingError, RefusedError
+from bridge.hub.actions import Actions
+from bridge.hub.calls import Calls
+from bridge.hub.definitions import Definitions, RosVersion
+from bridge.hub.dispatcher import Dispatcher
 from bridge.hub.graph import Client, Graph
-from bridge.hub.handlers.actions import Actions
-from bridge.hub.handlers.calls import Calls
-from bridge.hub.handlers.rosapi import NODE, ROSOUT, Rosapi
-from bridge.hub.handlers.topics import TURN_WORK, Topics
-from bridge.hub.limits import HubLimits
-from bridge.hub.operations import Operation, is_logged, text
+from bridge.hub.limits import DefinitionsPendingError, HubLimits, Operation, RefusedError, is_logged, text
+from bridge.hub.outbox import Outbox
+from bridge.hub.rosapi import NODE, ROSOUT, Rosapi
+from bridge.hub.topics import TURN_WORK, Topics
 from bridge.stamps import stamp
 
 log = logging.getLogger(__name__)
@@ -268,7 +266,7 @@ class Broker:
         if rosout is not None and rosout.subscriptions and not self._logging_to_rosout:
             self._logging_to_rosout = True
             with contextlib.suppress(RefusedError):
-                self._topics.distribute(rosout, self._log_message(f"{client.node}: {why}"), None, self._now)
+                self._topics.distribute(rosout, self._log_message(f"{client.node}: {why}"), self._now)
             self._logging_to_rosout = False
 
     def _log_message(self, sentence: str) -> dict[str, Any]:

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bridge.codecs.fragments import Reassembler
-from bridge.hub.delivery.encodings import Compression
-from bridge.hub.delivery.filling import Filler
-from bridge.hub.delivery.outbox import Lane, Outbox
-from bridge.hub.operations import OperationId
+from bridge.hub.encodings import Compression
+from bridge.hub.filling import Filler
+from bridge.hub.limits import OperationId
+from bridge.hub.outbox import Lane, Outbox
 
 
 @dataclass(eq=False, slots=True)
@@ -57,7 +57,7 @@ class Client:
     last_published: "Advertisement | None" = None
     """The advertisement of the client's last message with a known envelope."""
     envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)
-    """The client's advertisements by known envelope (see `bridge.codecs.envelope`)."""
+    """The client's advertisements by known envelope (see `bridge.codecs.json_codec`)."""
     close_reason: str = ""
     """Reason why the client must be disconnected, or empty."""
     is_ready: bool = False

@@ -25,7 +25,7 @@ from bridge.client.protocol.events import (
 )
 from bridge.client.protocol.services import MAX_CALLS, MAX_REQUESTS
 from bridge.codecs import cbor_codec, json_codec, png
-from bridge.codecs.arrays import with_arrays, with_lists
+from bridge.codecs.cbor_codec import with_arrays, with_lists
 from bridge.codecs.fragments import Reassembler, split
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import BridgeError, DecodeError, EncodeError

@@ -12,10 +12,8 @@ import orjson
 
 from bridge.client.protocol.events import MessageDiscarded, MessageReceived, UnusableReceived
 from bridge.client.protocol.wire import RosVersion, Wire, check_fragment_size
-from bridge.codecs.arrays import with_arrays, with_lists
-from bridge.codecs.cbor_codec import Arrays
-from bridge.codecs.envelope import BRACE, envelope_of, topic_of
-from bridge.codecs.json_codec import excerpt, is_deeper
+from bridge.codecs.cbor_codec import Arrays, with_arrays, with_lists
+from bridge.codecs.json_codec import BRACE, envelope_of, excerpt, is_deeper, topic_of
 from bridge.errors import OptionError, TypeConflictError
 from bridge.names import absolute, check_name, same_type, split_type
 from bridge.qos import Qos

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 
-from bridge.codecs.arrays import with_arrays, with_lists
+from bridge.codecs.cbor_codec import with_arrays, with_lists
 
 
 def test_lists_of_numbers_become_arrays():

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from bridge.client.protocol import ClientCore
 from bridge.client.protocol.events import MessageReceived
-from bridge.codecs.envelope import LONGEST, envelope_of, topic_of
+from bridge.codecs.json_codec import LONGEST, envelope_of, topic_of
 
 CANONICAL = b'{"op":"publish","topic":"/t","msg":'
 

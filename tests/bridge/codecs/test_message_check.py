@@ -12,7 +12,7 @@ from bridge.codecs.message_check import (
     definitions_from_rosapi,
 )
 from bridge.errors import MessageTypeError
-from bridge.hub.delivery.definitions import Definitions
+from bridge.hub.definitions import Definitions
 
 TWIST = "geometry_msgs/Twist"
 ODOMETRY = "nav_msgs/Odometry"

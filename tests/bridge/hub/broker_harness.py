@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 from bridge.codecs import cbor_codec
 from bridge.hub.broker import Broker
-from bridge.hub.delivery.outbox import is_text
 from bridge.hub.graph import Client
 from bridge.hub.limits import HubLimits
+from bridge.hub.outbox import is_text
 
 WALL_CLOCK = 1_700_000_000_123_456_789
 

@@ -9,7 +9,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
 from bridge.hub.access import AccessPolicy, is_loopback, read_tokens, tls_context
-from bridge.hub.errors import HubError
+from bridge.hub.limits import HubError
 from tests.bridge.hub.sockets import Client, RawClient, running_hub
 from tests.certificates import issue
 
@@ -99,6 +99,16 @@ async def test_a_page_needs_a_known_origin_and_this_machines_name(
         headers = [] if origin is None else [f"Origin: {origin}"]
         assert f" {status} " in await raw.request(*headers, host=host)
         raw.cut()
+
+
+@pytest.mark.parametrize("hosts", [[], ["localhost", "localhost"], ["localhost", "attacker.example"]])
+async def test_a_request_names_one_host(hosts: list[str]) -> None:
+    async with running_hub() as port:
+        raw = await RawClient.connect(port, handshake=False)
+        lines = [*(f"Host: {host}" for host in hosts), "Upgrade: websocket", "Connection: Upgrade"]
+        lines += ["Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version: 13"]
+        raw.writer.write("\r\n".join(["GET / HTTP/1.1", *lines, "", ""]).encode())
+        assert (await raw.ended()).startswith(b"HTTP/1.1 403 ")
 
 
 async def test_without_a_list_no_page_but_of_this_machine_is_let_in() -> None:

@@ -2,8 +2,7 @@ import dataclasses
 
 import pytest
 
-from bridge.hub.errors import HubError
-from bridge.hub.limits import HubLimits
+from bridge.hub.limits import HubError, HubLimits
 
 
 def test_every_limit_must_be_positive() -> None:

@@ -10,8 +10,7 @@ from websockets.exceptions import InvalidStatus
 
 from bridge.hub import server
 from bridge.hub.access import AccessPolicy
-from bridge.hub.errors import HubError
-from bridge.hub.limits import HubLimits
+from bridge.hub.limits import HubError, HubLimits
 from bridge.hub.server import serve_hub
 from tests.bridge.hub.sockets import RawClient, client, running_hub
 from tests.patience import PATIENCE

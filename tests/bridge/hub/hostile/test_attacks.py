@@ -23,7 +23,7 @@ from bridge.codecs.fragments import OVERHEAD, Reassembler
 from bridge.errors import DecodeError
 from bridge.hub import server
 from bridge.hub.broker import TURN_WORK
-from bridge.hub.delivery.definitions import Definitions
+from bridge.hub.definitions import Definitions
 from bridge.hub.limits import HubLimits
 from tests.bridge.hub.broker_harness import Harness, Peer, publisher_and_subscriber
 from tests.bridge.hub.sockets import RawClient, client, running_hub

@@ -8,14 +8,12 @@ import orjson
 
 from bridge.client.protocol.events import GoalStatus
 from bridge.errors import BridgeError
-from bridge.hub.delivery.definitions import Definitions
-from bridge.hub.delivery.dispatcher import Dispatcher
-from bridge.hub.delivery.outbox import Lane
-from bridge.hub.errors import RefusedError
+from bridge.hub.calls import Caller, Offers, filled
+from bridge.hub.definitions import Definitions
+from bridge.hub.dispatcher import Dispatcher
 from bridge.hub.graph import Client, Graph, Offer
-from bridge.hub.handlers.requests import Caller, Offers, filled
-from bridge.hub.limits import HubLimits
-from bridge.hub.operations import Operation, flag, optional_text, text
+from bridge.hub.limits import HubLimits, Operation, RefusedError, flag, optional_text, text
+from bridge.hub.outbox import Lane
 from bridge.names import absolute, ros2_type, same_type
 
 _CANCEL_ALL: Final = "/_action/cancel_goal"

@@ -5,11 +5,10 @@ from typing import Final
 
 import orjson
 
-from bridge.hub.delivery.encodings import as_png
-from bridge.hub.delivery.outbox import Lane
-from bridge.hub.errors import RefusedError
+from bridge.hub.encodings import as_png
 from bridge.hub.graph import Client
-from bridge.hub.limits import HubLimits
+from bridge.hub.limits import HubLimits, RefusedError
+from bridge.hub.outbox import Lane
 
 SMALLEST_FRAGMENT: Final = 256
 """Minimum size of a fragment in bytes; smaller ones would consist mostly of framing."""

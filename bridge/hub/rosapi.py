@@ -17,11 +17,10 @@ import orjson
 
 from bridge.codecs.json_codec import is_deeper
 from bridge.errors import NameFormError
-from bridge.hub.delivery.definitions import Definitions
-from bridge.hub.delivery.interfaces import part_name
-from bridge.hub.errors import RefusedError
+from bridge.hub.definitions import Definitions
 from bridge.hub.graph import Graph
-from bridge.hub.limits import HubLimits
+from bridge.hub.interfaces import part_name
+from bridge.hub.limits import HubLimits, RefusedError
 from bridge.names import MAX_NAME, absolute, ros1_type, ros2_type
 
 NODE: Final = "/rosapi"

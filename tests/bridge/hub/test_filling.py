@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.codecs import cbor_codec, png
-from bridge.hub.delivery.definitions import Definitions
-from bridge.hub.delivery.filling import _KNOWN, HEADER
+from bridge.hub.definitions import Definitions
+from bridge.hub.filling import _KNOWN, HEADER
 from bridge.names import ros2_type
 from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer, publisher_and_subscriber
 

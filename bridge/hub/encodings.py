@@ -12,8 +12,8 @@ import orjson
 
 from bridge.codecs.png import encode as to_picture
 from bridge.errors import BridgeError
-from bridge.hub.delivery.definitions import Definitions
-from bridge.hub.errors import RefusedError
+from bridge.hub.definitions import Definitions
+from bridge.hub.limits import RefusedError
 
 
 class Compression(StrEnum):

@@ -6,12 +6,11 @@ from typing import Any, Final
 
 import orjson
 
-from bridge.codecs.envelope import BRACE, envelope_of, topic_of
-from bridge.codecs.json_codec import is_deeper
+from bridge.codecs.json_codec import BRACE, envelope_of, is_deeper, topic_of
 from bridge.errors import BridgeError
-from bridge.hub.delivery.definitions import Definitions
-from bridge.hub.delivery.dispatcher import Dispatcher, fragment_size_of
-from bridge.hub.delivery.encodings import (
+from bridge.hub.definitions import Definitions
+from bridge.hub.dispatcher import Dispatcher, fragment_size_of
+from bridge.hub.encodings import (
     AROUND,
     COMPRESSIONS,
     TYPED,
@@ -20,13 +19,12 @@ from bridge.hub.delivery.encodings import (
     compression_of,
     json_prefix,
 )
-from bridge.hub.errors import RefusedError
 from bridge.hub.graph import Advertisement, Client, Graph, SubscribeOptions, Subscription, Topic
-from bridge.hub.handlers.rosapi import ROSOUT, rosout_type
-from bridge.hub.limits import HubLimits
-from bridge.hub.operations import (
+from bridge.hub.limits import (
+    HubLimits,
     Operation,
     OperationId,
+    RefusedError,
     checked_name,
     flag,
     number,
@@ -35,19 +33,11 @@ from bridge.hub.operations import (
     quality,
     text,
 )
+from bridge.hub.rosapi import ROSOUT, rosout_type
 from bridge.names import absolute, same_type, split_type
 
 _ENVELOPE_KEYS: Final = 3
 """Keys of an operation with a reusable envelope: op, topic and msg."""
-_WORTH_CUTTING: Final = 512
-"""Minimum bytes of a message that is cut out of the received operation; smaller ones are rewritten as fast.
-"""
-_KEY: Final = b'"msg"'
-_QUOTES: Final = 200
-"""Maximum number of quotes in a message that is cut out; checking more takes as long as rewriting it."""
-_SHORT: Final = 4096
-"""Bytes up to which the key itself is searched; in longer messages, mostly numbers, quotes are found faster.
-"""
 _MESSAGE_WORK: Final = 20
 """Units of work of one message, besides those for each subscriber."""
 TURN_WORK: Final = 10_000
@@ -130,13 +120,9 @@ class Topics:
             _learn_envelope(advertisement, name, raw)
         topic, filler = advertisement.topic, advertisement.filler
         if topic.subscriptions or topic.latching:
-            data = _cut_out(operation, raw)
-            tail = filler.fill(parsed, self._limits.message_bytes) if filler else b""
-            if tail is None:
-                data = None
-            elif tail and data is not None:
-                data = data[: data.rindex(b"}")] + tail[:-1]
-            self.distribute(topic, parsed, data, now)
+            if filler is not None:
+                filler.fill(parsed, self._room)
+            self.distribute(topic, parsed, now)
 
     def publish_known(self, client: Client, messages: Sequence[bytes], first: int, now: float) -> int:
         """Perform `publish` operations with known envelopes: only their messages are parsed, and forwarded as received.
@@ -190,16 +176,9 @@ class Topics:
                     return index
         return len(messages)
 
-    def distribute(self, topic: Topic, parsed: dict[str, Any], data: bytes | None, now: float) -> None:
-        """Deliver a message to all subscribers of its topic.
-
-        Args:
-            topic: The topic.
-            parsed: The message.
-            data: The message as JSON, or None if it must be written.
-            now: Monotonic seconds.
-        """
-        self._deliver(topic, parsed, (orjson.dumps(parsed) if data is None else data) + b"}", b"", now)
+    def distribute(self, topic: Topic, parsed: dict[str, Any], now: float) -> None:
+        """Deliver a message to all subscribers of its topic."""
+        self._deliver(topic, parsed, orjson.dumps(parsed) + b"}", b"", now)
 
     def _deliver(
         self, topic: Topic, parsed: dict[str, Any], payload: bytes, prefix: bytes, now: float
@@ -387,29 +366,3 @@ def _forget_envelope(advertisement: Advertisement) -> None:
     client.envelopes.pop(advertisement.envelope, None)
     if client.last_published is advertisement:
         client.last_published = None
-
-
-def _cut_out(operation: Operation, raw: bytes | None) -> bytes | None:
-    """Return a large message's own bytes in the received operation, or None if it must be rewritten.
-
-    Their position is certain only if the operation is JSON without escapes that has the key once, so the key
-    is not part of the message, and if it ends with two braces and only the message is an object, so the
-    message is last.
-    """
-    if raw is None or len(raw) < _WORTH_CUTTING or raw[-2:] != b"}}" or b"\\" in raw:
-        return None
-    if sum(type(value) is dict for value in operation.values()) != 1:
-        return None
-    if len(raw) < _SHORT:
-        key = raw.find(_KEY)
-        return raw[raw.index(b"{", key) : -1] if key > 0 and raw.find(_KEY, key + 1) < 0 else None
-    key = at = -1
-    for _ in range(_QUOTES):  # one byte is found ten times as fast as five
-        at = raw.find(b'"', at + 1)
-        if at < 0:
-            return raw[raw.index(b"{", key) : -1] if key > 0 else None
-        if raw.startswith(_KEY, at):
-            if key > 0:
-                return None
-            key = at
-    return None

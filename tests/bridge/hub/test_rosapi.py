@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from bridge.hub.handlers.rosapi import _ROS2_FIELDS, PREFIX
+from bridge.hub.rosapi import _ROS2_FIELDS, PREFIX
 from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer
 
 

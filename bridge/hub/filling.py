@@ -18,7 +18,7 @@ from typing import Any, Final, Literal
 
 import orjson
 
-from bridge.hub.errors import RefusedError
+from bridge.hub.limits import RefusedError
 from bridge.stamps import stamp
 
 RosVersion = Literal[1, 2]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bridge.hub.delivery.outbox import Lane, Outbox
+from bridge.hub.outbox import Lane, Outbox
 
 
 def _drain(outbox: Outbox) -> list[bytes]:

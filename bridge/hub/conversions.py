@@ -1,0 +1,199 @@
+"""Conversion of messages from JSON to the types of their fields: typed arrays for CBOR, and objects for serialising.
+
+Every conversion checks the type, range and number of values before it allocates memory for them.
+"""
+
+from base64 import b64decode
+from collections.abc import Callable
+from math import inf, nan
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+Convert = Callable[[Any], Any]
+
+_NUMBERS: Final = {
+    "int8": "i1",
+    "uint8": "u1",
+    "octet": "u1",
+    "byte": "u1",
+    "char": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "int64": "i8",
+    "uint64": "u8",
+    "float32": "f4",
+    "float64": "f8",
+}
+"""Element types of arrays by rosbags' names of numbers."""
+_FLOAT32: Final = 3.4028234663852886e38
+_RANGES: Final = {"f4": (-_FLOAT32, _FLOAT32), "f8": (-inf, inf)} | {
+    f"{sign}{size}": (-(1 << 8 * size - 1), (1 << 8 * size - 1) - 1)
+    if sign == "i"
+    else (0, (1 << 8 * size) - 1)
+    for sign in "iu"
+    for size in (1, 2, 4, 8)
+}
+DEFAULTS: Final[dict[str, Any]] = {"bool": False, "string": "", "wstring": ""} | {
+    name: 0.0 if elements[0] == "f" else 0 for name, elements in _NUMBERS.items()
+}
+_BYTES: Final = frozenset({"uint8", "octet", "char"})
+TIMES: Final = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/Duration": "duration"}
+ROS1_TIME: Final = {"sec": "secs", "nanosec": "nsecs"}
+"""Fields of a time in ROS 1, by their names in rosbags, which are ROS 2's."""
+DUMMY: Final = "structure_needs_at_least_one_member"
+
+
+class Builder:
+    """Builder of rosbags' objects from JSON; fields that are left out get their default."""
+
+    def __init__(self, store: "Typestore", max_values: int) -> None:
+        self._store = store
+        self._max_values = max_values
+        self._values = 0
+
+    def message(self, name: str, message: Any, place: str) -> Any:
+        """Build a message of a known type."""
+        if not isinstance(message, dict):
+            raise TypeError(f"{place or 'the message'} is not an object")
+        _constants, fields = self._store.fielddefs[name]
+        self._count(len(fields))
+        given = dict(message)
+        values = {}
+        for field, (kind, content) in fields:
+            value = given.pop(field, None)
+            other = ROS1_TIME.get(field) if name in TIMES else None
+            if other is not None and (alias := given.pop(other, None)) is not None:
+                value = alias
+            values[field] = self._value(kind, content, value, f"{place}{field}")
+        if given:
+            raise ValueError(f"the type has no field {place}{next(iter(given))}")
+        return self._store.types[name](**values)
+
+    def _value(self, kind: Any, content: Any, value: Any, place: str) -> Any:
+        element, length = element_of(kind, content)
+        if length < 0:
+            if element in self._store.fielddefs:
+                return self.message(element, {} if value is None else value, f"{place}.")
+            return _scalar(value, element, place)
+        if value is None:
+            value = [DEFAULTS.get(element)] * length
+        if element in _NUMBERS:
+            import numpy as np
+
+            numbers = _numbers(value, element, length, place)
+            if isinstance(numbers, bytes):
+                return np.frombuffer(numbers, np.uint8)
+            return np.array(numbers, _NUMBERS[element])
+        if not isinstance(value, list) or (length and len(value) != length):
+            raise ValueError(f"{place} is not an array of {length or 'any number of'} elements")
+        self._count(len(value))
+        inner_kind, inner_content = content[0]
+        return [
+            self._value(inner_kind, inner_content, item, f"{place}[{index}]")
+            for index, item in enumerate(value)
+        ]
+
+    def _count(self, values: int) -> None:
+        """Count values, and refuse a message with too many before they are built."""
+        self._values += max(values, 1)
+        if self._values > self._max_values:
+            raise ValueError(f"it has more than {self._max_values} values")
+
+
+def fields_of(store: "Typestore", name: str) -> list[Any]:
+    """Return the fields of a type, without the one that ROS 2 adds to an empty message."""
+    return [entry for entry in store.fielddefs[name][1] if entry[0] != DUMMY]
+
+
+def element_of(kind: Any, content: Any) -> tuple[str, int]:
+    """Return the type of a field or of its elements, and its length: -1 for a scalar, 0 for any."""
+    name = kind.name
+    if name == "BASE":
+        return str(content[0]), -1
+    if name == "NAME":
+        return str(content), -1
+    inner, length = content
+    element, _ = element_of(*inner)
+    return element, length if name == "ARRAY" else 0
+
+
+def _scalar(value: Any, element: str, place: str) -> Any:
+    default = DEFAULTS[element]
+    if value is None:
+        return default
+    if element in _NUMBERS:
+        return type(default)(_numbers([value], element, 1, place)[0])
+    if element == "bool" and value in (0, 1):
+        return bool(value)
+    if not isinstance(default, str) or not isinstance(value, str):
+        raise TypeError(f"{place} is not a {element}")
+    return value
+
+
+def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | bytes:
+    """Return an array's numbers, checked: their types, their range, and their number unless `length` is 0."""
+    if isinstance(values, str) and element in _BYTES:
+        values = b64decode(values, validate=True)
+    if not isinstance(values, list | bytes) or (length and len(values) != length):
+        raise ValueError(f"{place} is not an array of {length or 'any number of'} {element}")
+    if isinstance(values, bytes):
+        return values
+    elements = _NUMBERS[element]
+    kinds = set(map(type, values))
+    present: list[Any] = values
+    if elements[0] == "f" and type(None) in kinds:
+        present = [value for value in values if value is not None]
+        kinds.discard(type(None))
+    low, high = _RANGES[elements]
+    if not kinds <= ({int, float} if elements[0] == "f" else {int}) or (
+        present and high != inf and not (low <= min(present) and max(present) <= high)
+    ):
+        raise ValueError(f"{place} has values that are not {element}")
+    checked: list[Any] = (
+        values if present is values else [nan if value is None else value for value in values]
+    )
+    return checked
+
+
+def typed_converter(store: "Typestore", name: str, known: dict[str, Convert]) -> Convert:
+    """Return the function that converts a message's arrays of numbers and leaves other fields unchanged."""
+    converts: dict[str, Convert] = {}
+
+    def convert(message: dict[str, Any]) -> dict[str, Any]:
+        return {
+            field: converts[field](value) if field in converts else value for field, value in message.items()
+        }
+
+    known[name] = convert
+    for field, (kind, content) in store.fielddefs[name][1]:
+        element, length = element_of(kind, content)
+        if element in _NUMBERS:
+            if length >= 0:
+                converts[field] = _array_converter(field, element, length)
+        elif element in store.fielddefs:
+            inner = known.get(element) or typed_converter(store, element, known)
+            converts[field] = inner if length < 0 else _each(inner)
+    return convert
+
+
+def _each(convert: Convert) -> Convert:
+    def each(values: Any) -> list[Any]:
+        if not isinstance(values, list):
+            raise TypeError
+        return [convert(value) for value in values]
+
+    return each
+
+
+def _array_converter(field: str, element: str, length: int) -> Convert:
+    from bridge.codecs.cbor_codec import typed_array
+
+    def convert(values: Any) -> Any:
+        numbers = _numbers(values, element, length, field)
+        return bytes(numbers) if element in _BYTES else typed_array(numbers, _NUMBERS[element])
+
+    return convert

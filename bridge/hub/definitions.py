@@ -1,0 +1,235 @@
+"""Message definitions (the fields of each type) from `rosbags`, if it is installed.
+
+The hub forwards JSON without them. They are needed to fill absent fields, for CBOR with typed arrays, for serialised
+messages (cbor-raw) and for rosapi's descriptions of types. `rosbags` is imported by the first operation that needs it;
+without it CBOR packs only floats, and the last two are refused.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from bridge.errors import BridgeError
+from bridge.hub.conversions import (
+    DEFAULTS,
+    DUMMY,
+    ROS1_TIME,
+    TIMES,
+    Builder,
+    Convert,
+    element_of,
+    fields_of,
+    typed_converter,
+)
+from bridge.hub.filling import FieldTypes, Filler, Types
+from bridge.hub.interfaces import PARTS, message_texts, part_name
+from bridge.hub.limits import DefinitionsPendingError, RefusedError
+from bridge.names import ros1_type, ros2_type
+
+if TYPE_CHECKING:
+    from rosbags.typesys import Stores
+    from rosbags.typesys.store import Typestore
+
+RosVersion = Literal[1, 2]
+
+_BYTES_A_VALUE: Final = 16
+"""Bytes of the size limit per value of a serialised message; `{}` in an array can stand for dozens of values.
+"""
+_MISSING: Final = (
+    "the hub has no message definitions: install rosbags (pip install rosbags) and start the hub again"
+)
+
+
+class Definitions:
+    """The known message types of one ROS version."""
+
+    def __init__(self, ros_version: RosVersion = 1, wall_clock: Callable[[], int] = time.time_ns) -> None:
+        """Start without definitions; `wall_clock` returns nanoseconds since 1970, for absent stamps."""
+        self.ros_version: RosVersion = ros_version
+        self.load_in_background: Callable[[], None] | None = None
+        """Starts a thread for `load`; without it, loading blocks the operation that needs definitions."""
+        self.pending = False
+        """True while an operation waits for `load`."""
+        self._store: Typestore | None = None
+        self._missing = False
+        self._typed: dict[str, Convert] = {}
+        self._types = Types(self._field_types, DEFAULTS, TIMES, ros_version, wall_clock)
+        self._texts: dict[str, str] = {}
+
+    def load(self) -> None:
+        """Import rosbags and its types, which takes tenths of a second."""
+        try:
+            from rosbags.typesys import Stores
+        except ImportError:
+            self._missing = True
+        else:
+            self._store = _store(Stores.ROS2_JAZZY if self.ros_version == 2 else Stores.ROS1_NOETIC)
+        self.pending = False
+
+    def preload(self) -> None:
+        """Load the definitions in the background, before an operation needs them."""
+        with contextlib.suppress(DefinitionsPendingError):
+            self.require()
+
+    def require(self) -> None:
+        """Load the definitions for an operation that needs them.
+
+        Raises:
+            DefinitionsPendingError: They are being loaded in the background; repeat the operation afterwards.
+        """
+        if self._store is not None or self._missing:
+            return
+        if self.load_in_background is None:
+            self.load()
+        else:
+            if not self.pending:
+                self.pending = True
+                self.load_in_background()
+            raise DefinitionsPendingError
+
+    def name(self, type_name: str) -> str:
+        """Return a message type's name as this ROS version writes it."""
+        return ros2_type(type_name) if self.ros_version == 2 else ros1_type(type_name)
+
+    def filler(self, type_name: str) -> Filler | None:
+        """Return the filler of the absent fields of a message type, or None if the type is unknown.
+
+        Raises:
+            DefinitionsPendingError: The definitions are being loaded.
+        """
+        self.require()
+        try:
+            _store, known = self._known(type_name)
+        except BridgeError:
+            return None
+        return self._types.filler(known)
+
+    def fillers(self, type_name: str, kind: Literal["srv", "action"]) -> dict[str, Filler]:
+        """Return the fillers of the parts of a service or an action, such as `Request`, without unknown parts.
+
+        Raises:
+            DefinitionsPendingError: The definitions are being loaded.
+        """
+        fillers = {part: self.filler(part_name(type_name, part, self.ros_version)) for part in PARTS[kind]}
+        return {part: filler for part, filler in fillers.items() if filler is not None}
+
+    def _field_types(self, name: str) -> FieldTypes:
+        store, known = self._known(name)
+        fields = fields_of(store, known)
+        return {self._field(name, field): element_of(kind, content) for field, (kind, content) in fields}
+
+    def typed(self, type_name: str, message: dict[str, Any]) -> dict[str, Any] | None:
+        """Convert a message's arrays of numbers to typed arrays, for CBOR.
+
+        Returns:
+            The message, or None if its type is unknown or does not fit it.
+        """
+        try:
+            convert = self._typed.get(type_name)
+            if convert is None:
+                store, known = self._known(type_name)
+                convert = self._typed[type_name] = typed_converter(store, known, {})
+            converted: dict[str, Any] = convert(message)
+        except (BridgeError, TypeError, ValueError, AttributeError):
+            return None
+        return converted
+
+    def serialise(self, type_name: str, message: dict[str, Any], max_size: int) -> bytes:
+        """Serialise a message as ROS 1's transport would, or as CDR with its header, or raise a RefusedError."""
+        store, known = self._known(type_name)
+        try:
+            built = Builder(store, max_size // _BYTES_A_VALUE).message(known, message, "")
+            serialise = store.serialize_cdr if self.ros_version == 2 else store.serialize_ros1
+            return bytes(serialise(built, known))
+        except Exception as error:  # rosbags, NumPy and struct raise their own errors for unsuitable values
+            raise RefusedError(f"a message does not fit its type {self.name(type_name)}: {error}") from None
+
+    def full_text(self, type_name: str) -> str:
+        """Return the definitions of a type and of its parts, as in bag files, or raise a RefusedError."""
+        text = self._texts.get(type_name)
+        if text is None:
+            store, known = self._known(type_name)
+            text, _digest = store.generate_msgdef(known, ros_version=self.ros_version)
+            self._texts[type_name] = text
+        return text
+
+    def details(self, type_name: str) -> list[dict[str, Any]]:
+        """Return the fields of a type and of its parts, as `rosapi_msgs/TypeDef`, or raise a RefusedError."""
+        store, known = self._known(type_name)
+        found: dict[str, dict[str, Any]] = {}
+        waiting = [known]
+        while waiting:
+            name = waiting.pop(0)
+            if name in found:
+                continue
+            constants, fields = store.fielddefs[name][0], fields_of(store, name)
+            elements = [element_of(kind, content) for _, (kind, content) in fields]
+            nested = [element in store.fielddefs for element, _ in elements]
+            found[name] = {
+                "type": self._shown(name),
+                "fieldnames": [self._field(name, field) for field, _ in fields],
+                "fieldtypes": [
+                    self._shown(element) if inner else element
+                    for (element, _), inner in zip(elements, nested, strict=True)
+                ],
+                "fieldarraylen": [length for _, length in elements],
+                "examples": [
+                    "[]" if length >= 0 else "{}" if inner else str(DEFAULTS.get(element, ""))
+                    for (element, length), inner in zip(elements, nested, strict=True)
+                ],
+                "constnames": [constant for constant, _, _ in constants],
+                "constvalues": [str(value) for _, _, value in constants],
+            }
+            waiting += [element for (element, _), inner in zip(elements, nested, strict=True) if inner]
+        return list(found.values())
+
+    def _shown(self, name: str) -> str:
+        if self.ros_version == 1:
+            return TIMES.get(name) or ros1_type(name)
+        part = name.rpartition("_")[2]  # names of messages have no underscore
+        kind = next(
+            (kind for kind, parts in PARTS.items() if part in parts and "_" in name.rpartition("/")[2]), "msg"
+        )
+        return name.replace("/msg/", f"/{kind}/")
+
+    def _field(self, type_name: str, field: str) -> str:
+        return ROS1_TIME[field] if self.ros_version == 1 and type_name in TIMES else field
+
+    def _known(self, type_name: str) -> "tuple[Typestore, str]":
+        self.require()
+        if self._store is None:
+            raise RefusedError(_MISSING)
+        known = ros2_type(type_name)
+        if not _define(self._store, known, self.ros_version):
+            raise RefusedError(f"the hub does not know the fields of {type_name}")
+        return self._store, known
+
+
+@cache
+def _store(name: "Stores") -> "Typestore":
+    """Return the types of a ROS version, one store for all hubs of a process."""
+    from rosbags.typesys import get_typestore
+
+    return get_typestore(name)
+
+
+def _define(store: "Typestore", name: str, ros_version: RosVersion) -> bool:
+    """Return whether a type is known, after adding its definition and those of its parts if rosbags lacks them."""
+    if name in store.fielddefs:
+        return True
+    text = message_texts(ros_version).get(name)
+    if text is None:
+        return False
+    from rosbags.typesys import get_types_from_msg
+
+    types = get_types_from_msg(text, name)
+    for field in types[name][1]:
+        element, _length = element_of(*field[1])
+        if element not in DEFAULTS:
+            _define(store, element, ros_version)
+    if ros_version == 1:
+        types = {name: (types[name][0], [entry for entry in types[name][1] if entry[0] != DUMMY])}
+    store.register(types)
+    return True

@@ -1,1 +1,0 @@
-"""Outgoing messages: their encodings, and the bounded queue of each client."""

@@ -1,1 +1,0 @@
-"""Operations of clients, one module for each kind."""
