@@ -1,1 +1,36 @@
-"""Case studies, each with a model, a simulator or a data reader, and a page that describes it."""
+"""Case studies, each with a model, a simulator or a data reader, and a page that describes it.
+
+Here are the errors of all of them, and the flag `--uri` of their commands.
+"""
+
+from typing import Annotated, ClassVar
+
+import typer
+
+
+class CaseStudyError(Exception):
+    """Base class of the case studies' errors; `str()` is one sentence that says what to do."""
+
+    exit_code: ClassVar[int] = 2
+
+
+class DataFileError(CaseStudyError):
+    """A file of recorded data is missing or is not valid."""
+
+
+def _find(uri: str) -> str:
+    from bridge.discovery import find_uri
+
+    return find_uri(uri)
+
+
+Uri = Annotated[
+    str,
+    typer.Option(
+        envvar="BM_URI",
+        help="The rosbridge server.",
+        metavar="ws://HOST:PORT|robot:NAME",
+        callback=_find,
+    ),
+]
+DEFAULT_URI = "ws://127.0.0.1:9090"

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from casestudies.boat.geometry import (
+from casestudies.boat.sensors import (
     BEACONS,
     BEARING_NAMES,
     BEARING_SIGMA,

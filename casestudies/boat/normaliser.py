@@ -6,12 +6,14 @@ from typing import Annotated
 
 import typer
 
-from casestudies.boat.geometry import LONGEST_DISTANCE, SENSOR_NAMES
-from casestudies.boat.messages import (
+from casestudies import DEFAULT_URI, Uri
+from casestudies.boat.sensors import (
     ARRAY_TYPE,
+    LONGEST_DISTANCE,
     RAW_MSG,
     RAW_TOPIC,
     RAW_TYPE,
+    SENSOR_NAMES,
     SENSORS_MSG,
     SENSORS_TOPIC,
     SENSORS_TYPE,
@@ -20,7 +22,6 @@ from casestudies.boat.messages import (
     read_raw,
     readings_message,
 )
-from casestudies.server import DEFAULT_URI, Uri
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import say
@@ -54,8 +55,7 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
         BridgeError: No rosbridge server answers at the URI.
     """
     from bridge.client import connect
-    from casestudies.boat.lossy import LossyPublication, report_refused
-    from casestudies.readiness import Readiness, serve_readiness
+    from casestudies.publishing import LossyPublication, Readiness, report_refused, serve_readiness
 
     reported: set[str] = set()
     readiness = Readiness("a reading was normalised")

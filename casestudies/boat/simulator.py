@@ -8,26 +8,24 @@ from typing import Annotated
 
 import typer
 
-from casestudies.boat.geometry import (
+from casestudies import DEFAULT_URI, Uri
+from casestudies.boat.sensors import (
+    ARRAY_TYPE,
     BEACONS,
     BEARING_SIGMA,
+    MAP_FRAME,
     MAP_HIGH,
     MAP_LOW,
-    bearing,
-    distance,
-    distance_sigma,
-)
-from casestudies.boat.messages import (
-    ARRAY_TYPE,
-    MAP_FRAME,
     RAW_TOPIC,
     RAW_TYPE,
     TRUE_POSE_TOPIC,
     TRUE_POSE_TYPE,
+    bearing,
+    distance,
+    distance_sigma,
     readings_message,
     true_pose,
 )
-from casestudies.server import DEFAULT_URI, Uri
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import say
@@ -101,8 +99,7 @@ async def simulate(
     """
     from bridge.client import connect
     from bridge.stamps import header
-    from casestudies.boat.lossy import LossyPublication, report_refused
-    from casestudies.readiness import Readiness, serve_readiness
+    from casestudies.publishing import LossyPublication, Readiness, report_refused, serve_readiness
 
     readiness = Readiness("a reading was published")
     async with (

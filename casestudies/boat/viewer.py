@@ -1,17 +1,16 @@
 """Viewer of the boat's posteriors next to the truth; it needs only three topics."""
 
 import math
-import sys
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Final, Self
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from casestudies.boat.messages import TRUE_POSE_TOPIC
-from casestudies.server import DEFAULT_URI, Uri
+from casestudies import DEFAULT_URI, Uri
+from casestudies.boat.sensors import TRUE_POSE_TOPIC
 from posteriors.errors import NoResultError
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
@@ -20,10 +19,8 @@ from terminal.output import check_writable, say, write_json
 from terminal.signals import run_async
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
-    from casestudies.boat.shares import StageShare
-    from casestudies.truths import Instance, Truth
+    from casestudies.boat.pictures import StageShare
+    from casestudies.listening import Instance, Truth
 
 POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
@@ -66,8 +63,8 @@ class Line:
 
 def line_of(instance: "Instance") -> Line:
     """Return the line for a frame, or raise an OutputError if its posterior is not over a map."""
-    from casestudies.boat.geometry import map_grid
     from casestudies.boat.pictures import posterior_grid
+    from casestudies.boat.sensors import map_grid
 
     grid = map_grid() if instance.posterior is None else posterior_grid(instance.posterior)
     true_position = true_cell = mean = mean_value = None
@@ -146,7 +143,7 @@ class Viewer:
         """
         from bridge.client import connect
         from casestudies.listening import listen
-        from casestudies.readiness import Readiness, serve_readiness
+        from casestudies.publishing import Readiness, serve_readiness
 
         readiness = Readiness("a result was shown")
         async with (
@@ -155,27 +152,23 @@ class Viewer:
             listen(ros, truth_topic=truth_topic, truth_tolerance_s=truth_tolerance_s) as listener,
         ):
             say(f"boat-viewer: listening to {uri}")
-            with _Shown(self.count) as shown:
-                shown.line(HEADING)
-                try:
-                    while not self.done:
-                        line = self.add(await listener.next(limit_s if self.lines else first_limit_s))
-                        shown.line(str(line))
-                        readiness.record()
-                        shown.count(self.results)
-                except NoResultError as error:
-                    if not self.lines:
-                        raise
-                    raise NoResultError(f"after {_results(self.results)}, {error}") from None
-                finally:
-                    self.route = tuple(listener.route)
-                    if listener.announced_only:
-                        say(f"warning: frames on /bm/frame without their result: {listener.announced_only}")
+            print(HEADING, flush=True)
+            try:
+                while not self.done:
+                    print(self.add(await listener.next(limit_s if self.lines else first_limit_s)), flush=True)
+                    readiness.record()
+            except NoResultError as error:
+                if not self.lines:
+                    raise
+                raise NoResultError(f"after {_results(self.results)}, {error}") from None
+            finally:
+                self.route = tuple(listener.route)
+                if listener.announced_only:
+                    say(f"warning: frames on /bm/frame without their result: {listener.announced_only}")
 
     def draw(self, folder: Path) -> tuple[Path, ...]:
         """Write the two pictures and return their paths, or raise an OutputError."""
-        from casestudies.boat.pictures import draw_positions, draw_shares, far_apart
-        from casestudies.boat.shares import stage_shares
+        from casestudies.boat.pictures import draw_positions, draw_shares, far_apart, stage_shares
 
         written = []
         if chosen := far_apart(self.instances):
@@ -186,17 +179,22 @@ class Viewer:
             draw_shares(written[-1], shares, frames=self.results)
         return tuple(written)
 
-    def write_numbers(self, path: Path) -> None:
-        """Write the frames and the times by stage as one JSON object, or raise an OutputError."""
-        from casestudies.boat.shares import stage_shares
-
+    def medians(self) -> tuple[float | None, float | None]:
+        """Return the median distance in cells and the median time in milliseconds, where they are known."""
         distances = [line.distance for line in self.lines if line.distance is not None]
         times = [line.time_ms for line in self.lines if line.time_ms is not None]
+        return median(distances) if distances else None, median(times) if times else None
+
+    def write_numbers(self, path: Path) -> None:
+        """Write the frames and the times by stage as one JSON object, or raise an OutputError."""
+        from casestudies.boat.pictures import stage_shares
+
+        distance, time = self.medians()
         numbers = {
             "results": self.results,
             "frames_without_posterior": self.frames - self.results,
-            "median_distance_cells": median(distances) if distances else None,
-            "median_time_ms": median(times) if times else None,
+            "median_distance_cells": distance,
+            "median_time_ms": time,
             "stages": [_stage_numbers(stage) for stage in stage_shares(self.instances)],
             "frames": [
                 _frame_numbers(line, instance)
@@ -204,41 +202,6 @@ class Viewer:
             ],
         }
         write_json(path, numbers)
-
-
-class _Shown:
-    """Lines on standard output; on a terminal, a progress bar below them."""
-
-    def __init__(self, count: int | None) -> None:
-        self._progress: Progress | None = None
-        self._task: TaskID | None = None
-        if sys.stdout.isatty():
-            from rich import console, progress
-
-            columns = progress.TextColumn("results"), progress.BarColumn(), progress.MofNCompleteColumn()
-            self._progress = progress.Progress(*columns, console=console.Console(), transient=True)
-            self._task = self._progress.add_task("results", total=count)
-
-    def __enter__(self) -> Self:
-        if self._progress is not None:
-            self._progress.start()
-        return self
-
-    def __exit__(self, *_exception: object) -> None:
-        if self._progress is not None:
-            self._progress.stop()
-
-    def line(self, text: str) -> None:
-        """Print one line."""
-        if self._progress is None:
-            print(text, flush=True)
-        else:
-            self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-    def count(self, results: int) -> None:
-        """Update the progress bar."""
-        if self._progress is not None and self._task is not None:
-            self._progress.update(self._task, completed=results)
 
 
 def _frame_numbers(line: Line, instance: "Instance") -> dict[str, object]:
@@ -344,15 +307,14 @@ def _finish(viewer: Viewer, out: Path | None, numbers: Path | None) -> None:
     """Print the summary, and write numbers and pictures."""
     if not viewer.results:
         return
-    distances = [line.distance for line in viewer.lines if line.distance is not None]
-    times = [line.time_ms for line in viewer.lines if line.time_ms is not None]
+    distance, time = viewer.medians()
     summary = [_results(viewer.results)]
     if without := viewer.frames - viewer.results:
         summary.append(f"{without} frames without a posterior")
-    if distances:
-        summary.append(f"median distance {median(distances):.2f} cells")
-    if times:
-        summary.append(f"median time {median(times):.2f} ms")
+    if distance is not None:
+        summary.append(f"median distance {distance:.2f} cells")
+    if time is not None:
+        summary.append(f"median time {time:.2f} ms")
     print(", ".join(summary), flush=True)
     if numbers is not None:
         viewer.write_numbers(numbers)

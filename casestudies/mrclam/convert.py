@@ -17,8 +17,8 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from casestudies.errors import DataFileError
-from casestudies.mrclam.recording import LANDMARKS
+from casestudies import DataFileError
+from casestudies.mrclam.player import LANDMARKS
 from terminal.command_line import CommandLine
 from terminal.errors import OutputError
 from terminal.output import check_writable, say
@@ -234,7 +234,7 @@ def write_landmarks(path: Path, positions: dict[int, tuple[float, float]]) -> No
 
 
 def write_recording(path: Path, kept: Sequence[Window], landmarks: Sequence[int]) -> None:
-    """Write a file that `casestudies.mrclam.recording` reads, or raise an OutputError."""
+    """Write a file that `casestudies.mrclam.player` reads, or raise an OutputError."""
     heading = ["time_s", "ref_x_m", "ref_y_m", "ref_std_m", "heading_rad"]
     heading += [name for number in landmarks for name in (f"range_{number}_m", f"bearing_{number}_rad")]
     rows = []

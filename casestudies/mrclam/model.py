@@ -2,16 +2,46 @@
 
 Column order range_6, bearing_6, range_7, bearing_7, ... for the landmarks of the file in its order; line = y *
 width + x from the lower left corner. Readings of a landmark that is not seen are missing.
+`unquantised_posterior` fuses the same readings in float64, without bins, codes or counts, as a reference.
 """
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from casestudies.mrclam.landmarks import read_landmarks
 from toolchain.errors import ModelError
 from toolchain.learning.fitted import with_fit
+from toolchain.learning.recording import read_recording
 from toolchain.models import Known, Model, cell_centres, interval, normal, wrapped_normal
+from toolchain.models.model import fuse
+
+
+@dataclass(frozen=True, slots=True)
+class Landmark:
+    """A landmark's number and its position in metres."""
+
+    number: int
+    x: float
+    y: float
+
+
+def read_landmarks(path: Path) -> tuple[Landmark, ...]:
+    """Return the landmarks of a CSV file with the columns landmark, x_m and y_m, in the file's order, or raise a ModelError."""
+    columns = read_recording(Path(path), ("landmark", "x_m", "y_m")).columns
+    found: dict[int, Landmark] = {}
+    for row, values in enumerate(zip(*columns.values(), strict=True), start=1):
+        number, x, y = (value if isinstance(value, float) else math.nan for value in values)
+        if not (number.is_integer() and number >= 0 and math.isfinite(x) and math.isfinite(y)):
+            raise ModelError(f"{path}, row {row}: expected a landmark's number from 0 and a finite position")
+        if number in found:
+            raise ModelError(f"{path}, row {row}: landmark {number:g} is listed twice")
+        found[int(number)] = Landmark(int(number), x, y)
+    return tuple(found.values())
+
 
 X_LIMITS = (-2.0, 7.0)
 Y_LIMITS = (-7.0, 7.0)
@@ -78,3 +108,42 @@ def model(
             )
         )
     return with_fit(Model(name="mrclam", searched=(rows, columns), known=tuple(known)), fit)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LandmarkReading:
+    """A reading of one landmark: metres and radians (absolute, any turn), or None if it was not seen."""
+
+    range_m: float | None = None
+    bearing_rad: float | None = None
+
+
+def unquantised_posterior(
+    landmarks: Sequence[Landmark],
+    readings: Sequence[LandmarkReading],
+    *,
+    width: int = 32,
+    height: int = 32,
+    floor: float = FLOOR,
+) -> NDArray[np.float64]:
+    """Return the posterior over the cells, float64[width * height] with line = y * width + x.
+
+    There is one reading for each landmark, in the same order. An outlier's density is the floor everywhere,
+    relative to the peak. Without a floor, readings that are impossible on every line raise a ModelError.
+    """
+    y, x = cell_centres(interval("y", *Y_LIMITS, cells=height), interval("x", *X_LIMITS, cells=width))
+    factors = []
+    for landmark, reading in zip(landmarks, readings, strict=True):
+        if reading.range_m is not None:
+            away = reading.range_m - np.hypot(landmark.x - x, landmark.y - y)
+            factors.append(_likelihood(away / RANGE_SIGMA, floor))
+        if reading.bearing_rad is not None:
+            away = reading.bearing_rad - np.arctan2(landmark.y - y, landmark.x - x)
+            away = (away + np.pi) % (2 * np.pi) - np.pi
+            factors.append(_likelihood(away / BEARING_SIGMA, floor))
+    return fuse(np.ones(width * height), factors)
+
+
+def _likelihood(z: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
+    likelihood: NDArray[np.float64] = np.exp(-0.5 * z**2) + floor
+    return likelihood

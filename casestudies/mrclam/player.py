@@ -1,32 +1,25 @@
-"""Player of a recording on a rosbridge server; it prints each posterior's distance from the reference.
+"""A recording of a robot among landmarks, and its player, which compares posteriors with the reference.
 
 python -m casestudies.mrclam.player DATA_DIR/ds1_robot3.csv --uri ws://127.0.0.1:9090
 """
 
 import contextlib
+import csv
 import math
+import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from bridge.client import Publication
 from bridge.client.protocol import RosVersion
-from casestudies.mrclam.recording import (
-    MAP_FRAME,
-    SIGHTINGS_MSG,
-    SIGHTINGS_TOPIC,
-    SIGHTINGS_TYPE,
-    RecordedFrame,
-    area_grid,
-    read_recording,
-    sightings_message,
-)
-from casestudies.server import DEFAULT_URI, Uri
+from casestudies import DEFAULT_URI, DataFileError, Uri
+from casestudies.grid import Grid
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.posterior import Posterior
 from terminal.command_line import CommandLine
@@ -35,8 +28,138 @@ from terminal.output import check_writable, say, write_json
 from terminal.signals import run_async
 
 if TYPE_CHECKING:
-    from casestudies.listening import Listener
-    from casestudies.truths import Instance
+    from casestudies.listening import Instance, Listener
+
+
+SIGHTINGS_TOPIC: Final = "/mrclam/sightings"
+SIGHTINGS_TYPE: Final = "mrclam_msgs/Sightings"
+MAP_FRAME: Final = "map"
+LANDMARKS: Final = range(6, 21)
+"""The data set's numbers of the 15 landmarks; 1 to 5 are the robots."""
+
+SIGHTINGS_MSG: Final = (
+    "# mrclam_msgs/Sightings: range (m) and absolute bearing (rad, counter-clockwise from +x) of the landmarks "
+    "seen.\n# NaN where a landmark was not seen; a client without message definitions leaves the field out.\n"
+    "std_msgs/Header header\n"
+    + "".join(f"float64 range_{number}\nfloat64 bearing_{number}\n" for number in LANDMARKS)
+)
+
+_SIGHTING_COLUMN: Final = re.compile(r"range_(\d+)_m")
+_REFERENCE_COLUMNS: Final = ("time_s", "ref_x_m", "ref_y_m", "ref_std_m", "heading_rad")
+
+
+def area_grid(width: int = 32, height: int = 32) -> Grid:
+    """Return the area of the experiment, x in [-2, 7] m and y in [-7, 7] m, as a grid of cells."""
+    return Grid(x_low=-2.0, x_high=7.0, y_low=-7.0, y_high=7.0, width=width, height=height)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sighting:
+    """A sighting of one landmark: its range in metres, its absolute bearing in radians."""
+
+    landmark: int
+    range_m: float
+    bearing_rad: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordedFrame:
+    """The sightings of one second, and the robot's reference position in metres."""
+
+    number: int
+    time_s: float
+    x: float
+    y: float
+    sightings: tuple[Sighting, ...]
+
+
+def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
+    """Read a file such as `ds1_robot3.csv`, or raise a DataFileError that names the damaged line."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = csv.reader(file, strict=True)
+            columns = next(rows, [])
+            landmarks = _landmarks(path, columns)
+            frames = tuple(_frames(path, columns, landmarks, rows))
+    except OSError as error:
+        raise DataFileError(
+            f"{path} cannot be read: {error.strerror or error}; the case study's page says where to get the data"
+        ) from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DataFileError(f"{path} is not a CSV file: {error}") from None
+    if not frames:
+        raise DataFileError(f"{path} has a heading but no frames")
+    return frames
+
+
+def sightings_message(frame: RecordedFrame, header: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a frame as a `mrclam_msgs/Sightings` message, without the landmarks that were not seen."""
+    message: dict[str, Any] = {"header": dict(header)}
+    for sighting in frame.sightings:
+        message[f"range_{sighting.landmark}"] = sighting.range_m
+        message[f"bearing_{sighting.landmark}"] = sighting.bearing_rad
+    return message
+
+
+def _landmarks(path: Path, columns: Sequence[str]) -> tuple[int, ...]:
+    """Return the landmarks that the file has columns for."""
+    landmarks = tuple(int(match[1]) for column in columns if (match := _SIGHTING_COLUMN.fullmatch(column)))
+    wanted = [*_REFERENCE_COLUMNS, *(f"bearing_{landmark}_rad" for landmark in landmarks)]
+    missing = [column for column in wanted if column not in columns]
+    if missing or not landmarks:
+        raise DataFileError(
+            f"{path} is not a recording of sightings: its first line lacks the column "
+            f"{missing[0] if missing else 'range_N_m'}; name a file such as ds1_robot3.csv"
+        )
+    if unknown := set(landmarks) - set(LANDMARKS):
+        raise DataFileError(
+            f"{path} has sightings of landmark {min(unknown)}, but the landmarks are "
+            f"{LANDMARKS[0]} to {LANDMARKS[-1]}"
+        )
+    return landmarks
+
+
+def _frames(
+    path: Path, columns: Sequence[str], landmarks: Sequence[int], rows: Iterator[list[str]]
+) -> Iterator[RecordedFrame]:
+    for number, row in enumerate(rows, start=1):
+        where = f"{path}, line {number + 1}"
+        if len(row) != len(columns):
+            raise DataFileError(
+                f"{where} has {len(row)} values, but the heading has {len(columns)}: is the file truncated?"
+            )
+        cells = dict(zip(columns, row, strict=True))
+        sightings = []
+        for landmark in landmarks:
+            range_text, bearing_text = cells[f"range_{landmark}_m"], cells[f"bearing_{landmark}_rad"]
+            if bool(range_text) != bool(bearing_text):
+                raise DataFileError(f"{where}: landmark {landmark} has a range or a bearing, but not both")
+            if range_text:
+                sightings.append(
+                    Sighting(
+                        landmark=landmark,
+                        range_m=_number(range_text, where, f"range_{landmark}_m"),
+                        bearing_rad=_number(bearing_text, where, f"bearing_{landmark}_rad"),
+                    )
+                )
+        yield RecordedFrame(
+            number=number,
+            time_s=_number(cells["time_s"], where, "time_s"),
+            x=_number(cells["ref_x_m"], where, "ref_x_m"),
+            y=_number(cells["ref_y_m"], where, "ref_y_m"),
+            sightings=tuple(sightings),
+        )
+
+
+def _number(text: str, where: str, column: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise DataFileError(f"{where}: {column} must be a number, not {text!r}")
+    return value
+
 
 LOST_DISTANCE: Final = 9.0
 """Distance in metres at which a frame without a result is counted: the width of the area."""
@@ -105,9 +228,13 @@ async def play(
         publication = await ros.advertise(topic, SIGHTINGS_TYPE)
         for frame in frames:
             first = not played
-            turn = _Turn(frame, publication, listener, version)
-            instance = await turn.take(
-                first_timeout_s if first else timeout_s, repeat_s=_REPEAT_S if first else math.inf
+            instance = await _take_turn(
+                frame,
+                publication,
+                listener,
+                version,
+                limit_s=first_timeout_s if first else timeout_s,
+                repeat_s=_REPEAT_S if first else math.inf,
             )
             if first and instance is None:
                 raise NoResultError(
@@ -119,47 +246,31 @@ async def play(
     return played
 
 
-class _Turn:
-    """The publication of one frame and the wait for its result."""
+async def _take_turn(
+    frame: RecordedFrame,
+    publication: "Publication",
+    listener: "Listener",
+    version: "RosVersion | None",
+    *,
+    limit_s: float,
+    repeat_s: float,
+) -> "Instance | None":
+    """Publish a frame until its result arrives and return it, or None after the limit; skip late results of others."""
+    from bridge.stamps import header
 
-    def __init__(
-        self,
-        frame: RecordedFrame,
-        publication: "Publication",
-        listener: "Listener",
-        version: "RosVersion | None",
-    ) -> None:
-        self._frame = frame
-        self._publication = publication
-        self._listener = listener
-        self._version = version
-        self._stamps: set[int] = set()
-
-    async def take(self, limit_s: float, *, repeat_s: float) -> "Instance | None":
-        """Publish until a result arrives and return it, or None after the limit."""
-        end = time.monotonic() + limit_s
-        while (left := end - time.monotonic()) > 0:
-            await self._publish()
-            with contextlib.suppress(NoResultError):
-                return await self._answer(min(left, repeat_s))
-        return None
-
-    async def _publish(self) -> None:
-        from bridge.stamps import header
-
+    stamps: set[int] = set()
+    end = time.monotonic() + limit_s
+    while (now := time.monotonic()) < end:
         stamp_ns = time.time_ns()
-        self._stamps.add(stamp_ns)
-        await self._publication.publish(
-            sightings_message(self._frame, header(stamp_ns, MAP_FRAME, self._version))
-        )
-
-    async def _answer(self, limit_s: float) -> "Instance":
-        """Return the next result of this frame; skip late results of earlier frames."""
-        end = time.monotonic() + limit_s
-        while True:
-            instance = await self._listener.next(max(end - time.monotonic(), 0.0))
-            if instance.report is not None and instance.report.stamp_ns in self._stamps:
-                return instance
+        stamps.add(stamp_ns)
+        await publication.publish(sightings_message(frame, header(stamp_ns, MAP_FRAME, version)))
+        again = min(end, now + repeat_s)
+        with contextlib.suppress(NoResultError):
+            while True:
+                instance = await listener.next(max(again - time.monotonic(), 0.0))
+                if instance.report is not None and instance.report.stamp_ns in stamps:
+                    return instance
+    return None
 
 
 def _played(frame: RecordedFrame, instance: "Instance | None", timeout_s: float) -> PlayedFrame:

@@ -19,11 +19,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from casestudies.mrclam.fusion import LandmarkReading, unquantised_posterior
-from casestudies.mrclam.landmarks import Landmark, read_landmarks
-from casestudies.mrclam.model import model
-from casestudies.mrclam.player import median_distance, play
-from casestudies.mrclam.recording import RecordedFrame, area_grid, read_recording
+from casestudies.mrclam.model import Landmark, LandmarkReading, model, read_landmarks, unquantised_posterior
+from casestudies.mrclam.player import RecordedFrame, area_grid, median_distance, play, read_recording
 from scripts.running.flags import ScriptParser, output_file
 from scripts.running.processes import ROOT, Process, build, run_script
 from toolchain.deployment.address import to_address

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from bridge.errors import BridgeError
-from casestudies.errors import CaseStudyError
+from casestudies import CaseStudyError
 from services.errors import StackError
 from services.supervision.child import own_command
 from services.supervision.parent import ask_for_end_with_parent

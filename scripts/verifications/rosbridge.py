@@ -33,7 +33,7 @@ from bridge.client import Message, Qos, Ros, State, connect
 from bridge.client.protocol import Compression
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import BridgeError, EncodeError, GoalError, NoMessageError, ServiceError
-from casestudies.boat import geometry
+from casestudies.boat import sensors
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR
 from scripts.running.processes import BOAT_TOPIC, ROOT, Process, build, run_script
@@ -569,12 +569,10 @@ async def robot(stand: Stand, received: Received, sent: list[Sent]) -> AsyncIter
 
 def readings_of(column: int, row: int) -> list[float]:
     """Return the sensors' readings at a cell's centre without noise, in the order of the machine's columns."""
-    width = (geometry.MAP_HIGH - geometry.MAP_LOW) / SIZE
-    x, y = (geometry.MAP_LOW + width * (index + 0.5) for index in (column, row))
-    distances = [
-        min(round(geometry.distance(x, y, at)), geometry.LONGEST_DISTANCE) for at in geometry.BEACONS
-    ]
-    bearings = [round(geometry.bearing(x, y, at)) % 360 for at in geometry.BEACONS]
+    width = (sensors.MAP_HIGH - sensors.MAP_LOW) / SIZE
+    x, y = (sensors.MAP_LOW + width * (index + 0.5) for index in (column, row))
+    distances = [min(round(sensors.distance(x, y, at)), sensors.LONGEST_DISTANCE) for at in sensors.BEACONS]
+    bearings = [round(sensors.bearing(x, y, at)) % 360 for at in sensors.BEACONS]
     return [float(value) for value in distances + bearings]
 
 

@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from casestudies import readiness as module
-from casestudies.readiness import Readiness, serve_readiness
+from casestudies import publishing as module
+from casestudies.publishing import Readiness, serve_readiness
 from terminal.health import is_ready, read_status, status_socket
 from tests.patience import PATIENCE
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from casestudies.truths import Truth, Truths, read_truth
+from casestudies.listening import Truth, Truths, read_truth
 from posteriors.errors import BadResultError
 from posteriors.frame_report import FrameReport
 from posteriors.posterior import Posterior

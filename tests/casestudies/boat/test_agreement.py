@@ -6,11 +6,11 @@ Boat.measure  ->  normalise  ->  the model's exact posterior  ->  coverage of it
 import numpy as np
 import pytest
 
-from casestudies.boat.correctness import correctness
-from casestudies.boat.geometry import map_grid
 from casestudies.boat.model import model
 from casestudies.boat.normaliser import normalise
+from casestudies.boat.sensors import map_grid
 from casestudies.boat.simulator import Boat
+from tests.casestudies.figures import coverage, distances, means
 from toolchain.models.model import exact_posterior
 
 
@@ -24,6 +24,6 @@ def test_float64_fusion_covers_the_truth(seed):
         posteriors.append(exact_posterior(the_model, readings))
         lines.append(grid.line(boat.x, boat.y))
     exact = np.array(posteriors)
-    result = correctness(lines, exact, exact, width=grid.width)
-    assert result.coverage == pytest.approx(0.95, abs=0.03)
-    assert result.truth_distance_median < 3
+    assert coverage(lines, exact) == pytest.approx(0.95, abs=0.03)
+    truth = np.stack(np.divmod(lines, grid.width)[::-1], axis=1)
+    assert np.median(distances(means(exact, grid.width), truth)) < 3

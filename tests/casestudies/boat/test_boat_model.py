@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from casestudies.boat.geometry import BEACONS, SENSOR_NAMES, bearing, distance, distance_sigma, map_grid
 from casestudies.boat.model import model
+from casestudies.boat.sensors import BEACONS, SENSOR_NAMES, bearing, distance, distance_sigma, map_grid
 from machines.parameters import BM1Parameters
 from toolchain.building.quantise import quantise
 from toolchain.errors import ModelError

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from casestudies.boat.geometry import BEACONS, bearing, distance, distance_sigma
+from casestudies.boat.sensors import BEACONS, bearing, distance, distance_sigma
 
 on_map = st.floats(-50, 50)
 

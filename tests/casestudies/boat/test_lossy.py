@@ -2,7 +2,7 @@
 
 import pytest
 
-from casestudies.boat import lossy
+from casestudies import publishing
 
 TYPE = "boat_msgs/Raw"
 
@@ -19,6 +19,6 @@ class Server:
     ("known", "warnings"), [(None, 0), ("", 1), ("boat_msgs/msg/Raw", 0), ("std_msgs/String", 1)]
 )
 async def test_a_refused_topic_is_reported_as_far_as_rosapi_tells(known, warnings, capsys, monkeypatch):
-    monkeypatch.setattr(lossy, "SETTLED_S", 0)
-    await lossy.report_refused(Server(known), "/boat/raw", TYPE)
+    monkeypatch.setattr(publishing, "SETTLED_S", 0)
+    await publishing.report_refused(Server(known), "/boat/raw", TYPE)
     assert capsys.readouterr().err.count("warning: ") == warnings

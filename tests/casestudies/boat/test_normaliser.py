@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from casestudies.boat.messages import BadReadingError, read_raw, readings_message
 from casestudies.boat.normaliser import app, normalise, normalise_bearing, normalise_distance
+from casestudies.boat.sensors import BadReadingError, read_raw, readings_message
 from tests.command_runner import invoke
 
 HEAD = {"stamp": {"secs": 5, "nsecs": 6}, "frame_id": "map", "seq": 3}

@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from casestudies.boat.pictures import draw_positions, draw_shares, far_apart, posterior_grid
-from casestudies.boat.shares import StageKind, stage_shares
-from casestudies.truths import Instance, Truth
+from casestudies.boat.pictures import (
+    StageKind,
+    draw_positions,
+    draw_shares,
+    far_apart,
+    posterior_grid,
+    stage_shares,
+)
+from casestudies.listening import Instance, Truth
 from posteriors.frame_report import FrameReport, StageTimes
 from posteriors.posterior import Posterior
 from terminal.errors import OutputError

@@ -16,7 +16,7 @@ import pytest
 from matplotlib.image import imread
 
 from casestudies.boat import normaliser, simulator, viewer
-from casestudies.boat.geometry import map_grid
+from casestudies.boat.sensors import map_grid
 from tests.casestudies.pretend_stack import PretendStack, certain, frame_message, posterior_message
 from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from casestudies.boat.geometry import BEACONS, BEARING_SIGMA, bearing, distance, distance_sigma
+from casestudies.boat.sensors import BEACONS, BEARING_SIGMA, bearing, distance, distance_sigma
 from casestudies.boat.simulator import Boat
 
 

@@ -5,10 +5,10 @@ import os
 
 import pytest
 
-from casestudies.errors import DataFileError
+from casestudies import DataFileError
 from casestudies.mrclam.convert import app, read_barcodes
-from casestudies.mrclam.landmarks import read_landmarks
-from casestudies.mrclam.recording import read_recording
+from casestudies.mrclam.model import read_landmarks
+from casestudies.mrclam.player import read_recording
 from tests.command_runner import invoke
 
 T0 = 1248272272.0

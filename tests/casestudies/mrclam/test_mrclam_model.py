@@ -7,10 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from casestudies.mrclam.fusion import LandmarkReading, unquantised_posterior
-from casestudies.mrclam.landmarks import Landmark, read_landmarks
-from casestudies.mrclam.model import model
-from casestudies.mrclam.recording import area_grid
+from casestudies.mrclam.model import Landmark, LandmarkReading, model, read_landmarks, unquantised_posterior
+from casestudies.mrclam.player import area_grid
 from machines.encode import decode_code
 from toolchain.building.quantise import quantise
 from toolchain.deployment.address import to_address
@@ -160,12 +158,12 @@ def test_landmarks_are_read_in_the_files_order(path):
     [
         ("", "landmarks.csv"),
         ("landmark,x_m,y_m\n", "landmarks.csv"),
-        ("number,x_m,y_m\n1,2,3\n", "line 2.*'landmark'"),
-        ("landmark,x_m,y_m\n1,2,3\n1,4,5\n", "line 3: landmark 1"),
-        ("landmark,x_m,y_m\n1,2,north\n", "line 2"),
+        ("number,x_m,y_m\n1,2,3\n", "no column 'landmark'"),
+        ("landmark,x_m,y_m\n1,2,3\n1,4,5\n", "row 2: landmark 1"),
+        ("landmark,x_m,y_m\n1,2,north\n", "row 1"),
         ("landmark,x_m,y_m\n1,2\n", "line 2"),
-        ("landmark,x_m,y_m\n1,2,nan\n", "line 2"),
-        ("landmark,x_m,y_m\n-1,2,3\n", "line 2"),
+        ("landmark,x_m,y_m\n1,2,nan\n", "row 1"),
+        ("landmark,x_m,y_m\n-1,2,3\n", "row 1"),
         ("landmark,x_m,y_m\n1,\xff,3\n", "landmarks.csv"),
     ],
 )

@@ -11,8 +11,17 @@ import sys
 import pytest
 
 from bridge.errors import BridgeError
-from casestudies.mrclam.player import LOST_DISTANCE, PlayedFrame, app, median_distance, play
-from casestudies.mrclam.recording import SIGHTINGS_TOPIC, RecordedFrame, Sighting, area_grid
+from casestudies.mrclam.player import (
+    LOST_DISTANCE,
+    SIGHTINGS_TOPIC,
+    PlayedFrame,
+    RecordedFrame,
+    Sighting,
+    app,
+    area_grid,
+    median_distance,
+    play,
+)
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.posterior import Posterior
 from tests.casestudies.pretend_stack import PretendStack, certain

@@ -2,9 +2,9 @@
 
 import pytest
 
-from casestudies.errors import DataFileError
+from casestudies import DataFileError
 from casestudies.mrclam.model import X_LIMITS, Y_LIMITS
-from casestudies.mrclam.recording import (
+from casestudies.mrclam.player import (
     RecordedFrame,
     Sighting,
     area_grid,
