@@ -27,10 +27,7 @@ def _find(uri: str) -> str:
 Uri = Annotated[
     str,
     typer.Option(
-        envvar="BM_URI",
-        help="The rosbridge server.",
-        metavar="ws://HOST:PORT|robot:NAME",
-        callback=_find,
+        envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT|robot:NAME", callback=_find
     ),
 ]
 DEFAULT_URI = "ws://127.0.0.1:9090"

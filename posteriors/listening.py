@@ -130,11 +130,7 @@ class Posteriors:
         """
         return await self._within(timeout, self._take)
 
-    async def _within(
-        self,
-        timeout: float | None,
-        wait: Callable[[], Coroutine[Any, Any, Result]],
-    ) -> Result:
+    async def _within(self, timeout: float | None, wait: Callable[[], Coroutine[Any, Any, Result]]) -> Result:
         try:
             async with asyncio.timeout(timeout):
                 return await wait()

@@ -126,13 +126,7 @@ class Viewer:
         return line
 
     async def watch(
-        self,
-        uri: str,
-        *,
-        truth_topic: str,
-        truth_tolerance_s: float,
-        first_limit_s: float,
-        limit_s: float,
+        self, uri: str, *, truth_topic: str, truth_tolerance_s: float, first_limit_s: float, limit_s: float
     ) -> None:
         """Listen until all results have arrived, and print a line for each frame.
 
@@ -268,8 +262,7 @@ def boat_viewer(
         str, typer.Option(help="Topic of the true pose.", metavar="TOPIC")
     ] = TRUE_POSE_TOPIC,
     truth_tolerance: Annotated[
-        float,
-        typer.Option(min=0, help="Seconds by which a true pose may be older than the reading."),
+        float, typer.Option(min=0, help="Seconds by which a true pose may be older than the reading.")
     ] = 0.5,
     first_timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")] = 60.0,
     timeout: Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")] = 30.0,

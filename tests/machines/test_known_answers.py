@@ -85,10 +85,7 @@ FIFTH = (MAX_CYCLES, 5, [2, 3, 1, 0], "11110010 10000100")
             [({"addresses": (), "target_count": 7}, (OVERFLOW, 7, [3, 7, 1, 0], "11001010"))],
         ),
         # column 0 shows 3 2 1 1, column 1 shows 0 0 2 1
-        (
-            {"steps_per_clock": 2},
-            [({"max_cycles": 4}, (MAX_CYCLES, 4, [2, 2, 0, 0], "10010100 00100111"))],
-        ),
+        ({"steps_per_clock": 2}, [({"max_cycles": 4}, (MAX_CYCLES, 4, [2, 2, 0, 0], "10010100 00100111"))]),
     ],
     ids=[
         "the first cycle sees the seeds, and the generators step after the last",
@@ -125,8 +122,7 @@ def test_slices_are_one_frame(make):
 
 
 @pytest.mark.parametrize(
-    ("reset", "states"),
-    [(RngReset.BANK, "10011111 11100001"), (RngReset.FREE, "01111100 10100001")],
+    ("reset", "states"), [(RngReset.BANK, "10011111 11100001"), (RngReset.FREE, "01111100 10100001")]
 )
 def test_a_machine_in_which_no_line_can_count_is_not_run(make, reset, states):
     machine = BM1Machine(

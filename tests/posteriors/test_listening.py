@@ -248,10 +248,7 @@ print("ended after", listen("{uri}", function), flush=True)
 
 @pytest.mark.parametrize(
     "when",
-    [
-        pytest.param("inside", marks=pytest.mark.thorough),
-        pytest.param("waiting", marks=pytest.mark.process),
-    ],
+    [pytest.param("inside", marks=pytest.mark.thorough), pytest.param("waiting", marks=pytest.mark.process)],
 )
 @pytest.mark.asyncio(loop_factories=["asyncio"])
 async def test_ctrl_c_is_an_end_like_any_other(when):

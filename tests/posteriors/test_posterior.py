@@ -149,10 +149,7 @@ def test_hostile_posteriors_are_read_or_refused_in_one_sentence(message):
 
 def test_one_replica_by_itself():
     both = Posterior(
-        probabilities=(0.25, 0.75, 0.0, 0.0, 1.0, 0.0),
-        labels=("replica", "s"),
-        sizes=(3, 2),
-        heard_ns=5,
+        probabilities=(0.25, 0.75, 0.0, 0.0, 1.0, 0.0), labels=("replica", "s"), sizes=(3, 2), heard_ns=5
     )
     assert both.replicas == 3
     first = both.replica(0)

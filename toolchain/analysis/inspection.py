@@ -103,23 +103,13 @@ def inspect_deployment(
         stop=section.stop,
     )
     resources = tuple(
-        estimate(
-            machine.parameters,
-            options.device,
-            pcie=options.pcie,
-            table_length=table_length(machine),
-        )
+        estimate(machine.parameters, options.device, pcie=options.pcie, table_length=table_length(machine))
         for machine in machines
     )
     banks = options.banks or (SLOW_BANKS if _is_slow(whole) else BANKS)
     with progress(len(readings)) as advance:
         accuracy = measure(
-            boards,
-            readings,
-            model,
-            banks=banks,
-            replicas=section.replicas,
-            advance=lambda: advance("frames"),
+            boards, readings, model, banks=banks, replicas=section.replicas, advance=lambda: advance("frames")
         )
     return Inspection(
         deployment=deployment,
@@ -269,10 +259,7 @@ def _loss_part(found: Inspection) -> str:
     if found.losses is None:
         return "Lost by quantising: as report.txt says, which the build wrote; give the model with --model to compare."
     width = max(6, *(len(loss.name) for loss in found.losses))
-    rows = [
-        loss_heading(found.machine.parameters.sensor_mode),
-        f"  {'column':{width}}       mass         KL",
-    ]
+    rows = [loss_heading(found.machine.parameters.sensor_mode), f"  {'column':{width}}       mass         KL"]
     rows += [f"  {loss.name:{width}}  {loss.mass:9.2e}  {loss.kl_bits:9.2e}" for loss in found.losses]
     return "\n".join(rows)
 
@@ -378,7 +365,7 @@ def _energy_part(found: Inspection) -> str:
         (
             f"Energy of a frame of {median:,.0f} cycles, a toggle-count model, not a measurement: {_with_unit(dynamic, 'J')} for toggles "
             f"({found.energy.toggles:,.0f} per cycle on all boards) and {_with_unit(static, 'J')} for leakage while it runs. It assumes:"
-        ),
+        )
     ]
     rows += [f"  - {assumption}" for assumption in ASSUMPTIONS]
     return "\n".join(rows)

@@ -195,12 +195,7 @@ def _normalised(distribution: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def recorded_readings(
-    path: Path,
-    variables: Sequence[Variable],
-    given: Sequence[str],
-    *,
-    frames: int,
-    tolerance_s: float = 0.1,
+    path: Path, variables: Sequence[Variable], given: Sequence[str], *, frames: int, tolerance_s: float = 0.1
 ) -> Readings:
     """Return at most `frames` readings of a recording (CSV, MCAP or bag), spread over its length.
 

@@ -99,11 +99,7 @@ class Estimate:
 
 
 def estimate(
-    parameters: BM1Parameters,
-    device: Device,
-    *,
-    pcie: Pcie = Pcie.HARD,
-    table_length: int = LENGTH,
+    parameters: BM1Parameters, device: Device, *, pcie: Pcie = Pcie.HARD, table_length: int = LENGTH
 ) -> Estimate:
     """Return the resources of a machine on a device, or raise a BuildError if it lacks a part."""
     if pcie is Pcie.HARD and not device.hard_pcie:
@@ -235,9 +231,7 @@ def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
         toggles += p.replicas * _stream_toggles(one_replica(machine), readings, slice(end - p.lines, end))
         clocked += sum(parts[each].registers for each in ("generators", "counters", "inputs", "control"))
     return Energy(
-        toggles=toggles,
-        cycle_j=toggles * TOGGLE_J + clocked * CLOCK_J,
-        static_w=len(machines) * STATIC_W,
+        toggles=toggles, cycle_j=toggles * TOGGLE_J + clocked * CLOCK_J, static_w=len(machines) * STATIC_W
     )
 
 

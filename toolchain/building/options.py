@@ -12,12 +12,7 @@ from pydantic import Field, ValidationError
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from toolchain.bounded_files import TomlFile, nearest_name
 from toolchain.deployment import Output, Queue, Scale, Source, Stop, Variable, WrittenPrior
-from toolchain.deployment.sections import (
-    MessagePath,
-    Name,
-    Section,
-    Sequence,
-)
+from toolchain.deployment.sections import MessagePath, Name, Section, Sequence
 from toolchain.errors import BuildError, ToolchainError
 
 if TYPE_CHECKING:

@@ -20,13 +20,11 @@ def build(
     ],
     flags: BuildFlags,
     uri: Annotated[
-        str,
-        typer.Option(help="rosbridge server of the readings.", metavar="ws://HOST:PORT|robot:NAME"),
+        str, typer.Option(help="rosbridge server of the readings.", metavar="ws://HOST:PORT|robot:NAME")
     ] = "",
     topic: Annotated[str, typer.Option(help="Topic of the readings.", metavar="TOPIC")] = "",
     message_type: Annotated[
-        str,
-        typer.Option("--type", help="Type of the topic.", metavar="PACKAGE/NAME"),
+        str, typer.Option("--type", help="Type of the topic.", metavar="PACKAGE/NAME")
     ] = "",
     sources: Annotated[
         Path | None,
@@ -37,12 +35,10 @@ def build(
     ] = None,
     output: Annotated[str, typer.Option(help="Topic of the posteriors.", metavar="TOPIC")] = "/BMresults",
     prior_path: Annotated[
-        str | None,
-        typer.Option(help="Path of a written prior in the message.", metavar="PATH"),
+        str | None, typer.Option(help="Path of a written prior in the message.", metavar="PATH")
     ] = None,
     queue: Annotated[
-        Queue,
-        typer.Option(help="If readings arrive too fast: keep only the latest, or all in order."),
+        Queue, typer.Option(help="If readings arrive too fast: keep only the latest, or all in order.")
     ] = Queue.LATEST,
     tolerance: Annotated[
         float,

@@ -20,8 +20,7 @@ def check(
     path: Annotated[
         Path,
         typer.Argument(
-            help="Folder with model.py, a network file, or the folder of a deployment.",
-            metavar="MODEL|DIR",
+            help="Folder with model.py, a network file, or the folder of a deployment.", metavar="MODEL|DIR"
         ),
     ],
     flags: BuildFlags,

@@ -14,8 +14,7 @@ def fit(
         Path, typer.Argument(help="Folder with model.py, whose variables are fitted.", metavar="MODEL")
     ],
     recordings: Annotated[
-        list[Path],
-        typer.Argument(help="CSV, MCAP or bag with readings and the truth.", metavar="RECORDING"),
+        list[Path], typer.Argument(help="CSV, MCAP or bag with readings and the truth.", metavar="RECORDING")
     ],
     output: Annotated[
         Path,
@@ -64,8 +63,7 @@ def fit(
         ),
     ] = None,
     tolerance: Annotated[
-        float,
-        typer.Option(help="bags: maximum time between a reading and its truth.", metavar="SECONDS"),
+        float, typer.Option(help="bags: maximum time between a reading and its truth.", metavar="SECONDS")
     ] = 0.1,
 ) -> None:
     """Learn the tables of a model, and its prior, from recordings with ground truth, and report the data behind each.

@@ -41,16 +41,14 @@ ReadingColumns: TypeAlias = Annotated[
     ),
 ]
 Settings: TypeAlias = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="A parameter of the model; repeatable.", metavar="KEY=VALUE"),
+    list[str] | None, typer.Option("--set", help="A parameter of the model; repeatable.", metavar="KEY=VALUE")
 ]
 StopWhen: TypeAlias = Annotated[
     Stop,
     typer.Option(help="slices: all boards shortly after the first overflow; own: each at its own overflow."),
 ]
 TargetCount: TypeAlias = Annotated[
-    int | None,
-    typer.Option(help="Count that stops a machine.", show_default="the counters' maximum"),
+    int | None, typer.Option(help="Count that stops a machine.", show_default="the counters' maximum")
 ]
 
 
@@ -61,16 +59,14 @@ class ModelFlags:
     settings: Settings = None
     searched: Annotated[str, typer.Option(help="Searched variables.", metavar="A,B")] = ""
     known: Annotated[
-        str,
-        typer.Option(help="Variables with readings, in the order of the columns.", metavar="A,B"),
+        str, typer.Option(help="Variables with readings, in the order of the columns.", metavar="A,B")
     ] = ""
     given: Annotated[
         list[str] | None,
         typer.Option(help="A variable with a fixed state; repeatable.", metavar="NAME=STATE"),
     ] = None
     prior_select: Annotated[
-        str,
-        typer.Option(help="Variable whose readings select the prior.", metavar="NAME"),
+        str, typer.Option(help="Variable whose readings select the prior.", metavar="NAME")
     ] = ""
     on_missing: Annotated[OnMissing, typer.Option(help="Meaning of an absent reading.")] = OnMissing.ERROR
 
@@ -117,8 +113,7 @@ class BuildFlags(ModelFlags):
     prob_bits: Annotated[int, typer.Option(help="Bits of a code.", min=1, max=16)] = 8
     bits: Bits = None
     prior_mode: Annotated[
-        PriorMode,
-        typer.Option(help="table: the prior is in the images; written: the host writes it."),
+        PriorMode, typer.Option(help="table: the prior is in the images; written: the host writes it.")
     ] = PriorMode.TABLE
     counter_bits: Annotated[int, typer.Option(help="Bits of a line's counter.", min=1, max=32)] = 8
     target_count: TargetCount = None
@@ -143,8 +138,7 @@ class BuildFlags(ModelFlags):
         typer.Option(help="bank: each frame restarts the generators; free: never, as in the thesis."),
     ] = RngReset.BANK
     shared: Annotated[
-        bool,
-        typer.Option("--shared/--per-cell", help="One generator per column, or one per cell."),
+        bool, typer.Option("--shared/--per-cell", help="One generator per column, or one per cell.")
     ] = True
     steps_per_clock: Annotated[
         int,

@@ -33,8 +33,7 @@ def memories(
     model: Annotated[
         Path | None,
         typer.Option(
-            help="Use the tables of the current model; without it, those of the images.",
-            metavar="MODEL",
+            help="Use the tables of the current model; without it, those of the images.", metavar="MODEL"
         ),
     ] = None,
     verbose: Verbose = False,
@@ -85,8 +84,7 @@ def deployment(
     ] = None,
     output: Annotated[str | None, typer.Option(help="Topic of the posteriors.", metavar="TOPIC")] = None,
     order: Annotated[
-        str | None,
-        typer.Option(help="The sensors in the order of columns 1 to N.", metavar="A,B,C"),
+        str | None, typer.Option(help="The sensors in the order of columns 1 to N.", metavar="A,B,C")
     ] = None,
     path: Annotated[
         list[str] | None,

@@ -164,11 +164,7 @@ def _normals(
 
 
 def mixture(
-    residuals: Sequence[NDArray[np.float64]],
-    widths: Sequence[float],
-    *,
-    bias: bool,
-    least_sigma: float,
+    residuals: Sequence[NDArray[np.float64]], widths: Sequence[float], *, bias: bool, least_sigma: float
 ) -> tuple[float, float, list[float]]:
     """Fit one normal and, for each variable, the share of uniform outliers.
 

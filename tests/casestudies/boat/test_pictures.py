@@ -33,11 +33,7 @@ def instance(number, x=0.0, y=0.0, *, cell=None, truth=True, width=32, height=32
         stamp_ns=number, heard_ns=number, outcome="", number=number, sent_ns=0, stages=StageTimes(**stages)
     )
     posterior = Posterior(
-        probabilities=tuple(values),
-        labels=("y", "x"),
-        sizes=(height, width),
-        heard_ns=500_000,
-        report=report,
+        probabilities=tuple(values), labels=("y", "x"), sizes=(height, width), heard_ns=500_000, report=report
     )
     return Instance(heard=posterior, truth=Truth(stamp_ns=number, x=x, y=y) if truth else None)
 

@@ -4,13 +4,7 @@ import pytest
 
 from casestudies import DataFileError
 from casestudies.mrclam.model import X_LIMITS, Y_LIMITS
-from casestudies.mrclam.player import (
-    RecordedFrame,
-    Sighting,
-    area_grid,
-    read_recording,
-    sightings_message,
-)
+from casestudies.mrclam.player import RecordedFrame, Sighting, area_grid, read_recording, sightings_message
 
 HEADING = "time_s,ref_x_m,ref_y_m,ref_std_m,heading_rad,range_6_m,bearing_6_rad,range_20_m,bearing_20_rad"
 FIRST = "1248272277.018,4.392,2.407,0.041,-2.0698,,,6.712,-1.8623"

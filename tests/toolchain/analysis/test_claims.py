@@ -8,15 +8,7 @@ import pytest
 from machines.bm1 import Start, addressed_codes
 from machines.reference import ReferenceBM1
 from toolchain.analysis import claims
-from toolchain.analysis.claims import (
-    KINDS,
-    Faults,
-    FaultyMachine,
-    beacons,
-    frames_of,
-    machine_of,
-    run_claims,
-)
+from toolchain.analysis.claims import KINDS, Faults, FaultyMachine, beacons, frames_of, machine_of, run_claims
 from toolchain.analysis.pictures import draw_claims
 from toolchain.analysis.readings import sample_readings
 from toolchain.models.model import exact_posterior

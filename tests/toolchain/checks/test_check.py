@@ -66,10 +66,7 @@ def sparse_models(draw):
     if not prior.any():
         prior[0] = 1
     return Model(
-        name="sparse",
-        searched=(dimension("s", size=lines),),
-        known=tuple(known),
-        prior=prior / prior.sum(),
+        name="sparse", searched=(dimension("s", size=lines),), known=tuple(known), prior=prior / prior.sum()
     )
 
 

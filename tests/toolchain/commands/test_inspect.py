@@ -32,7 +32,7 @@ def test_with_the_model(case, deployment):
     assert "20 frames drawn from the model (seed 1), each with 4 sets of seeds." in text
     assert "time at 50 MHz" in text
     assert [part.split()[0] for part in text.split("\n\n")] == [
-        *("Deployment", "Lost", "Readings:", "Cycles", "Accuracy", "Resources", "Energy"),
+        *("Deployment", "Lost", "Readings:", "Cycles", "Accuracy", "Resources", "Energy")
     ]
 
 

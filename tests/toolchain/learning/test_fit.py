@@ -186,7 +186,7 @@ def test_counted_tables_and_their_file_survive_a_round_trip(tmp_path):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     with zipfile.ZipFile(tmp_path / "a.npz") as packed:
         assert set(json.loads(packed.read("fit.json"))) == {
-            *("format", "method", "model", "floor", "recording", "variable"),
+            *("format", "method", "model", "floor", "recording", "variable")
         }
     again = read_fit(tmp_path / "a.npz")
     assert again.file == fit.file

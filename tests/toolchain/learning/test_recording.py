@@ -110,14 +110,7 @@ def test_bags(tmp_path, kind):
 
 
 @pytest.mark.parametrize(
-    "columns",
-    [
-        ["range"],
-        ["/rnge:data"],
-        ["/range:value"],
-        ["/range:data[x]"],
-        ["/range:__class__.__mro__"],
-    ],
+    "columns", [["range"], ["/rnge:data"], ["/range:value"], ["/range:data[x]"], ["/range:__class__.__mro__"]]
 )
 def test_columns_that_a_bag_does_not_have(tmp_path, columns):
     with pytest.raises(ModelError):

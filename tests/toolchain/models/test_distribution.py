@@ -5,14 +5,7 @@ import pytest
 
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal, wrapped_normal
-from toolchain.models.distribution import (
-    MAX_ENTRIES,
-    conditional_normal,
-    function,
-    potential,
-    table,
-    uniform,
-)
+from toolchain.models.distribution import MAX_ENTRIES, conditional_normal, function, potential, table, uniform
 from toolchain.models.symbol import IntegerType, IntervalType, LabelType, Symbol
 
 A = Symbol("A", LabelType("no", "yes"))

@@ -194,8 +194,7 @@ def test_a_markov_network():
 def test_a_line_that_is_impossible_changes_no_code():
     s, k = Symbol("s", IntegerType(0, 2)), Symbol("k", YES_NO)
     joint = JointDistribution(
-        "impossible",
-        (table(s, [0.5, 0.5, 0]), table(k, [[0.9, 0.8, 0.0], [0.1, 0.2, 1.0]], given=[s])),
+        "impossible", (table(s, [0.5, 0.5, 0]), table(k, [[0.9, 0.8, 0.0], [0.1, 0.2, 1.0]], given=[s]))
     )
     model = joint.ask(["s"], ["k"]).model()
     assert model.prior_distribution.tolist() == [0.5, 0.5, 0]
@@ -219,10 +218,7 @@ NEVER = (uniform(S), table(R, [[1, 1], [0, 0]], given=[S]))
         (lambda: SPRINKLER.ask(["R"], given={"S": "maybe"}), "S .*'maybe'; .*no, yes"),
         (lambda: JointDistribution("j", (table(S, COIN, given=[R]),)), r"uniform\(R\)"),
         (lambda: JointDistribution("j", (uniform(R), uniform(R))), "j: R "),
-        (
-            lambda: JointDistribution("j", (uniform(R), uniform(Symbol("R", IntegerType(0, 1))))),
-            "j: .*'R'",
-        ),
+        (lambda: JointDistribution("j", (uniform(R), uniform(Symbol("R", IntegerType(0, 1))))), "j: .*'R'"),
         (lambda: JointDistribution("j", tuple(CYCLE)), "j: .* -> "),
         (lambda: JointDistribution("j", NEVER).ask(["S"], given={"R": "yes"}).model(), "j: "),
     ],

@@ -357,10 +357,7 @@ def test_long_nonsense_is_refused_without_taking_long(tmp_path, text):
 
 
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    st.sampled_from(sorted(TEXTS)),
-    st.data(),
-)
+@given(st.sampled_from(sorted(TEXTS)), st.data())
 def test_a_damaged_file_is_read_or_refused(tmp_path, file, data):
     text = TEXTS[file].encode()
     at = data.draw(st.integers(0, len(text) - 1))
