@@ -16,10 +16,8 @@ import numpy as np
 from bridge.client import Ros, connect
 from bridge.errors import BridgeError
 from bridge.stamps import stamp_ns
-from casestudies.boat.sensors import SENSOR_NAMES
-from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
-from casestudies.listening import listen
-from casestudies.listening import Instance
+from casestudies.boat.sensors import SENSOR_NAMES, SENSORS_TOPIC, SENSORS_TYPE
+from casestudies.listening import Instance, listen
 from machines.bm1 import Start
 from machines.posterior import joint_posterior
 from machines.reference import ReferenceBM1
