@@ -36,11 +36,9 @@ from pcie_shim.errors import (
     StaleHandleError,
     UnreachableError,
 )
-from pcie_shim.host.frame import BoardResult
-from pcie_shim.host.frame_encoder import BoardWords
-from pcie_shim.host.link import Done, Link, RegisterWrite
+from pcie_shim.host.frame import BoardResult, BoardWords
 from pcie_shim.host.loader import program
-from pcie_shim.host.socket_link import SocketLink
+from pcie_shim.host.socket_link import Done, RegisterWrite, SocketLink
 from pcie_shim.programming_file import Image, interface_words, is_plain
 from pcie_shim.register_layout import ALL_ONES, REPLICA_OUTCOME, next_doorbell
 from pcie_shim.register_map import BoardState
@@ -69,7 +67,7 @@ class DrivenBoard:
         self.result_bytes = self.counts_bytes + (
             self.replicas * REPLICA_OUTCOME.itemsize if self.replicas > 1 else 0
         )
-        self.link: Link | None = None
+        self.link: SocketLink | None = None
         self.broken = "it has not been opened"
         self.speed = _ASSUMED_SPEED
         self._forget()
@@ -112,7 +110,7 @@ class DrivenBoard:
         self.link = link
         self.readable.register(link.fileno(), select.POLLIN)
 
-    def _identified(self, timeout: float, connect_timeout: float) -> Link:
+    def _identified(self, timeout: float, connect_timeout: float) -> SocketLink:
         """Return a link to the board, after checking its identity and register map."""
         link = SocketLink.open(self.endpoint, timeout=timeout, connect_timeout=connect_timeout)
         try:
@@ -122,7 +120,7 @@ class DrivenBoard:
             raise
         return link
 
-    def _check_identity(self, link: Link) -> None:
+    def _check_identity(self, link: SocketLink) -> None:
         identity = link.read32(rm.ID)
         pattern = time.monotonic_ns() & ALL_ONES
         link.write32(rm.LIVENESS, pattern)
@@ -139,7 +137,7 @@ class DrivenBoard:
                 f"{rm.MAP_SHA256}: use a board and a host of the same version"
             )
 
-    def _check_image(self, link: Link) -> None:
+    def _check_image(self, link: SocketLink) -> None:
         found = link.read_block(rm.IMAGE_HASH, rm.IMAGE_HASH_WORDS).hex()
         if found != self.image.image_hash:
             raise ImageMismatchError(
@@ -148,7 +146,7 @@ class DrivenBoard:
                 "programmed when it is opened)"
             )
 
-    def _check_capabilities(self, link: Link) -> None:
+    def _check_capabilities(self, link: SocketLink) -> None:
         """Check that the registers used by the host exist, independently of the image hash."""
         parameters = self.image.machine.parameters
         words = struct.iter_unpack("<I", link.read_block(_CAPABILITIES.start, len(_CAPABILITIES)))
@@ -176,7 +174,7 @@ class DrivenBoard:
             )
 
     @property
-    def open_link(self) -> Link:
+    def open_link(self) -> SocketLink:
         """The link of an open board; a LinkClosedError without one."""
         if self.link is None:
             raise LinkClosedError(f"The link to the board at {self.endpoint} is closed: {self.broken}")

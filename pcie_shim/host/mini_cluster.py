@@ -23,9 +23,8 @@ from pcie_shim.errors import (
     StaleHandleError,
 )
 from pcie_shim.host.driven_board import DrivenBoard, board_error
-from pcie_shim.host.frame import FrameInput, FrameOutput
-from pcie_shim.host.frame_encoder import FrameEncoder
-from pcie_shim.host.link import LONGEST_POLL_S
+from pcie_shim.host.frame import FrameEncoder, FrameInput, FrameOutput
+from pcie_shim.host.socket_link import LONGEST_POLL_S
 from pcie_shim.programming_file import Image
 
 SLACK_S: Final = 5.0

@@ -1,4 +1,18 @@
-"""The link over a blocking socket (AF_UNIX or TCP): frames with sequence numbers and CRCs."""
+"""The link to a board over a blocking socket (AF_UNIX or TCP): frames with sequence numbers and CRCs.
+
+    host                                              board
+      │◀─ GREET: map, image, token ─────────────────────│   before it AUTHENTICATE, if there is a key
+      │── READ 1 ──────────────────────────────────────▶│
+      │◀─ reply 1 ──────────────────────────────────────│
+      │── WRITE 2, POSTED: settings and sensors ───────▶│   no reply
+      │── WRITE 3, POSTED: RUN_UNTIL and the doorbell ─▶│
+      │◀─ IRQ 1: DONE, STATUS, CYCLES, counts ──────────│   numbered apart from the requests
+      │◀─ ERROR 3 ──────────────────────────────────────│   instead of the IRQ, if write 3 was refused
+
+A host with one board reads, writes and waits. A host with many boards posts to each of them, polls their
+descriptors and receives what has arrived. Every method raises `LinkError`: `AccessError` if the board refused the
+access (the link stays open), and any other error if the link is broken (it is closed).
+"""
 
 import hmac
 import socket
@@ -6,7 +20,7 @@ import struct
 import time
 from collections.abc import Iterable
 from contextlib import suppress
-from typing import Final, NoReturn, Self
+from typing import Final, NamedTuple, NoReturn, Self, TypeAlias
 
 from pcie_shim import credentials, framing, register_map
 from pcie_shim.endpoint import Endpoint, connect
@@ -26,9 +40,44 @@ from pcie_shim.errors import (
     StaleHandleError,
 )
 from pcie_shim.framing import Frame, Octets
-from pcie_shim.host.link import Done, Link, RegisterWrite
 from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, WORD
 from pcie_shim.register_map import ErrorCode
+
+LONGEST_POLL_S: Final = 3600.0
+"""Maximum duration of a single wait in seconds, because poll expects milliseconds in 31 bits."""
+
+RegisterWrite: TypeAlias = "tuple[int, Octets]"
+"""An address of the register map in bytes, and the little-endian words to write from that address on."""
+
+
+class Done(NamedTuple):
+    """The answer of a board when its machine has stopped.
+
+    Attributes:
+        number: The number of the start or resume that has stopped.
+        status: The STATUS register.
+        cycles: Cycles run in this frame.
+        compute_ns: Computing time since that start or resume, in nanoseconds.
+        results: One 32-bit count per line, replica after replica, followed by OUTCOMES if there are replicas;
+            as bytes, valid until the link receives again.
+    """
+
+    number: int
+    status: int
+    cycles: int
+    compute_ns: int
+    results: memoryview
+
+    @property
+    def state(self) -> int:
+        """STATUS.STATE."""
+        return self.status & register_map.STATUS_STATE_MASK
+
+    @property
+    def reason(self) -> int:
+        """STATUS.STOP_REASON."""
+        return (self.status & register_map.STATUS_STOP_REASON_MASK) >> register_map.STATUS_STOP_REASON_SHIFT
+
 
 _ENDS_S: Final = 1.0
 """Seconds by which the end of this host's previous link may reach a board on the network after its next link."""
@@ -36,24 +85,29 @@ _RETRY_S: Final = 0.02
 _CLOSING_CODES: Final = (ErrorCode.STALE, ErrorCode.HELD, ErrorCode.BAD_FRAME)
 
 
-class SocketLink(Link):
-    """An open link over a socket; it closes itself when the stream cannot be trusted.
-
-    Attributes:
-        endpoint: Endpoint of the board.
-        greeting: Greeting of the board.
-        timeout: Timeout of an answer in seconds.
-    """
+class SocketLink:
+    """An open link over a socket; it closes itself when the stream cannot be trusted."""
 
     def __init__(self, endpoint: Endpoint, *, timeout: float, connect_timeout: float) -> None:
         """Connect and receive the greeting; use `open`, which also checks it."""
         self.endpoint = endpoint
         self.timeout = timeout
+        """Seconds that the board may take for an answer, and to accept data."""
+
+        # Why the link was closed, which later calls report; empty while it is open.
         self._closed = ""
-        self._decoder = framing.FrameDecoder()
+
+        # Numbers of the last request and of the last interrupt. Both ends count, so that a lost or repeated frame is
+        # noticed, and an answer is known to be that of its request.
         self._sequence = 0
         self._interrupts = 0
+
+        # The buffer of received bytes. Payloads are views of it, which the next receive overwrites.
+        self._decoder = framing.FrameDecoder()
+
+        # An interrupt that came while a request waited for its answer, with a copy of its results, until it is taken.
         self._done: Done | None = None
+
         deadline = time.monotonic() + connect_timeout
         self._socket = connect(endpoint, timeout=connect_timeout)
         try:
@@ -65,6 +119,7 @@ class SocketLink(Link):
             if frame.operation == framing.ERROR:
                 self._refused(frame)
             self.greeting = framing.decode_greeting(frame)
+            # proves to the programming port that its owner holds this link
             self.token = self.greeting.token
         except LinkError as error:
             self._give_up(error)
@@ -353,11 +408,9 @@ class SocketLink(Link):
 
     def _give_up(self, error: LinkError) -> NoReturn:
         """Close the link, and raise the error."""
-        if type(error) in {FramingError, CrcError, SequenceError}:
+        if not self._closed and type(error) in {FramingError, CrcError, SequenceError}:
             # the decoder does not know the endpoint
-            text = str(error)
-            if str(self.endpoint) not in text:
-                error = type(error)(f"The link to the board at {self.endpoint} is broken and closed: {text}")
+            error = type(error)(f"The link to the board at {self.endpoint} is broken and closed: {error}")
         self.close(str(error))
         raise error
 

@@ -15,9 +15,9 @@ from pcie_shim.errors import (
     PcieShimError,
 )
 from pcie_shim.host.frame import FrameInput, FrameOutput
-from pcie_shim.host.link import LONGEST_POLL_S
 from pcie_shim.host.loader import program
 from pcie_shim.host.mini_cluster import PROGRAMMING_S, MiniCluster
+from pcie_shim.host.socket_link import LONGEST_POLL_S
 from pcie_shim.programming_file import Image, read_image
 from services.boards.frames import BoardAwayError, driver_input
 from services.settings import Settings

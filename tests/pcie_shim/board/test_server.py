@@ -30,9 +30,8 @@ from pcie_shim.errors import (
     LinkClosedError,
 )
 from pcie_shim.host import socket_link
-from pcie_shim.host.link import Done
 from pcie_shim.host.loader import program
-from pcie_shim.host.socket_link import SocketLink
+from pcie_shim.host.socket_link import Done, SocketLink
 from pcie_shim.programming_file import image_bytes
 from pcie_shim.register_map import BoardState, ErrorCode
 from tests.patience import PATIENCE
@@ -417,3 +416,21 @@ def test_the_programming_port_takes_no_registers_writes_no_part_out_of_turn_and_
         link.request(framing.PROGRAM, 0, 0, 1, words(1))
     with open_programming(board) as link, pytest.raises(AccessError):
         begin(link, 2**40, hashlib.sha256().digest())
+    for second in (0, 8):  # repeated, and lost
+        with open_programming(board) as link:
+            begin(link, 12, hashlib.sha256(words(1, 2, 3)).digest())
+            link.request(framing.PROGRAM, 0, 0, 1, words(1))
+            with refused(ErrorCode.BAD_FRAME):
+                link.request(framing.PROGRAM, 0, second, 1, words(2))
+
+
+def test_a_host_that_opens_the_board_during_a_transfer_keeps_it(start_board: StartBoard) -> None:
+    board = start_board()
+    content = image_bytes(image(MACHINE))
+    with open_programming(board) as loader, open_link(board) as host:
+        begin(loader, len(content), hashlib.sha256(content).digest())
+        loader.post_part(0, content + bytes(-len(content) % 4))
+        assert host.read32(rm.PROGRAMMED) == 0
+        with pytest.raises(HeldError):
+            loader.request(framing.PROGRAM, framing.END, len(content), 0)
+        assert host.read_block(rm.IMAGE_HASH, 8) == bytes(32)

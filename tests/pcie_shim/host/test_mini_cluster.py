@@ -3,6 +3,7 @@
 MiniCluster (the test's thread) ══ 4 links ══ 4 boards (a thread each)
 """
 
+import contextlib
 import dataclasses
 import itertools
 import re
@@ -22,7 +23,7 @@ from machines.parameters import PriorMode
 from pcie_shim import endpoint
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard
-from pcie_shim.endpoint import Endpoint
+from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import (
     BoardGoneError,
     BoardHeldError,
@@ -38,14 +39,16 @@ from pcie_shim.errors import (
     LinkClosedError,
     PcieShimError,
     SequenceError,
+    ShortReadError,
 )
 from pcie_shim.host import mini_cluster
 from pcie_shim.host.driven_board import DrivenBoard
-from pcie_shim.host.frame import FrameInput, FrameOutput
-from pcie_shim.host.frame_encoder import BoardWords
+from pcie_shim.host.frame import BoardWords, FrameInput, FrameOutput
 from pcie_shim.host.loader import program
 from pcie_shim.host.mini_cluster import MiniCluster
+from pcie_shim.host.socket_link import Done
 from pcie_shim.programming_file import Image
+from pcie_shim.register_map import BoardState
 from tests.patience import PATIENCE
 from tests.pcie_shim.boards import (
     BoardProcess,
@@ -417,6 +420,17 @@ def refuse_on_opening(board: ServedBoard, error: type[PcieShimError]) -> None:
 
 def test_a_board_of_another_register_map_is_refused(start_board: StartBoard) -> None:
     refuse_on_opening(start_board(misbehave="wrong-map"), BoardMismatchError)
+
+
+@pytest.mark.parametrize("words", [-1, 0, 1])
+def test_an_interrupt_has_exactly_the_results_of_its_board(words: int) -> None:
+    board = DrivenBoard(0, parse_endpoint("unix:/nowhere"), images(1, (3,))[0])
+    board.waiting = True
+    status = BoardState.DONE << rm.STATUS_STATE_SHIFT | StopReason.OVERFLOW << rm.STATUS_STOP_REASON_SHIFT
+    done = Done(board.number, status, 9, 100, memoryview(bytes(4 * (3 + words))))
+    with pytest.raises(ShortReadError) if words else contextlib.nullcontext():
+        board._take(done)
+    assert board.waiting is bool(words)
 
 
 def test_the_slowest_board_sets_the_deadline(boards: list[ServedBoard], clock: SimpleNamespace) -> None:
