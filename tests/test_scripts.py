@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import os
-import re
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,21 +20,17 @@ PARTS = {
     "bench": ("bridge", "cycle", "load", "mrclam"),
     "verify": ("conformance", "containers", "hdl", "networks", "resources", "rosbridge"),
 }
-PAGES = [(path, part) for path in SCRIPTS for part in ("", *PARTS.get(path.name, ()))]
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(("script", "part"), PAGES, ids=lambda each: getattr(each, "name", each))
-def test_a_script_prints_its_usage(script, part, tmp_path):
-    command = [script, part, "--help"] if part else [script, "--help"]
-    done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, timeout=PROCESS_PATIENCE, check=False
-    )
-    assert done.returncode == 0
-    assert script.name in done.stdout
-    prose = re.sub(r"\[default: [^]]+\]", "", " ".join(done.stdout.split()))
-    assert not re.search(r"\(\d+(\.\d+)?\)|\bdefaults?\b", prose), "a default is shown as [default: 10]"
-    assert not done.stderr
+def test_every_script_prints_its_usage(tmp_path):
+    for script, part in [(path, part) for path in SCRIPTS for part in ("", *PARTS.get(path.name, ()))]:
+        command = [script, *part.split(), "--help"]
+        done = subprocess.run(
+            command, cwd=tmp_path, capture_output=True, text=True, timeout=PROCESS_PATIENCE, check=False
+        )
+        assert (done.returncode, done.stderr) == (0, ""), command
+        assert script.name in done.stdout
     assert not list(tmp_path.iterdir())
 
 

@@ -55,6 +55,7 @@ ULP: Final = 1e-15
 """Relative tolerance, because the real server's JSON loses the last bit of some doubles."""
 COUNT: Final = 10
 """Number of results of a `--loop` run."""
+LOOP: Final = ("--loop", "--count", str(COUNT))
 EVERY: Final = 0.2
 """Seconds between two readings, far more than a cycle takes, so that a stamp identifies its reading."""
 FIRST_DATA_TIMEOUT: Final = 2
@@ -68,49 +69,37 @@ TAIL: Final = 12
 # Servers and masters
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A kind of server: its command, its ready line, and whether messages of two topics keep their order."""
-
-    name: str
-    command: tuple[str, ...]
-    ready: str
-    keeps_order: bool
-
-
-KINDS: Final = {
-    "real": Kind(
-        "real ROS 2 server",
-        ("python", "-P", "-m", real_rosbridge.__name__, "serve", "PORT"),
-        ready=real_rosbridge.READY,
-        keeps_order=False,  # DDS transports each topic separately
-    ),
-    "hub": Kind("hub", ("hub", "--host", "127.0.0.1", "--port", "PORT"), ready=r"ws://\S+", keeps_order=True),
+SERVERS: Final = {
+    "real": ("python", "-P", "-m", real_rosbridge.__name__, "serve", "PORT"),
+    "hub": ("hub", "--host", "127.0.0.1", "--port", "PORT", "--ros-version", "2"),
 }
+READY: Final = rf"{real_rosbridge.READY}|ws://\S+"
+
+
+@contextlib.asynccontextmanager
+async def within(seconds: float, otherwise: str) -> AsyncIterator[None]:
+    """Raise a `CheckError` if the block does not end in time."""
+    try:
+        async with asyncio.timeout(seconds):
+            yield
+    except TimeoutError:
+        raise CheckError(f"{otherwise} within {seconds:g} s") from None
 
 
 class Stand:
     """A server that can be restarted, its clients, and the masters on it."""
 
-    def __init__(self, kind: Kind, port: int, deployments: dict[str, Path]) -> None:
+    def __init__(self, kind: str, port: int, deployments: dict[str, Path]) -> None:
         self.kind = kind
+        self.real = kind == "real"
         self.port = port
+        self.uri = f"ws://127.0.0.1:{port}"
         self.deployments = deployments
         self.logs: list[Path] = []
         """Logs of the current check, of which the last lines are printed if it fails."""
         self._server: Process | None = None
         self._log = Path()
         self._count = 0
-
-    @property
-    def real(self) -> bool:
-        """True for a real ROS 2 server."""
-        return self.kind is KINDS["real"]
-
-    @property
-    def uri(self) -> str:
-        """The server's URI."""
-        return f"ws://127.0.0.1:{self.port}"
 
     def topic(self) -> str:
         """Return the name of a topic that was not used before."""
@@ -119,7 +108,7 @@ class Stand:
 
     def _new_log(self, name: str) -> Path:
         self._count += 1
-        self.logs.append(OUT / f"{self.kind.name.replace(' ', '-')}-{self._count}-{name}.log")
+        self.logs.append(OUT / f"{self.kind}-{self._count}-{name}.log")
         return self.logs[-1]
 
     async def start(self) -> None:
@@ -132,13 +121,10 @@ class Stand:
             self.logs.append(self._log)
             return
         self._log = self._new_log("server")
-        self._server = Process(self.kind.name, self._log)
-        try:
-            await self._server.start(*(word.replace("PORT", str(self.port)) for word in self.kind.command))
-            async with asyncio.timeout(PATIENCE):
-                await self._server.line(self.kind.ready)
-        except TimeoutError:
-            raise CheckError(f"the {self.kind.name} did not serve within {PATIENCE:g} s") from None
+        self._server = Process(self.kind, self._log)
+        await self._server.start(*(word.replace("PORT", str(self.port)) for word in SERVERS[self.kind]))
+        async with within(PATIENCE, "the server did not serve"):
+            await self._server.line(READY)
 
     async def stop(self, *, kill: bool = False) -> None:
         """End the server, or kill it as a crash would."""
@@ -194,11 +180,8 @@ class Stand:
         Raises:
             CheckError: It ends with another code, or not in time.
         """
-        try:
-            async with asyncio.timeout(2 * PATIENCE):
-                got = await master.wait()
-        except TimeoutError:
-            raise CheckError(f"the master did not end within {2 * PATIENCE:g} s") from None
+        async with within(2 * PATIENCE, "the master did not end"):
+            got = await master.wait()
         output = self.logs[-1].read_text()
         expect("Traceback" not in output, "the master shows a traceback")
         expect(got == code, f"the master's exit code is {got}, not {code}")
@@ -506,16 +489,12 @@ class PlainClient:
         Raises:
             CheckError: They do not arrive in time.
         """
-        try:
-            async with asyncio.timeout(PATIENCE):
-                while min(self.count(RESULT_TOPIC), self.count(FRAME_TOPIC)) < count:
-                    self._news.clear()
-                    await self._news.wait()
-        except TimeoutError:
-            raise CheckError(
-                f"{self.count(RESULT_TOPIC)} of {count} results and {self.count(FRAME_TOPIC)} frames came "
-                f"within {PATIENCE:g} s; the server answered: {self.refused[-1:]}"
-            ) from None
+        async with within(
+            PATIENCE, f"fewer than {count} results and frames came; refused: {self.refused[-1:]}"
+        ):
+            while min(self.count(RESULT_TOPIC), self.count(FRAME_TOPIC)) < count:
+                self._news.clear()
+                await self._news.wait()
 
 
 @contextlib.asynccontextmanager
@@ -618,7 +597,7 @@ def check_received(stand: Stand, received: Received, sent: list[Sent], count: in
     )
     for topic, messages in ((FRAME_TOPIC, frames), (RESULT_TOPIC, results)):
         expect(len(messages) == count, f"{len(messages)} messages came on {topic}, not {count}")
-    if stand.kind.keeps_order:
+    if not stand.real:  # DDS transports each topic separately
         order = [topic for topic, _msg in received]
         expect(order == [FRAME_TOPIC, RESULT_TOPIC] * count, f"they came in the order {order}")
     number, last = 0, -1
@@ -632,34 +611,24 @@ def check_received(stand: Stand, received: Received, sent: list[Sent], count: in
             raise CheckError(f"result {at} of {count}: {error}") from error
 
 
-async def check_once(stand: Stand, form: str) -> None:
-    """Check that `--once` computes one frame, sees its result on the wire, and ends with 0."""
+async def check_run(stand: Stand, form: str, count: int, *flags: str) -> None:
+    """Check that a run publishes this number of results, sees them on the wire, and ends with 0."""
     received: Received = []
     sent: list[Sent] = []
-    async with stand.master(form, "--once") as master, robot(stand, received, sent) as listener:
-        output = await stand.ended(master, 0)
-        await listener.results(1)
-    expect("frame 1: " in output, "the master does not print the frame's most probable cell")
-    expect("not seen on the wire" not in output, "the master did not see its result on the wire")
-    check_received(stand, received, sent, 1)
-
-
-async def check_loop(stand: Stand, form: str) -> None:
-    """Check that `--loop --count N` publishes N results and ends with 0."""
-    received: Received = []
-    sent: list[Sent] = []
-    flags = ("--loop", "--count", str(COUNT))
     async with stand.master(form, *flags) as master, robot(stand, received, sent) as listener:
-        await stand.ended(master, 0)
-        await listener.results(COUNT)
-    check_received(stand, received, sent, COUNT)
+        output = await stand.ended(master, 0)
+        await listener.results(count)
+    if "--once" in flags:
+        expect("frame 1: " in output, "the master does not print the frame's most probable cell")
+    expect("not seen on the wire" not in output, "the master did not see its result on the wire")
+    check_received(stand, received, sent, count)
 
 
-async def check_restart(stand: Stand, form: str) -> None:
+async def check_restart(stand: Stand) -> None:
     """Check that a run waits for a server that ends or is killed, and then continues to publish results."""
     received: Received = []
     sent: list[Sent] = []
-    async with stand.master(form, "--loop", "--count", str(COUNT)) as master:
+    async with stand.master("ros2", *LOOP) as master:
         master_log = stand.logs[-1]
         for kill in (False, True):
             async with robot(stand, received, sent) as listener:
@@ -675,9 +644,9 @@ async def check_restart(stand: Stand, form: str) -> None:
     check_received(stand, received, sent, COUNT)
 
 
-async def check_silence(stand: Stand, form: str) -> None:
+async def check_silence(stand: Stand) -> None:
     """Check that a topic without a publisher ends the run in time, with exit code 3 and the topic's name."""
-    async with stand.master(form, "--once", "--first-data-timeout", str(FIRST_DATA_TIMEOUT)) as master:
+    async with stand.master("ros1", "--once", "--first-data-timeout", str(FIRST_DATA_TIMEOUT)) as master:
         output = await stand.ended(master, 3)
     errors = [line for line in output.splitlines() if line.startswith("error: ")]
     expect(len(errors) == 1, f"the master says {len(errors)} errors, not one")
@@ -687,11 +656,6 @@ async def check_silence(stand: Stand, form: str) -> None:
 # All of them
 
 Check = Callable[[Stand], Awaitable[None]]
-
-
-def on(form: str, check: Callable[[Stand, str], Awaitable[None]]) -> Check:
-    """Return a check of the deployment with type names of this ROS."""
-    return lambda stand: check(stand, form)
 
 
 CHECKS: Final[dict[str, Check]] = {
@@ -708,11 +672,11 @@ CHECKS: Final[dict[str, Check]] = {
     "client: a wrong type": check_wrong_type,
     "client: NaN": check_nan,
     "client: the server killed": check_killed,
-    "master --once, deployment with ROS 1 type names": on("ros1", check_once),
-    "master --once, deployment with ROS 2 type names": on("ros2", check_once),
-    f"master --loop --count {COUNT}, ROS 1 type names": on("ros1", check_loop),
-    "the server ended, then killed, during --loop, ROS 2 type names": on("ros2", check_restart),
-    "a topic without a publisher: exit code 3 and its name": on("ros1", check_silence),
+    "master --once, deployment with ROS 1 type names": lambda stand: check_run(stand, "ros1", 1, "--once"),
+    "master --once, deployment with ROS 2 type names": lambda stand: check_run(stand, "ros2", 1, "--once"),
+    f"master --loop --count {COUNT}, ROS 1 type names": lambda stand: check_run(stand, "ros1", COUNT, *LOOP),
+    "the server ended, then killed, during --loop, ROS 2 type names": check_restart,
+    "a topic without a publisher: exit code 3 and its name": check_silence,
 }
 
 
@@ -739,7 +703,7 @@ async def verify(kinds: list[str], only: str) -> int:
     before = bytes_of(list(deployments.values()))
     tally = Tally()
     for kind in kinds:
-        stand = Stand(KINDS[kind], port, deployments)
+        stand = Stand(kind, port, deployments)
         try:
             for name, check in CHECKS.items():
                 if only not in name:
@@ -752,7 +716,7 @@ async def verify(kinds: list[str], only: str) -> int:
                 except (CheckError, StackError, BridgeError, OSError, ConnectionClosed) as error:
                     why = f"{type(error).__name__}: {error}"
                     await stand.stop()  # the next check gets a new server
-                tally.report(f"{stand.kind.name}: {name}", started, why, stand.tails() if why else "")
+                tally.report(f"{stand.kind}: {name}", started, why, stand.tails() if why else "")
         finally:
             await stand.stop()
     changed = (
