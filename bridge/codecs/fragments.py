@@ -28,8 +28,8 @@ MAX_AGE: Final = 10.0
 OVERHEAD: Final = 128
 """Minimum overhead in bytes of a stored fragment, so that empty fragments count too."""
 _LONGEST_ID: Final = 1024
+# Value and mask of UTF-8 bytes inside a character.
 _CONTINUATION: Final = 0x80, 0xC0
-"""Value and mask of UTF-8 bytes inside a character."""
 
 _DIGITS = re.compile(r"[0-9]{1,9}(?:\.[0-9]{0,9})?")
 

@@ -33,26 +33,27 @@ MAX_DEPTH: Final = 64
 
 _OPTIONS: Final = orjson.OPT_SERIALIZE_NUMPY
 _EXCERPT: Final = 60
+# Size in bytes up to which counting a character is faster than searching for each occurrence.
 _COUNTED: Final = 4096
-"""Size in bytes up to which counting a character is faster than searching for each occurrence."""
+# Number of occurrences of one character to check before searching for the whole word.
 _HOPS: Final = 64
-"""Number of occurrences of one character to check before searching for the whole word."""
+# Number of bytes for each level up to which the size of a message can show that it is not too deep.
 _SMALL: Final = 6
-"""Number of bytes for each level up to which the size of a message can show that it is not too deep."""
+# The first byte of `null`; testing for a number is ten times as fast as for a byte string.
 _N: Final = ord("n")
-"""The first byte of `null`; testing for a number is ten times as fast as for a byte string."""
+# For `is_deeper`: all other bytes, braces as brackets, and these as one level up or down (signed bytes).
 _NO_BRACKETS: Final = bytes(byte for byte in range(256) if byte not in b"[]{}")
 _BRACKETS: Final = bytes.maketrans(b"{}", b"[]")
 _STEPS: Final = bytes.maketrans(b"[]", b"\x01\xff")
-"""One level up or down, as signed bytes."""
 
 _KEY: Final = b'"msg":'
 _JSON_TOPIC: Final = re.compile(rb'"topic":\s*"([^"]+)"')
+# The key `topic` and the header of the text after it: its length is in the low bits, or in a byte of its
+# own.
 _CBOR_TOPIC: Final = re.compile(rb"etopic(?:x(.)|[\x61-\x77])", re.DOTALL)
-"""The key `topic` and the header of the text after it: its length is in the low bits, or in a byte of its own."""
 _CBOR_LENGTH: Final = 0x1F
+# Maximum length of an envelope in bytes.
 LONGEST: Final = 512
-"""Maximum length of an envelope in bytes."""
 BRACE: Final = ord("}")
 """The last byte of an operation."""
 

@@ -20,10 +20,10 @@ from bridge.codecs.json_codec import MAX_SIZE
 from bridge.errors import DecodeError
 
 _SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+# The lowest level: 1 MiB of numbers takes 12 ms instead of 74 ms, and becomes 7 % longer.
 _COMPRESSION_LEVEL: Final = 1
-"""The lowest level: 1 MiB of numbers takes 12 ms instead of 74 ms, and becomes 7 % longer."""
+# Bytes per pixel by colour type.
 _CHANNELS: Final = {0: 1, 2: 3, 4: 2, 6: 4}
-"""Bytes per pixel by colour type."""
 
 
 def decode(data: str, *, max_size: int = MAX_SIZE) -> bytes:

@@ -13,8 +13,8 @@ from bridge.names import ros2_type
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
+# Headers of CDR: big and little endian, without options.
 _CDR: Final = (b"\x00\x00\x00\x00", b"\x00\x01\x00\x00")
-"""Headers of CDR: big and little endian, without options."""
 _TIMES: Final = frozenset({"builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration"})
 
 

@@ -24,11 +24,11 @@ from bridge.hub.limits import HubError
 SUBPROTOCOL: Final = Subprotocol("rosbridge")
 """The hub's subprotocol, for clients that request one."""
 _BEARER: Final = "bearer."
+# Tokens of characters that both a header and a subprotocol accept.
 _TOKEN: Final = re.compile(r"[A-Za-z0-9._~-]{16,1024}")
-"""Tokens of characters that both a header and a subprotocol accept."""
 _LOCAL: Final = r"(localhost|127\.\d+\.\d+\.\d+|\[::1\])(:\d+)?"
+# Web pages of this machine; any other page could control a robot through its visitor's browser.
 LOCAL_ORIGIN: Final = re.compile(f"https?://{_LOCAL}")
-"""Web pages of this machine; any other page could control a robot through its visitor's browser."""
 _LOCAL_HOST: Final = re.compile(_LOCAL)
 _MAX_TOKENS: Final = 1000
 

@@ -16,8 +16,8 @@ from bridge.hub.limits import HubLimits, Operation, RefusedError, flag, optional
 from bridge.hub.outbox import Lane
 from bridge.names import absolute, ros2_type, same_type
 
+# ROS 2's service that cancels all goals of an action, as roslibjs calls it.
 _CANCEL_ALL: Final = "/_action/cancel_goal"
-"""ROS 2's service that cancels all goals of an action, as roslibjs calls it."""
 _RESULT: Final = ("action_result", "action")
 
 

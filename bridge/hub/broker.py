@@ -30,7 +30,7 @@ from bridge.hub.calls import Calls
 from bridge.hub.definitions import Definitions, RosVersion
 from bridge.hub.dispatcher import Dispatcher
 from bridge.hub.graph import Client, Graph
-from bridge.hub.limits import DefinitionsPendingError, HubLimits, Operation, RefusedError, is_logged, text
+from bridge.hub.limits import HubLimits, Operation, RefusedError, is_logged, text
 from bridge.hub.outbox import Outbox
 from bridge.hub.rosapi import NODE, ROSOUT, Rosapi
 from bridge.hub.topics import TURN_WORK, Topics
@@ -39,10 +39,10 @@ from bridge.stamps import stamp
 log = logging.getLogger(__name__)
 
 _OPERATION_WORK: Final = 20
+# Levels of `set_level`, and whether they include the hub's status messages, which are all errors.
 _LEVELS: Final = {"info": True, "warning": True, "error": True, "none": False}
-"""Levels of `set_level`, and whether they include the hub's status messages, which are all errors."""
+# ERROR of rosgraph_msgs/Log, and of rcl_interfaces/msg/Log.
 _LOG_ERROR: Final = {1: 8, 2: 40}
-"""ERROR of rosgraph_msgs/Log, and of rcl_interfaces/msg/Log."""
 
 _Handler = Callable[[Client, Operation, float], None]
 
@@ -69,7 +69,6 @@ class Broker:
         self.definitions = Definitions(ros_version, wall_clock)
         self._wall_clock = wall_clock
         self._ros_version: RosVersion = ros_version
-        self._client_numbers = itertools.count(1)
         rosapi = Rosapi(self.graph, self.limits, self.definitions, wall_clock)
         self._dispatcher = Dispatcher(self.limits)
         self.take_ready = self._dispatcher.take_ready
@@ -79,10 +78,15 @@ class Broker:
         self._calls = Calls(
             self.graph, self.limits, self._dispatcher, self.definitions, rosapi, self._actions.cancel_all
         )
+        # Clients are numbered in the order of connection; a number is not used again.
+        self._client_numbers = itertools.count(1)
+        # The clients with incomplete messages, and when the first of these expires, or earlier.
         self._reassembling: set[Client] = set()
         self._fragment_deadline = inf
+        # Time and id of the operation that is being performed, for a refusal anywhere below.
         self._now = 0.0
         self._operation_id: object = None
+        # True while a refusal is published on /rosout: if that is refused too, it must not be published again.
         self._logging_to_rosout = False
         self._operations: dict[str, _Handler] = {
             "subscribe": self._topics.subscribe,
@@ -146,9 +150,6 @@ class Broker:
             client: Its sender.
             data: A whole WebSocket message, text or binary, with any content.
             now: Monotonic seconds.
-
-        Raises:
-            DefinitionsPendingError: Message definitions are being loaded; nothing was done.
         """
         self._now, self._operation_id = now, None
         self._dispatcher.work += _OPERATION_WORK + (len(data) >> 7)
@@ -166,9 +167,8 @@ class Broker:
             now: Monotonic seconds.
 
         Returns:
-            The number of messages performed. The others need another turn: after the client has read its
-            answers if its outbox is congested, and after the definitions are loaded if `definitions.pending`
-            is true.
+            The number of messages performed. The others need another turn, after the client has read its answers if
+            its outbox is congested.
         """
         self._now, self._operation_id = now, None
         dispatcher, outbox = self._dispatcher, client.outbox
@@ -179,11 +179,7 @@ class Broker:
             number = self._topics.publish_known(client, messages, number, now)
             if number == len(messages) or dispatcher.work > TURN_WORK:
                 break
-            try:
-                self.receive(client, messages[number], now)
-            except DefinitionsPendingError as error:
-                messages[number] = error.data or messages[number]
-                break
+            self.receive(client, messages[number], now)
             number += 1
         return number
 
@@ -233,10 +229,7 @@ class Broker:
         finally:
             self._note_fragments(client)
         if message is not None:
-            try:
-                self._perform(client, message, now, is_whole=False)
-            except DefinitionsPendingError:
-                raise DefinitionsPendingError(message) from None
+            self._perform(client, message, now, is_whole=False)
 
     def _note_fragments(self, client: Client) -> None:
         """Schedule the expiry of a client's incomplete messages."""

@@ -44,8 +44,8 @@ from bridge.names import absolute
 
 log = logging.getLogger(__name__)
 
+# Number of deadlines of answered calls by which the queue may exceed the open calls.
 _ANSWERED: Final = 64
-"""Number of deadlines of answered calls by which the queue may exceed the open calls."""
 _RESPONSE: Final = ("service_response", "service")
 
 
@@ -175,7 +175,9 @@ class Calls:
             graph.services, lambda client: client.services, limits.services_per_client, "service"
         )
         self._numbers = itertools.count(1)
-        self._deadlines: list[tuple[float, str]] = []  # a heap
+        # A heap of the calls' deadlines. Those of answered calls stay until they pass or are too many (`_schedule`),
+        # because finding one in a heap takes longer than skipping it.
+        self._deadlines: list[tuple[float, str]] = []
         self.pending: dict[str, _Call] = {}
 
     @property

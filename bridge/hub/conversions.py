@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 Convert = Callable[[Any], Any]
 
+# Element types of arrays by rosbags' names of numbers.
 _NUMBERS: Final = {
     "int8": "i1",
     "uint8": "u1",
@@ -28,7 +29,6 @@ _NUMBERS: Final = {
     "float32": "f4",
     "float64": "f8",
 }
-"""Element types of arrays by rosbags' names of numbers."""
 _FLOAT32: Final = 3.4028234663852886e38
 _RANGES: Final = {"f4": (-_FLOAT32, _FLOAT32), "f8": (-inf, inf)} | {
     f"{sign}{size}": (-(1 << 8 * size - 1), (1 << 8 * size - 1) - 1)
@@ -42,8 +42,8 @@ DEFAULTS: Final[dict[str, Any]] = {"bool": False, "string": "", "wstring": ""} |
 }
 _BYTES: Final = frozenset({"uint8", "octet", "char"})
 TIMES: Final = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/Duration": "duration"}
+# Fields of a time in ROS 1, by their names in rosbags, which are ROS 2's.
 ROS1_TIME: Final = {"sec": "secs", "nanosec": "nsecs"}
-"""Fields of a time in ROS 1, by their names in rosbags, which are ROS 2's."""
 DUMMY: Final = "structure_needs_at_least_one_member"
 
 

@@ -25,7 +25,7 @@ from bridge.hub.conversions import (
 )
 from bridge.hub.filling import FieldTypes, Filler, Types
 from bridge.hub.interfaces import PARTS, message_texts, part_name
-from bridge.hub.limits import DefinitionsPendingError, RefusedError
+from bridge.hub.limits import RefusedError
 from bridge.names import ros1_type, ros2_type
 
 if TYPE_CHECKING:
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 RosVersion = Literal[1, 2]
 
+# Bytes of the size limit per value of a serialised message; `{}` in an array can stand for dozens of
+# values.
 _BYTES_A_VALUE: Final = 16
-"""Bytes of the size limit per value of a serialised message; `{}` in an array can stand for dozens of values.
-"""
 _MISSING: Final = (
     "the hub has no message definitions: install rosbags (pip install rosbags) and start the hub again"
 )
@@ -48,58 +48,28 @@ class Definitions:
     def __init__(self, ros_version: RosVersion = 1, wall_clock: Callable[[], int] = time.time_ns) -> None:
         """Start without definitions; `wall_clock` returns nanoseconds since 1970, for absent stamps."""
         self.ros_version: RosVersion = ros_version
-        self.load_in_background: Callable[[], None] | None = None
-        """Starts a thread for `load`; without it, loading blocks the operation that needs definitions."""
-        self.pending = False
-        """True while an operation waits for `load`."""
+        # None before `load`, and also afterwards if rosbags is not installed.
         self._store: Typestore | None = None
-        self._missing = False
+        self._is_loaded = False
         self._typed: dict[str, Convert] = {}
         self._types = Types(self._field_types, DEFAULTS, TIMES, ros_version, wall_clock)
         self._texts: dict[str, str] = {}
 
     def load(self) -> None:
-        """Import rosbags and its types, which takes tenths of a second."""
-        try:
-            from rosbags.typesys import Stores
-        except ImportError:
-            self._missing = True
-        else:
-            self._store = _store(Stores.ROS2_JAZZY if self.ros_version == 2 else Stores.ROS1_NOETIC)
-        self.pending = False
+        """Import rosbags and its types, unless that was done; it takes a tenth of a second."""
+        if not self._is_loaded:
+            self._is_loaded = True
+            with contextlib.suppress(ImportError):
+                from rosbags.typesys import Stores
 
-    def preload(self) -> None:
-        """Load the definitions in the background, before an operation needs them."""
-        with contextlib.suppress(DefinitionsPendingError):
-            self.require()
-
-    def require(self) -> None:
-        """Load the definitions for an operation that needs them.
-
-        Raises:
-            DefinitionsPendingError: They are being loaded in the background; repeat the operation afterwards.
-        """
-        if self._store is not None or self._missing:
-            return
-        if self.load_in_background is None:
-            self.load()
-        else:
-            if not self.pending:
-                self.pending = True
-                self.load_in_background()
-            raise DefinitionsPendingError
+                self._store = _store(Stores.ROS2_JAZZY if self.ros_version == 2 else Stores.ROS1_NOETIC)
 
     def name(self, type_name: str) -> str:
         """Return a message type's name as this ROS version writes it."""
         return ros2_type(type_name) if self.ros_version == 2 else ros1_type(type_name)
 
     def filler(self, type_name: str) -> Filler | None:
-        """Return the filler of the absent fields of a message type, or None if the type is unknown.
-
-        Raises:
-            DefinitionsPendingError: The definitions are being loaded.
-        """
-        self.require()
+        """Return the filler of the absent fields of a message type, or None if the type is unknown."""
         try:
             _store, known = self._known(type_name)
         except BridgeError:
@@ -107,11 +77,7 @@ class Definitions:
         return self._types.filler(known)
 
     def fillers(self, type_name: str, kind: Literal["srv", "action"]) -> dict[str, Filler]:
-        """Return the fillers of the parts of a service or an action, such as `Request`, without unknown parts.
-
-        Raises:
-            DefinitionsPendingError: The definitions are being loaded.
-        """
+        """Return the fillers of the parts of a service or an action, such as `Request`, without unknown parts."""
         fillers = {part: self.filler(part_name(type_name, part, self.ros_version)) for part in PARTS[kind]}
         return {part: filler for part, filler in fillers.items() if filler is not None}
 
@@ -198,7 +164,7 @@ class Definitions:
         return ROS1_TIME[field] if self.ros_version == 1 and type_name in TIMES else field
 
     def _known(self, type_name: str) -> "tuple[Typestore, str]":
-        self.require()
+        self.load()
         if self._store is None:
             raise RefusedError(_MISSING)
         known = ros2_type(type_name)

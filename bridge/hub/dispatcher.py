@@ -12,8 +12,8 @@ from bridge.hub.outbox import Lane
 
 SMALLEST_FRAGMENT: Final = 256
 """Minimum size of a fragment in bytes; smaller ones would consist mostly of framing."""
+# Maximum of status messages queued for a client.
 _STATUS_QUEUE: Final = 20
-"""Maximum of status messages queued for a client."""
 
 
 class Dispatcher:
@@ -22,7 +22,9 @@ class Dispatcher:
     def __init__(self, limits: HubLimits) -> None:
         """Start without output."""
         self._limits = limits
+        # The clients with output, each once (`Client.is_ready`), until the owner of the sockets takes them.
         self._ready: list[Client] = []
+        # The clients whose outboxes hold messages for their throttles.
         self.throttled: set[Client] = set()
         self.deadline = inf
         """When the broker must be woken at the latest (monotonic seconds): for a throttle, a call or a fragment."""

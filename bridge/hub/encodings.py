@@ -26,8 +26,6 @@ class Compression(StrEnum):
 
 
 COMPRESSIONS: Final = tuple(Compression)
-TYPED: Final = (Compression.CBOR, Compression.CBOR_RAW)
-"""Encodings that need message definitions."""
 
 
 def compression_of(requested: object) -> Compression:
@@ -45,8 +43,8 @@ def json_prefix(name: str) -> bytes:
     return b'{"op":"publish","topic":"%b","msg":' % name.encode()
 
 
+# Maximum depth of JSON that the hub itself has read.
 _DEEPEST: Final = 256
-"""Maximum depth of JSON that the hub itself has read."""
 AROUND: Final = len(json_prefix("")) + 1
 """Bytes around a topic's name and a message's JSON."""
 

@@ -27,10 +27,10 @@ FieldTypes = Mapping[str, tuple[str, int]]
 
 HEADER: Final = "std_msgs/msg/Header"
 _TIME: Final = {1: ("secs", "nsecs"), 2: ("sec", "nanosec")}
+# Number of combinations of absent fields that are remembered for one type.
 _KNOWN: Final = 32
-"""Number of combinations of absent fields that are remembered for one type."""
+# The only field of the common ROS 2 messages whose default is not zero.
 _ONE: Final = {("geometry_msgs/msg/Quaternion", "w"): 1.0}
-"""The only field of the common ROS 2 messages whose default is not zero."""
 
 
 _Parts = tuple[tuple[str, "Filler", bool], ...]

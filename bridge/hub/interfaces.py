@@ -62,6 +62,7 @@ _SERVICES: Final = {
     "std_srvs/Trigger": "---\nbool success\nstring message",
     "tf2_msgs/FrameGraph": "---\nstring frame_yaml",
 }
+# Services of rosapi as in ROS 1; `_ROSAPI_2` contains the additions of ROS 2.
 _ROSAPI: Final = {
     "ActionFeedbackDetails": "string type\n---\nTypeDef[] typedefs",
     "ActionGoalDetails": "string type\n---\nTypeDef[] typedefs",
@@ -95,7 +96,6 @@ _ROSAPI: Final = {
     "TopicsAndRawTypes": "---\nstring[] topics\nstring[] types\nstring[] typedefs_full_text",
     "TopicsForType": "string type\n---\nstring[] topics",
 }
-"""Services of rosapi as in ROS 1; `_ROSAPI_2` contains the additions of ROS 2."""
 _ROSAPI_2: Final = {
     "DeleteParam": "string name\n---\nbool successful\nstring reason",
     "GetParam": "string name\nstring default_value\n---\nstring value\nbool successful\nstring reason",
@@ -152,12 +152,13 @@ _ACTIONS: Final = {
         geometry_msgs/TransformStamped[] transforms
     """,
 }
+# The second field of the messages of ROS 1's actions; a header is the first, and the part itself the
+# third.
 _ACTIONLIB: Final = {
     "Goal": "actionlib_msgs/GoalID goal_id",
     "Result": "actionlib_msgs/GoalStatus status",
     "Feedback": "actionlib_msgs/GoalStatus status",
 }
-"""The second field of the messages of ROS 1's actions; a header is the first, and the part itself the third."""
 
 
 def part_name(type_name: str, part: str, ros_version: Literal[1, 2]) -> str:

@@ -11,25 +11,25 @@ from bridge.codecs.json_codec import MAX_DEPTH, MAX_SIZE
 from bridge.errors import BridgeError
 from bridge.names import MAX_NAME
 
+# Maximum depth that orjson writes, minus one level for the operation around a message.
 _DEEPEST: Final = 250
-"""Maximum depth that orjson writes, minus one level for the operation around a message."""
 
 Operation = dict[str, Any]
 OperationId = str | int | None
 """rosbridge's optional `id`, which distinguishes operations of one client."""
 
+# Names of ROS 1 and ROS 2, and names with parts that start with a digit (`/camera/0`).
 _NAME: Final = re.compile(r"[~/]?[A-Za-z0-9_]+(?:/[A-Za-z0-9_]+)*")
-"""Names of ROS 1 and ROS 2, and names with parts that start with a digit (`/camera/0`)."""
+# Maximum number of characters in an id, because the hub stores ids of open operations.
 _LONGEST_ID: Final = 1024
-"""Maximum number of characters in an id, because the hub stores ids of open operations."""
+# Upper bound of every rate, length and time.
 _HUGE: Final = 1e12
-"""Upper bound of every rate, length and time."""
+# ROS 2's quality-of-service policies, as the reference server writes them.
 _POLICIES: Final = {
     "durability": ("volatile", "transient_local"),
     "reliability": ("reliable", "best_effort"),
     "history": ("keep_last", "keep_all"),
 }
-"""ROS 2's quality-of-service policies, as the reference server writes them."""
 _ANY_POLICY: Final = ("system_default", "best_available")
 
 
@@ -41,15 +41,6 @@ class HubError(BridgeError):
 
 class RefusedError(BridgeError):
     """Raised when the hub refuses an operation; the text is for the log, or for the answer to a call."""
-
-
-class DefinitionsPendingError(Exception):
-    """Raised when a message must be repeated once the message definitions are loaded."""
-
-    def __init__(self, data: bytes | None = None) -> None:
-        """Store the message if it arrived in fragments, which cannot be repeated."""
-        super().__init__()
-        self.data = data
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,8 +19,8 @@ from bridge.codecs.fragments import split
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+# Number of gaps by which a queue may exceed its messages before it is packed.
 _GAPS: Final = 64
-"""Number of gaps by which a queue may exceed its messages before it is packed."""
 _BRACE: Final = ord("{")
 
 
@@ -84,12 +84,18 @@ class Outbox:
         """Bound the queue to `max_bytes`; a single payload has at most `largest`."""
         self._max_bytes = max_bytes
         self._largest = largest
+        # All queued messages in order. `_droppable` and each lane's `queued` have the same entries of topics, in the
+        # same order, so that the oldest of all or of one lane is found at once.
         self._entries: deque[_Entry] = deque()
         self._droppable: deque[_Entry] = deque()
+        # Entries without a payload in `_entries`, left by dropped messages.
         self._gaps = 0
+        # The lanes with held messages, for `release`.
         self._holding: set[Lane] = set()
+        # The rest of the message that is being sent in fragments, whose bytes (`_cutting`) count until the last one.
         self._fragments: Iterator[bytes] | None = None
         self._cutting = 0
+        # Ids of fragmented messages.
         self._numbers = itertools.count(1)
         self.wire: list[bytes] | None = None
         """Payloads of this turn for the socket; None while it accepts nothing, when everything is queued."""

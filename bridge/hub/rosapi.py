@@ -19,7 +19,7 @@ from bridge.codecs.json_codec import is_deeper
 from bridge.errors import NameFormError
 from bridge.hub.definitions import Definitions
 from bridge.hub.graph import Graph
-from bridge.hub.interfaces import part_name
+from bridge.hub.interfaces import PARTS, part_name
 from bridge.hub.limits import HubLimits, RefusedError
 from bridge.names import MAX_NAME, absolute, ros1_type, ros2_type
 
@@ -29,11 +29,11 @@ PREFIX: Final = NODE + "/"
 """The prefix of their names, which clients cannot use."""
 ROSOUT: Final = "/rosout"
 """The topic of ROS's log, which carries the hub's refusals."""
+# Topics that a server of ROS 1's actionlib publishes or subscribes to under its name.
 _ACTIONLIB: Final = ("goal", "cancel", "status", "feedback", "result")
-"""Topics that a server of ROS 1's actionlib publishes or subscribes to under its name."""
 
+# Fields that have another name in ROS 2.
 _ROS2_FIELDS: Final = {"default": "default_value"}
-"""Fields that have another name in ROS 2."""
 
 Values = dict[str, Any]
 Answer = Callable[..., Values]
@@ -60,17 +60,6 @@ class Rosapi:
         self._parameter_bytes = 0
         # short name -> type, arguments (all strings) in order, function
         self._services: dict[str, tuple[str, tuple[str, ...], Answer]] = {
-            "action_feedback_details": (
-                "ActionFeedbackDetails",
-                ("type",),
-                partial(self._part_details, "Feedback"),
-            ),
-            "action_goal_details": ("ActionGoalDetails", ("type",), partial(self._part_details, "Goal")),
-            "action_result_details": (
-                "ActionResultDetails",
-                ("type",),
-                partial(self._part_details, "Result"),
-            ),
             "action_servers": ("GetActionServers", (), self._action_servers),
             "action_type": ("ActionType", ("action",), self._action_type),
             "delete_param": ("DeleteParam", ("name",), self._delete_param),
@@ -86,16 +75,6 @@ class Rosapi:
             "search_param": ("SearchParam", ("name",), self._search_param),
             "publishers": ("Publishers", ("topic",), self._publishers),
             "service_host": ("ServiceHost", ("service",), self._service_host),
-            "service_request_details": (
-                "ServiceRequestDetails",
-                ("type",),
-                partial(self._part_details, "Request"),
-            ),
-            "service_response_details": (
-                "ServiceResponseDetails",
-                ("type",),
-                partial(self._part_details, "Response"),
-            ),
             "service_node": ("ServiceNode", ("service",), self._service_node),
             "service_providers": ("ServiceProviders", ("service",), self._service_providers),
             "service_type": ("ServiceType", ("service",), self._service_type),
@@ -108,6 +87,10 @@ class Rosapi:
             "topics_and_raw_types": ("TopicsAndRawTypes", (), self._topics_and_raw_types),
             "topics_for_type": ("TopicsForType", ("type",), self._topics_for_type),
         }
+        for kind, parts in ("action", PARTS["action"]), ("service", PARTS["srv"]):
+            for part in parts:
+                details = f"{kind.title()}{part}Details", ("type",), partial(self._part_details, part)
+                self._services[f"{kind}_{part.lower()}_details"] = details
 
     def offers(self, service: str) -> bool:
         """Return whether a service (its absolute name) is one of these."""
@@ -121,7 +104,6 @@ class Rosapi:
 
         Raises:
             RefusedError: The arguments are wrong, or a limit is reached.
-            DefinitionsPendingError: Message definitions are being loaded.
         """
         _type, names, answer = self._services[service.removeprefix(PREFIX)]
         if isinstance(args, list):
@@ -152,7 +134,6 @@ class Rosapi:
         return {"topics": list(topics), "types": list(topics.values())}
 
     def _topics_and_raw_types(self) -> Values:
-        self._definitions.require()
         topics = self._all_topics()
         texts = {type_name: self._full_text(type_name) for type_name in set(topics.values())}
         if sum(len(texts[type_name]) for type_name in topics.values()) > self._limits.message_bytes:

@@ -1,5 +1,9 @@
 """The hub's socket: a thin layer of WebSockets around the broker.
 
+    asyncio ─▶ _Connection.messages_received ─▶ Broker.receive_turn ─▶ outboxes of clients
+                              └─▶ _Hub.serve ─▶ Broker.take_ready ─▶ _Connection.flush of each ─▶ asyncio
+    timers ──▶ _Hub._wake ─▶ Broker.wake ─▶ outboxes;   _Hub.sweep ─▶ silent and stuck connections
+
 Connections do not have tasks: messages are read, brokered and written to all subscribers within one callback
 of the event loop, with one write per subscriber. Data is not compressed, because on loopback that costs more
 than it saves.
@@ -33,25 +37,25 @@ from bridge.transport.websocket import MESSAGE_BYTES_HEADER, WebSocketTransport
 
 log = logging.getLogger(__name__)
 
+# Bytes that wait in the process for one socket before its client's outbox is used.
 _WRITE_BUFFER: Final = 64 * 1024
-"""Bytes that wait in the process for one socket before its client's outbox is used."""
+# Bytes that wait in the kernel for one socket; with more, data would only arrive later.
 _SEND_BUFFER: Final = 256 * 1024
-"""Bytes that wait in the kernel for one socket; with more, data would only arrive later."""
+# One client's share of a turn: what is read from it (see `WebSocketTransport`), and the queued messages or fragments
+# that are written to it.
 _TURN_FRAMES: Final = 64
 _TURN_BYTES: Final = 64 * 1024
-_TURN_MESSAGES: Final = 32
-"""Number of queued messages or fragments written to one client before other tasks get their turn."""
 _SLICE_BYTES: Final = 4 * 1024
-"""One client's share of a turn (see `WebSocketTransport`)."""
+_TURN_MESSAGES: Final = 32
+# Seconds between two checks for silent and stuck clients.
 _SWEEP: Final = 1.0
-"""Seconds between two checks for silent and stuck clients."""
+# Seconds that a client has to end a connection which the hub closed.
 _CLOSE_TIMEOUT: Final = 2.0
-"""Seconds that a client has to end a connection which the hub closed."""
+# Maximum number of connections in a handshake; the oldest is aborted to admit another.
 _HANDSHAKES: Final = 64
-"""Maximum number of connections in a handshake; the oldest is aborted to admit another."""
+# At most so many lines about refused and closed connections in so many seconds: anybody can cause them.
 _LOG_LINES: Final = 10
 _LOG_PERIOD: Final = 10.0
-"""Period, in seconds, in which at most `_LOG_LINES` lines about refused and closed connections are logged."""
 _LAST_PORT: Final = 65535
 
 
@@ -88,6 +92,7 @@ async def serve_hub(
         )
     access = access or AccessPolicy()
     hub = _Hub(limits or HubLimits(), access, ros_version, loopback=is_loopback(host))
+    hub.broker.definitions.load()
     loop = asyncio.get_running_loop()
     try:
         server = await loop.create_server(
@@ -109,7 +114,6 @@ async def serve_hub(
         ) from None
     try:
         hub.sweep()
-        hub.broker.definitions.preload()
         if on_graph is not None:
             on_graph(hub.broker.graph)
         if on_ready is not None:
@@ -128,20 +132,26 @@ class _Hub:
     ) -> None:
         self.limits = limits
         self.loopback = loopback
+        self.access = access
         self.broker = Broker(limits, ros_version=ros_version)
         self._take_ready = self.broker.take_ready
-        self.access = access
+        # All sockets, from `begin` to `forget`; `_nobody_left` is set when the last one is gone.
         self.connections: set[_Connection] = set()
-        self.handshakes: dict[_Connection, None] = {}  # in the order of their beginning
+        self._nobody_left = asyncio.Event()
+        # Those in the opening or closing handshake, the oldest first. They have no client, so the limit of clients
+        # does not bound them.
+        self.handshakes: dict[_Connection, None] = {}
+        # Those that the broker knows, from `admit` to `dismiss`.
         self._by_client: dict[Client, _Connection] = {}
+        # The call of `Broker.wake` at the broker's deadline; no timer stands for infinity.
         self._timer: asyncio.TimerHandle | None = None
         self._timer_deadline = inf
+        # The next `sweep`, and when the last one was: a hub that was late must not blame its clients.
         self._sweeper: asyncio.TimerHandle | None = None
         self._swept = time.monotonic()
-        self._nobody_left = asyncio.Event()
+        # Lines about connections since `_log_since` (see `warn`).
         self._log_lines = 0
         self._log_since = -inf
-        self.broker.definitions.load_in_background = self._load_definitions
 
     def admit(self, connection: "_Connection", address: str) -> Client:
         client = self.broker.connect(address)
@@ -178,15 +188,6 @@ class _Hub:
         self._log_lines += 1
         if self._log_lines <= _LOG_LINES:
             log.warning(message, *args)
-
-    def _load_definitions(self) -> None:
-        loaded = asyncio.get_running_loop().run_in_executor(None, self.broker.definitions.load)
-        loaded.add_done_callback(self._definitions_loaded)
-
-    def _definitions_loaded(self, loaded: asyncio.Future[None]) -> None:
-        for connection in list(self.connections):
-            connection.proceed()
-        loaded.result()
 
     def sweep(self) -> None:
         """Check for silent and stuck clients, periodically."""
@@ -253,24 +254,24 @@ class _Connection(WebSocketTransport):
         )
         super().__init__(protocol, max_size=hub.limits.message_bytes, write_limit=_WRITE_BUFFER)
         self._hub = hub
-        self._server_protocol = protocol
+        self._server_protocol = protocol  # the same as `_protocol`, with its type
+        # The broker's client, from the handshake until the connection closes. None before and after.
         self._client: Client | None = None
         self._address = "?"
+        # Monotonic seconds, for `sweep`: when the handshake began, when the client was last pinged (None if it has
+        # sent something since), since when its socket accepts nothing, and when a closing connection is cut off.
         self._started = time.monotonic()
         self._pinged_at: float | None = None
         self._stuck_since: float | None = None
         self._close_by = inf
+        # True while the next turn of `_flush_backlog` is scheduled.
         self._flushing = False
 
     @property
     def is_blocked(self) -> bool:
-        """Return whether the client must first read its answers, or needs definitions that are being loaded."""
+        """Return whether the client must first read its answers."""
         client = self._client
-        return client is not None and (
-            client.outbox.congested
-            or self._pongs_unread
-            or (bool(self._postponed) and self._hub.broker.definitions.pending)
-        )
+        return client is not None and (client.outbox.congested or self._pongs_unread)
 
     # --- called by the event loop
 

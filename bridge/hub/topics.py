@@ -13,7 +13,6 @@ from bridge.hub.dispatcher import Dispatcher, fragment_size_of
 from bridge.hub.encodings import (
     AROUND,
     COMPRESSIONS,
-    TYPED,
     Compression,
     Message,
     compression_of,
@@ -36,10 +35,10 @@ from bridge.hub.limits import (
 from bridge.hub.rosapi import ROSOUT, rosout_type
 from bridge.names import absolute, same_type, split_type
 
+# Keys of an operation with a reusable envelope: op, topic and msg.
 _ENVELOPE_KEYS: Final = 3
-"""Keys of an operation with a reusable envelope: op, topic and msg."""
+# Units of work of one message, besides those for each subscriber.
 _MESSAGE_WORK: Final = 20
-"""Units of work of one message, besides those for each subscriber."""
 TURN_WORK: Final = 10_000
 """Units of work, of about a microsecond each, after which a client's turn ends."""
 _PLAIN: Final = Compression.NONE
@@ -247,8 +246,6 @@ class Topics:
             compression_of(operation.get("compression")),
             fragment_size_of(number(operation, "fragment_size")),
         )
-        if options.compression in TYPED:
-            self._definitions.require()
         subscription = client.subscriptions.get(absolute(name))
         is_new = subscription is None or own_id not in subscription.options
         if is_new and client.open_subscriptions >= self._limits.subscriptions_per_client:
@@ -322,7 +319,6 @@ class Topics:
         is_new = advertisement is None or own_id not in advertisement.ids
         if is_new and client.open_advertisements >= self._limits.advertisements_per_client:
             raise RefusedError(f"this client already has {client.open_advertisements} advertisements")
-        self._definitions.require()
         topic = self._join(name, type_name, type_needed=True)
         if advertisement is None:
             filler = self._definitions.filler(topic.type)

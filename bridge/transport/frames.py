@@ -23,17 +23,17 @@ _WHOLE: Final = frozenset((_TEXT, _BINARY))
 _MASKED: Final = 0x80
 _BRACE: Final = ord("{")
 _MEDIUM: Final = 126
+# Payload lengths from which on headers are longer.
 _LONG: Final = 1 << 16
-"""Payload lengths from which on headers are longer."""
 _MEDIUM_HEADER: Final = Struct("!BBH").pack
 _LONG_HEADER: Final = Struct("!BBQ").pack
+# Length in bytes of the longest header that `only_message` reads; shorter data is left to the others.
 _LONGEST_HEADER: Final = 8
-"""Length in bytes of the longest header that `only_message` reads; shorter data is left to the others."""
+# First bytes of valid frames: with or without FIN, no reserved bit, a defined opcode.
 _SOUND: Final = frozenset(end | opcode for end in (0, 0x80) for opcode in (0, 1, 2, 8, 9, 10))
-"""First bytes of valid frames: with or without FIN, no reserved bit, a defined opcode."""
 _KEPT_HEADERS: Final = 4096
+# Number of masking keys generated at once.
 _KEYS: Final = 1024
-"""Number of masking keys generated at once."""
 
 UNKNOWN: Final = 0
 """Value instead of a frame's end: the header is incomplete."""

@@ -1,5 +1,12 @@
 """A WebSocket on an asyncio transport, for client and hub: bytes in, whole messages out.
 
+    socket ──▶ data_received ─┬─ one whole message, the usual case ─────────────────▶ messages_received
+                              ├─ frames.whole_messages: several in one piece ───────▶ messages_received
+                              ├─ an incomplete frame: kept until the rest arrives
+                              └─ the library: handshake, control frames, fragments ─▶ events, answers
+    socket ◀── write ◀─┬─ send: frames of whole messages
+                       └─ _flush: what the library answers
+
 The sans-I/O protocol of `websockets` handles handshakes, control frames, fragments and malformed frames.
 Nearly all rosbridge messages are unfragmented; the functions of `bridge.transport.frames` read and write them
 in a fraction of the time. The library gets only whole frames, so it is always between two of them. After a
@@ -23,64 +30,79 @@ from bridge.transport import frames
 
 MESSAGE_BYTES_HEADER: Final = "Rosbridge-Message-Bytes"
 """Header of the hub's handshake: maximum size in bytes of the messages that it accepts."""
+# Maximum size of the unread answers to a peer, in messages of the maximum size.
 _MAX_UNREAD: Final = 4
-"""Maximum size of the unread answers to a peer, in messages of the maximum size."""
 _BEGINNING: Final = 512
+# Looking up a module-level name is faster than looking up an enumeration member.
 _OPEN: Final = State.OPEN
-"""Looking up a module-level name is faster than looking up an enumeration member."""
 _END_OF_HEADERS: Final = b"\r\n\r\n"
 _FIRST_BYTES: Final = 64
 _DATA_OPCODES: Final = frozenset((Opcode.TEXT, Opcode.BINARY, Opcode.CONT))
 
 
 class WebSocketTransport(asyncio.Protocol):
-    """A WebSocket connection; a subclass handles the handshake, the messages and the end.
+    """A WebSocket connection; a subclass handles the handshake, the messages and the end."""
 
-    Attributes:
-        last_heard: monotonic time in seconds of the last data from the peer.
-        is_open: whether messages can be sent.
-        first_bytes: the beginning of the peer's answer, for error messages.
-        paused: whether so much data waits for the peer that writers should wait too (see `drain`).
-        refused: the beginning of a frame that was invalid or too large, with its header.
-    """
-
+    # A turn: after this much from one peer, other tasks get theirs. A client has one peer and needs none.
     turn_frames: ClassVar[int] = sys.maxsize
-    """Number of frames handled before other tasks get their turn."""
     turn_bytes: ClassVar[int] = sys.maxsize
-    """Number of bytes handled before other tasks get their turn."""
+    # Bytes that the library reads in one turn once it reads everything, in which it is much slower.
     slice_bytes: ClassVar[int] = sys.maxsize
-    """Number of bytes that the library reads in one turn when it reads everything."""
 
     def __init__(self, protocol: ClientProtocol | ServerProtocol, *, max_size: int, write_limit: int) -> None:
         """Prepare the connection: `max_size` is that of `protocol`; `write_limit` bytes set `paused`."""
+        # Monotonic seconds of the last data from the peer, whatever it was.
         self.last_heard = time.monotonic()
+        # True while messages can be sent. It copies the library's state, which takes longer to look up, after each
+        # call of the library (`_flush`), and `abort` clears it.
         self.is_open = False
+        # For error messages: the beginning of the peer's answer, and of a frame that was invalid or too large.
         self.first_bytes = b""
         self.refused = b""
+        # True while so much data waits for the peer that writers should wait too (see `drain`), which asyncio decides
+        # by `write_limit`.
         self.paused = False
-        self._protocol = protocol
-        self._transport: asyncio.Transport | None = None
-        self._write_limit = write_limit
-        self._max_size = max_size
-        self._is_server = isinstance(protocol, ServerProtocol)
-        self._encode = frames.unmasked if self._is_server else frames.Masker().encode
-        self._in_handshake = True
-        self._handshake_tail = b""
-        self._quick = False
-        self._rest = bytearray()
-        self._wanted = 0
-        self._fragments: bytearray | None = None
-        self._held: list[bytes] | None = None
-        self._postponed: list[bytes] = []
-        self._interrupted: tuple[bytes, int] | None = None
-        self._pongs_unread = False
-        self._is_answering = False
-        self._unread = 0
-        self._is_scheduled = False
-        self._ends = False
         self._writable = asyncio.Event()
         self._writable.set()
+        self._write_limit = write_limit
+
+        self._protocol = protocol
+        self._is_server = isinstance(protocol, ServerProtocol)
+        self._max_size = max_size
+        self._encode = frames.unmasked if self._is_server else frames.Masker().encode
+        # Set when the event loop has connected, and kept after the end.
+        self._transport: asyncio.Transport | None = None
         self._lost = asyncio.Event()
+        # True once `close_expected` was called, which happens at most once.
+        self._ends = False
+
+        # Until the end of the HTTP headers the library reads; `_handshake_tail` has bytes that may begin that end.
+        self._in_handshake = True
+        self._handshake_tail = b""
+        # True while whole messages are split off here: from the handshake to the first invalid frame or the end.
+        self._quick = False
+        # An incomplete frame, of `_wanted` bytes in all, or 0 while its header is incomplete. It is kept here because
+        # the library must stand between two frames while `_quick`.
+        self._rest = bytearray()
+        self._wanted = 0
+        # The data frames of an incomplete message, None between messages. Until it is complete, the library reads
+        # all frames.
+        self._fragments: bytearray | None = None
+
+        # What a turn left over: messages, then bytes from an index on. While `_interrupted` is set, the socket is not
+        # read; `_is_scheduled` is set while `_proceed` is scheduled to end that.
+        self._postponed: list[bytes] = []
+        self._interrupted: tuple[bytes, int] | None = None
+        self._is_scheduled = False
+        # Output that `together` holds back, or None outside of it.
+        self._held: list[bytes] | None = None
+        # True from a pong that the socket does not accept until it accepts data again: then a server does not read,
+        # because each ping that it reads could cost memory for another pong.
+        self._pongs_unread = False
+        # Bytes caused by the peer since it last read something (`count_unread`); answers of the library count while
+        # `_is_answering`.
+        self._unread = 0
+        self._is_answering = False
 
     # For the subclass to implement
 

@@ -9,9 +9,8 @@ import gc
 import json
 import logging
 import sys
-import threading
 from collections.abc import Iterator
-from contextlib import AsyncExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +22,9 @@ from bridge.codecs.fragments import OVERHEAD, Reassembler
 from bridge.errors import DecodeError
 from bridge.hub import server
 from bridge.hub.broker import TURN_WORK
-from bridge.hub.definitions import Definitions
 from bridge.hub.limits import HubLimits
 from tests.bridge.hub.broker_harness import Harness, Peer, publisher_and_subscriber
 from tests.bridge.hub.sockets import RawClient, client, running_hub
-from tests.patience import PATIENCE
 
 MEBIBYTE = 1 << 20
 MARGIN = 64 * MEBIBYTE
@@ -305,40 +302,6 @@ def test_a_turn_ends_after_a_bounded_amount_of_work(prepare: Any) -> None:
         messages = messages[performed:]
         turns += 1
     assert turns > 5
-
-
-async def test_definitions_are_loaded_beside_the_event_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    go = threading.Event()
-    load = Definitions.load
-
-    def slow_load(definitions: Definitions) -> None:
-        assert go.wait(PATIENCE)
-        load(definitions)
-
-    monkeypatch.setattr(Definitions, "load", slow_load)
-    async with AsyncExitStack() as stack:
-        port = await stack.enter_async_context(running_hub())
-        witness = await stack.enter_async_context(client(port))
-        waiting = [await stack.enter_async_context(client(port)) for _ in range(2)]
-        subscribe = {
-            "op": "subscribe",
-            "topic": "/t",
-            "type": "std_msgs/UInt8MultiArray",
-            "compression": "cbor",
-        }
-        await waiting[0].send(**subscribe)
-        text = json.dumps(subscribe)
-        for number, part in enumerate((text[:20], text[20:])):  # the same in fragments
-            await waiting[1].send(op="fragment", id="f", data=part, num=number, total=2)
-        await witness.sync()
-        assert (await witness.ask("/rosapi/subscribers", topic="/t"))["subscribers"] == []
-        go.set()
-        for each in waiting:
-            await each.sync()
-        await witness.send(op="publish", topic="/t", msg={"data": [1, 2]})
-        for each in waiting:
-            payload = await each.websocket.recv(decode=False)
-            assert cbor_codec.decode(payload)["msg"]["data"] == b"\x01\x02"
 
 
 # --- connections
