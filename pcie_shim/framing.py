@@ -1,7 +1,12 @@
 """Frames of the link, without sockets: encoding and decoding (docs/reference/boards.md has the wire format).
 
-A frame is a header of 20 bytes (operation, flags, sequence, address, count, CRC-32) and 32-bit words, all
-little-endian. It corresponds to the data link layer of thesis 2.3, which adds sequence numbers and CRCs to
+     0        2          3      4         8        12       16      20
+    ┌────────┬──────────┬──────┬─────────┬────────┬────────┬───────┬───────────────┐
+    │ "BM"   │ operation│ flags│ sequence│ address│ count  │ CRC-32│ count words   │
+    └────────┴──────────┴──────┴─────────┴────────┴────────┴───────┴───────────────┘
+
+All numbers are little-endian. The CRC is that of the other 16 bytes of the header and the words. A request to read, and
+the reply to a write, have a count and no words. It corresponds to the data link layer of thesis 2.3, which adds sequence numbers and CRCs to
 read and write requests. `FrameDecoder` uses one buffer as long as the link is open.
 """
 
@@ -91,6 +96,8 @@ class FrameDecoder:
     """
 
     def __init__(self) -> None:
+        # Received bytes that were not returned yet are in [start, end). Twice the longest frame, so that bytes are
+        # moved to the beginning once in a while instead of after each frame.
         self._buffer = memoryview(bytearray(2 * _MAX_FRAME))
         self._start = 0
         self._end = 0
@@ -127,6 +134,7 @@ class FrameDecoder:
         magic, operation, flags, sequence, address, count, crc = _HEADER.unpack_from(self._buffer, start)
         if magic != _MAGIC or operation not in _OPERATIONS or flags > 15:
             raise FramingError("the bytes received are not a frame of the link")
+        # before anything waits for them: a wrong count must not become a wait for megabytes
         if count > MAX_PAYLOAD_WORDS:
             raise FramingError(f"a frame has {count} words; the maximum is {MAX_PAYLOAD_WORDS}")
         payload_start = start + HEADER_BYTES

@@ -1,5 +1,9 @@
 """The emulated FPGA board, without sockets: a register file and a Bayesian machine.
 
+    load ──▶ IDLE ── START ──▶ RUNNING ── step, step, ... ──▶ DONE (overflow, impossible, max cycles, end of a slice)
+               ▲                  │                            │
+               └───── reset ──────┴────────────────────────────┘ RESUME continues a slice
+
 The whole map is one array of bytes, so a read is a slice, and only registers with side effects need code. The
 machine runs in chunks of about 50 ms (`EmulatedBoard.step`), between which the server can receive a reset.
 Chunks do not change results, because a machine that is stopped and resumed gives the same bits.
@@ -48,37 +52,46 @@ class RefusedError(PcieShimError):
 
 
 class EmulatedBoard:
-    """A board: blank until an image is loaded, then a BM1 with registers (docs/reference/registers.md).
-
-    Attributes:
-        programmed: Number of images loaded so far.
-        done: The number of the last start or resume that has stopped (register DONE).
-        running: Whether the machine is running and `step` must be called.
-    """
+    """A board: blank until an image is loaded, then a BM1 with registers (docs/reference/registers.md)."""
 
     def __init__(self, make: Callable[[BM1Machine], BM1Kernel] = make_kernel) -> None:
         self._make = make
         self.turned = 0.0
         """Monotonic time at which its server last looked for requests; 0 before the first time."""
+        self.programmed = 0
+        """Number of images loaded so far."""
+        self.done = 0
+        """The number of the last start or resume that has stopped (register DONE)."""
+        self.running = False
+        """True while the machine is running and `step` must be called; registers are then read-only."""
+
+        # The whole map, and for each word of it whether it may be read and written. Changed by `load` alone.
         self._memory = bytearray(rm.BAR_SIZE)
         self._view = memoryview(self._memory)
         self._access = bytearray(rm.BAR_SIZE // 4)
+
+        # The machine of the loaded image, None while blank, and what follows from its parameters. The arrays are
+        # views of the map: what is assigned to them is what a host reads.
         self._kernel: BM1Kernel | None = None
         self._results: npt.NDArray[np.uint32] = np.empty(0, np.uint32)
         self._outcomes: npt.NDArray[np.void] = np.empty(0, REPLICA_OUTCOME)
         self._sensors = struct.Struct("")
         self._is_plain = True
+
+        # High words of 64-bit registers by address, from the read of the low word until they are read.
         self._latched: dict[int, bytes] = {}
+
+        # Why the last access was refused, for STATUS.ERROR; cleared by a reset.
         self._error = ErrorCode.NONE
-        # those of the last start or resume
+
+        # Cycles of the next chunk, which adapts to the measured speed, and of the first one of each frame.
         self._chunk = self._first_chunk = _SHORTEST_CHUNK
+
+        # Those of the last start or resume: its limits, its time so far, and its number.
         self._max_cycles = 0
         self._run_until = 0
         self._compute_ns = 0
         self._number = 0
-        self.programmed = 0
-        self.done = 0
-        self.running = False
         self._power_up()
 
     # ---- identity -------------------------------------------------------------------------------------

@@ -36,12 +36,6 @@ class RtlBoard:
 
     While it is blank, there is no hardware, and an emulated blank board answers. The error of a simulation that
     ends, hangs or answers garbage is a SimulationError, after which the board is useless.
-
-    Attributes:
-        turned: Monotonic time at which its server last looked for requests; 0 before the first time.
-        programmed: Number of images loaded so far.
-        done: The number of the last start or resume that has stopped (register DONE).
-        running: True while the machine is running and `step` must be called.
     """
 
     def __init__(self, simulate: Callable[[Image], Simulation]) -> None:
@@ -51,12 +45,22 @@ class RtlBoard:
             simulate: Compiles and starts the simulation of an image's hardware, or raises a SimulationError.
         """
         self._simulate = simulate
+
+        # While there is no simulation, this one answers.
         self._blank = EmulatedBoard()
+
+        # The hardware of the loaded image, which goes with it; it is replaced when the board is programmed again.
         self._simulation: Simulation | None = None
-        self._preparation: _Preparation | None = None
         self._image: Image | None = None
         self._image_hash = self._blank.image_hash
+
+        # Hardware that is being compiled, or is ready for `load` to take.
+        self._preparation: _Preparation | None = None
+
+        # Clocks of the next chunk, which adapts to the measured speed.
         self._chunk = _SHORTEST_CHUNK
+
+        # Those of `Board`: `done` and `running` are what the hardware's registers said last.
         self.turned = 0.0
         self.programmed = 0
         self.done = 0

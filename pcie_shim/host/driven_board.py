@@ -55,10 +55,14 @@ _CAPABILITIES: Final = range(rm.CAP_MACHINE, rm.CAP_INTERFACE + 4, 4)
 class DrivenBoard:
     """One board: its link, and the known contents of its registers."""
 
-    def __init__(self, index: int, endpoint: Endpoint, image: Image) -> None:
+    def __init__(self, index: int, endpoint: Endpoint, image: Image, *, reprogram: bool = False) -> None:
+        """Store the number of the board, its place and image; `reprogram` is that of `MiniCluster.open`."""
         self.index = index
         self.endpoint = endpoint
         self.image = image
+        self._reprogram = reprogram
+
+        # What follows from the image: where the inputs are, and the extent of a result, which every answer must have.
         parameters = image.machine.parameters
         self.lines = parameters.lines
         self.replicas = parameters.replicas
@@ -67,20 +71,31 @@ class DrivenBoard:
         self.result_bytes = self.counts_bytes + (
             self.replicas * REPLICA_OUTCOME.itemsize if self.replicas > 1 else 0
         )
+
+        # Either an open link, or None and the reason why.
         self.link: SocketLink | None = None
         self.broken = "it has not been opened"
+
+        # Cycles per second, as the board reports them when it is opened.
         self.speed = _ASSUMED_SPEED
         self._forget()
 
     def _forget(self) -> None:
-        """Forget the contents of the registers."""
+        """Forget the contents of the registers, which another host may have written."""
+        # What the board has: a frame writes only what differs. Empty or None: unknown.
         self.settings = b""
         self.selects = b""
-        self.outcomes: npt.NDArray[np.void] = np.zeros(0, REPLICA_OUTCOME)
         self.prior: npt.NDArray[np.uint16] | None = None
+
+        # Number of the last doorbell, and whether its answer is still missing: then `done` is None.
         self.number = 0
         self.waiting = False
         self.done: Done | None = None
+
+        # The replicas' part of the last answer, copied, because the others wait for the buffer of the link.
+        self.outcomes: npt.NDArray[np.void] = np.zeros(0, REPLICA_OUTCOME)
+
+        # A poll of this board's link alone.
         self.readable = select.poll()
 
     # ---- opening --------------------------------------------------------------------------------------
@@ -95,7 +110,9 @@ class DrivenBoard:
         self._forget()
         link = self._identified(timeout, connect_timeout)
         try:
-            if not any(link.read_block(rm.IMAGE_HASH, rm.IMAGE_HASH_WORDS)):
+            held = link.read_block(rm.IMAGE_HASH, rm.IMAGE_HASH_WORDS)
+            if not any(held) or (self._reprogram and held.hex() != self.image.image_hash):
+                # with the token, because this host holds the board
                 program(self.endpoint, self.image, timeout=programming_timeout, token=link.token)
                 link.close("the board was programmed")
                 link = self._identified(timeout, connect_timeout)

@@ -1,5 +1,10 @@
 """The mini-cluster: all boards of a model, driven by one blocking thread (thesis 3.2, figure 3.3).
 
+    post ──▶ start to board 0, 1, ... ─┐
+                                       ├─ collect: all have answered ──▶ the last slice? ──▶ FrameOutput
+             resume to those that ◀────┘                                      │
+             have not stopped      ◀──────────────── no ──────────────────────┘
+
 The sensors and the start of a frame are posted to every board before waiting for the first one; then results
 are received as the boards stop. Boards stop together (`slices`) or independently (`own`, as in the thesis).
 """
@@ -40,14 +45,23 @@ class _Progress:
 
     def __init__(self, max_cycles: int, end: int, boards: Sequence[DrivenBoard]) -> None:
         self.max_cycles = max_cycles
-        self.begun = 0  # first cycle of the slice
-        self.end = end  # last cycle of the slice; 0: the frame's
+
+        # The slice: its first cycle, and its last one (0: that of the frame).
+        self.begun = 0
+        self.end = end
+
+        # The boards that were started for this slice, and how many of them have not answered yet. The replicas in
+        # `halted` have overflowed on a board and stay stopped for the rest of the frame.
         self.running = boards
+        self.left = 0
         self.halted: frozenset[int] = frozenset()
-        self.left = 0  # boards that are still running this slice
+
+        # The cycles of the slice, the seconds that they may take, and the monotonic time when these are over.
         self.cycles = 0
         self.limit = 0.0
         self.deadline = 0.0
+
+        # For the output: finished slices, and nanoseconds of each stage since the last look at the clock.
         self.slices = 0
         self.writes_ns = self.waits_ns = self.computing_ns = 0
         self.clock_ns = time.perf_counter_ns()
@@ -60,13 +74,20 @@ class MiniCluster:
         """Store the boards; use `open`, which also connects."""
         self._boards = tuple(boards)
         self._encoder = FrameEncoder([board.image for board in self._boards])
+        self._replicas = self._boards[0].replicas
         self._timeout = timeout
         self._slack = slack
-        self._interrupted: list[DrivenBoard] = []
+
+        # The posted frame, from `post` until `collect` returns its result or either raises an error.
         self._progress: _Progress | None = None
+
+        # Boards that were still computing when another one failed the frame. Their links were closed, which stops
+        # them, and the next frame opens them again; for the caller they are open.
+        self._interrupted: list[DrivenBoard] = []
+
+        # The links of all open boards: registered in the poll when a board is opened, removed when it is closed.
         self._poll = select.poll()
         self._by_descriptor: dict[int, DrivenBoard] = {}
-        self._replicas = self._boards[0].replicas
 
     @classmethod
     def open(
@@ -76,6 +97,7 @@ class MiniCluster:
         *,
         timeout: float = 10.0,
         slack: float = SLACK_S,
+        reprogram: bool = False,
     ) -> Self:
         """Open all boards: check identity, liveness and image, program blank boards, and reset the machines.
 
@@ -84,6 +106,8 @@ class MiniCluster:
             images: The boards' images.
             timeout: Seconds for a board to listen, and for each of its answers.
             slack: Seconds that a frame may take beyond the time for its cycles at the speed of the boards.
+            reprogram: Program boards with another image, now and whenever they are reopened, instead of refusing
+                them.
 
         Raises:
             EndpointError: An endpoint is invalid.
@@ -93,7 +117,7 @@ class MiniCluster:
         places = [parse_endpoint(place) if isinstance(place, str) else place for place in endpoints]
         _check_images(len(places), images)
         boards = [
-            DrivenBoard(index, place, image)
+            DrivenBoard(index, place, image, reprogram=reprogram)
             for index, (place, image) in enumerate(zip(places, images, strict=True))
         ]
         cluster = cls(boards, timeout=timeout, slack=slack)

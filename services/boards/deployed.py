@@ -1,23 +1,11 @@
 """The boards of a deployment: programming, opening, frames, and recovery after restarts."""
 
-import time
 from collections.abc import Sequence
 
 from pcie_shim.endpoint import Endpoint
-from pcie_shim.errors import (
-    BoardError,
-    BoardHeldError,
-    BoardLinkError,
-    BoardMismatchError,
-    GreetingMismatchError,
-    HeldError,
-    ImageError,
-    PcieShimError,
-)
+from pcie_shim.errors import BoardError, BoardMismatchError
 from pcie_shim.host.frame import FrameInput, FrameOutput
-from pcie_shim.host.loader import program
-from pcie_shim.host.mini_cluster import PROGRAMMING_S, MiniCluster
-from pcie_shim.host.socket_link import LONGEST_POLL_S
+from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, read_image
 from services.boards.frames import BoardAwayError, driver_input
 from services.settings import Settings
@@ -32,9 +20,7 @@ TICK = 0.2
 class DeployedBoards:
     """The boards of a deployment; a restarted board is programmed and opened again.
 
-    Attributes:
-        deployment: The deployment.
-        gone: Reasons why boards are unusable, by board number.
+    One thread at a time may use it, except for `status`.
     """
 
     def __init__(
@@ -51,51 +37,28 @@ class DeployedBoards:
         self._images = images_of(deployment)
         self._reprogram = reprogram
         self._endpoints = list(endpoints)
+
+        # None until `open` has succeeded; from then on the same one, whose boards are reopened one by one.
         self._cluster: MiniCluster | None = None
+
+        # Why a board is unusable, by its number: from the failure until `recover` has reopened it. While there is one,
+        # no frame is posted.
         self.gone: dict[int, str] = {}
+
+        # How often each board was gone, for the status.
         self._times_gone = [0] * len(self._endpoints)
 
     def open(self) -> str:
         """Open all boards, program blank ones, and return a sentence for the user, or raise a PcieShimError."""
-        programmed: set[int] = set()
-        while self._cluster is None:
-            try:
-                self._cluster = self._opened(self._images)
-            except BoardMismatchError as error:
-                if not self._reprogram or error.board in programmed:
-                    raise
-                programmed.add(error.board)
-                self._program(error.board, self._images[error.board])
-        count = len(self._endpoints)
-        return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
-
-    def _opened(self, images: Sequence[Image]) -> MiniCluster:
-        return MiniCluster.open(
+        self._cluster = MiniCluster.open(
             self._endpoints,
-            images,
+            self._images,
             timeout=self._settings.peer_timeout,
             slack=self._settings.board_timeout,
+            reprogram=self._reprogram,
         )
-
-    def _program(self, board: int, image: Image) -> None:
-        """Program a board that this process does not have open, or raise a BoardError."""
-        deadline = time.monotonic() + self._settings.peer_timeout
-        while True:
-            try:
-                program(
-                    self._endpoints[board], image, timeout=max(self._settings.peer_timeout, PROGRAMMING_S)
-                )
-            except HeldError as error:
-                # over TCP, the end of our own link may reach the board after the loader's connection
-                if time.monotonic() > deadline:
-                    raise BoardHeldError(f"Board {board}: {error}", board=board) from error
-                time.sleep(TICK / 4)
-            except (GreetingMismatchError, ImageError) as error:
-                raise BoardMismatchError(f"Board {board}: {error}", board=board) from error
-            except PcieShimError as error:
-                raise BoardLinkError(f"Board {board}: {error}", board=board) from error
-            else:
-                return
+        count = len(self._endpoints)
+        return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
 
     def status(self, output: FrameOutput | None) -> list[BoardStatus]:
         """Return the state of each board, with its part of the last output; for use in another thread."""
@@ -115,20 +78,15 @@ class DeployedBoards:
 
     def run(self, frame: Frame) -> FrameOutput:
         """Compute one frame; a board that fails (a BoardError) is in `gone` until `recover` has reopened it."""
-        self._whole_cluster()
         try:
-            self.post(frame)
-            while (output := self.collect(LONGEST_POLL_S)) is None:
-                pass
+            return self._whole_cluster().run(self._input(frame))
         except BoardError as error:
             self.find_lost_boards(error)
             raise
-        return output
 
     def post(self, frame: Frame) -> None:
         """Start a frame, whose result `collect` returns; after a BoardError call `find_lost_boards`."""
-        given = self._input(frame)
-        self._whole_cluster().post(given)
+        self._whole_cluster().post(self._input(frame))
 
     def collect(self, seconds: float = 0) -> FrameOutput | None:
         """Return the posted frame's result, or None while boards run; after a BoardError, call `find_lost_boards`."""
@@ -161,6 +119,7 @@ class DeployedBoards:
             self._is_gone(error.board, error)
         for board in range(len(self._endpoints)):
             if board != error.board and board not in self.gone:
+                # reopening tells whether it is alive; a board that answers is as good as before
                 try:
                     self._cluster.reopen(board, timeout=TICK)
                 except BoardError as other:
@@ -177,11 +136,11 @@ class DeployedBoards:
             BoardMismatchError: A board is back with another image, so waiting would not help.
         """
         back: list[int] = []
+        if self._cluster is None:
+            return back
         for board in list(self.gone):
-            if self._cluster is None:
-                break
             try:
-                self._reopen(self._cluster, board)
+                self._cluster.reopen(board, timeout=TICK)
             except BoardMismatchError:
                 raise
             except BoardError as error:
@@ -190,15 +149,6 @@ class DeployedBoards:
                 del self.gone[board]
                 back.append(board)
         return back
-
-    def _reopen(self, cluster: MiniCluster, board: int) -> None:
-        try:
-            cluster.reopen(board, timeout=TICK)
-        except BoardMismatchError:
-            if not self._reprogram:
-                raise
-            self._program(board, self._images[board])
-            cluster.reopen(board, timeout=TICK)
 
     def close(self) -> None:
         """Close the links to all boards."""

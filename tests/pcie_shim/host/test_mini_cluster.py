@@ -283,8 +283,14 @@ def test_another_image_is_refused_with_both_hashes(boards: list[ServedBoard]) ->
     assert caught.value.board == 1
     assert caught.value.exit_code == 2
     # the boards that were opened before it were let go
-    program(boards[1].endpoint, parts[1])
-    MiniCluster.open(endpoints_of(boards), parts).close()
+    with MiniCluster.open(endpoints_of(boards), parts, reprogram=True) as cluster:
+        assert outcome(cluster.run(frame())) == expected(parts, frame())
+        assert [board.link.read32(rm.PROGRAMMED) for board in cluster._boards] == [1, 2]
+        program(boards[1].endpoint, others[1], token=cluster._boards[1].link.token)
+        with pytest.raises(BoardStaleError):
+            cluster.run(frame())
+        cluster.reopen(1)
+        assert outcome(cluster.run(frame())) == expected(parts, frame())
 
 
 def test_a_held_board_is_refused(boards: list[ServedBoard]) -> None:
