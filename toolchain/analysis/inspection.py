@@ -24,7 +24,7 @@ from toolchain.analysis.readings import (
     recorded_readings,
     sample_readings,
 )
-from toolchain.analysis.resources import ASSUMPTIONS, Energy, Estimate, Pcie, energy, estimate
+from toolchain.analysis.resources import ASSUMPTIONS, Energy, Estimate, energy, estimate
 from toolchain.building.build import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
 from toolchain.building.report import loss_heading, many_sentence
@@ -59,7 +59,6 @@ class InspectOptions:
         seed: Seed of drawn readings.
         clock_hz: Clock frequency of the boards.
         device: FPGA of the boards.
-        pcie: The kind of PCIe controller.
     """
 
     recording: Path | None
@@ -70,7 +69,6 @@ class InspectOptions:
     seed: int
     clock_hz: float
     device: Device
-    pcie: Pcie
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +101,7 @@ def inspect_deployment(
         stop=section.stop,
     )
     resources = tuple(
-        estimate(machine.parameters, options.device, pcie=options.pcie, table_length=table_length(machine))
+        estimate(machine.parameters, options.device, table_length=table_length(machine))
         for machine in machines
     )
     banks = options.banks or (SLOW_BANKS if _is_slow(whole) else BANKS)
@@ -339,17 +337,11 @@ def _resource_part(found: Inspection) -> str:
         rows.append(
             f"  tables     {memories.alms:8,.0f}             {memories.logic_tables:,} tables in {memories.mlabs:,} memory LABs"
         )
-    low, high = largest.pcie_alms
-    controller = (
-        "hard: no logic; of logic it would take 8,000 to 30,000 logic elements"
-        if largest.pcie is Pcie.HARD
-        else f"soft: {low:,.0f} to {high:,.0f} ALMs (8,000 to 30,000 logic elements)"
-    )
     rows += [
         f"  together   {largest.alms:8,.0f} {largest.logic.registers:10,.0f}   {largest.alm_share:.0%} of {device.alms:,} ALMs",
         (
             f"  Table memories: {memories.table_bits:,} bits in {memories.blocks:,} of {device.blocks:,} M20K blocks "
-            f"({largest.block_share:.0%}). PCIe controller {controller}."
+            f"({largest.block_share:.0%}). The PCIe controller is a block of the device."
         ),
         "  It fits: up to 80 % of each can be used."
         if largest.fits
@@ -393,7 +385,6 @@ def as_json(found: Inspection) -> str:
                 "table_bits": each.memories.table_bits,
                 "blocks": each.memories.blocks,
                 "memory_labs": each.memories.mlabs,
-                "pcie_alms": list(each.pcie_alms),
                 "fits": each.fits,
             }
             for each in found.resources

@@ -34,7 +34,6 @@ class Device:
     registers_per_alm: int
     blocks: int
     usable: float = 0.8
-    hard_pcie: bool = True
 
 
 DEVICES: Final = {

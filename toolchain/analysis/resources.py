@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -32,37 +31,19 @@ if TYPE_CHECKING:
     from toolchain.analysis.readings import Readings
 
 
-SOFT_PCIE_ELEMENTS: Final = (8_000, 30_000)
-"""Minimum and maximum number of logic elements of a soft PCIe controller (thesis 2.3)."""
-
-ELEMENTS_PER_ALM: Final = 2.65
-"""Number of logic elements per ALM according to the vendor."""
-
-
-class Pcie(StrEnum):
-    """The kind of PCIe controller."""
-
-    HARD = "hard"
-    """A block of the device, as in the thesis: no logic."""
-    SOFT = "soft"
-    """Logic: 8,000 to 30,000 elements."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """Resources of a machine on an FPGA; `pcie_alms` are the minimum and maximum of the PCIe controller."""
+    """Resources of a machine on an FPGA, whose PCIe controller is a block without logic."""
 
     device: Device
     logic: Logic
     memories: Memories
-    pcie: Pcie
-    pcie_alms: tuple[float, float]
 
     @property
     def alms(self) -> float:
-        """All ALMs: logic, registers that don't fit into its ALMs, tables, and the largest PCIe controller."""
+        """All ALMs: logic, registers that don't fit into its ALMs, and tables."""
         logic = max(self.logic.alms, self.logic.registers / self.device.registers_per_alm)
-        return logic + self.memories.alms + self.pcie_alms[1]
+        return logic + self.memories.alms
 
     @property
     def alm_share(self) -> float:
@@ -98,19 +79,12 @@ class Estimate:
         return ""
 
 
-def estimate(
-    parameters: BM1Parameters, device: Device, *, pcie: Pcie = Pcie.HARD, table_length: int = LENGTH
-) -> Estimate:
-    """Return the resources of a machine on a device, or raise a BuildError if it lacks a part."""
-    if pcie is Pcie.HARD and not device.hard_pcie:
-        raise BuildError(f"{device.title} has no hard PCIe controller; use --soft-pcie")
-    soft = tuple(elements / ELEMENTS_PER_ALM for elements in SOFT_PCIE_ELEMENTS)
+def estimate(parameters: BM1Parameters, device: Device, *, table_length: int = LENGTH) -> Estimate:
+    """Return the resources of a machine on a device, or raise a BuildError if it exists only in emulation."""
     return Estimate(
         device=device,
         logic=logic_of(parameters, table_length=table_length),
         memories=place_memories(parameters, device, table_length),
-        pcie=pcie,
-        pcie_alms=(0.0, 0.0) if pcie is Pcie.HARD else (soft[0], soft[1]),
     )
 
 
@@ -119,13 +93,12 @@ def boards_needed(
     device: Device,
     *,
     largest_lines: int = 4096,
-    pcie: Pcie = Pcie.HARD,
     table_length: int = LENGTH,
 ) -> tuple[int, str]:
     """Return the minimum number of boards for a machine, and the reason as a sentence, or raise a BuildError."""
 
     def on(lines: int) -> Estimate:
-        return estimate(replace(parameters, lines=lines), device, pcie=pcie, table_length=table_length)
+        return estimate(replace(parameters, lines=lines), device, table_length=table_length)
 
     room = interface_room(parameters)
     largest_lines = min(largest_lines, room[1] // parameters.replicas)

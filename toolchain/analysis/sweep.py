@@ -14,7 +14,7 @@ from toolchain.analysis.accuracy import measure
 from toolchain.analysis.emulation import EmulatedBoards, one_replica
 from toolchain.analysis.logic import Device
 from toolchain.analysis.readings import Readings, check_frames, readings_of_lines, sample_readings
-from toolchain.analysis.resources import Pcie, estimate
+from toolchain.analysis.resources import estimate
 from toolchain.analysis.results import Point
 from toolchain.building.machine import (
     MachinePlan,
@@ -241,7 +241,7 @@ def with_resources(task: Task, point: Point, device: Device) -> Point:
         return point
     lines = partition_lines(parameters.lines, options.partitions)[0].lines
     largest = replace(parameters, lines=lines)
-    took = estimate(largest, device, pcie=Pcie.HARD)
+    took = estimate(largest, device)
     update = {"alms": took.alms, "blocks": took.memories.blocks, "fits": took.fits}
     return point.model_copy(update=update)
 

@@ -1,6 +1,6 @@
-"""The `toolchain explore` command: a sweep over machines for a model, or the thesis's claims as experiments."""
+"""The `toolchain explore` command: a sweep over machines for a model."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -9,13 +9,20 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from machines.parameters import RngKind, SensorMode
-from toolchain.commands.flags import Bits, MaxCycles, ModelFlags, Partitions, ReadingFlags, StopWhen
+from toolchain.commands.flags import (
+    Bits,
+    MaxCycles,
+    ModelFlags,
+    ModelPath,
+    Partitions,
+    ReadingFlags,
+    StopWhen,
+)
 from toolchain.commands.progress import progress
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
 
 if TYPE_CHECKING:
-    from toolchain.analysis.claims import Course
     from toolchain.analysis.readings import Readings
     from toolchain.analysis.results import Point
     from toolchain.analysis.sweep import Sweep
@@ -62,15 +69,9 @@ class SweepFlags(ModelFlags):
 
 
 def explore(
+    model: ModelPath,
     flags: SweepFlags,
     readings: ReadingFlags,
-    model: Annotated[
-        Path | None,
-        typer.Argument(
-            help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net, .xdsl (.gz).",
-            metavar="[MODEL]",
-        ),
-    ] = None,
     frames: Annotated[int, typer.Option(help="Maximum number of frames.")] = 50,
     results: Annotated[
         Path,
@@ -81,40 +82,15 @@ def explore(
     plot: Annotated[
         Path | None, typer.Option(help="Picture of accuracy against cycles.", metavar="PNG")
     ] = None,
-    claims: Annotated[
-        Path | None,
-        typer.Option(
-            help="Instead of a sweep: the thesis's claims as experiments, with numbers and a picture in this folder.",
-            metavar="DIR",
-        ),
-    ] = None,
 ) -> None:
     """Sweep over machines for a model: accuracy against cycles and ALMs, with the Pareto front.
 
     For example `toolchain explore casestudies/boat --partitions 4 --prob-bits 6,8 --plot boat.png`; after
-    Ctrl-C, the same command resumes the sweep. `toolchain explore --claims out/claims` tests the thesis's
-    claims.
+    Ctrl-C, the same command resumes the sweep, whose points are in the results file.
     """
-    if claims is not None:
-        if model is not None:
-            raise BuildError(f"--claims has its own model: omit {model}")
-        _run_claims(claims, frames=frames, seed=readings.seed)
-    elif model is None:
-        raise BuildError(
-            "name a model to explore, such as 'toolchain explore casestudies/boat', or --claims DIR"
-        )
-    else:
-        _run_sweep(model, flags, readings, frames, results, plot)
-
-
-def _run_sweep(
-    path: Path, flags: SweepFlags, readings: ReadingFlags, count: int, results: Path, plot: Path | None
-) -> None:
-    """Run the sweep, store every point in the results file, and print the points, even after an interruption."""
     from toolchain.analysis.logic import device_named
-    from toolchain.analysis.pictures import check_pictures_possible, draw_sweep
     from toolchain.analysis.readings import check_columns
-    from toolchain.analysis.results import Results, pareto, table
+    from toolchain.analysis.results import Results, check_pictures_possible, draw_sweep, pareto, table
     from toolchain.analysis.sweep import Frames, run_sweep, run_task, tasks, with_resources
     from toolchain.commands.request import read_model
 
@@ -122,15 +98,15 @@ def _run_sweep(
         check_pictures_possible(plot)
     device = device_named(readings.device)
     sweep = _sweep(flags)
-    model = read_model(path, flags, flags.bits)
+    read = read_model(model, flags, flags.bits)
     check_columns(readings.readings, readings.reading)
-    frames = Frames(model, count, seed=readings.seed, recorded=_recorded(model, readings))
+    drawn = Frames(read, frames, seed=readings.seed, recorded=_recorded(read, readings))
     kept = Results(results)
-    found = tasks(model, sweep, frames, device)
+    found = tasks(read, sweep, drawn, device)
     kept.check_writable()
     there = sum(task.key in kept.points for task in found)
     typer.echo(
-        f"{len(found)} machines of {model.name} over {frames.columns(found[0].plan.options.replicas).source}"
+        f"{len(found)} machines of {read.name} over {drawn.columns(found[0].plan.options.replicas).source}"
         + (f"; {there} of them are in {results}" if there else ""),
         err=True,
     )
@@ -139,7 +115,7 @@ def _run_sweep(
             run_sweep(
                 found,
                 kept.points,
-                lambda task: run_task(task, frames, device, sweep.banks),
+                lambda task: run_task(task, drawn, device, sweep.banks),
                 kept.append,
                 lambda point: advance(_name_of(point)),
             )
@@ -154,7 +130,7 @@ def _run_sweep(
             typer.echo(table(points, front), nl=False)
             typer.echo(f"{len(points)} of {len(found)} machines are in {results}", err=True)
             if plot is not None:
-                draw_sweep(plot, model.name, points, front)
+                draw_sweep(plot, read.name, points, front)
                 typer.echo(f"Wrote {plot}", err=True)
 
 
@@ -210,45 +186,3 @@ def _name_of(point: "Point") -> str:
     name = f"{point.rng}, codes of {point.prob_bits} bits, target {point.target_count}, scale {point.scale}"
     name += "" if point.sensor_mode == "column" else f", {point.sensor_mode}"
     return name if point.replicas == 1 else f"{name}, {point.replicas} replicas"
-
-
-def _run_claims(directory: Path, *, frames: int, seed: int) -> None:
-    from toolchain.analysis.claims import experiments, run_claims
-    from toolchain.analysis.pictures import check_pictures_possible, draw_claims
-    from toolchain.analysis.readings import check_frames
-
-    figures, picture = directory / "claims.json", directory / "claims.png"
-    check_pictures_possible()
-    check_frames(frames)
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as reason:
-        raise BuildError(f"{directory} cannot be created: {reason.strerror or reason}") from None
-    check_pictures_possible(picture)
-    with progress(experiments()) as advance:
-        claims = run_claims(frames=frames, seed=seed, advance=advance)
-    for heading, courses in (
-        ("Cycles by the number of lines (4 sensors, target 255):", claims.lines),
-        ("Cycles by the number of sensors (256 lines, target 255):", claims.sensors),
-        ("Cycles by the target count (256 lines, 4 sensors):", claims.targets),
-    ):
-        typer.echo(_courses(heading, courses), nl=False)
-    typer.echo(f"Total variation by the share of flipped bits ({claims.fault_frames} frames):")
-    for name, faults in claims.faults.items():
-        typer.echo(
-            f"  {name:31} " + "  ".join(f"{fault.rate:g}: {fault.total_variation:.3f}" for fault in faults)
-        )
-    try:
-        figures.write_text(claims.as_json(), encoding="utf-8")
-    except OSError as reason:
-        raise BuildError(f"{figures} cannot be written: {reason.strerror or reason}") from None
-    draw_claims(picture, claims)
-    typer.echo(f"Wrote {figures} and {picture}", err=True)
-
-
-def _courses(heading: str, courses: "Sequence[Course]") -> str:
-    rows = [heading, "          median   quartiles"]
-    rows += [
-        f"  {each.x:6,.0f}  {each.median:7,.0f}   {each.low:,.0f} to {each.high:,.0f}" for each in courses
-    ]
-    return "\n".join(rows) + "\n"

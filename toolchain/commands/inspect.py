@@ -41,10 +41,6 @@ def inspect(
         typer.Option(help="Number of seed sets for each frame.", show_default="4, or 1 for a slow machine"),
     ] = None,
     clock: Annotated[float, typer.Option(help="Clock frequency of the boards.", metavar="HERTZ")] = 100e6,
-    soft_pcie: Annotated[
-        bool,
-        typer.Option("--soft-pcie", help="Use soft PCIe controllers instead of the hard ones of the device."),
-    ] = False,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
     """Explain a deployment: machine, quantisation loss, cycles, accuracy, resources and energy.
@@ -55,7 +51,6 @@ def inspect(
     """
     from toolchain.analysis.inspection import InspectOptions, as_json, inspect_deployment, inspection_report
     from toolchain.analysis.logic import device_named
-    from toolchain.analysis.resources import Pcie
     from toolchain.commands.request import read_model
     from toolchain.deployment import load_deployment
 
@@ -72,7 +67,6 @@ def inspect(
         seed=readings.seed,
         clock_hz=clock,
         device=device_named(readings.device),
-        pcie=Pcie.SOFT if soft_pcie else Pcie.HARD,
     )
     deployment = load_deployment(directory)
     read = None if model is None else read_model(model, flags, bits)

@@ -18,8 +18,7 @@ from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.corridor import corridor
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis.logic import DEVICES
-from toolchain.analysis.pictures import check_pictures_possible
-from toolchain.analysis.results import Point, Results, pareto
+from toolchain.analysis.results import Point, Results, check_pictures_possible, pareto
 from toolchain.analysis.sweep import Frames, Sweep, run_sweep, run_task, tasks
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
@@ -262,14 +261,12 @@ def test_looking_whether_a_picture_can_be_written_leaves_nothing(tmp_path):
         (["--device", "d9"], ["--device d9", "proce-v-d8"]),
         (["--reading", "a=b"], ["--reading a=b", "--readings FILE"]),
         (["--frames", "0"], ["--frames is 0", "1 to 100000"]),
-        (["--claims", "x"], ["--claims"]),
         (["--partitions", "13"], ["12 lines", "13 boards"]),
         (["--banks", "0"], ["--banks"]),
     ],
 )
 def test_mistakes(case, arguments, named):
     assert_refused(run(case, *arguments), *named)
-    assert_refused(toolchain("explore"), "--claims DIR")
 
 
 @pytest.mark.thorough

@@ -6,7 +6,7 @@ import pytest
 
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
 from toolchain.analysis.logic import DEVICES, device_named, logic_of
-from toolchain.analysis.resources import Pcie, boards_needed, estimate
+from toolchain.analysis.resources import boards_needed, estimate
 from toolchain.errors import BuildError
 
 D8 = DEVICES["proce-v-d8"]
@@ -39,15 +39,6 @@ def test_a_table_of_random_numbers_is_as_long_as_the_users():
     # 7 generators, each with a copy: of 65,536 words of 8 bits, or of 500
     assert made.memories.blocks - own.memories.blocks == 7 * (32 - 1)
     assert made.logic.registers - own.logic.registers == 7 * (16 - 9)
-
-
-def test_a_controller_of_logic_takes_8000_to_30000_elements():
-    hard, soft = on_d8(BOAT), on_d8(BOAT, pcie=Pcie.SOFT)
-    assert hard.pcie_alms == (0, 0)
-    assert [round(alms * 2.65) for alms in soft.pcie_alms] == [8000, 30000]
-    assert soft.alms - hard.alms == pytest.approx(soft.pcie_alms[1])
-    with pytest.raises(BuildError):
-        estimate(BOAT, replace(D8, hard_pcie=False))
 
 
 def test_registers_are_counted_exactly():

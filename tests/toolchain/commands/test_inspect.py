@@ -44,13 +44,13 @@ def test_without_the_model(deployment):
 
 
 def test_json(case, deployment):
-    result = look(deployment, "--model", str(case), "--json", "--soft-pcie")
+    result = look(deployment, "--model", str(case), "--json")
     found = json.loads(result.stdout)
     assert (found["lines"], found["columns"], found["boards"], found["clock_hz"]) == (12, 3, 2, 100e6)
     assert found["accuracy"]["frames"] == 20
     assert 0 < found["accuracy"]["machine"]["total_variation"]["value"] < 0.2
     assert [loss["name"] for loss in found["losses"]] == ["prior", "range", "loud"]
-    assert all(each["fits"] and each["pcie_alms"][1] > 10_000 for each in found["resources"])
+    assert all(each["fits"] for each in found["resources"])
     assert found["energy_model"]["dynamic_j"] > 0
 
 
