@@ -1,16 +1,34 @@
-"""Connections to the rosbridge servers of a deployment."""
+"""Connections to the rosbridge servers of a deployment, and what these know about its topics.
 
+`connect_all` connects each server once. rosapi, where a server has it, then tells whether a topic of readings has
+a publisher, and whether results can be received.
+"""
+
+import asyncio
 import contextlib
+import difflib
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from bridge.client import Ros, State, connect
 from bridge.discovery import announced_uri
+from bridge.errors import BridgeError
+from bridge.names import absolute, same_type
 from services.settings import Settings
+from terminal.one_line import shown
 
 OnState = Callable[[str, State, str], None]
 """Callback with the URI of a server, the new state of its connection, and the reason."""
+
+AFTER: Final = 2.0
+"""Seconds in which a publisher may appear before a mistyped name is suspected."""
+ROSAPI_TIME = 2.0
+"""Seconds in which a server may answer; many have no rosapi, and then nothing is known."""
+SETTLED_TIME = 3.0
+"""Seconds after which a server that knows nothing of an advertised topic has refused it."""
+CHECK_INTERVAL = 10.0
 
 
 async def connect_all(
@@ -51,3 +69,65 @@ def reconnect_now(rosbridges: Mapping[str, Ros]) -> None:
     """Try at once to reach the servers that are away: another service has reached one."""
     for ros in rosbridges.values():
         ros.reconnect_now()
+
+
+# --- topics of readings --------------------------------------------------------------------
+
+
+async def report_unpublished(ros: Ros, topic: str, report: Callable[[str], None]) -> None:
+    """Report a topic that has no publisher `AFTER` seconds from now, with the nearest names, if there is rosapi."""
+    await asyncio.sleep(AFTER)
+    if await ros.publishers(topic) != []:
+        return  # or the server has no rosapi
+    others = {name for name in await ros.topics() or [] if name != absolute(topic)}
+    near = difflib.get_close_matches(absolute(topic), others, 3, 0.6)
+    perhaps = f"; did you mean {' or '.join(shown(name) for name in near)}?" if near else ""
+    report(f"{topic} has no publisher at {ros.uri} yet{perhaps}")
+
+
+# --- topics of results ---------------------------------------------------------------------
+
+
+class NotReceivableError(BridgeError):
+    """Raised if the result of a run of one frame cannot be received."""
+
+
+@dataclass(frozen=True, slots=True)
+class AdvertisedTopic:
+    """A topic that was advertised at a server."""
+
+    ros: Ros
+    uri: str
+    name: str
+    type: str
+
+
+async def refusals(topics: Iterable[AdvertisedTopic], *, settled: bool) -> dict[str, str]:
+    """Return, by topic, why topics cannot be received, according to rosapi.
+
+    Args:
+        topics: The topics.
+        settled: Whether the servers have had time to register them.
+    """
+    asked = list(topics)
+    found = await asyncio.gather(*(_refusal(topic, settled=settled) for topic in asked))
+    return {topic.name: why for topic, why in zip(asked, found, strict=True) if why}
+
+
+async def _refusal(topic: AdvertisedTopic, *, settled: bool) -> str:
+    if topic.ros.state is not State.CONNECTED:
+        return ""
+    known = await topic.ros.topic_type(topic.name, ROSAPI_TIME)
+    if known is None:
+        return ""
+    if known and not same_type(known, topic.type):
+        return (
+            f"{topic.name} cannot be received at {topic.uri}: it is {known[:80]} there, not {topic.type}; "
+            "end the other publisher, or build with another output topic"
+        )
+    if not known and settled:
+        return (
+            f"{topic.name} cannot be received at {topic.uri}: the server does not know it although it was advertised; "
+            f"does its topics_glob allow the topic, and does it have {topic.type.partition('/')[0]}?"
+        )
+    return ""

@@ -9,8 +9,13 @@ import msgspec
 
 from bridge.client import State
 from bridge.errors import BridgeError
-from services.pipeline.connections import reconnect_now
-from services.pipeline.delivery import CHECK_INTERVAL, SETTLED_TIME, NotReceivableError, refusals
+from services.pipeline.connections import (
+    CHECK_INTERVAL,
+    SETTLED_TIME,
+    NotReceivableError,
+    reconnect_now,
+    refusals,
+)
 from services.pipeline.result_topics import RESULTS_DEPTH, ROLE, ResultTopics
 from services.settings import Settings
 from services.sockets.records import (

@@ -13,8 +13,7 @@ from bridge.client import Publication, Ros, State, Subscription
 from bridge.errors import BridgeError, DisconnectedError, NoMessageError, SlowPeerError
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, write_frame_report
 from posteriors.posterior import MAX_RESULT, posterior_layout
-from services.pipeline.connections import OnState, connect_all
-from services.pipeline.delivery import AdvertisedTopic
+from services.pipeline.connections import AdvertisedTopic, OnState, connect_all
 from services.pipeline.inference import Inference, report_of
 from services.settings import Settings
 from services.sockets.records import Outcome, Publish, Published

@@ -1,4 +1,10 @@
-"""The subscriber, which converts messages of a deployment's topics to readings (thesis 3.1, Subscriber.jar)."""
+"""The subscriber, which converts messages of a deployment's topics to readings (thesis 3.1, Subscriber.jar).
+
+    topic ──message──▶ _follow ──▶ FrameAssembler.take ──readings──▶ _forward ──Reading──▶ master
+    timer ───────────▶ _wake ────▶ FrameAssembler.due ───readings──▶
+
+The timer runs while a set of messages waits for a topic that may be missing.
+"""
 
 import asyncio
 import contextlib
@@ -10,9 +16,8 @@ import msgspec
 from bridge.client import Message, Ros, State, Subscription
 from bridge.errors import BridgeError, NoMessageError, TopicLeftOutError
 from services.errors import RosbridgeLostError, VariableError
-from services.pipeline.connections import connect_all, reconnect_now
-from services.pipeline.timed_frames import TimedFrames
-from services.pipeline.unpublished import report_unpublished
+from services.pipeline.connections import connect_all, reconnect_now, report_unpublished
+from services.pipeline.frames import FrameAssembler
 from services.settings import Settings
 from services.sockets.local_socket import MAX_RECORD
 from services.sockets.records import (
@@ -70,20 +75,29 @@ class Subscriber:
     def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
         self._settings = settings
         self._deployment = deployment
-        self._assembler = TimedFrames(deployment, self._forward)
+        self._assembler = FrameAssembler(deployment)
+        # At the assembler's deadline (monotonic, ns), `_wake` forwards the readings that are due.
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_deadline: int | None = None
         self._queue_all = (settings.queue or deployment.queue) == "all"
+        # Set by the master's `Begin`: all services are ready. With `once`, the run ends with its first reading, and a
+        # lost server ends this service (through `_lost`) until that reading has been sent.
         self._begun = asyncio.Event()
         self._once = False
+        self._lost: asyncio.Future[None] | None = None
         self._logs_frames = settings.log_level == "debug"
         self._log = get_logger(ROLE, settings.log_level)
         self._link = link(self._take)
-        self._lost: asyncio.Future[None] | None = None
+        # Connections by URI, from their first attempt on, and the subscriptions of this run.
         self._rosbridges: dict[str, Ros] = {}
         self._subscriptions: list[Subscription] = []
+        # Counts since the start. Of those ending in `_sent`, the master has heard so far: each reading brings it the rest.
         self._received = self._completed = self._unusable = 0
         self._passed_over = self._passed_over_sent = 0
         self._unpaired_sent = 0
+        # Receipt of the last complete reading (monotonic, ns); 0 before the first one.
         self._last_tick = 0
+        # What was reported already: a gap of stamps until the next reading, and topics without which frames go on.
         self._gap_reported = False
         self._absent_reported: set[str] = set()
 
@@ -244,18 +258,38 @@ class Subscriber:
 
     def _read(self, at: int, message: Message) -> None:
         try:
-            self._assembler.add(at, message)
+            readings = self._assembler.take(
+                at, message.msg, message.received_ns, message.received_monotonic_ns
+            )
         except VariableError as error:
             self._unusable += 1
             cause = f"{type(error.__cause__).__name__} {at}"
             self._link.send(Unusable(cause, str(error)))
             return
+        self._forward(readings)
         gap = self._assembler.stamp_gap()
         if gap is not None and not self._gap_reported:
             self._link.notice("warning", str(gap))
             self._gap_reported = True
 
-    def _forward(self, reading: Reading) -> None:
+    def _wake(self) -> None:
+        self._timer = self._timer_deadline = None
+        self._forward(self._assembler.due(time.monotonic_ns()))
+
+    def _forward(self, readings: list[Reading]) -> None:
+        """Send readings to the master, and set the timer for those that wait."""
+        for reading in readings:
+            self._send(reading)
+        deadline = self._assembler.deadline
+        if deadline != self._timer_deadline:
+            if self._timer is not None:
+                self._timer.cancel()
+            self._timer, self._timer_deadline = None, deadline
+            if deadline is not None:
+                delay = max(deadline - time.monotonic_ns(), 0) / 1e9
+                self._timer = asyncio.get_running_loop().call_later(delay, self._wake)
+
+    def _send(self, reading: Reading) -> None:
         self._gap_reported = False
         for topic in self._assembler.absent.keys() - self._absent_reported:
             self._absent_reported.add(topic)

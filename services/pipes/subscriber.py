@@ -2,14 +2,14 @@
 
 import asyncio
 import contextlib
+import time
 from collections.abc import Callable
 
-from bridge.client import State, connect
+from bridge.client import Message, State, connect
 from bridge.fields import Field, all_missing
-from services.pipeline.connections import OnState, connect_all
+from services.pipeline.connections import OnState, connect_all, report_unpublished
+from services.pipeline.frames import FrameAssembler
 from services.pipeline.subscriber import RECEIVED_QUEUE
-from services.pipeline.timed_frames import TimedFrames
-from services.pipeline.unpublished import report_unpublished
 from services.settings import Settings
 from services.sockets.records import Reading
 from terminal.connection import report_wait
@@ -77,23 +77,31 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
         NoMessageError: No message came in time.
         VariableError: A variable is missing or unusable.
     """
-    printed = 0
+    frames = FrameAssembler(deployment)
+    arrived: asyncio.Queue[tuple[int, Message]] = asyncio.Queue(RECEIVED_QUEUE)
 
-    def put(reading: Reading) -> None:
-        nonlocal printed
-        if count is not None and printed >= count:
-            return
-        printed += 1
-        codes = list(memoryview(reading.prior_codes).cast("H"))
-        print_json_line(
-            {"stamp_ns": reading.stamp_ns, "addresses": reading.addresses}
-            | ({"prior_codes": codes} if codes else {})
-        )
-        if printed == count:
-            finished.set_result(None)
+    async def next_readings() -> list[Reading]:
+        """Return the readings that the next message completes, or that are due before it."""
+        deadline = frames.deadline
+        wait = None if deadline is None else max(deadline - time.monotonic_ns(), 0) / 1e9
+        try:
+            async with asyncio.timeout(wait):
+                at, message = await arrived.get()
+        except TimeoutError:
+            return frames.due(time.monotonic_ns())
+        return frames.take(at, message.msg, message.received_ns, message.received_monotonic_ns)
 
-    finished: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-    frames = TimedFrames(deployment, put)
+    async def print_all() -> None:
+        printed = 0
+        while True:
+            for reading in await next_readings():
+                codes = list(memoryview(reading.prior_codes).cast("H"))
+                line = {"stamp_ns": reading.stamp_ns, "addresses": reading.addresses}
+                print_json_line(line | ({"prior_codes": codes} if codes else {}))
+                printed += 1
+                if printed == count:
+                    return
+
     async with contextlib.AsyncExitStack() as stack:
         by_uri = await connect_all(
             stack,
@@ -115,14 +123,15 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
                 max_bytes=settings.topic_bytes or source.topic_bytes,
             )
             while True:
-                frames.add(at, await subscription.next(timeout=settings.first_data_timeout))
+                await arrived.put((at, await subscription.next(timeout=settings.first_data_timeout)))
                 hint.cancel()
 
         for source in deployment.sources:
             say(f"listening on {source.topic} at {settings.uri or source.uri}")
-        tasks = [asyncio.ensure_future(follow(at, source)) for at, source in enumerate(deployment.sources)]
+        work = [print_all(), *(follow(at, source) for at, source in enumerate(deployment.sources))]
+        tasks = [asyncio.ensure_future(each) for each in work]
         try:
-            ended, _ = await asyncio.wait([*tasks, finished], return_when=asyncio.FIRST_COMPLETED)
+            ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for each in ended:
                 each.result()
         finally:

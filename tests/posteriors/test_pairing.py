@@ -6,6 +6,7 @@ The two topics are handed over one by one, so any order across topics must give 
 
 import random
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -76,6 +77,14 @@ def test_a_server_that_swaps_a_report_and_its_result():
     pairing.add_report(report(5, 50))
     assert pairs(pairing.add_posterior(result(5, 55))) == [(5, 5)]
     assert pairing.announced_only == 1
+
+
+@pytest.mark.parametrize(("heard", "number"), [(12, 1), (15, 1), (16, 2)])
+def test_a_result_is_of_the_first_report_until_the_disorder_is_over(heard, number):
+    pairing = Pairing(disorder_ns=5)
+    pairing.add_report(report(1, 10))
+    pairing.add_report(report(2, 14))
+    assert pairs(pairing.add_posterior(result(7, heard))) == [(number, 7)]
 
 
 def test_memory_is_bounded_where_only_one_topic_speaks():

@@ -134,6 +134,20 @@ async def test_no_frame_is_computed_whose_result_nobody_could_get(run):
     assert run.app.frames == [1]
 
 
+async def test_a_single_frame_does_not_wait_for_the_server(boat):
+    run = Run(boat, once=True)
+    run.take(run.publisher, Rosbridge(connected=False))
+    run.read()
+    assert (run.app.frames, run.lost) == ([1], {})
+
+
+async def test_a_failure_of_another_frame_leaves_the_present_one(run):
+    run.read(2)
+    run.take(run.app, FrameFailed(9, 0, 5, "Board 0 is tired", FailureReason.AWAY))
+    computed(run, 1)
+    assert [each.result.number for each in run.publisher.records] == [1]
+
+
 async def test_frames_wait_for_peers_that_are_not_ready(run):
     for peer in (run.peers.app, run.peers.publisher):
         peer.ready = False

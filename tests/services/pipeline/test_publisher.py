@@ -12,7 +12,7 @@ import pytest
 from bridge.client import State
 from pcie_shim.host.frame import BoardResult
 from services.boards.frames import encode_boards
-from services.pipeline.delivery import NotReceivableError
+from services.pipeline.connections import NotReceivableError
 from services.pipeline.publisher import Publisher
 from services.pipeline.result_topics import ResultTopics
 from services.settings import Settings
@@ -132,6 +132,20 @@ def test_each_result_is_logged_for_debugging(boat, link, level, logged):
     publisher._log = Mock()
     publisher._report(Published(7, Outcome.PUBLISHED, None, 0, 1.0, 9, 9))
     assert [each.kwargs["frame"] for each in publisher._log.debug.mock_calls] == [7] * logged
+
+
+@pytest.mark.parametrize(
+    ("refused", "outcome", "missed"), [("/a", Outcome.PUBLISHED, 1), ("/a /b", Outcome.REFUSED, 0)]
+)
+async def test_a_result_counts_as_refused_if_every_topic_is(boat, link, refused, outcome, missed):
+    publisher = Publisher(Settings(), boat, link.make)
+    publisher._topics = FakeTopics()
+    publisher._topics.advertised = [Mock(), Mock()]
+    publisher._topics.advertised[0].name, publisher._topics.advertised[1].name = "/a", "/b"
+    publisher._refused = dict.fromkeys(refused.split(), "why")
+    publisher._report(Published(7, Outcome.PUBLISHED, None, 0, 1.0, 9, 9))
+    (published,) = link.sent
+    assert (published.outcome, published.missed) == (outcome, missed)
 
 
 async def test_results_go_on_where_a_server_is(boat):

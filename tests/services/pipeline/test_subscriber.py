@@ -36,6 +36,34 @@ def test_passed_over_readings_are_reported_once_and_counted_in_all(boat, link):
     assert (frames.completed, frames.lost) == (3, {LossReason.PASSED_OVER: 5})
 
 
+def test_unpaired_messages_are_reported_once_and_a_wait_ends_by_itself(boat, link):
+    """Every other variable has a topic of its own, which may be missing."""
+    source = boat.sources[0]
+    variables = tuple(
+        each.model_copy(update={"source": at % 2, "on_missing": "missing" if at % 2 else "error"})
+        for at, each in enumerate(boat.variables)
+    )
+    sources = source, source.model_copy(update={"topic": "/second"})
+    deployment = boat.model_copy(update={"sources": sources, "variables": variables, "tolerance_s": 0.02})
+
+    def readings():
+        return [each for each in link.sent if isinstance(each, Reading)]
+
+    async def read():
+        subscriber = Subscriber(Settings(), deployment, link.make)
+        for at, stamp in ((1, 1), (1, 2), (0, 3), (1, 4), (0, 5)):  # two, one
+            stamped = READING | {"header": {"stamp": {"sec": stamp, "nanosec": 0}}}
+            now = time.monotonic_ns()
+            subscriber._read(at, Message("/t", stamped, now, now))
+        async with asyncio.timeout(PATIENCE):
+            while len(readings()) < 2:  # the last one waits for the second topic
+                await asyncio.sleep(0.001)
+        assert subscriber.status().frames.lost == {LossReason.UNPAIRED: 3}
+
+    asyncio.run(read())
+    assert [reading.unpaired for reading in readings()] == [2, 1]
+
+
 def test_readings_without_a_master_are_counted_as_passed_over(boat, link, monkeypatch):
     subscriber = Subscriber(Settings(), boat, link.make)
     with monkeypatch.context() as away:
@@ -68,7 +96,7 @@ def test_the_number_of_a_reading_is_logged_for_debugging(boat, link, level, logg
 async def test_a_topic_that_nobody_publishes_is_reported_with_similar_names(
     boat, link, monkeypatch, existing, hinted
 ):
-    monkeypatch.setattr("services.pipeline.unpublished.AFTER", 0.05)
+    monkeypatch.setattr("services.pipeline.connections.AFTER", 0.05)
     async with FakeRosbridge(rosapi=True) as fake:
         fake.know(existing, "boat_msgs/Sensors")
         subscriber = Subscriber(Settings(uri=fake.uri), boat, link.make)

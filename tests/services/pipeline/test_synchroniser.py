@@ -91,10 +91,30 @@ def test_a_slow_topic_delays_nothing_between_its_messages():
     assert synchroniser.unpaired <= 1  # the first one, before its period was known
 
 
-def test_a_late_message_of_an_optional_topic_makes_no_set_of_its_own():
+def test_a_set_waits_from_the_message_that_completed_its_needed_topics():
+    synchroniser = Synchroniser([True, True, False], TOLERANCE)
+    synchroniser.add(0, 10, 5, "a")
+    synchroniser.add(1, 0, 8, "b")  # the pivot is a, which came before
+    assert synchroniser.take_set(8) is None
+    assert synchroniser.deadline == 8 + TOLERANCE
+    assert synchroniser.take_set(7 + TOLERANCE) is None
+    assert synchroniser.take_set(8 + TOLERANCE) == {0: "a", 1: "b"}
+
+
+def test_a_message_older_than_the_newest_of_a_set_makes_no_set_of_its_own():
+    synchroniser = Synchroniser([False] * 2, TOLERANCE)
+    synchroniser.add(0, 0, 1, "a")
+    synchroniser.add(1, 30 * MS, 2, "b")
+    assert synchroniser.take_set(1 + TOLERANCE) == {0: "a", 1: "b"}
+    synchroniser.add(0, 20 * MS, 2 + TOLERANCE, "c")
+    assert (synchroniser.take_set(10 * TOLERANCE), synchroniser.unpaired) == (None, 1)
+
+
+@pytest.mark.parametrize("late", [300, 345], ids=["same stamp", "within half a period"])
+def test_a_late_message_of_an_optional_topic_makes_no_set_of_its_own(late):
     arrivals = [(at, t, t) for t in range(0, 300, 100) for at in range(2)]
     sets, synchroniser = sets_of(
-        [False] * 2, [*arrivals, (0, 300, 300), (1, 300, 360), (0, 400, 400), (1, 400, 401)]
+        [False] * 2, [*arrivals, (0, 300, 300), (1, late, 360), (0, 400, 400), (1, 400, 401)]
     )
     assert sets[-2:] == [{0: 300}, {0: 400, 1: 400}]
     assert synchroniser.unpaired == 1

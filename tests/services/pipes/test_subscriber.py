@@ -16,7 +16,7 @@ from toolchain.deployment import Source
 
 @pytest.mark.parametrize("of_deployment", [False, True])
 async def test_a_mistyped_topic_is_named_with_similar_ones(boat, capsys, monkeypatch, of_deployment):
-    monkeypatch.setattr("services.pipeline.unpublished.AFTER", 0.05)
+    monkeypatch.setattr("services.pipeline.connections.AFTER", 0.05)
     async with FakeRosbridge(rosapi=True) as fake:
         fake.know("/boat/sensors2", "boat_msgs/Sensors")
         settings = Settings(uri=fake.uri, first_data_timeout=PATIENCE)

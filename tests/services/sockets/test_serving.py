@@ -122,6 +122,7 @@ async def test_one_master_is_served_at_a_time(changed, serve):
     await until(lambda: len(records) == 2)
     assert records[1].sentence == "state"
     assert service.records == []  # a greeting is the link's
+    assert service.link.masters == 2
 
 
 async def test_what_a_service_says_before_its_master_comes_is_not_lost(changed, serve):
