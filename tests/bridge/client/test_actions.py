@@ -4,11 +4,14 @@ import asyncio
 import contextlib
 from typing import Any
 
+import numpy as np
 import pytest
 
 from bridge.client import GoalRequest, State, connect
-from bridge.client.protocol.events import GoalStatus
-from bridge.errors import ActionlibError, GoalError
+from bridge.client.actions import FEEDBACK_QUEUE_SIZE
+from bridge.client.protocol.events import GoalFeedback, GoalStatus
+from bridge.errors import ActionlibError, ConcurrentReadError, DisconnectedError, GoalError, NoAnswerError
+from tests.bridge.client.waits import until
 from tests.bridge.hub.sockets import running_hub
 from tests.patience import PATIENCE
 
@@ -58,9 +61,59 @@ async def test_a_goal_is_fed_back_and_ends(order, status, sequence):
     ):
         assert await anext(goal) == {"sequence": [0, 1]}
         if order == 2:
+            with pytest.raises(NoAnswerError, match="/count .* did not end within 0.05 s"):
+                await goal.result(0.05)
             await goal.cancel()
-        result = await goal.result(PATIENCE)
-        assert (result.status, result.values) == (status, {"sequence": sequence})
+        for _ in range(2):
+            result = await goal.result(PATIENCE)
+            assert (result.status, result.values) == (status, {"sequence": sequence})
+        assert [feedback async for feedback in goal] == []
+    assert not ros._session.goals
+
+
+async def test_leaving_the_block_cancels_the_goal_and_feedback_is_optional():
+    async with serving() as (server, ros):
+        executed = server._session.action_servers["/count"]._goals
+        async with await ros.send_goal("/count", FIBONACCI, {"order": np.int64(2)}, feedback=False) as goal:
+            await until(lambda: executed)
+        await until(lambda: not executed)  # it ends only if it is cancelled
+        assert not goal._feedback
+
+
+async def test_feedback_that_nobody_reads_is_bounded():
+    async with serving() as (_server, ros):
+        goal = await ros.send_goal("/count", FIBONACCI, {"order": 2})
+        await anext(goal)
+        for n in range(FEEDBACK_QUEUE_SIZE + 30):
+            goal.receive(GoalFeedback(goal._identity, {"n": n}))
+        await goal.cancel()
+        await goal.result(PATIENCE)
+        read = [feedback["n"] async for feedback in goal]
+        assert read == list(range(30, FEEDBACK_QUEUE_SIZE + 30))
+        assert goal.lost == 30
+
+
+async def test_goals_end_with_the_connection_or_the_client():
+    async with serving() as (_server, ros):
+        goal = await ros.send_goal("/count", FIBONACCI, {"order": 2})
+        await anext(goal)
+        tasks = [asyncio.ensure_future(anext(goal)), asyncio.create_task(goal.result(PATIENCE))]
+        await asyncio.sleep(0)
+        with pytest.raises(ConcurrentReadError):
+            await anext(goal)
+        ros._session._websocket.abort()
+        for waiting in (*tasks, goal.result(1)):
+            with pytest.raises(DisconnectedError):
+                await asyncio.wait_for(waiting, PATIENCE)
+        await goal.cancel()
+        await ros.wait_for_state(State.CONNECTED, PATIENCE)
+        another = await ros.send_goal("/count", FIBONACCI, {"order": 2})
+        await anext(another)
+        await ros.close()
+        with pytest.raises(DisconnectedError):
+            await another.result(1)
+        with pytest.raises(DisconnectedError):
+            await ros.send_goal("/count", FIBONACCI)
 
 
 @pytest.mark.parametrize("wrong", ["feedback", "result"])
@@ -82,10 +135,11 @@ async def test_feedback_or_a_result_of_another_type_aborts_the_goal(wrong):
 
 async def test_a_handler_that_fails_and_a_server_that_goes_away_end_the_goal():
     async with serving() as (server, ros):
-        failed = await ros.send_goal("/count", FIBONACCI, {"order": 3})
-        with pytest.raises(GoalError) as caught:
-            await failed.result(PATIENCE)
-        assert "RuntimeError" in caught.value.reason
+        for action, order, why in (("/count", 3, "RuntimeError"), ("/nowhere", 3, "/nowhere")):
+            failed = await ros.send_goal(action, FIBONACCI, {"order": order})
+            with pytest.raises(GoalError, match=f"action {action} at ws://.* has no result") as caught:
+                await failed.result(PATIENCE)
+            assert why in caught.value.reason
         waiting = await ros.send_goal("/count", FIBONACCI, {"order": 2})
         await anext(waiting)
         await server.close()

@@ -1,6 +1,6 @@
-"""The client on doubles of the real servers A, B and R: it accepts or reports each difference.
+"""The client on doubles of the real servers A, B and R, and on the hub: it accepts or reports each difference.
 
-Ros ◀──WebSocket──▶ Double (A, B or R)
+Ros ◀──WebSocket──▶ Double (A, B or R), or hub ◀──WebSocket──▶ another Ros
 """
 
 import asyncio
@@ -14,11 +14,14 @@ import pytest
 from bridge.client import Ros, connect
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import DecodeError, NoAnswerError, NoMessageError, ServiceError
+from bridge.qos import Qos
 from tests.bridge.client.doubles import Double
 from tests.bridge.client.waits import give_up, until
+from tests.bridge.hub.sockets import running_hub
 from tests.patience import PATIENCE
 
 TYPE = "std_msgs/Float64MultiArray"
+SCAN_TYPE = "sensor_msgs/LaserScan"
 VALUES = [1.5, 2.5, -3.0]
 MSG = {"layout": {"dim": [], "data_offset": 0}, "data": VALUES}
 SERVERS = pytest.mark.parametrize("double", ["A", "B", "R"], indirect=True)
@@ -43,8 +46,7 @@ async def ros(double: Double) -> AsyncIterator[Ros]:
     ],  # B never delivers one
     indirect=["double"],
 )
-@pytest.mark.parametrize("arrays", ["list", "numpy"])
-@pytest.mark.parametrize("fragment_size", [None, 16, 37, 100_000])
+@pytest.mark.parametrize(("arrays", "fragment_size"), [("list", None), ("list", 16), ("numpy", 37)])
 async def test_messages_come_from_every_server(double, ros, compression, arrays, fragment_size):
     subscription = ros.subscribe(
         "/a", TYPE, compression=compression, arrays=arrays, fragment_size=fragment_size
@@ -110,3 +112,27 @@ async def test_no_operation_of_the_client_makes_a_server_deaf(double):
         assert not any(client.dead for client in double._clients)
         assert all(received.op is not None for received in double.received)
         assert double.ops("fragment"), "what is larger than its fragments leaves in them"
+
+
+@pytest.mark.parametrize(
+    ("compression", "fragment_size", "arrays"),
+    [("none", 50, "numpy"), ("png", None, "list"), ("cbor", None, "numpy"), ("cbor", 50, "list")],
+)
+async def test_a_scan_passes_the_hub_unchanged(compression, fragment_size, arrays):
+    options = {"compression": compression, "fragment_size": fragment_size, "arrays": arrays}
+    async with (
+        running_hub(ros_version=2) as port,
+        connect(f"ws://127.0.0.1:{port}") as one,
+        connect(one.uri, fragment_size=64) as other,
+    ):
+        scans = one.subscribe("/scan", SCAN_TYPE, qos=Qos(reliability="best_effort"), **options)
+        await one.call("/rosapi/get_time", timeout=PATIENCE)
+        publication = await other.advertise("/scan", SCAN_TYPE, qos=Qos(depth=5))
+        await publication.publish(
+            {"header": {"frame_id": "laser"}, "ranges": np.array([0.5, 1.5, 2.5], np.float32)}
+        )
+        msg = (await scans.next(PATIENCE)).msg
+    assert (msg["header"]["frame_id"], list(msg["ranges"])) == ("laser", [0.5, 1.5, 2.5])
+    assert isinstance(msg["ranges"], np.ndarray if arrays == "numpy" else list)
+    if arrays == "numpy" and compression == "cbor":
+        assert msg["ranges"].dtype == np.float32

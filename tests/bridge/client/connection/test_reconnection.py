@@ -2,7 +2,6 @@
 
 import asyncio
 import re
-import socket
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -242,25 +241,6 @@ async def test_closing_from_the_callback(fake):
         await fake.cut()
         await ros.wait_for_state(State.CLOSED, PATIENCE)
     await asyncio.gather(*closing)
-
-
-async def test_a_peer_that_does_not_say_goodbye_is_not_waited_for(fake, ros, monkeypatch):
-    monkeypatch.setattr("bridge.client.websocket.CLOSE_TIMEOUT", 0.2)
-    fake.freeze()
-    await asyncio.wait_for(ros.close(), PATIENCE)
-
-
-async def test_nothing_is_left_open():
-    async with FakeRosbridge() as fake:
-        for _ in range(3):
-            async with connect(fake.uri) as ros:
-                ros.subscribe("/a", "p/T")
-                await fake.cut()
-        # this one, and the fake's accepting one
-        await until(lambda: not fake._clients and len(asyncio.all_tasks()) <= 2)
-    with socket.socket() as again:
-        again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        again.bind(("127.0.0.1", fake.port))
 
 
 async def test_the_first_message_after_losses_says_how_long_it_was_dark(fake, monkeypatch):
