@@ -15,9 +15,8 @@ It behaves as real servers do (A: rosbridge_suite on ROS 1, B: on ROS 2, R: rosb
 * a subscription without a type, to a topic that nobody has advertised, is forgotten (A, B, R);
 * a `throttle_rate` that is not an int ends a subscription (A and B silently, R with a status);
 * errors are not reported (A, B), unless `statuses` (R: `{"op": "status", "level": "error", ...}`);
-* a client that subscribes to a topic by two ids gets its first message twice (B), with `doubles_first` every
-  client does;
-* NaN and infinities leave as null (A, B, R), with `leaks_nan` as bare `NaN`;
+* a client that subscribes to a topic by two ids gets its first message twice (B);
+* NaN and infinities leave as null (A, B, R);
 * null where a published message may hold a number is refused (A, B, R), with `refuses_null`;
 * after a message that is JSON but not an object the connection is open and dead (A, B), with `zombies`;
 * every `/` leaves as `\\/` (A, B), with `escapes`;
@@ -95,13 +94,10 @@ class FakeRosbridge:
         ros: int = 2,
         rosapi: bool = False,
         statuses: bool = False,
-        doubles_first: bool = False,
-        leaks_nan: bool = False,
         refuses_null: bool = False,
         zombies: bool = False,
         escapes: bool = False,
         silent: bool = False,
-        delay: float = 0.0,
         refuses: int | None = None,
         max_size: int | None = None,
     ) -> None:
@@ -109,13 +105,11 @@ class FakeRosbridge:
         self.ros = ros
         self.rosapi = rosapi
         self.statuses = statuses
-        self.doubles_first = doubles_first
-        self.leaks_nan = leaks_nan
         self.refuses_null = refuses_null
         self.zombies = zombies
         self.escapes = escapes
         self.silent = silent
-        self.delay = delay
+        self.delay = 0.0
         self.refuses = refuses
         self.max_size = max_size
         self.received: list[Received] = []
@@ -256,10 +250,6 @@ class FakeRosbridge:
         """Publish as a ROS node would, and return the number of clients that got it."""
         return await self._publish(_slashed(topic), msg)
 
-    def latch(self, topic: str, msg: dict[str, Any]) -> None:
-        """Latch a message for later subscribers."""
-        self.latched[_slashed(topic)] = msg
-
     def serve(self, service: str, handler: Callable[[dict[str, Any]], Any]) -> None:
         """Serve a service: the handler returns the values, or a str to refuse, or None never to answer."""
         self.services[_slashed(service)] = handler
@@ -314,7 +304,7 @@ class FakeRosbridge:
 
     async def _say(self, client: _Client, data: str | bytes | dict[str, Any]) -> None:
         if isinstance(data, dict):
-            data = json.dumps(data if self.leaks_nan else _without_nan(data))
+            data = json.dumps(_without_nan(data))
             if self.escapes:
                 data = data.replace("/", "\\/")
         if self.delay:
@@ -392,7 +382,7 @@ class FakeRosbridge:
         if not first and now - client.heard[topic] < throttle:
             return 0
         client.heard[topic] = now
-        return 2 if first and (self.doubles_first or len(subscriptions) > 1) else 1
+        return 2 if first and len(subscriptions) > 1 else 1
 
     async def _op_subscribe(self, client: _Client, op: dict[str, Any]) -> None:
         topic, type_name = _slashed(op.get("topic")), op.get("type")

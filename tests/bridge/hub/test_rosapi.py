@@ -27,19 +27,16 @@ _SECONDS, _NANOSECONDS = divmod(WALL_CLOCK, 10**9)
     ("service", "args", "values"),
     [
         ("topic_type", {"topic": "/chatter"}, {"type": "std_msgs/String"}),
-        ("topic_type", {"topic": "chatter"}, {"type": "std_msgs/String"}),
         ("topic_type", {"topic": "/nowhere"}, {"type": ""}),
         ("topic_type", {}, {"type": ""}),
         ("topic_type", ["/chatter"], {"type": "std_msgs/String"}),
         ("topic_type", ["/chatter", "too", "many"], {"type": "std_msgs/String"}),
         ("topics_for_type", {"type": "std_msgs/String"}, {"topics": ["/chatter"]}),
         ("topics_for_type", {"type": "std_msgs/msg/String"}, {"topics": ["/chatter"]}),
-        ("topics_for_type", {"type": "a/B"}, {"topics": []}),
         ("topics_for_type", {"type": ""}, {"topics": []}),
         ("nodes", None, {"nodes": ["/rosapi", "/client_1", "/client_2", "/client_3"]}),
         ("publishers", {"topic": "/chatter"}, {"publishers": ["/client_1"]}),
         ("subscribers", {"topic": "/chatter"}, {"subscribers": ["/client_2"]}),
-        ("publishers", {"topic": "/nowhere"}, {"publishers": []}),
         ("node_details", {"node": "client_1"}, _NOTHING | {"publishing": ["/boat/sensors", "/chatter"]}),
         (
             "node_details",
@@ -49,18 +46,15 @@ _SECONDS, _NANOSECONDS = divmod(WALL_CLOCK, 10**9)
         ("node_details", {"node": "/nobody"}, _NOTHING),
         ("service_type", {"service": "add"}, {"type": "a/Add"}),
         ("service_type", {"service": "/rosapi/topics"}, {"type": "rosapi/Topics"}),
-        ("service_type", {"service": "/nowhere"}, {"type": ""}),
         ("services_for_type", {"type": "a/srv/Add"}, {"services": ["/add"]}),
         ("services_for_type", {"type": "rosapi/Topics"}, {"services": ["/rosapi/topics"]}),
         ("service_node", {"service": "/add"}, {"node": "/client_2"}),
         ("service_node", {"service": "/rosapi/topics"}, {"node": "/rosapi"}),
-        ("service_node", {"service": "/nowhere"}, {"node": ""}),
         ("service_host", {"service": "/add"}, {"host": "10.0.0.2"}),
         ("service_host", {"service": "/rosapi/topics"}, {"host": "localhost"}),
         ("service_host", {"service": "/nowhere"}, {"host": ""}),
         ("service_providers", {"service": "a/Add"}, {"providers": ["/client_2"]}),
         ("service_providers", {"service": "rosapi/Topics"}, {"providers": ["/rosapi"]}),
-        ("action_servers", {}, {"action_servers": []}),
         ("get_param", {"name": "/p"}, {"value": "null"}),
         ("get_param", {"name": "/p", "default": "[1]"}, {"value": "[1]"}),
         ("get_ros_version", {}, {"version": 1, "distro": "hub"}),
@@ -82,11 +76,10 @@ _SECONDS, _NANOSECONDS = divmod(WALL_CLOCK, 10**9)
         ),
     ],
 )
-@pytest.mark.parametrize("slash", ["/", ""])
-def test_the_graph_is_described(peer: Peer, slash: str, service: str, args: object, values: object) -> None:
-    answer = peer.ask(f"{slash}rosapi/{service}", args)
-    assert (answer["service"], answer["result"]) == (f"{slash}rosapi/{service}", True)
-    assert answer["values"] == values
+def test_the_graph_is_described(peer: Peer, service: str, args: object, values: object) -> None:
+    for name in (f"/rosapi/{service}", f"rosapi/{service}"):
+        answer = peer.ask(name, args)
+        assert (answer["service"], answer["result"], answer["values"]) == (name, True, values)
 
 
 def test_every_service_that_is_listed_can_be_called(peer: Peer) -> None:

@@ -69,10 +69,6 @@ def test_extra_fields_are_ignored(hub: Harness) -> None:
     assert subscriber.messages() == [{"a": 1}]
 
 
-def test_an_id_after_the_name_is_not_split_off(hub: Harness) -> None:
-    assert hub.connect().ask("/rosapi/topics#33")["result"] is False
-
-
 def _goal(hub: Harness, **options: Any) -> tuple[Peer, Peer, list[Any]]:
     server, client = hub.connect(), hub.connect()
     server.send(op="advertise_action", action=DOCK, type=DOCK_TYPE)
@@ -93,11 +89,6 @@ def test_one_goal_at_a_time_may_have_no_id(hub: Harness) -> None:
     ]
 
 
-def test_the_type_of_a_goal_may_be_left_out(hub: Harness) -> None:
-    _server, _client, goals = _goal(hub, action_type=None)
-    assert [goal["action_type"] for goal in goals] == [DOCK_TYPE]
-
-
 def test_feedback_and_result_as_png(hub: Harness) -> None:
     server, client, (goal,) = _goal(hub, compression="png", feedback=True, id="g")
     server.send(op="action_feedback", id=goal["id"], action=DOCK, values={"a": 1})
@@ -115,13 +106,3 @@ def test_an_answer_needs_only_its_id(hub: Harness) -> None:
     assert client.read() == [
         {"op": "service_response", "service": "/s", "values": {}, "result": True, "id": 7}
     ]
-
-
-@pytest.mark.parametrize("lengths", [(3, 10), (10, 3)])
-def test_the_smallest_queue_length_counts(hub: Harness, publisher: Peer, lengths: tuple[int, int]) -> None:
-    slow = hub.connect()
-    for index, length in enumerate(lengths):
-        slow.subscribe("/t", id=index, queue_length=length)
-    for index in range(20):
-        publisher.publish("/t", {"i": index})
-    assert len(slow.messages()) == 3

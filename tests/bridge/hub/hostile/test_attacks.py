@@ -61,12 +61,9 @@ def subscribed(compression: str, type_name: str, ros_version: Any = 1) -> tuple[
     [
         ("sensor_msgs/Image", {"data": 300_000_000}),
         ("sensor_msgs/Image", {"data": 10**13}),
-        ("sensor_msgs/Image", {"data": 5}),
         ("sensor_msgs/Image", {"data": [1, 256]}),
-        ("sensor_msgs/Image", {"data": [-1]}),
         ("sensor_msgs/Image", {"data": [True]}),
         ("sensor_msgs/Image", {"data": "no base64"}),
-        ("sensor_msgs/Image", {"data": {}}),
         ("sensor_msgs/Imu", {"orientation_covariance": [0, 1, 2]}),
         ("sensor_msgs/LaserScan", {"ranges": 10**9}),
         ("sensor_msgs/LaserScan", {"ranges": [0, "x"]}),
@@ -74,10 +71,8 @@ def subscribed(compression: str, type_name: str, ros_version: Any = 1) -> tuple[
         ("std_msgs/Int32MultiArray", {"layout": {"dim": {}}}),
         ("std_msgs/Int32", {"data": 1.5}),
         ("std_msgs/Int32", {"data": True}),
-        ("std_msgs/UInt8", {"data": 256}),
         ("std_msgs/Float32", {"data": 1e300}),
         ("std_msgs/Bool", {"data": 2}),
-        ("std_msgs/String", {"data": 1}),
     ],
 )
 def test_a_message_that_does_not_fit_its_type_is_neither_converted_nor_serialised(
