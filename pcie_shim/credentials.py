@@ -23,6 +23,7 @@ from pcie_shim.errors import CredentialsError
 NONCE_BYTES: Final = 32
 PROOF_BYTES: Final = 32
 _KEY: Final = re.compile(rb"[!-~]{16,1024}")
+# The two proofs differ, so that a host's cannot be sent back as the board's.
 _HOST: Final = b"rosbayes host"
 _BOARD: Final = b"rosbayes board"
 
@@ -54,6 +55,7 @@ def read_key(path: Path) -> bytes:
             key = file.read(4096).strip()
     except OSError as error:
         raise CredentialsError(f"the key in {path} cannot be read: {error.strerror}") from None
+    # before its content is used: a key that others can read is none
     if mode & 0o077:
         raise CredentialsError(f"others may read the key in {path}: run chmod 600 {path}")
     if _KEY.fullmatch(key) is None:

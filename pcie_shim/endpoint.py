@@ -124,6 +124,7 @@ def _listen_privately(path: str) -> socket.socket:
         except OSError as error:
             if error.errno != errno.EADDRINUSE or is_served(path):
                 raise
+            # a killed process has left its file behind
             Path(path).unlink()
             server.bind(path)
         server.listen()
@@ -154,6 +155,7 @@ def connect(endpoint: Endpoint, *, timeout: float) -> socket.socket:
         LinkTimeoutError: The host of a TCP endpoint does not answer.
     """
     deadline = time.monotonic() + timeout
+    # a board that was started together with this host may not listen yet
     while True:
         try:
             return _connect_once(endpoint, max(deadline - time.monotonic(), _RETRY_S))
@@ -170,6 +172,7 @@ def connect(endpoint: Endpoint, *, timeout: float) -> socket.socket:
 
 def _connect_once(endpoint: Endpoint, timeout: float) -> socket.socket:
     if not endpoint.path:
+        # a timeout for connecting alone: the link limits its calls in the kernel
         tcp = socket.create_connection((endpoint.host, endpoint.port), timeout=timeout)
         no_delay(tcp)
         tcp.settimeout(None)

@@ -13,7 +13,6 @@ read and write requests. `FrameDecoder` uses one buffer as long as the link is o
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 from zlib import crc32
 
@@ -110,6 +109,7 @@ class FrameDecoder:
     def room(self) -> memoryview:
         """Return the buffer for the next bytes; payloads returned so far become invalid."""
         if self._start == self._end:
+            # the usual case: all frames were taken, and nothing has to be moved
             self._start = self._end = 0
         elif self._start > _MAX_FRAME:
             rest = self._end - self._start
@@ -128,6 +128,7 @@ class FrameDecoder:
             FramingError: The bytes are not a frame.
             CrcError: A frame's CRC is wrong.
         """
+        # decoded in place: payloads of 8,192 words are not copied
         start = self._start
         if self._end - start < HEADER_BYTES:
             return None
@@ -152,8 +153,7 @@ _GREETING: Final = struct.Struct("<8sIII32s32s8s")
 _LINK_MAGIC: Final = b"ROSBAYES"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Greeting:
+class Greeting(NamedTuple):
     """The identity of a board, sent when a link opens.
 
     Attributes:
@@ -175,15 +175,8 @@ class Greeting:
 
 def encode_greeting(greeting: Greeting) -> bytes:
     """Return the greeting's frame."""
-    payload = _GREETING.pack(
-        _LINK_MAGIC,
-        greeting.protocol_version,
-        greeting.bar_size,
-        greeting.board,
-        bytes.fromhex(greeting.map_hash),
-        bytes.fromhex(greeting.image_hash),
-        greeting.token,
-    )
+    *numbers, map_hash, image_hash, token = greeting
+    payload = _GREETING.pack(_LINK_MAGIC, *numbers, bytes.fromhex(map_hash), bytes.fromhex(image_hash), token)
     return encode(GREET, 0, 0, 0, len(payload) // 4, payload)
 
 
@@ -191,17 +184,10 @@ def decode_greeting(frame: Frame) -> Greeting:
     """Decode the greeting in a frame, or raise a FramingError."""
     if frame.operation != GREET or len(frame.payload) < _GREETING.size:
         raise FramingError("the link does not begin with a board's greeting")
-    magic, version, bar_size, board, map_hash, image_hash, token = _GREETING.unpack_from(frame.payload)
+    magic, version, size, board, map_hash, image_hash, token = _GREETING.unpack_from(frame.payload)
     if magic != _LINK_MAGIC:
         raise FramingError("the link does not begin with a board's greeting")
-    return Greeting(
-        protocol_version=version,
-        bar_size=bar_size,
-        board=board,
-        map_hash=map_hash.hex(),
-        image_hash=image_hash.hex(),
-        token=token,
-    )
+    return Greeting(version, size, board, map_hash.hex(), image_hash.hex(), token)
 
 
 def encode_error(sequence: int, address: int, code: int, detail: str) -> bytes:
@@ -224,8 +210,7 @@ NO_TOKEN: Final = bytes(8)
 """The token of a loader without a link."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProgramBegin:
+class ProgramBegin(NamedTuple):
     """A loader's announcement of a programming file.
 
     Attributes:
@@ -240,16 +225,11 @@ class ProgramBegin:
 
     def encode(self) -> bytes:
         """Return the payload of a PROGRAM frame with BEGIN."""
-        return _PROGRAM_BEGIN.pack(self.size, self.sha256, self.token)
+        return _PROGRAM_BEGIN.pack(*self)
 
     @classmethod
     def decode(cls, payload: memoryview) -> ProgramBegin:
-        """Decode a frame's payload.
-
-        Raises:
-            FramingError: It is too short.
-        """
+        """Decode a frame's payload; a FramingError if it is too short."""
         if len(payload) < _PROGRAM_BEGIN.size:
             raise FramingError("a PROGRAM frame with BEGIN is too short")
-        size, sha256, token = _PROGRAM_BEGIN.unpack_from(payload)
-        return cls(size=size, sha256=sha256, token=token)
+        return cls(*_PROGRAM_BEGIN.unpack_from(payload))

@@ -259,6 +259,7 @@ def image_from_bytes(content: bytes, name: str = "the image") -> Image:
             f"{name} was built for register map {manifest.identity.map_hash}, this software has "
             f"{register_map.MAP_SHA256}: build the deployment again"
         )
+    # before the image hash, so that an error names the damaged table
     sections = _read_sections(content, name, manifest, data_start)
     if manifest.identity.hash != manifest.image_hash:
         raise DamagedImageError(
@@ -299,6 +300,7 @@ def _read_manifest(content: bytes, name: str) -> tuple[_Manifest, int]:
         raise ImageMismatchError(
             f"{name} has format {magic[7]}, this software reads format {MAGIC[7]}: build the deployment again"
         )
+    # nothing of the manifest is believed before its hash was compared
     start = _HEADER.size + length
     text = content[_HEADER.size : start]
     _check_hash(name, "its manifest", text, digest.hex(), "its header")
@@ -358,6 +360,7 @@ def _check_hash(name: str, what: str, data: bytes, expected: str, source: str) -
 
 def _manifest(image: Image, sections: list[tuple[str, npt.NDArray[Any]]]) -> _Manifest:
     part = image.partition
+    # the date and the version are outside: they do not change what the board computes
     identity = _Identity(
         machine="BM1",
         parameters=image.machine.parameters,

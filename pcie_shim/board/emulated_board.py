@@ -23,7 +23,6 @@ from machines.bm1 import BM1Machine, Start, StopReason, missing_inputs
 from machines.errors import MachineError, StartError
 from machines.kernel import BM1Kernel
 from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, RngReset
-from machines.parameters import SensorMode as InputMode
 from pcie_shim import register_map as rm
 from pcie_shim.errors import ImageError, PcieShimError
 from pcie_shim.programming_file import Image, image_from_bytes, is_plain
@@ -136,11 +135,13 @@ class EmulatedBoard:
         try:
             image = image_from_bytes(content, "the image")
             kernel = self._make(image.machine)
+            # now, so that the first frame does not wait for it
             kernel.prepare()
         except (ImageError, MachineError) as error:
             raise RefusedError(ErrorCode.BAD_IMAGE, str(error).rstrip(".")) from error
         self._kernel = kernel
         self.programmed += 1
+        # the registers of the former image must not be seen beside those of this one
         self._power_up()
         self._describe(image)
         speed = _measure_speed(kernel)
@@ -207,11 +208,7 @@ class EmulatedBoard:
     # ---- registers ------------------------------------------------------------------------------------
 
     def read(self, address: int, count: int) -> bytes:
-        """Return `count` words from `address` on, little-endian.
-
-        Raises:
-            RefusedError: One of them is not in the map, or not implemented.
-        """
+        """Return `count` words from `address` on; a RefusedError if one is not in the map, or not implemented."""
         end = address + 4 * count
         outside = end > rm.BAR_SIZE or self._access.find(_NO_ACCESS, address >> 2, end >> 2) >= 0
         if address & 3 or not count or outside:
@@ -225,12 +222,7 @@ class EmulatedBoard:
         return words
 
     def write(self, address: int, words: bytes | memoryview) -> None:
-        """Write little-endian words from `address` on; a doorbell among them starts the machine.
-
-        Raises:
-            RefusedError: The board is busy, or an address or value is invalid; earlier words of the same burst
-                may be written.
-        """
+        """Write words from `address` on, as `Board.write`; if a word is refused, earlier ones may be written."""
         count = len(words) >> 2
         end = address + 4 * count
         first = address >> 2
@@ -354,6 +346,7 @@ class EmulatedBoard:
                 self._run(kernel, start, end)
             except StartError as error:
                 self._refuse(ErrorCode.BAD_VALUE, str(error).rstrip("."))
+        # only now: a refused doorbell leaves the register as it was
         self._put(doorbell, number)
 
     def _inputs(self, parameters: BM1Parameters) -> tuple[int, ...] | npt.NDArray[np.int64]:
@@ -458,11 +451,6 @@ _DATA: Final = (
     range(rm.RESULTS, rm.RESULTS + 4 * rm.RESULTS_WORDS),
     range(rm.PRIOR_CODES, rm.PRIOR_CODES + 4 * rm.PRIOR_CODES_WORDS),
 )
-
-
-def _lines_of(parameters: BM1Parameters) -> int:
-    """Return the number of inputs of a sensor column, in each replica."""
-    return 1 if parameters.sensor_mode is InputMode.COLUMN else parameters.lines
 
 
 def _measure_speed(kernel: BM1Kernel) -> float:

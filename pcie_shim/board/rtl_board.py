@@ -95,14 +95,7 @@ class RtlBoard:
             raise self._preparation.error
 
     def load(self, content: bytes) -> None:
-        """Program the board with the bytes of a programming file.
-
-        The compilation of the hardware continues in the background if it takes longer than LOAD_S.
-
-        Raises:
-            RefusedError: The machine is running, the image is damaged or for another map, its hardware cannot
-                be simulated, or is still being compiled.
-        """
+        """Program the board, or raise a RefusedError, also if its hardware is not compiled after LOAD_S seconds."""
         if self.running:
             raise RefusedError(ErrorCode.BUSY, "the machine is running; reset it before programming")
         try:
@@ -129,6 +122,7 @@ class RtlBoard:
             self._preparation = preparation = _Preparation(self._simulate, image)
             preparation.start()
         if preparation.is_alive():
+            # the loader waits as long as for any board, and tries again later
             preparation.join(LOAD_S)
         if preparation.is_alive() or preparation.identity != wanted:
             raise RefusedError(
@@ -143,11 +137,7 @@ class RtlBoard:
     # ---- registers ------------------------------------------------------------------------------------
 
     def read(self, address: int, count: int) -> bytes:
-        """Return `count` words from `address` on, little-endian.
-
-        Raises:
-            RefusedError: One of them is not in the map, or not implemented.
-        """
+        """Return `count` words from `address` on; a RefusedError if one is not in the map, or not implemented."""
         simulation = self._simulation
         if simulation is None:
             return self._blank.read(address, count)
@@ -168,12 +158,7 @@ class RtlBoard:
         return bytes(words)
 
     def write(self, address: int, words: bytes | memoryview) -> None:
-        """Write little-endian words from `address` on; a doorbell among them starts the machine.
-
-        Raises:
-            RefusedError: The board is busy, or an address or value is invalid; earlier words of the same burst
-                may be written.
-        """
+        """Write words from `address` on, as `Board.write`; if a word is refused, earlier ones may be written."""
         simulation = self._simulation
         if simulation is None:
             self._blank.write(address, words)
@@ -186,6 +171,7 @@ class RtlBoard:
             # in a burst, doorbells take effect after all other words, and 0 is none
             rings = [write for write in writes if write[0] in _DOORBELLS and write[1]]
             writes = [write for write in writes if write[0] not in _DOORBELLS] + rings
+        # one by one, up to the first that is refused
         refused = next((place for place, word in writes if not simulation.write(place, word)), None)
         if address <= rm.RESUME and address + len(words) > rm.CONTROL:
             self._look()
@@ -279,6 +265,7 @@ class _Preparation(threading.Thread):
             simulation = self._simulate(self._image)
             simulation.power_up()
             simulation.speed = _measure_speed(simulation, self._image)
+            # again, because measuring has written registers
             simulation.power_up()
             self.simulation = simulation
         except SimulationError as error:

@@ -70,7 +70,11 @@ class Board(Protocol):
         """Return `count` words from `address` on, little-endian, or raise a RefusedError."""
 
     def write(self, address: int, words: bytes | memoryview) -> None:
-        """Write little-endian words from `address` on, or raise a RefusedError; a doorbell starts the machine."""
+        """Write little-endian words from `address` on; a doorbell among them, taken last, starts the machine.
+
+        Raises:
+            RefusedError: The board is busy, or an address or value is invalid.
+        """
 
     def step(self) -> None:
         """Run the machine for one more chunk; then `running` tells whether it must continue."""
@@ -150,6 +154,8 @@ class BoardServer:
         self._index = index
         self._stop = stop
         self._endpoint = endpoint
+        # a unix socket is private without a key
+        self._key = endpoint.key if endpoint.host else b""
         self._registers = listen(endpoint)
         try:
             self._programming = listen(endpoint.programming)
@@ -226,10 +232,6 @@ class BoardServer:
             )
         )
 
-    def _key(self) -> bytes:
-        """Return the key that a peer must have; a unix socket is private without one."""
-        return self._endpoint.key if self._endpoint.host else b""
-
     # ---- the host -------------------------------------------------------------------------------------
 
     def _accept_host(self) -> None:
@@ -239,10 +241,12 @@ class BoardServer:
         if self._is_held():
             _refuse(connection, _HELD)
             return
+        # a port scanner, or a host that hangs, must not keep others out
         if len(self._silent_hosts) == MAX_SILENT:
             self._drop_host(next(iter(self._silent_hosts.values())))
+        # unpredictable, because it permits programming
         token = os.urandom(8)
-        host = HostConnection(connection, self._key(), self._greeting(token), token, self.board.programmed)
+        host = HostConnection(connection, self._key, self._greeting(token), token, self.board.programmed)
         self._silent_hosts[host.socket.fileno()] = host
         self._epoll.register(host.socket.fileno(), _READABLE)
 
@@ -268,6 +272,7 @@ class BoardServer:
                 raise RefusedError(ErrorCode.HELD, _HELD)
             self._host = self._silent_hosts.pop(host.socket.fileno())
             _LOG.info("board %d: a host opened it", self._index)
+        # after every programming, even with the same image: registers and counters are reset
         if host.programmed != board.programmed:
             raise RefusedError(ErrorCode.STALE, "the board was programmed after it was opened")
         if operation == framing.READ:
@@ -278,6 +283,7 @@ class BoardServer:
             # acknowledge before the interrupt that the write may cause
             if not flags & framing.POSTED:
                 self._send(host, framing.WRITE, framing.REPLY, sequence, address, b"")
+            # a short frame is over before the write returns; a longer one ends in `run`
             if board.done != done:
                 self._interrupt_if_done()
         else:
@@ -322,7 +328,7 @@ class BoardServer:
             return
         if len(self._silent_loaders) == MAX_SILENT:
             self._drop_loader(next(iter(self._silent_loaders.values())))
-        loader = LoaderConnection(connection, self._key(), self._greeting(framing.NO_TOKEN))
+        loader = LoaderConnection(connection, self._key, self._greeting(framing.NO_TOKEN))
         self._silent_loaders[loader.socket.fileno()] = loader
         self._epoll.register(loader.socket.fileno(), _READABLE)
 
@@ -348,6 +354,7 @@ class BoardServer:
             raise FramingError(f"the programming port does not support operation {operation}")
         if flags & framing.BEGIN:
             begin = framing.ProgramBegin.decode(payload)
+            # before memory is taken for it
             if begin.size > MAX_IMAGE_BYTES:
                 raise RefusedError(
                     ErrorCode.BAD_IMAGE, f"it has {begin.size} bytes, the maximum is {MAX_IMAGE_BYTES}"

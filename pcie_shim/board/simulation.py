@@ -57,7 +57,10 @@ class Simulation:
             SimulationError: It cannot be started.
         """
         self.speed = 0.0
+
+        # The beginning of an answer whose end has not arrived.
         self._received = bytearray()
+        # What the child writes on standard error, for the sentence of an error. A file, because nobody reads it meanwhile.
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
         try:
             self._child = subprocess.Popen(
@@ -124,6 +127,7 @@ class Simulation:
 
     def _execute(self, operation: str, first: int, second: int, clocks: int, limit: float = 0.0) -> Answer:
         """Send a request that takes about this number of clocks, and return its answer."""
+        # a busy computer must not look like a simulator that hangs
         limit = limit or ANSWER_S + (10 * clocks / self.speed if self.speed else 0)
         try:
             self._requests.write(f"{operation} {first:08x} {second:08x}\n".encode())

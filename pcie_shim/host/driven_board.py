@@ -139,6 +139,7 @@ class DrivenBoard:
 
     def _check_identity(self, link: SocketLink) -> None:
         identity = link.read32(rm.ID)
+        # a device that is gone reads all ones, and memory that is no board reads what was written
         pattern = time.monotonic_ns() & ALL_ONES
         link.write32(rm.LIVENESS, pattern)
         alive = link.read32(rm.LIVENESS) == pattern ^ ALL_ONES
@@ -174,6 +175,7 @@ class DrivenBoard:
         room = capabilities[rm.CAP_INTERFACE] & 0xFFFF, capabilities[rm.CAP_INTERFACE] >> 16
         inputs, results = interface_words(parameters)
         wanted = rm.SensorMode[parameters.sensor_mode.name]
+        # these decide how long a result is, and where its parts are
         for what, theirs, ours in (
             ("replicas", capabilities[rm.CAP_REPLICAS], parameters.replicas),
             ("sensor mode", mode, int(wanted)),
@@ -239,6 +241,7 @@ class DrivenBoard:
         self, writes: list[RegisterWrite], address: int, before: bytes, layout: struct.Struct, *words: int
     ) -> None:
         link = self.open_link
+        # the board refuses any number but the next, so a repeated start does nothing
         self.number = next_doorbell(self.number)
         self.waiting = True
         self.done = None
@@ -253,6 +256,7 @@ class DrivenBoard:
         link = self.open_link
         done = link.receive_done()
         is_done = done is not None
+        # a second answer is an error, which must not wait until the next frame
         while done is not None:
             self._take(done)
             done = link.take_done()

@@ -114,11 +114,13 @@ class FrameEncoder:
     """Encoder of frames for each board, which checks them against the whole machine."""
 
     def __init__(self, images: Sequence[Image]) -> None:
+        # the boards differ in their lines and priors alone, so one has the parameters of all
         self._images = tuple(images)
         self._parameters = images[0].machine.parameters
         self._replicas = self._parameters.replicas
         self._total_lines = sum(image.machine.parameters.lines for image in images)
         self._is_plain = is_plain(self._parameters)
+        # of plain machines: the words of SENSORS, and the address of a missing reading in each column
         self._sensor_words = struct.Struct(f"<{self._parameters.sensors}I")
         self._missing = tuple((1 << bits) - 1 for bits in self._parameters.sensor_bits)
 
@@ -199,6 +201,7 @@ class FrameEncoder:
                 f"integers of the shape {shape}"
             )
         missing = np.array(self._missing, dtype=np.int64)[:, np.newaxis]
+        # a reading is missing in all lines or in none: the cells of a column share the address of a missing one
         words = inputs.reshape(replicas, sensors, -1).astype(np.int64)
         absent = words == -1
         partly = absent.any(axis=2) & ~absent.all(axis=2)
@@ -229,6 +232,7 @@ class FrameEncoder:
                 )
             return [None] * len(self._images)
         if codes is None:
+            # written all the same, because the frame before may have written another
             return [np.tile(image.machine.prior[0], self._replicas) for image in self._images]
         shapes = {(self._total_lines,)} | (
             {(self._replicas, self._total_lines)} if self._replicas > 1 else set()

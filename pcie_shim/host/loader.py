@@ -16,7 +16,7 @@ PART_BYTES: Final = 4 * framing.MAX_PAYLOAD_WORDS
 
 def program(
     endpoint: Endpoint | str,
-    image: Image | Path | bytes,
+    image: Image | Path,
     *,
     timeout: float = 30.0,
     token: bytes = framing.NO_TOKEN,
@@ -27,7 +27,7 @@ def program(
 
     Args:
         endpoint: Endpoint of the board's registers, from which the programming port follows.
-        image: An image, the path of a programming file, or its bytes.
+        image: An image, or the path of a programming file.
         timeout: Seconds for each step: connecting, transferring the file, loading the machine.
         token: The token of this host's link to the board, if it has one.
 
@@ -45,6 +45,7 @@ def program(
     with SocketLink.open(where.programming, timeout=timeout) as link:
         begin = framing.ProgramBegin(size=len(content), sha256=hashlib.sha256(content).digest(), token=token)
         _request(link, framing.BEGIN, 0, begin.encode())
+        # parts are not acknowledged: the reply to END is that of the whole file
         for offset in range(0, len(content), PART_BYTES):
             part = content[offset : offset + PART_BYTES]
             padded = part + bytes(-len(part) % 4)
@@ -52,6 +53,7 @@ def program(
         _request(link, framing.END, len(content), b"")
         identity = link.read32(register_map.ID)
         found = link.read_block(register_map.IMAGE_HASH, register_map.IMAGE_HASH_WORDS).hex()
+    # the board may have loaded something else than it was sent
     if identity != register_map.ID_VALUE or found != expected:
         raise ImageMismatchError(
             f"The board at {where} reads ID {identity:#010x} and image {found} after programming; "
@@ -60,12 +62,10 @@ def program(
     return found
 
 
-def _content(image: Image | Path | bytes) -> tuple[bytes, str]:
+def _content(image: Image | Path) -> tuple[bytes, str]:
     """Return the bytes of the programming file, and the expected image hash."""
     if isinstance(image, Image):
         return image_bytes(image), image.image_hash
-    if isinstance(image, bytes):
-        return image, image_from_bytes(image).image_hash
     content = read_bytes(image)
     return content, image_from_bytes(content, str(image)).image_hash
 

@@ -135,11 +135,6 @@ class MiniCluster:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @property
-    def total_lines(self) -> int:
-        """Lines of the whole model."""
-        return sum(board.lines for board in self._boards)
-
     def is_open(self, board: int) -> bool:
         """Return whether board number `board` is usable; otherwise `reopen` it."""
         return self._boards[board].link is not None or self._boards[board] in self._interrupted
@@ -268,6 +263,7 @@ class MiniCluster:
 
     def _next_slice(self, progress: _Progress) -> FrameOutput | None:
         """Return the frame's result after its last slice; otherwise start the next slice and return None."""
+        # the boards' own times are of this slice, so those of the slowest are added up
         now = time.perf_counter_ns()
         progress.waits_ns += now - progress.clock_ns
         progress.clock_ns = now
@@ -276,10 +272,12 @@ class MiniCluster:
             board.done.compute_ns for board in progress.running if board.done is not None
         )
         halts = b""
+        # replicas stop one by one: those that are over on a board are halted on the others
         if self._replicas > 1:
             running, halts = self._boards_of_replicas(progress)
         else:
             running = [board for board in progress.running if board.reason == StopReason.SLICE]
+            # with `slices` the frame is over for all, and with `own` no board has a slice left
             if any(board.reason == StopReason.OVERFLOW for board in self._boards):
                 running = []
         if running:
@@ -348,6 +346,7 @@ class MiniCluster:
                 )
 
     def _open(self, board: DrivenBoard, connect_timeout: float) -> None:
+        # its link may be open still, if only another board has failed
         self._close(board, "it is being opened")
         try:
             board.open(self._timeout, connect_timeout, max(self._timeout, PROGRAMMING_S))

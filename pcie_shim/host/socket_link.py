@@ -168,6 +168,7 @@ class SocketLink:
             GreetingMismatchError: It has another protocol version, register map or BAR size.
             LinkError: It does not greet, or is not a board.
         """
+        # the greeting is the board's word; `DrivenBoard` compares the registers too
         link = cls._opened(endpoint, timeout, timeout if connect_timeout is None else connect_timeout)
         greeting = link.greeting
         for what, theirs, ours in (
@@ -190,6 +191,7 @@ class SocketLink:
             try:
                 return cls(endpoint, timeout=timeout, connect_timeout=connect_timeout)
             except HeldError:
+                # perhaps by this host's own link, whose end is still on its way
                 if time.monotonic() >= deadline:
                     raise
                 time.sleep(_RETRY_S)
@@ -302,6 +304,7 @@ class SocketLink:
             except LinkError as error:
                 self._give_up(error)
             if frame.operation == framing.IRQ:
+                # copied, because the next receive overwrites the buffer
                 done = self._interrupt(frame)
                 self._done = done._replace(results=memoryview(bytes(done.results)))
             elif frame.operation == framing.ERROR:

@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Self
 
@@ -129,7 +129,7 @@ class MisbehavingServer(BoardServer):
         if not self._now(Kind.WRONG_MAP):
             return greeting
         other = framing.decode_greeting(decoder.next_frame())
-        return framing.encode_greeting(replace(other, map_hash=hashlib.sha256(b"another map").hexdigest()))
+        return framing.encode_greeting(other._replace(map_hash=hashlib.sha256(b"another map").hexdigest()))
 
     def _serve_host(self, host: HostConnection) -> None:
         if host not in self._stalled:

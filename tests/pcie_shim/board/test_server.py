@@ -304,7 +304,7 @@ def test_a_blank_board_is_programmed_and_programmed_again(start_board: StartBoar
         assert not any(bytes.fromhex(link.greeting.image_hash))
     assert len(image_bytes(first)) > 300_000  # it comes in parts
     assert program(board.endpoint, first) == first.image_hash
-    assert program(board.endpoint, image_bytes(second)) == second.image_hash
+    assert program(board.endpoint, second) == second.image_hash
     with open_link(board) as link:
         assert link.read_block(rm.IMAGE_HASH, 8).hex() == link.greeting.image_hash == second.image_hash
         assert link.read32(rm.CAP_LINES) == 3
@@ -401,9 +401,10 @@ def test_a_file_that_no_loader_has_checked_is_checked_by_the_board(
         assert link.read_block(rm.IMAGE_HASH, 8) == bytes(32)
 
 
-def test_the_loader_refuses_a_file_for_another_map(start_board: StartBoard) -> None:
+def test_the_loader_refuses_a_file_for_another_map(start_board: StartBoard, folder: Path) -> None:
+    (folder / "other.bm").write_bytes(foreign(b""))
     with pytest.raises(ImageMismatchError):
-        program(start_board().endpoint, foreign(b""))
+        program(start_board().endpoint, folder / "other.bm")
 
 
 def test_the_programming_port_takes_no_registers_writes_no_part_out_of_turn_and_no_endless_file(

@@ -45,7 +45,8 @@ class Case:
     def shape(self) -> tuple[int, ...]:
         """Of a frame's inputs, over all boards."""
         parameters = self.parts[0].machine.parameters
-        return dataclasses.replace(parameters, lines=self.cluster.total_lines).input_shape
+        lines = self.parts[0].partition.total_lines
+        return dataclasses.replace(parameters, lines=lines).input_shape
 
     def frame(self, seed: int, **changed) -> FrameInput:
         parameters = self.parts[0].machine.parameters
