@@ -70,26 +70,13 @@ def quantile(values: list[float], share: float) -> float:
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]
 
 
-def processes_of(master: int) -> dict[str, list[int]]:
-    """Return the process numbers of the master and its descendants, by command."""
-    parents: dict[int, int] = {}
-    names: dict[int, str] = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                pid = int(entry.name)
-                parents[pid] = int((entry / "stat").read_text().rsplit(")", 1)[1].split()[1])
-                words = (entry / "cmdline").read_bytes().split(b"\0")
-                names[pid] = Path(words[1].decode() if b"python" in words[0] else words[0].decode()).name
-            except (OSError, IndexError):
-                continue
-    found: dict[str, list[int]] = {}
-    for pid in parents:
-        above = pid
-        while above in parents and above != master:
-            above = parents[above]
-        if above == master:
-            found.setdefault(names.get(pid, "?"), []).append(pid)
+def processes_of(pid: int) -> dict[str, list[int]]:
+    """Return the process numbers of a process and its descendants, by command."""
+    words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+    found = {Path(words[1].decode() if b"python" in words[0] else words[0].decode()).name: [pid]}
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        for command, pids in processes_of(int(child)).items():
+            found.setdefault(command, []).extend(pids)
     return found
 
 
