@@ -13,9 +13,7 @@ UNUSABLE = "with an unusable variable"
 """Reason that needs no fault, but a reading with such a variable."""
 WITH_PUBLISHER = "lost with the publisher"
 """Reason of results that may have arrived, because the publisher was killed before it confirmed them."""
-WITH_APP = "lost with pcie-app"
-FAILED = "failed on a board"
-ROSBRIDGE_AWAY = "rosbridge away"
+WITH_APP, FAILED, ROSBRIDGE_AWAY = "lost with pcie-app", "failed on a board", "rosbridge away"
 NOT_LOST = "on some topics only"
 MOST_IN_TRANSIT = 5
 """Maximum number of readings, and of results, that a step may cut off between two processes."""
@@ -23,9 +21,8 @@ MOST_IN_TRANSIT = 5
 
 @dataclass(frozen=True, slots=True)
 class Counters:
-    """The master's counters."""
+    """The master's counters of results and of losses by reason."""
 
-    received: int = 0
     completed: int = 0
     lost: Mapping[str, int] = field(default_factory=dict)
 
@@ -33,15 +30,8 @@ class Counters:
         """Return the increase since earlier counters of the same master."""
         lost = {reason: count - former.lost.get(reason, 0) for reason, count in self.lost.items()}
         return Counters(
-            self.received - former.received,
-            self.completed - former.completed,
-            {reason: count for reason, count in lost.items() if count},
+            self.completed - former.completed, {why: count for why, count in lost.items() if count}
         )
-
-    @property
-    def losses(self) -> int:
-        """The number of readings without a result."""
-        return sum(count for reason, count in self.lost.items() if reason != NOT_LOST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,55 +80,40 @@ class Excuses:
     overdue: Overdue = Overdue()
 
 
-def in_transit(added: Counters, readings: Iterable[Reading], excuses: Excuses) -> Overdue:
-    """Return what no counter includes, as it was cut off between two processes, or is late."""
-    uncounted, astray = _difference(added, readings, excuses.overdue)
-    missing = [each for each in readings if each.forwarded and not each.arrived]
-    return Overdue(missing, max(0, uncounted), max(0, astray), excuses.reasons | {PASSED_OVER})
+def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses) -> tuple[list[Finding], Overdue]:
+    """Compare the master's counters with the readings of the same time, when nothing is in flight.
 
-
-def _difference(added: Counters, readings: Iterable[Reading], overdue: Overdue) -> tuple[int, int]:
-    """Return the numbers of uncounted readings, and of results that are counted and have not arrived."""
-    given = [each for each in readings if each.forwarded]
-    arrived = sum(each.arrived for each in given) + overdue.late
-    return len(given) + overdue.late - added.completed - added.losses, added.completed - arrived
-
-
-def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses) -> list[Finding]:
-    """Compare the master's counters with the readings of the same time, when nothing is in flight."""
+    Returns:
+        The findings, and what no counter includes, as it was cut off between two processes, or is late.
+    """
     findings = []
+    overdue, late = excuses.overdue, excuses.overdue.late
     given = [each for each in readings if each.forwarded]
-    arrived = sum(each.arrived for each in given)
-    doubtful = added.lost.get(WITH_PUBLISHER, 0)
-    excusable = [each for each in given if not each.arrived and each.published <= excuses.until]
-    most = min(len(excusable), excuses.most)
-    figures = f"{len(given)} readings, {arrived} results; counted: {added}"
-    uncounted, astray = _difference(added, readings, excuses.overdue)
-    slack = min(excuses.overdue.late, excuses.overdue.astray)  # of these, the readings were counted before
+    missing = [each for each in given if not each.arrived]
+    arrived = len(given) - len(missing) + late
+    losses = sum(count for reason, count in added.lost.items() if reason != NOT_LOST)
+    uncounted, astray = len(given) + late - added.completed - losses, added.completed - arrived
+    most = min(sum(each.published <= excuses.until for each in missing), excuses.most)
+    slack = min(late, overdue.astray)  # of these, the readings were counted before
+    figures = f"{len(given)} readings, {len(missing)} without result; counted: {added}"
     if uncounted > slack + (most if excuses.readings else 0):
         findings.append(Finding(Flaw.UNCOUNTED, f"{uncounted} readings: {figures}"))
-    if -uncounted > slack + excuses.overdue.uncounted - excuses.overdue.late:
+    if -uncounted > slack + overdue.uncounted - late:
         findings.append(Finding(Flaw.MISCOUNTED, f"{-uncounted} too many: {figures}"))
     if astray > (most if excuses.results else 0):
         findings.append(Finding(Flaw.UNCOUNTED, f"{astray} results are counted as published: {figures}"))
-    if -astray > doubtful + slack:
+    if -astray > slack + added.lost.get(WITH_PUBLISHER, 0):
         findings.append(Finding(Flaw.MISCOUNTED, f"{-astray} results that were not counted: {figures}"))
-    return findings + _unexplained(added, given, excuses)
-
-
-def _unexplained(added: Counters, given: list[Reading], excuses: Excuses) -> list[Finding]:
-    """Return losses whose reasons neither the readings nor a fault explain."""
-    findings = []
-    known = {
+    explained = {
         PASSED_OVER: sum(each.crowded for each in given),
         UNUSABLE: sum(each.addresses is None for each in given),
     }
-    late = excuses.overdue.uncounted  # these may be counted only now, under a reason of the step before
+    left = overdue.uncounted  # these may be counted only now, under a reason of the step before
     for reason, number in added.lost.items():
-        more = 0 if reason in excuses.reasons else number - known.get(reason, 0)
-        if more > 0 and reason in excuses.overdue.reasons:
-            more, late = max(0, more - late), max(0, late - more)
-        if more > 0:
-            sentence = f"{more} readings {reason}, without a fault that explains it; counted: {added}"
-            findings.append(Finding(Flaw.UNEXPLAINED, sentence))
-    return findings
+        more = 0 if reason in excuses.reasons else max(0, number - explained.get(reason, 0))
+        if reason in overdue.reasons:
+            more, left = max(0, more - left), max(0, left - more)
+        if more:
+            findings.append(Finding(Flaw.UNEXPLAINED, f"{more} {reason}, which no fault explains; {figures}"))
+    reasons = excuses.reasons | {PASSED_OVER}
+    return findings, Overdue(missing, max(0, uncounted), max(0, astray), reasons)

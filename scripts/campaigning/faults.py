@@ -179,10 +179,7 @@ class Schedule:
     def _pair(self) -> Step:
         one, other = self._rng.sample(self._topology.roles, 2)
         second = "stop" if self._rng.random() < 0.3 else "kill"
-        return (
-            Fault(Kind.SIGNALS, "kill", one),
-            Fault(Kind.SIGNALS, second, other, self._seconds(2)),
-        )
+        return (Fault(Kind.SIGNALS, "kill", one), Fault(Kind.SIGNALS, second, other, self._seconds(2)))
 
     def _rosbridge(self) -> Step:
         what = self._rng.choice(["gone", "hold", "slow", "delay", "nonsense", "cut-inside", "finish"])

@@ -20,7 +20,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from scripts.campaigning.accounts import ROSBRIDGE_AWAY, Counters, Excuses, Overdue, in_transit, judge
+from scripts.campaigning.accounts import ROSBRIDGE_AWAY, Counters, Excuses, Overdue, judge
 from scripts.campaigning.connections import REPORTS, Client
 from scripts.campaigning.expected import POOL, Addresses, Outcome, addresses_of
 from scripts.campaigning.faults import Kind, Step, excuses_of
@@ -52,15 +52,14 @@ class RoundResult:
 
     findings: list[Finding] = field(default_factory=list)
     frames: int = 0
-    readings: int = 0
     steps: int = 0
     """Number of steps that were taken; the last one led to the findings."""
     losses: Counter[str] = field(default_factory=Counter)
     """Counted losses, and readings and results that were between two processes when they were cut."""
     recoveries: list[tuple[float, str]] = field(default_factory=list)
     """Seconds until results arrived again after a step's end, which are only reported, and the step."""
-    resources: dict[tuple[str, int], list[tuple[int, int, int]]] = field(default_factory=dict)
-    """By role and process: frames so far, resident KiB and descriptors."""
+    resources: dict[tuple[str, int], list[tuple[int, int]]] = field(default_factory=dict)
+    """By role and process: resident KiB and descriptors after each step."""
     words: str = ""
 
 
@@ -73,25 +72,21 @@ class Round:
         topology: Topology,
         deployment: Path,
         expected: Callable[[Addresses, int], Outcome],
-        seed: int,
+        rng: random.Random,
         *,
         calm_frames: int,
     ) -> None:
         """Store an empty folder, and the number of frames to compute between two steps."""
-        self._rng = random.Random(seed)
-        self._topology = topology
-        self._calm_frames = calm_frames
-        self.stack = Stack(folder, topology, deployment, self._rng)
+        self._rng, self._topology, self._calm_frames = rng, topology, calm_frames
+        self.stack = Stack(folder, topology, deployment, rng)
         self.observer = Observer(expected)
         self._injector = Injector(self.stack, topology, folder / "clock", self._special)
         self._client = Client(self.stack.hub_port, self._take, self.observer.reconnected)
         self._result = RoundResult()
         # The master's counters when they were last judged, and what was missing then.
-        self._base = Counters()
-        self._overdue = Overdue()
+        self._base, self._overdue = Counters(), Overdue()
         # Set by each message to the observer, which came at this time.
-        self._news = asyncio.Event()
-        self._arrived = now()
+        self._news, self._arrived = asyncio.Event(), now()
         # While it is True, `_drive` does not publish.
         self._paused = False
         self._last: Addresses = ()
@@ -108,10 +103,8 @@ class Round:
         await self._client.publish(stamp, values)
 
     def _reading(self) -> dict[str, object]:
-        while (near_far := self._rng.choice(POOL)) == self._last:
-            pass
-        self._last = near_far
-        return dict(zip(("near", "far"), near_far, strict=True))
+        self._last = self._rng.choice([each for each in POOL if each != self._last])
+        return dict(zip(("near", "far"), self._last, strict=True))
 
     async def _drive(self) -> None:
         """Publish readings, each after the result of the previous one has arrived or is late."""
@@ -119,9 +112,8 @@ class Round:
             if self._paused or not self._client.connected.is_set():
                 await asyncio.sleep(0.01)
                 continue
-            stamp = next(_stamps)
+            stamp, published = next(_stamps), now()
             await self._publish(self._reading(), stamp)
-            published = now()
             while not self.observer.seen(stamp):
                 if now() - published > (_ANSWER if self.observer.in_fault else _ANSWER_LIMIT):
                     break
@@ -139,14 +131,15 @@ class Round:
         stamps = [next(_stamps) for _ in range(number)]
         if what == "disorder":
             self._rng.shuffle(stamps)
+        near: dict[str, tuple[object, ...]] = {
+            "nan": (float("nan"),),
+            "huge": (1e308, -1e308, 10**30, 7.5, -(10**30)),
+            "unusable": ("five", [1, 2], {"x": 1}),
+        }
         for stamp in stamps:
             values = self._reading()
-            if what == "nan":
-                values["near"] = float("nan")
-            elif what == "huge":
-                values["near"] = self._rng.choice([1e308, -1e308, 10**30, 7.5, -(10**30)])
-            elif what == "unusable":
-                values["near"] = self._rng.choice(["five", [1, 2], {"x": 1}])
+            if what in near:
+                values["near"] = self._rng.choice(near[what])
             await self._publish(values, stamp)
             if what != "burst":
                 await asyncio.sleep(0.005)
@@ -158,11 +151,10 @@ class Round:
         result, observer = self._result, self.observer
         if any(fault.kind is Kind.CLOCK for step in steps for fault in step):
             self.stack.environment |= self._injector.steppable_clock()
-        driver = None
+        driver = asyncio.create_task(self._drive())
         try:
             await self.stack.start(observer.forwarded)
             await self._client.start()
-            driver = asyncio.create_task(self._drive())
             observer.fault()
             await self._recover("start")
             await self._settle(Excuses(frozenset({ROSBRIDGE_AWAY}), readings=True, results=True, until=now()))
@@ -175,22 +167,19 @@ class Round:
         except NotThereError as error:
             observer.find(Flaw.ENDED, str(error))
         finally:
-            if driver is not None:
-                driver.cancel()
-                await asyncio.gather(driver, return_exceptions=True)
+            driver.cancel()
+            await asyncio.gather(driver, return_exceptions=True)
             await self._client.end()
             if observer.findings:
                 result.words = self.stack.last_words()
             await self.stack.end()
-        result.findings = observer.findings
-        result.frames, result.readings = observer.results, observer.readings
+        result.findings, result.frames = observer.findings, observer.results
         return result
 
     async def _take_step(self, step: Step) -> None:
         name = " + ".join(map(str, step))
         self.observer.fault()
-        outcomes = await asyncio.gather(*map(self._injector.inject, step), return_exceptions=True)
-        for error in outcomes:
+        for error in await asyncio.gather(*map(self._injector.inject, step), return_exceptions=True):
             if error is not None:
                 raise error
         if "master" in await self._injector.restart():
@@ -221,33 +210,27 @@ class Round:
         self._paused = True
         excuses = replace(excuses, overdue=self._overdue)
         strict = replace(excuses, readings=False, results=False)
-        try:
-            deadline, changed = now() + _SETTLE_LIMIT + _QUIET, now()
-            last: object = None
-            while True:
-                counters = await self.stack.counters()
-                readings = self.observer.pending_readings()
-                state = counters, self.observer.results, sum(each.forwarded for each in readings)
-                if state != last:
-                    last, changed = state, now()
-                if counters is not None:
-                    added = counters.since(self._base)
-                    findings = judge(added, readings, excuses)
-                    if not judge(added, readings, strict):
-                        break
-                    if (not findings and now() - changed > _QUIET) or now() > deadline:
-                        break
-                elif now() > deadline:
-                    return  # the master has ended, which is a separate finding
-                await asyncio.sleep(0.02)
-            self.observer.findings += findings
-            self._overdue = cut = in_transit(added, readings, excuses)
-            self._base = counters
-            self.observer.settle()
-            self._result.losses.update(added.lost)
-            self._result.losses.update({"readings cut off": cut.uncounted, "results cut off": cut.astray})
-        finally:
-            self._paused = False
+        deadline, changed, last = now() + _SETTLE_LIMIT + _QUIET, now(), None
+        while True:
+            counters, readings = await self.stack.counters(), self.observer.pending_readings()
+            state = counters, self.observer.results, sum(each.forwarded for each in readings)
+            if state != last:
+                last, changed = state, now()
+            if counters is not None:
+                added = counters.since(self._base)
+                findings, overdue = judge(added, readings, excuses)
+                is_quiet = not findings and now() - changed > _QUIET
+                if is_quiet or now() > deadline or not judge(added, readings, strict)[0]:
+                    self.observer.findings += findings
+                    self._base, self._overdue = counters, overdue
+                    self.observer.settle()
+                    cut = {"readings cut off": overdue.uncounted, "results cut off": overdue.astray}
+                    self._result.losses.update({**added.lost, **cut})
+                    break
+            elif now() > deadline:
+                break  # the master has ended, which is a separate finding
+            await asyncio.sleep(0.02)
+        self._paused = False
 
     async def _calm(self) -> None:
         """Compute frames without faults, settle strictly, and sample the processes' resources."""
@@ -260,9 +243,9 @@ class Round:
         if observer.results < wanted and not observer.findings:
             observer.find(
                 Flaw.SILENT,
-                f"{self._calm_frames - wanted + observer.results} of {self._calm_frames} results without a fault, "
-                f"the last one {now() - self._arrived:.1f} s ago; counted: {await self.stack.counters()}",
+                f"{wanted - observer.results} of {self._calm_frames} results are missing without a fault, the last one "
+                f"came {now() - self._arrived:.1f} s ago; counted: {await self.stack.counters()}",
             )
         await self._settle(Excuses())
         for process, used in (await self.stack.resources()).items():
-            self._result.resources.setdefault(process, []).append((observer.results, *used))
+            self._result.resources.setdefault(process, []).append(used)

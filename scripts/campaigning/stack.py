@@ -24,9 +24,8 @@ SERVICES = ("subscriber", "publisher", "pcie-app")
 BOARD_NAMES = tuple(f"board{at}" for at in range(BOARDS))
 BOARDS_PARENT = "boards"
 """The process from which a master's boards are forked."""
-START_LIMIT = 120.0 * FACTOR
-"""Seconds until a process must have started, even on a busy machine."""
-END_LIMIT = 30.0 * FACTOR
+START_LIMIT, END_LIMIT = 120.0 * FACTOR, 30.0 * FACTOR
+"""Seconds until a process must have started or ended, even on a busy machine."""
 BOARD_TIMEOUT = 2.0 * FACTOR
 """Seconds that a board may take; short, because some faults silence boards."""
 
@@ -56,15 +55,13 @@ class Topology(StrEnum):
     def roles(self) -> tuple[str, ...]:
         """All roles that are processes in this topology."""
         services = () if self.fused else SERVICES
-        parent = () if self.apart else (BOARDS_PARENT,)
-        return ("hub", *parent, *BOARD_NAMES, *services, "master")
+        return ("hub", *(() if self.apart else (BOARDS_PARENT,)), *BOARD_NAMES, *services, "master")
 
     @property
     def own_parts(self) -> tuple[str, ...]:
         """Roles whose processes the campaign starts, in order."""
-        boards = BOARD_NAMES if self.apart else ()
         services = SERVICES if self is Topology.APART else ()
-        return ("hub", *boards, *services, "master")
+        return ("hub", *(BOARD_NAMES if self.apart else ()), *services, "master")
 
 
 class NotThereError(Exception):
@@ -92,12 +89,10 @@ class Stack:
 
     def __init__(self, folder: Path, topology: Topology, deployment: Path, rng: random.Random) -> None:
         """Store an empty folder with a short path, and the deployment."""
-        self._folder = folder
-        self._topology = topology
-        self._deployment = deployment
+        self._folder, self._topology, self._deployment = folder, topology, deployment
         self._runs = folder / "run"
-        self._runs.mkdir(mode=0o700, parents=True)
-        (folder / "tmp").mkdir(mode=0o700)
+        for each in (self._runs, folder / "tmp"):
+            each.mkdir(mode=0o700, parents=True)
         self.environment = {name: f"{limit:g}" for name, limit in PRODUCT_LIMITS.items()}
         self.environment |= {"BM_RUN_DIRECTORY": str(self._runs), "TMPDIR": str(folder / "tmp")}
         # The newest process of each of `own_parts`, and the number of all starts, which numbers their logs.
@@ -115,11 +110,7 @@ class Stack:
             self.links[f"{name} programming"] = Proxy(outer + 1, inner + 1, rng)
 
     async def start(self, on_reading: Callable[[int], None]) -> None:
-        """Start everything, but do not wait until the master is ready.
-
-        Raises:
-            NotThereError: The hub or a board does not start.
-        """
+        """Start everything, but do not wait until the master is ready."""
         self.links["rosbridge"].on_reading = on_reading
         for link in self.links.values():
             await link.start()
@@ -136,11 +127,10 @@ class Stack:
         if role == "hub":
             return ["hub", "--port", str(self.hub_port)]
         if role in BOARD_NAMES:
-            index = ["--index", role.removeprefix("board")]
-            listen = ["--listen", f"tcp://127.0.0.1:{self._board_ports[role][1]}"]
+            endpoint, index = f"tcp://127.0.0.1:{self._board_ports[role][1]}", role.removeprefix("board")
             if misbehave:
-                return ["python", "-m", "tests.pcie_shim.misbehaving", listen[1], index[1], misbehave]
-            return ["board", *listen, *index]
+                return ["python", "-m", "tests.pcie_shim.misbehaving", endpoint, index, misbehave]
+            return ["board", "--listen", endpoint, "--index", index]
         if role == "pcie-app":
             return [role, *deployment, *listen, *boards, *limits]
         if role in SERVICES:
@@ -173,7 +163,7 @@ class Stack:
     def is_over(self, role: str) -> bool:
         """Return whether a process of the campaign's own has ended."""
         process = self._parts.get(role)
-        return process is None or not process.pid or (_stat(process.pid) or "Z")[0] == "Z"
+        return process is None or not process.pid or _stat(process.pid)[0] == "Z"
 
     async def wait(self, role: str) -> str:
         """Wait for the end of a process of the campaign's own, and return its exit code and last line."""
@@ -187,11 +177,11 @@ class Stack:
     async def forget_run(self) -> None:
         """Wait until the children of a killed master have ended."""
         left = set(self._topology.roles) - {*self._topology.own_parts, BOARDS_PARENT}
-        deadline = asyncio.get_running_loop().time() + END_LIMIT
-        while asyncio.get_running_loop().time() < deadline:
-            if not [role for role in left if await self.status(role) is not None]:
-                return
-            await asyncio.sleep(0.05)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(END_LIMIT):
+                while left:
+                    left = {role for role in left if await self.status(role) is not None}
+                    await asyncio.sleep(0.05)
 
     async def pid(self, role: str) -> int:
         """Return the PID of a role's process; 0 if it cannot be found."""
@@ -199,7 +189,7 @@ class Stack:
             return 0 if self.is_over(role) else self._parts[role].pid
         status = await self.status(BOARD_NAMES[0] if role == BOARDS_PARENT else role)
         pid = 0 if status is None else int(str(status["pid"]))
-        return int((_stat(pid) or "Z 0").split()[1]) if role == BOARDS_PARENT and pid else pid
+        return int(_stat(pid)[1]) if role == BOARDS_PARENT and pid else pid
 
     async def kill(self, role: str) -> bool:
         """Kill a role's process, and return whether it was found."""
@@ -221,11 +211,8 @@ class Stack:
 
     async def counters(self) -> Counters | None:
         """Return the master's counters; None if it does not answer."""
-        status = await self.status("master")
-        frames = None if status is None else status.get("frames")
-        if not isinstance(frames, dict):
-            return None
-        return Counters(frames["received"], frames["completed"], frames["lost"])
+        frames = (await self.status("master") or {}).get("frames")
+        return Counters(frames["completed"], frames["lost"]) if isinstance(frames, dict) else None
 
     async def resources(self) -> dict[tuple[str, int], tuple[int, int]]:
         """Return the resident memory in KiB and the open descriptors of each process, by role and PID."""
@@ -240,7 +227,9 @@ class Stack:
         """Return the last lines of all logs, for a finding."""
         lines = []
         for log in sorted(self._folder.glob("*.log")):
-            lines += [f"{log.stem}: {line}" for line in log.read_text(errors="replace").splitlines()[-4:]]
+            lines += [
+                f"    | {log.stem}: {line}" for line in log.read_text(errors="replace").splitlines()[-4:]
+            ]
         return "\n".join(lines)
 
     async def end(self) -> None:
@@ -255,18 +244,17 @@ class Stack:
 
 def used_by(pid: int) -> tuple[int, int, int]:
     """Return a process's bytes of address space, KiB in memory, and descriptors; raise an OSError if it has ended."""
-    size, resident = (
-        int(n) * os.sysconf("SC_PAGE_SIZE") for n in Path(f"/proc/{pid}/statm").read_text().split()[:2]
-    )
+    pages = Path(f"/proc/{pid}/statm").read_text().split()
+    size, resident = (int(each) * os.sysconf("SC_PAGE_SIZE") for each in pages[:2])
     return size, resident // 1024, len(list(Path(f"/proc/{pid}/fd").iterdir()))
 
 
-def _stat(pid: int) -> str:
-    """Return the state and the parent of a process and more, as in /proc; empty if it has ended."""
+def _stat(pid: int) -> list[str]:
+    """Return the state and the parent of a process and more, as in /proc; those of a zombie if it has ended."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].strip()
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     except OSError:
-        return ""
+        return ["Z", "0"]
 
 
 def _signal(pid: int, number: signal.Signals) -> bool:
