@@ -130,9 +130,10 @@ def test_a_picture_gives_bytes_within_the_limit(data):
     st.lists(
         st.fixed_dictionaries(
             {
-                "id": st.sampled_from((0, 1, "a", None, True)),
-                "num": st.sampled_from((0, 1, 2, 3, "1", "0x1", 2.0, -1, 1.5, None, math.nan)),
-                "total": st.sampled_from((1, 2, 3, 2.5, "3", 0, -1, 1e9, math.inf, None)),
+                "id": st.sampled_from((0, 1, "a", "b", None, True)),
+                "num": st.sampled_from((0, 1, 2))
+                | st.sampled_from((3, "1", "0x1", 2.0, -1, 1.5, None, math.nan)),
+                "total": st.just(3) | st.sampled_from((1, 2, 2.5, "3", 0, -1, 1e9, math.inf, None)),
                 "data": st.sampled_from(("", "a", "b" * 30, "c" * 70, None, 5)),
             }
         ),
@@ -140,14 +141,14 @@ def test_a_picture_gives_bytes_within_the_limit(data):
     )
 )
 def test_fragments_in_any_order_and_number_stay_within_their_bounds(fragments):
-    box = Reassembler(max_size=64, max_sets=3, max_age=10)
+    box = Reassembler(max_size=64, max_sets=2, max_age=10)
     for number, fragment in enumerate(fragments):
         try:
             whole = box.take(fragment, number * 1.5)
             assert whole is None or len(whole) <= 64
         except DecodeError as error:
             check_sentence(error)
-        assert len(box) <= 3
+        assert len(box) <= 2
         assert 0 <= box.waiting_bytes <= 4 * (64 + 128)
         assert (box.waiting_bytes == 0) == (len(box) == 0)
 
@@ -397,13 +398,13 @@ _ENVELOPES = (
     b'{"op":"publish","topic":"/a","msg":',
     b'{"op": "publish", "topic": "/a", "msg": ',
     b'{"op":"publish","topic":"a","msg":',
-    b'{"op":"publish","topic":"b","msg":',
+    b'{"op":"publish","topic":"/b","msg":',
     b'{"topic":"\\/a","op":"publish","msg":',
     b'{"op":"publish","topic":"/a","id":1,"msg":',
     b'{"op":"publish","msg":{},"topic":"/a","msg":',
     b'{"op":"publish","topic":"/a","msg":{"msg":',
     b'{"op":"status","topic":"/a","msg":',
-    b'{"op":"publish","topic":"/a","topic":"b","msg":',
+    b'{"op":"publish","topic":"/a","topic":"/b","msg":',
     b'{"op":"publish","topic":"/a","msg":"',
     b"",
 )
@@ -412,14 +413,17 @@ _LONG = b'{"long":"' + b"x" * 600 + b'"}'
 _PARTS = (
     *(b"{}", b'{"a":1}', b'{"data":[1.5,-0.0,1e15,123456789012345678901234567890]}', b'{"a":{"b":{"c":[]}}}'),
     *(_DEEP, b'{"a":NaN}', b'{"a":1e999}', b'{"a":"\xff"}', b'{"a":"\\ud800"}', b'{"a":"\\u00e9\xc3\xa9"}'),
-    *(b'{"a":1,"a":2}', b',"topic":"b"', b',"msg":{"z":1}', b"}", b"{", b'"', b" ", b"null", b"[1]", _LONG),
+    *(b'{"a":1,"a":2}', b',"topic":"/b"', b',"msg":{"z":1}', b"}", b"{", b'"', b" ", b"null", b"[1]", _LONG),
 )
-_message = st.sampled_from(_PARTS[:4]) | st.lists(
-    st.sampled_from(_PARTS) | st.binary(max_size=5), max_size=3
-).map(b"".join)
-published = st.tuples(
-    st.sampled_from(_ENVELOPES), _message, st.sampled_from((b"}", b"}", b"}", b"", b"} ", b"}}"))
-).map(b"".join)
+_right = st.tuples(
+    st.sampled_from((_ENVELOPES[0], _ENVELOPES[3])), st.sampled_from(_PARTS[:4]), st.just(b"}")
+)
+_any = st.tuples(
+    st.sampled_from(_ENVELOPES),
+    st.lists(st.sampled_from(_PARTS) | st.binary(max_size=5), max_size=3).map(b"".join),
+    st.sampled_from((b"}", b"}", b"}", b"", b"} ", b"}}")),
+)
+published = (_right | _any).map(b"".join)
 
 
 @settings(max_examples=200)
@@ -430,7 +434,7 @@ published = st.tuples(
         _ENVELOPES[10] + b"".join(_PARTS[6:11]) + b"}",
         _ENVELOPES[0] + b"{}}",
         _ENVELOPES[6] + b"[1]" + _LONG + b"{}{}}",
-        _ENVELOPES[4] + b',"topic":"b","msg":{"z":1}{}} ',
+        _ENVELOPES[4] + b',"topic":"/b","msg":{"z":1}{}} ',
         _ENVELOPES[0] + b"[1]" + _LONG * 3 + b"{}{}}",
     ],
     Delivery(),
@@ -440,7 +444,7 @@ def test_a_client_that_knows_an_envelope_reads_what_one_does_that_parses_all(mes
     for core in cores:
         core.restore()
         core.subscriptions.subscribe("/a", delivery=delivery)
-        core.subscriptions.subscribe("b")
+        core.subscriptions.subscribe("/b")
     for received in messages:
         cores[1].subscriptions.forget_envelopes()  # so that it parses everything
         events = [repr(core.receive(received, 0.0)) for core in cores]
@@ -474,7 +478,7 @@ def test_a_hub_that_knows_envelopes_delivers_what_one_does_that_parses_all(turns
             client.outbox.wire = []
             asked = {"op": "subscribe", "topic": topic, "compression": form, "queue_length": 1000}
             broker.receive(client, json.dumps(asked).encode(), 0.0)
-        for topic, latch in (("/a", True), ("b", False)):
+        for topic, latch in (("/a", True), ("/b", False)):
             asked = {"op": "advertise", "topic": topic, "type": "p/T", "latch": latch}
             broker.receive(publishers[-1], json.dumps(asked).encode(), 0.0)
     for said in turns:
