@@ -34,6 +34,7 @@ def service_command(
     """Return the command of a service; boards may take `compiling_time` seconds more to compile their kernels."""
     command = [*own_command(role), "--listen", str(endpoint)]
     command += ["--deployment", str(settings.deployment), "--log-level", settings.log_level]
+    # settings without a value here come from the environment, which children inherit
     command += _metrics(settings, role)
     if role == "pcie-app":
         command += ["--boards", ",".join(settings.boards)] if settings.boards else []

@@ -90,19 +90,29 @@ class FrameFlow:
         self._once = once
         self._count = count
         self._show = show
+        # A frame is in one of three places, in this order. `_send_next` moves the next one to the boards whenever
+        # something changes that may have held it back: a reading, a result, an outcome, or a peer that is ready again.
         self._readings: WaitingFrames[WaitingReading] = WaitingFrames(settings.queue or deployment.queue)
         self._computing: _Computing | None = None
         self._at_publisher: dict[int, Publish] = {}
+        # From here on the publisher's time counts (monotonic, s): since the first of the results that are there, or its
+        # last outcome.
         self._published_at = 0.0
+        # Number of the last frame sent to the boards; it also chooses the bank of the generators.
         self._number = 0
+        # For the status: complete readings so far, and the number of the last published frame with its time (ns).
         self._received = 0
         self._last = (0, 0)
+        # Without those that `_readings` has passed over, which `losses` adds.
         self._losses: Counter[LossReason] = Counter()
+        # Causes of unusable messages of which the user has been warned: one warning each.
         self._reported_causes: set[str] = set()
         self.latencies = Latencies()
         """Those of the published frames."""
+        # Times of the last frames that failed on a board, as many as may fail within `restart_window` and one more.
         self._failures: deque[float] = deque(maxlen=RESTARTS + 1)
         self.published = 0
+        """Number of results that reached at least one topic."""
         self.newest: Publish | None = None
         """The newest result that went to the publisher."""
         self.first_reading_at: float | None = None
@@ -188,6 +198,7 @@ class FrameFlow:
     def _take_reading(self, reading: Reading) -> None:
         self.has_data = True
         if self._once and self._number:
+            # the run ends with the first frame, which is on its way
             return
         self._received += 1
         if self.first_reading_at is None:
@@ -195,7 +206,8 @@ class FrameFlow:
         self._losses[LossReason.PASSED_OVER] += reading.passed_over
         self._losses[LossReason.UNPAIRED] += reading.unpaired
         if self._peers.publisher.away and not self._once:
-            self._losses[LossReason.ROSBRIDGE_AWAY] += 1  # its result could not be received
+            # computing it would only delay a later one, whose result can be received
+            self._losses[LossReason.ROSBRIDGE_AWAY] += 1
             return
         try:
             self._readings.put(WaitingReading(reading, time.monotonic_ns()))
@@ -221,7 +233,8 @@ class FrameFlow:
         if len(self._at_publisher) >= MOST_AT_PUBLISHER or not self._peers.publisher.ready:
             return
         if self._count is not None and self.published + len(self._at_publisher) >= self._count:
-            return  # until it is known whether the results at the publisher are enough
+            # until it is known whether the results at the publisher are enough
+            return
         waiting = self._readings.get()
         if waiting is None:
             return
@@ -250,6 +263,7 @@ class FrameFlow:
 
     def _take_result(self, result: FrameResult) -> None:
         computing = self._computing
+        # a frame that was counted as lost with a former pcie-app
         if computing is None or computing.number != result.number:
             return
         self._computing = None

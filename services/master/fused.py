@@ -77,6 +77,7 @@ def fused_services(
     Raises:
         SettingsError: The endpoints of the boards are invalid.
     """
+    # filled by the constructors of the services, which make their links
     ends: dict[str, FusedEnd] = {}
 
     def link_of(role: str) -> MakeLink:

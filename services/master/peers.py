@@ -1,4 +1,11 @@
-"""Peers of the master (subscriber, publisher, pcie-app): starting, connecting, restarting and stopping them."""
+"""Peers of the master (subscriber, publisher, pcie-app): starting, connecting, restarting and stopping them.
+
+    _keep:  _connect ──▶ _watch ──connection lost──▶ _bring_back ──▶ _connect ...
+    records of a connection:  Hello ──▶ Ready ──▶ (all ready: Begin) ──▶ readings, frames, results ──▶ FrameFlow
+
+Each peer has such a task, whose error ends the run. With `--fused` there are no connections to keep, and the
+tasks are the services themselves.
+"""
 
 from __future__ import annotations
 
@@ -68,14 +75,20 @@ class Peer:
         self.endpoint = endpoint
         self.where = "this process" if endpoint is None else str(endpoint)
         self.child = child
+        # Of the present connection, which `_keep` resets: None and False between two connections. A record counts only
+        # from a peer that has greeted; a frame or a result goes only to one that is ready.
         self.protocol: RecordProtocol | FusedEnd | None = None
         self.greeted = False
         self.ready = False
         self.away = False
         """True while it has no connection to its rosbridge servers."""
+        # Set at the end of the connection, with its error if it had one: that of a service of another version or
+        # deployment ends the run, any other end is mended.
         self.closed = asyncio.Event()
         self.reason: Exception | None = None
+        # When its time to greet or to get ready began (monotonic, s).
         self.since = 0.0
+        # True after a warning that it is gone, until it greets again: one warning for each absence.
         self.missed = False
 
     def cut(self) -> None:
@@ -124,13 +137,17 @@ class Peers:
         self._deployment = deployment
         self._log = log
         self._once = once
+        # Given to `start`; no record arrives before.
         self._events: PeerEvents
+        # Determined by `prepare`, in the order in which a frame meets them: the services by role, the folder of sockets
+        # if any of them is started here, the boards' process if the master starts it, and where boards listen.
+        self._by_role: dict[str, Peer] = {}
         self._private: PrivateDirectory | None = None
         self._boards: Child | None = None
-        self._by_role: dict[str, Peer] = {}
+        self.board_endpoints: tuple[str, ...] = ()
+        # Tasks that keep peers and boards, which end at once; and services in this process, which get time to end.
         self._tasks: list[asyncio.Task[None]] = []
         self._inside: list[asyncio.Task[None]] = []
-        self.board_endpoints: tuple[str, ...] = ()
         self.begun = asyncio.Event()
         """Set when all peers have been ready."""
 
@@ -303,6 +320,7 @@ class Peers:
             await boards.wait()
             failure = boards.failure()
             if boards.exit_code == ExitCode.BOARD:
+                # it has restarted its boards as often as it may
                 raise failure
             if self._once or not boards.may_restart(self._settings.restart_window):
                 raise BoardFailedError(str(failure))
@@ -401,12 +419,12 @@ class Peers:
         if child is None:
             if self._once:
                 raise ChildDiedError(f"{peer.role} at {peer.where} closed the connection")
-            if (
-                not peer.missed
-            ):  # a killed process may accept one more connection before its socket disappears
+            # a killed process may accept one more connection before its socket disappears
+            if not peer.missed:
                 self._log.warning(f"{peer.role} at {peer.where} is gone; waiting for it")
             peer.missed = True
             return
+        # it closes its socket before it exits, and its exit code says whether another start would help
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(child.wait(), self._settings.stop_timeout)
         if child.is_running:
@@ -428,6 +446,7 @@ class Peers:
         protocol.send(own_hello(ROLE, self._deployment.hash))
 
     def _closed(self, peer: Peer, protocol: RecordProtocol, why: Exception | None) -> None:
+        # a refused connection to a socket that is about to disappear may end after the next one has begun
         if peer.protocol in (protocol, None):
             peer.reason = why
             peer.closed.set()
@@ -436,6 +455,7 @@ class Peers:
         try:
             self._dispatch(peer, record)
         except OtherPeerError:
+            # the connection closes with it, and `_bring_back` raises it
             raise
         except Exception as error:  # a closed standard output, or a bug: not an error of the connection
             self._events.fail(error)
@@ -470,6 +490,7 @@ class Peers:
     def _rosbridge(self, peer: Peer, record: Rosbridge) -> None:
         peer.away = not record.connected
         if record.connected:
+            # the other one may be waiting for its next attempt, several seconds later
             for other in self:
                 if other is not peer and other.away and other.protocol is not None:
                     other.protocol.send(record)

@@ -4,20 +4,21 @@ import asyncio
 import contextlib
 import sys
 import time
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from services.errors import NoDataError
-from services.master.children import ChildrenWatch
 from services.master.flow import FrameFlow
-from services.master.peers import ROLE, Peers
+from services.master.peers import ROLE, Peer, Peers
 from services.output.axes import deployment_axes
 from services.output.master_output import print_json, sentence
 from services.settings import Settings
 from services.sockets.records import LossReason, Publish, Published
-from services.sockets.reporting import serve_status
-from services.sockets.status import ProcessStatus
+from services.sockets.reporting import STUCK_S, serve_status
+from services.sockets.status import ProcessStatus, read_process_status
 from terminal.errors import ExitCode
+from terminal.health import NoHealthError, status_socket
 from terminal.logs import get_logger
 from terminal.output import say, show_progress
 from toolchain.deployment import Deployment
@@ -25,6 +26,9 @@ from toolchain.deployment import Deployment
 if TYPE_CHECKING:
     from services.output.posterior_lines import Show
 
+ASK_EVERY = 5.0
+"""Seconds between two questions to all children whether they make progress."""
+_ANSWER_TIME = 2.0
 _PROGRESS_EVERY = 1.0
 _DRAWN_EVERY = 0.2
 """Minimum number of seconds between two pictures, so that drawing takes little time from the frames."""
@@ -50,6 +54,7 @@ class Master:
         self._count = 1 if once else count
         self._json = json
         self._plot = plot
+        # The last published result, for the progress; and the last drawn one, which is drawn only once.
         self._newest: Published | None = None
         self._drawn: Publish | None = None
         self._log = get_logger(ROLE, settings.log_level)
@@ -58,6 +63,7 @@ class Master:
         self._flow = FrameFlow(
             settings, deployment, self._peers, self._log, once=once, count=self._count, show=self._show
         )
+        # Work beside the frames, until the end of the run.
         self._tasks: list[asyncio.Task[None]] = []
 
     async def run(self) -> int:
@@ -105,6 +111,7 @@ class Master:
             for task in self._tasks:
                 task.cancel()
             await peers.leave()
+            # before the children end, because the private folder that contains the socket goes with them
             await sockets.aclose()
             await peers.end()
             if not self._once:
@@ -197,6 +204,39 @@ class Master:
         posterior = posterior_of(newest, self._deployment)
         if posterior is not None:
             show(posterior, deployment_axes(self._deployment))
+
+
+class ChildrenWatch:
+    """The progress of the processes that a master started, according to their status sockets.
+
+    A child that is being restarted does not count: the master knows of it. One that is stopped or stuck
+    while nothing is expected of it would otherwise go unnoticed.
+    """
+
+    def __init__(self, peers: Iterable[Peer], directory: Path) -> None:
+        """Take the services of the master, and the directory of their sockets."""
+        self._peers = peers
+        self._directory = directory
+        # When all of them last answered (monotonic, s). At first they have as long to start.
+        self._answered = time.monotonic()
+
+    def is_alive(self) -> bool:
+        """Return whether all of them have answered recently."""
+        return time.monotonic() - self._answered < STUCK_S
+
+    async def run(self) -> None:
+        """Ask until cancelled."""
+        while True:
+            running = [peer.role for peer in self._peers if peer.child is not None and peer.child.is_running]
+            if all(await asyncio.gather(*map(self._is_well, running))):
+                self._answered = time.monotonic()
+            await asyncio.sleep(ASK_EVERY)
+
+    async def _is_well(self, role: str) -> bool:
+        try:
+            return (await read_process_status(status_socket(self._directory, role), _ANSWER_TIME)).alive
+        except NoHealthError:
+            return False
 
 
 async def run_master(

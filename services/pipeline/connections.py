@@ -76,6 +76,7 @@ def reconnect_now(rosbridges: Mapping[str, Ros]) -> None:
 
 async def report_unpublished(ros: Ros, topic: str, report: Callable[[str], None]) -> None:
     """Report a topic that has no publisher `AFTER` seconds from now, with the nearest names, if there is rosapi."""
+    # a publisher that starts at the same time is not missing
     await asyncio.sleep(AFTER)
     if await ros.publishers(topic) != []:
         return  # or the server has no rosapi

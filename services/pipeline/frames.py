@@ -31,6 +31,7 @@ class _SourceReader:
 
     def __init__(self, deployment: Deployment, source: int) -> None:
         self._deployment = deployment
+        # Indices of this topic's variables in the deployment, which are the positions of their addresses in a reading.
         self.columns = [at for at, each in enumerate(deployment.variables) if each.source == source]
         variables = [deployment.variables[at] for at in self.columns]
         self._fields = [(each, Field(each.path or each.name)) for each in variables]
@@ -39,6 +40,7 @@ class _SourceReader:
         self._prior = None if prior is None or prior.source != source else Field(prior.path)
         self._prior_optional = prior is None or prior.on_missing == "model"
         self.topic = deployment.sources[source].topic
+        # With a single topic every message is a frame, even if all of its variables may be missing.
         optional = len(deployment.sources) > 1 and all(each.on_missing == "missing" for each in variables)
         self.needed = bool(variables and not optional) or (
             self._prior is not None and not self._prior_optional
@@ -123,8 +125,10 @@ class FrameAssembler:
         self._synchroniser: Synchroniser[Reading] = Synchroniser(
             [reader.needed for reader in self._readers], self._tolerance_ns
         )
-        self._newest: list[tuple[int, bool]] = [(0, True)] * count  # stamp, and whether a header had it
-        self._since_pair = [0] * count  # messages
+        # For each topic: the newest stamp and whether a header had it, and the messages since the last frame. They
+        # tell when messages come on all topics and their stamps never meet.
+        self._newest: list[tuple[int, bool]] = [(0, True)] * count
+        self._since_pair = [0] * count
         self.absent: Counter[str] = Counter()
         """Number of frames without a topic that was alive, by topic."""
 
@@ -214,12 +218,14 @@ class WaitingFrames(Generic[Item]):
 
     def __init__(self, queue: str) -> None:
         self._keep_all = queue == "all"
+        # At most one item unless all are kept.
         self._waiting: deque[Item] = deque()
         self.passed_over = 0
 
     def put(self, frame: Item) -> None:
         """Add a frame, or raise an OverflowedQueueError if the queue is full (only with `queue = all`)."""
         if self._keep_all:
+            # an error instead of a loss, because who keeps all readings wants every result
             if len(self._waiting) >= QUEUE_ALL_DEPTH:
                 raise OverflowedQueueError(
                     f"{QUEUE_ALL_DEPTH} frames wait for the boards and more come in: the boards (pcie-app) are the slow part; "

@@ -35,6 +35,7 @@ class Inference:
 
     def __init__(self, result: FrameResult) -> None:
         boards = self.boards = decode_boards(result)
+        # set by one of the two branches, unless a board has no counts
         self.totals: list[int] = []
         self.posterior: npt.NDArray[np.float64] | None = None
         if boards and boards[0].replica_cycles:
@@ -81,6 +82,7 @@ def report_of(
     result = publish.result
     sent_ns, tick = now
     boards_ns = result.register_writes_ns + result.compute_ns + result.reads_ns
+    # all times are of one monotonic clock, so what no process has measured was spent between them
     hops_ns = tick - publish.reading_sent_tick - publish.waited_ns - boards_ns
     if published := inference.posterior is not None:
         outcome = "posterior"

@@ -1,4 +1,8 @@
-"""The publisher, which publishes results as posteriors on /BMresults (thesis 3.1, Publisher.jar)."""
+"""The publisher, which publishes results as posteriors on /BMresults (thesis 3.1, Publisher.jar).
+
+master ──Publish──▶ publish_now ──────────────────────────────▶ Published ──▶ master
+                    └─ servers are away or slow, or --once ─▶ [waiting] ──▶ publish ──▶ Published
+"""
 
 import asyncio
 import time
@@ -46,17 +50,23 @@ class Publisher:
 
     def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
         self._topics = ResultTopics(settings, deployment)
+        # Results that could not be published at once. While `_draining`, later ones join them, so that all stay in
+        # order: until the topics are advertised, and then until the queue is empty.
         self._waiting: asyncio.Queue[Publish] = asyncio.Queue(RESULTS_DEPTH)
+        self._draining = True
+        # Set by the master's `Begin`: the only result must be seen on the wire, or be an error.
         self._once = False
-        self._draining = True  # set until the topics are advertised, and then until the queue is empty
         self._link = link(self._take)
         self._deployment = deployment
         self._logs_frames = settings.log_level == "debug"
         self._log = get_logger(ROLE, settings.log_level)
         self._settings = settings
+        # The sentence about topics and servers once they are advertised; empty before.
         self._where = ""
+        # For the status: outcomes so far, and the last published frame's number and time (monotonic, ns).
         self._outcomes: Counter[Outcome] = Counter()
         self._last = (0, 0)
+        # By topic, why the server does not pass it on, as of the last check.
         self._refused: dict[str, str] = {}
 
     def status(self) -> ProcessStatus:

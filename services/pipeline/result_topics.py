@@ -50,9 +50,12 @@ class ResultTopics:
         self._ros_version: Literal[1, 2] = 2
         self._deployment = deployment
         self._layout = posterior_layout(deployment)
+        # From `opened` on: each output with its server, and the topic of reports on the first server.
         self._outputs: list[tuple[Ros, Publication]] = []
         self._frames: Publication | None = None
+        # The subscription to the first output, in a run of one frame.
         self._watched: Subscription | None = None
+        # A report precedes its result, so it contains how long the previous result took to send.
         self._previous_out_ns = 0
         self.rosbridges: dict[str, Ros] = {}
         self.advertised: list[AdvertisedTopic] = []
@@ -158,6 +161,7 @@ class ResultTopics:
         )
         posterior = inference.posterior
         missed = 0
+        # one write of the socket for both, so that they arrive together
         with self._outputs[0][0].together():
             reported = self._frames is not None and _sent(
                 self._frames, write_frame_report(report, self._ros_version)

@@ -225,7 +225,9 @@ class Subscriber:
         )
         self._subscriptions.append(subscription)
         timeout = self._settings.first_data_timeout
+        # Before the first message, silence is an error of the deployment or of the robot; later it is waited out.
         first, silent = True, False
+        # Number of the connection whose backlog was skipped, and messages lost in the queue that were counted.
         connection: int | None = None
         lost_before = 0
         while True:
@@ -263,6 +265,7 @@ class Subscriber:
             )
         except VariableError as error:
             self._unusable += 1
+            # the master warns once for each cause; the sentence may contain the value, which differs each time
             cause = f"{type(error.__cause__).__name__} {at}"
             self._link.send(Unusable(cause, str(error)))
             return
@@ -298,6 +301,7 @@ class Subscriber:
                 f"frames go on without {topic}: it brought nothing within {self._deployment.tolerance_s:g} s of the others",
             )
         self._last_tick = reading.received_tick
+        # a master that reads slowly gets the newest readings, not all of them late
         if self._link.backlog > _BACKLOG_LIMIT and not self._queue_all:
             self._passed_over += 1
             return

@@ -37,10 +37,13 @@ class Stamped(Generic[Item]):
 class _Topic(Generic[Item]):
     """A topic: its unpaired messages, the oldest first, and its last intervals."""
 
+    # Whether every set needs a message of it.
     needed: bool
     waiting: deque[Stamped[Item]] = field(default_factory=deque)
+    # Stamp and receipt of the last message; None before the first one, and the stamp also after a restart of the clock.
     newest: int | None = None
     heard: int | None = None
+    # Between the stamps of consecutive messages; a repeated or older stamp adds none.
     intervals: deque[int] = field(default_factory=lambda: deque(maxlen=_INTERVALS))
 
     @property
@@ -88,9 +91,10 @@ class Synchroniser(Generic[Item]):
         self.absent: list[int] = []
         self._topics: list[_Topic[Item]] = [_Topic(each) for each in needed]
         self._tolerance = tolerance_ns
+        # Receipt of the first message of all: a topic that has not spoken since counts as silent from then on.
         self._begun: int | None = None
+        # If no topic is needed: the stamp up to which messages are too late for a set of their own.
         self._done = -1
-        """Stamp up to which messages are too late for a new set, if no topic is needed."""
 
     def add(self, at: int, stamp: int, tick: int, item: Item) -> None:
         """Add a message of the topic with index `at`."""
@@ -98,12 +102,14 @@ class Synchroniser(Generic[Item]):
             self._begun = tick
         topic = self._topics[at]
         if topic.newest is not None:
+            # a smaller step back is disorder between the publishers of one topic
             if stamp < topic.newest - self._tolerance:
                 self._restart()
             elif stamp > topic.newest:
                 topic.intervals.append(stamp - topic.newest)
         topic.newest, topic.heard = stamp, tick
         if len(topic.waiting) == DEPTH:
+            # the other topics are silent, or their stamps far away
             self._drop(topic, 1)
         topic.waiting.append(Stamped(stamp, tick, item))
 
@@ -112,6 +118,8 @@ class Synchroniser(Generic[Item]):
         self.deadline = None
         while (found := self._pivot()) is not None:
             at, pivot = found
+            # what is older than the pivot's reach can be in no later set either; without a needed message, the next
+            # pivot is another one
             needed_are_there = True
             for topic in self._topics:
                 stale = sum(each.stamp < pivot.stamp - self._tolerance for each in topic.waiting)
@@ -140,6 +148,7 @@ class Synchroniser(Generic[Item]):
         if not all(topic.waiting for topic in needed):
             return None
         if not needed:
+            # the rest of an instant whose set is out
             for topic in self._topics:
                 self._drop(topic, sum(each.stamp <= self._done for each in topic.waiting))
         heads = [
@@ -151,6 +160,7 @@ class Synchroniser(Generic[Item]):
         return choose(heads, key=lambda head: head[1].stamp, default=None)
 
     def _set(self, at: int, pivot: Stamped[Item], tick: int) -> dict[int, Item] | None:
+        # beyond half a period, a message is nearer to another one of the pivot's topic
         own_period = self._topics[at].period
         half = self._tolerance if own_period is None else min(self._tolerance, own_period // 2)
         chosen = {at: pivot}

@@ -26,6 +26,7 @@ def require_pipe(command: str, values: str) -> None:
 def blocking_lines() -> Iterator[tuple[int, bytes]]:
     """Yield non-blank lines of standard input with their numbers, or raise an InputLineError for a long one."""
     number = 0
+    # one byte more than permitted tells a line that is too long from one that just fits
     while line := sys.stdin.buffer.readline(LINE_LIMIT + 1):
         number += 1
         if len(line) > LINE_LIMIT:
@@ -37,7 +38,8 @@ def blocking_lines() -> Iterator[tuple[int, bytes]]:
 async def lines() -> AsyncIterator[tuple[int, bytes]]:
     """Yield the lines of `blocking_lines` without blocking the loop, so that a signal ends the wait."""
     kind = os.fstat(sys.stdin.fileno()).st_mode
-    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)):  # the loop supports only pipes; files never block
+    # the loop supports only pipes, and files never block
+    if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)):
         for each in blocking_lines():
             yield each
         return

@@ -45,6 +45,7 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
         for number, line in blocking_lines():
             reading = reading_from_line(line, number)
             codes = np.array(reading.prior_codes, "<u2").tobytes()
+            # as the master chooses it, so that the same readings give the same counts
             frame = Frame(number, reading.addresses, number % banks, codes)
             try:
                 output = boards.run(frame)

@@ -52,6 +52,7 @@ def result_from_line(
     expected = f"a result of pcie-app or an array of {count} probabilities"
     value = decoded(line, number, _Line, expected)
     found = len(value) if isinstance(value, list) else sum(len(board.counts) for board in value.boards)
+    # a model with as many results as another one cannot be told from it: a line has no deployment
     if found != count:
         raise InputLineError(f"{where} has {found} values; expected {expected}")
     if isinstance(value, list):
@@ -97,6 +98,7 @@ async def publish_lines(settings: Settings, deployment: Deployment) -> int:
                 outcomes[Outcome.PUBLISHED] += 1
                 continue
             result, stamp_ns = value
+            # the reading was received elsewhere, so the times of its frame begin here
             now, tick = time.time_ns(), time.monotonic_ns()
             published = await topics.publish(Publish(result, stamp_ns or now, now, tick, tick, 0), look=False)
             outcomes[published.outcome] += 1

@@ -53,6 +53,7 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
             source.topic, source.type, queue_size=RECEIVED_QUEUE, max_bytes=settings.topic_bytes
         )
         say(f"listening on {source.topic} at {source.uri}")
+        # cancelled by the first message
         hint = asyncio.ensure_future(report_unpublished(ros, source.topic, _warn))
         printed = 0
         try:
@@ -78,6 +79,7 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
         VariableError: A variable is missing or unusable.
     """
     frames = FrameAssembler(deployment)
+    # One queue for all topics, so that readings are formed in the order of arrival by one task.
     arrived: asyncio.Queue[tuple[int, Message]] = asyncio.Queue(RECEIVED_QUEUE)
 
     async def next_readings() -> list[Reading]:

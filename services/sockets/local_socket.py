@@ -40,6 +40,7 @@ class RecordSplitter:
 
     def __init__(self, peer: str) -> None:
         self._peer = peer
+        # The begin of a record whose end has not arrived; bounded, because a long one is refused by its length.
         self._pending = bytearray()
 
     def feed(self, data: bytes) -> list[AnyRecord]:
@@ -50,6 +51,7 @@ class RecordSplitter:
         at = 0
         while len(pending) - at >= _LENGTH.size:
             (length,) = _LENGTH.unpack_from(pending, at)
+            # before any of it is stored
             if length > MAX_RECORD:
                 raise LocalSocketError(
                     f"{self._peer} announced a record of {length} bytes; the maximum is {MAX_RECORD}, so it is not a rosbayes service"
@@ -106,10 +108,12 @@ class RecordProtocol(asyncio.Protocol):
         on_close: Callable[[RecordProtocol, Exception | None], None],
     ) -> None:
         self.where = where
+        # The functions get this connection, because its owner may already have the next one.
         self._splitter = RecordSplitter(where)
         self._on_record = on_record
         self._on_open = on_open
         self._on_close = on_close
+        # While the connection is open; and the error of this side that closes it, which `on_close` gets.
         self._transport: asyncio.Transport | None = None
         self._failure: Exception | None = None
 

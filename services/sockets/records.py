@@ -1,5 +1,19 @@
 """Records between the services.
 
+    subscriber            master                pcie-app             publisher
+        │ ◀───── Hello ─────▶ │ ◀────── Hello ──────▶ │                    │
+        │                     │ ◀─────────────── Hello ──────────────────▶ │
+        │ ────── Ready ─────▶ │ ◀────── Ready ─────── │                    │
+        │                     │ ◀─────────────── Ready ─────────────────── │
+        │ ◀───── Begin ────── │ ──────────────── Begin ──────────────────▶ │
+        │ ───── Reading ────▶ │ ─────── Frame ──────▶ │                    │
+        │                     │ ◀─── FrameResult ──── │                    │
+        │                     │ ─────────────── Publish ─────────────────▶ │
+        │                     │ ◀────────────── Published ──────────────── │
+
+Any service may send `Notice` at any time, and `Trouble` before it ends. `Unusable` replaces a reading, and
+`FrameFailed` a result.
+
 Every record is a MessagePack array whose first element is its tag. Fields `*_ns` are Unix times; fields
 `*_tick` are times of the machine's monotonic clock, comparable between its processes.
 """
@@ -53,6 +67,7 @@ class FailureReason(StrEnum):
     """A board that failed an earlier frame is not back yet."""
 
 
+# Arrays are shorter than maps and faster to decode. New fields go to the end, with a default.
 class Record(msgspec.Struct, array_like=True, frozen=True):
     """Base class of all records."""
 
@@ -198,6 +213,7 @@ class Published(Record, tag="published", frozen=True):
     out_ns: int = 0
 
 
+# What a decoder accepts, by tag; any other bytes are an error of the connection.
 AnyRecord = (
     Hello
     | Begin

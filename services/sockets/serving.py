@@ -125,6 +125,7 @@ class MasterLink(Link):
             self._server.close()
         if self._master is not None:
             self._master.close()
+            # the transport closes its socket in the next turn of the loop
             await asyncio.sleep(0)
         if self._listener is not None:
             remove_listener(self._endpoint, self._listener)
@@ -133,7 +134,8 @@ class MasterLink(Link):
 
     def _open(self, protocol: RecordProtocol) -> None:
         if self._master is not None:
-            return  # refuse it after its hello, because a record sent before might never be read
+            # it is refused after its hello, because a record sent before might never be read
+            return
         self._master = protocol
         self._greeted = False
         protocol.send(own_hello(self._role, self._deployment.hash))
@@ -155,6 +157,7 @@ class MasterLink(Link):
                 check_hello(record, "master", self._deployment.hash, f"{self._role} at {self._endpoint}")
             except OtherPeerError as error:
                 protocol.send(Trouble(error.exit_code, str(error)))
+                # a restart, by who started this service, gives it the deployment that the master has
                 self._outdated = outdated(self._deployment, record)
                 if self._outdated is not None and self._service is not None:
                     self._service.cancel()

@@ -36,6 +36,7 @@ def end_with_parent() -> None:
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None or not parent.isdigit():
         return
+    # the last child to exit removes what a killed master has left
     atexit.register(leave_private_directory)
     ask_for_end_with_parent()
     # the parent may have exited before the request to the kernel

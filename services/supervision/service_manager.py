@@ -16,14 +16,17 @@ class ServiceManager:
 
     def __init__(self) -> None:
         """Take the variables of the service manager out of the environment: they do not concern children."""
+        # Its datagram socket; empty without a service manager.
         self._address = os.environ.pop(_SOCKET, "")
         if self._address.startswith("@"):  # an abstract socket
             self._address = "\0" + self._address[1:]
         microseconds, pid = (os.environ.pop(name, "") for name in _WATCHDOG)
         is_number = microseconds.isascii() and microseconds.isdigit() and len(microseconds) < 20
+        # the watchdog may be meant for another process, such as the one that started this one
         expected = pid in {"", str(os.getpid())} and is_number
         self.watchdog_s: float = int(microseconds) / 1e6 if expected else 0.0
         """Seconds within which it expects a sign of life; 0 if it expects none."""
+        # What it has accepted: readiness is sent once, a status when it changes, and both again if its queue was full.
         self._ready = False
         self._status = ""
 

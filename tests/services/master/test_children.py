@@ -4,8 +4,8 @@ import asyncio
 import contextlib
 from types import SimpleNamespace
 
-from services.master import children
-from services.master.children import ChildrenWatch
+from services.master import run
+from services.master.run import ChildrenWatch
 from services.sockets.reporting import STUCK_S, serve_status
 from services.sockets.status import ProcessStatus
 from tests.patience import PATIENCE
@@ -23,9 +23,9 @@ class Peers(list):
 
 async def test_a_child_that_does_not_answer_is_noticed(tmp_path, monkeypatch):
     now, well = [0.0], [True]
-    monkeypatch.setattr(children, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    monkeypatch.setattr(children, "ASK_EVERY", 0.0)
-    monkeypatch.setattr(children, "_ANSWER_TIME", PATIENCE)
+    monkeypatch.setattr(run, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(run, "ASK_EVERY", 0.0)
+    monkeypatch.setattr(run, "_ANSWER_TIME", PATIENCE)
     process = SimpleNamespace(is_running=True)
     peers = Peers(
         [SimpleNamespace(role="subscriber", child=process), SimpleNamespace(role="publisher", child=None)]
