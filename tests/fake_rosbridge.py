@@ -98,6 +98,7 @@ class FakeRosbridge:
         zombies: bool = False,
         escapes: bool = False,
         silent: bool = False,
+        delay: float = 0.0,
         refuses: int | None = None,
         max_size: int | None = None,
     ) -> None:
@@ -109,7 +110,7 @@ class FakeRosbridge:
         self.zombies = zombies
         self.escapes = escapes
         self.silent = silent
-        self.delay = 0.0
+        self.delay = delay
         self.refuses = refuses
         self.max_size = max_size
         self.received: list[Received] = []
