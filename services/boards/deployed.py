@@ -9,7 +9,7 @@ from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, read_image
 from services.boards.frames import BoardAwayError, driver_input
 from services.settings import Settings
-from services.sockets.records import Frame
+from services.sockets.records import FrameRequest
 from services.sockets.status import BoardStatus
 from toolchain.deployment import Deployment
 
@@ -76,7 +76,7 @@ class DeployedBoards:
             for at, (endpoint, image) in enumerate(zip(self._endpoints, self._images, strict=True))
         ]
 
-    def run(self, frame: Frame) -> FrameOutput:
+    def run(self, frame: FrameRequest) -> FrameOutput:
         """Compute one frame; a board that fails (a BoardError) is in `gone` until `recover` has reopened it."""
         try:
             return self._whole_cluster().run(self._input(frame))
@@ -84,7 +84,7 @@ class DeployedBoards:
             self.find_lost_boards(error)
             raise
 
-    def post(self, frame: Frame) -> None:
+    def post(self, frame: FrameRequest) -> None:
         """Start a frame, whose result `collect` returns; after a BoardError call `find_lost_boards`."""
         self._whole_cluster().post(self._input(frame))
 
@@ -108,7 +108,7 @@ class DeployedBoards:
             raise BoardAwayError(f"board {board} is not back yet ({why})", board=board)
         return self._cluster
 
-    def _input(self, frame: Frame) -> FrameInput:
+    def _input(self, frame: FrameRequest) -> FrameInput:
         return driver_input(self.deployment, frame, self._settings.stop or self.deployment.machine.stop)
 
     def find_lost_boards(self, error: BoardError) -> None:

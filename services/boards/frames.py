@@ -10,7 +10,7 @@ import numpy.typing as npt
 from machines.parameters import SensorMode
 from pcie_shim.errors import BoardError, FrameInputError
 from pcie_shim.host.frame import BoardResult, FrameInput, FrameOutput
-from services.sockets.records import Addresses, FailureReason, Frame, FrameFailed, FrameResult
+from services.sockets.records import Addresses, FailureReason, FrameFailed, FrameRequest, FrameResult
 from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment, Variable
 
@@ -25,7 +25,7 @@ class BoardAwayError(BoardError):
     """A board that failed an earlier frame is not back yet."""
 
 
-def driver_input(deployment: Deployment, frame: Frame, stop: str) -> FrameInput:
+def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> FrameInput:
     """Return the driver's input for a frame, or raise a FrameInputError; `stop` is `slices` or `own`."""
     machine = deployment.machine
     prior = np.frombuffer(frame.prior_codes, "<u2") if frame.prior_codes else None

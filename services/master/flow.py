@@ -25,8 +25,8 @@ from services.settings import Settings
 from services.sockets.records import (
     AnyRecord,
     FailureReason,
-    Frame,
     FrameFailed,
+    FrameRequest,
     FrameResult,
     LossReason,
     Notice,
@@ -242,7 +242,7 @@ class FrameFlow:
         reading, number = waiting.reading, self._number
         bank = number % self._deployment.machine.rng_banks
         self._computing = _Computing(number, waiting, time.monotonic_ns())
-        app.protocol.send(Frame(number, reading.addresses, bank, reading.prior_codes))
+        app.protocol.send(FrameRequest(number, reading.addresses, bank, reading.prior_codes))
         if self._follows:
             self._follow(number, bank, waiting)
 

@@ -1,6 +1,6 @@
 """pcie-app, the only service that drives boards (thesis 3.2, figure 3.3).
 
-    master ──Frame──▶ posted ──the last board is done──────▶ FrameResult ──▶ master
+    master ──FrameRequest──▶ posted ──the last board is done──────▶ FrameResult ──▶ master
                         └──a board fails──▶ lost boards are found ──▶ FrameFailed ──▶ master
 
 One frame is on the boards at a time. Slow work (opening boards, finding lost ones, recovering them) runs in a
@@ -19,7 +19,7 @@ from pcie_shim.host.frame import FrameOutput
 from services.boards.deployed import TICK, DeployedBoards
 from services.boards.frames import frame_failed, result_record
 from services.settings import Settings
-from services.sockets.records import AnyRecord, Frame, LossReason, Notice, Ready, Record
+from services.sockets.records import AnyRecord, FrameRequest, LossReason, Notice, Ready, Record
 from services.sockets.reporting import serve_status
 from services.sockets.serving import MakeLink, report_failure
 from services.sockets.status import FrameCounts, ProcessStatus, reasons, seconds_since
@@ -42,7 +42,7 @@ class PcieApp:
         self._posted: tuple[int, int] | None = None
         # A frame that came while the boards were busy. A master waits for its result before it sends another one,
         # so the busy frame is that of a former master, or boards are being searched.
-        self._next: Frame | None = None
+        self._next: FrameRequest | None = None
         # While boards are searched after a failure. It and `DeployedBoards.recover` never run together.
         self._searching: asyncio.Task[None] | None = None
         # The descriptor on whose bytes `_collect` is called: that of the last board that is still running.
@@ -106,7 +106,7 @@ class PcieApp:
     # --- a frame -------------------------------------------------------------------------------
 
     def _take(self, record: AnyRecord) -> None:
-        if isinstance(record, Frame):  # other records do not concern boards
+        if isinstance(record, FrameRequest):  # other records do not concern boards
             self._next = record
             self._post_next()
 

@@ -11,7 +11,7 @@ from services.boards.deployed import DeployedBoards
 from services.errors import InputLineError
 from services.pipeline.inference import REASON_WORDS
 from services.pipes.lines import blocking_lines, decoded
-from services.sockets.records import Addresses, Frame
+from services.sockets.records import Addresses, FrameRequest
 from terminal.output import print_json_line, say, say_if_slow
 
 
@@ -46,7 +46,7 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
             reading = reading_from_line(line, number)
             codes = np.array(reading.prior_codes, "<u2").tobytes()
             # as the master chooses it, so that the same readings give the same counts
-            frame = Frame(number, reading.addresses, number % banks, codes)
+            frame = FrameRequest(number, reading.addresses, number % banks, codes)
             try:
                 output = boards.run(frame)
             except FrameInputError as error:

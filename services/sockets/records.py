@@ -6,7 +6,7 @@
         │ ────── Ready ─────▶ │ ◀────── Ready ─────── │                    │
         │                     │ ◀─────────────── Ready ─────────────────── │
         │ ◀───── Begin ────── │ ──────────────── Begin ──────────────────▶ │
-        │ ───── Reading ────▶ │ ─────── Frame ──────▶ │                    │
+        │ ───── Reading ────▶ │ ─── FrameRequest ───▶ │                    │
         │                     │ ◀─── FrameResult ──── │                    │
         │                     │ ─────────────── Publish ─────────────────▶ │
         │                     │ ◀────────────── Published ──────────────── │
@@ -150,7 +150,7 @@ class Unusable(Record, tag="unusable", frozen=True):
     sentence: str
 
 
-class Frame(Record, tag="frame", frozen=True):
+class FrameRequest(Record, tag="frame", frozen=True):
     """Master to pcie-app: compute this frame. `number` increases from 1 for each master."""
 
     number: int
@@ -223,7 +223,7 @@ AnyRecord = (
     | Trouble
     | Reading
     | Unusable
-    | Frame
+    | FrameRequest
     | FrameResult
     | FrameFailed
     | Publish

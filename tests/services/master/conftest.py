@@ -8,7 +8,7 @@ import pytest
 from services.master.peers import Peer
 from services.master.run import Master
 from services.settings import Settings
-from services.sockets.records import Frame, Reading
+from services.sockets.records import FrameRequest, Reading
 
 
 class Service:
@@ -24,7 +24,7 @@ class Service:
 
     @property
     def frames(self):
-        return [each.number for each in self.records if isinstance(each, Frame)]
+        return [each.number for each in self.records if isinstance(each, FrameRequest)]
 
     def send(self, record):
         if not self.takes:

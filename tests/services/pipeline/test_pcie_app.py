@@ -1,6 +1,6 @@
 """pcie-app between a master and boards that the test controls.
 
-link.take(Frame) ──▶ PcieApp ──▶ Boards.post;  Boards.finish() ──▶ PcieApp ──▶ link.sent
+link.take(FrameRequest) ──▶ PcieApp ──▶ Boards.post;  Boards.finish() ──▶ PcieApp ──▶ link.sent
 """
 
 import asyncio
@@ -14,7 +14,15 @@ from services.boards.frames import BoardAwayError
 from services.pipeline import pcie_app
 from services.pipeline.pcie_app import PcieApp
 from services.settings import Settings
-from services.sockets.records import FailureReason, Frame, FrameFailed, FrameResult, Notice, Ready, Trouble
+from services.sockets.records import (
+    FailureReason,
+    FrameFailed,
+    FrameRequest,
+    FrameResult,
+    Notice,
+    Ready,
+    Trouble,
+)
 from tests.patience import PATIENCE
 
 OUTPUT = SimpleNamespace(boards=[], compute_ns=2)
@@ -101,7 +109,7 @@ async def stage(link, monkeypatch):
 
 
 def frame(number):
-    return Frame(number, [1], 0)
+    return FrameRequest(number, [1], 0)
 
 
 async def test_a_frame_is_computed(stage):

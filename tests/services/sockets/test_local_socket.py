@@ -19,7 +19,7 @@ from services.sockets.local_socket import (
     encode_record,
     own_hello,
 )
-from services.sockets.records import VERSION, Frame, FrameResult, Hello, Notice
+from services.sockets.records import VERSION, FrameRequest, FrameResult, Hello, Notice
 
 
 def raw(value) -> msgspec.Raw:
@@ -29,7 +29,10 @@ def raw(value) -> msgspec.Raw:
 small = st.integers(0, 2**40)
 records = st.one_of(
     st.builds(
-        Frame, number=small, addresses=st.lists(st.none() | st.integers(0, 2**16), max_size=40), bank=small
+        FrameRequest,
+        number=small,
+        addresses=st.lists(st.none() | st.integers(0, 2**16), max_size=40),
+        bank=small,
     ),
     st.builds(Notice, level=st.text(max_size=9), sentence=st.text(max_size=99)),
     st.builds(
