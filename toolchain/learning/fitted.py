@@ -222,9 +222,8 @@ def _read_tables(path: Path) -> Fit:
         with open_regular(path, ModelError, MAX_BYTES) as packed, zipfile.ZipFile(packed) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
                 raise ModelError(f"{path} is larger than {MAX_BYTES} bytes, unpacked; this is the maximum")
-            # files of earlier versions have the names of the fields, in the plural
             content = json.loads(_member(archive, _META, _MAX_META_BYTES))
-            file = FitFile.model_validate(content, by_alias=True, by_name=True)
+            file = FitFile.model_validate(content, by_alias=True, by_name=False)
             counted = file.variables if file.method == "counts" else ()
             tables = {
                 variable.name: _array(archive, f"table{number}.npy")

@@ -1,18 +1,164 @@
-"""Accuracy: figures that can be computed by hand, and intervals with the stated coverage."""
+"""Accuracy beside hand-computed figures, the emulation of boards, and readings drawn or recorded."""
 
 import numpy as np
 import pytest
 
-from machines.bm1 import BM1Machine
+from machines.bm1 import BM1Machine, Start, StopReason, first_slice
 from machines.parameters import BM1Parameters
+from machines.reference import ReferenceBM1
 from tests.toolchain.corridor import corridor, machine_of
 from toolchain.analysis.accuracy import _difference, _line_probabilities, bootstrap, measure, share_of_frames
-from toolchain.analysis.emulation import EmulatedBoards
-from toolchain.analysis.readings import MISSING, Readings, sample_readings
+from toolchain.analysis.emulation import EmulatedBoards, joined
+from toolchain.analysis.readings import (
+    MISSING,
+    Readings,
+    model_of_codes,
+    reading_columns,
+    recorded_readings,
+    sample_readings,
+)
 from toolchain.building.machine import split
 from toolchain.deployment import Stop
-from toolchain.errors import ModelError
+from toolchain.errors import BuildError, ModelError
 from toolchain.models.model import Known, Model, dimension, exact_posterior
+
+MACHINE = machine_of(corridor(13, sigma=0.7))
+
+
+def test_boards_split_and_joined():
+    parts = split(MACHINE, 4)
+    assert [part.parameters.lines for part in parts] == [4, 3, 3, 3]
+    assert joined(parts) == MACHINE
+
+
+@pytest.mark.parametrize("address", [(9, 0), (9, 1), (20, 1)])
+def test_slices_are_those_of_the_reference(address):
+    target, limit = 200, 3000
+    parts = split(MACHINE, 3)
+    boards = EmulatedBoards(parts, target_count=target, max_cycles=limit, stop=Stop.SLICES)
+    for bank in (0, 3):
+        ran = boards.run(address, 0, bank)
+        kernels = [ReferenceBM1(part) for part in parts]
+        end = first_slice(target)
+        for kernel in kernels:
+            kernel.start(
+                Start(addresses=address, target_count=target, max_cycles=limit, bank=bank, run_until=end)
+            )
+        while not any(kernel.reason is StopReason.OVERFLOW for kernel in kernels):
+            left = [kernel for kernel in kernels if kernel.reason is StopReason.SLICE]
+            if not left:
+                break
+            end *= 2
+            for kernel in left:
+                kernel.resume(end if end < limit else 0)
+        assert ran.cycles == tuple(kernel.cycles for kernel in kernels)
+        assert ran.reasons == tuple(kernel.reason for kernel in kernels)
+        assert [counts.tolist() for counts in ran.counts] == [kernel.counts.tolist() for kernel in kernels]
+
+
+def test_own_stops_each_board_by_itself():
+    boards = EmulatedBoards(split(MACHINE, 2), target_count=255, max_cycles=100_000, stop=Stop.OWN)
+    ran = boards.run((2, 1), 0, 0)
+    assert ran.reasons[0] is StopReason.OVERFLOW
+    assert ran.cycles[0] != ran.cycles[1]
+    assert ran.length == max(ran.cycles)
+    posterior = ran.posterior
+    assert posterior is not None
+    assert posterior.sum() == pytest.approx(1)
+
+
+def test_a_run_of_a_given_length_is_stopped_by_no_counter():
+    boards = EmulatedBoards([MACHINE], target_count=3, max_cycles=100, stop=Stop.OWN)
+    ran = boards.run_for((2, 1), 0, 0, 5000)
+    assert ran.cycles == (5000,)
+    assert ran.counts[0].max() > 255
+
+
+def test_limits_that_make_no_sense():
+    with pytest.raises(BuildError, match="256"):
+        EmulatedBoards([MACHINE], target_count=256, max_cycles=10, stop=Stop.OWN)
+    with pytest.raises(BuildError, match="max_cycles"):
+        EmulatedBoards([MACHINE], target_count=5, max_cycles=0, stop=Stop.OWN)
+
+
+def test_readings_are_drawn_as_the_model_says():
+    model = corridor(4, sigma=2.0)
+    readings = sample_readings(model, 20_000, seed=3)
+    for column, known in enumerate(model.known):
+        expected = known.table @ model.prior_distribution
+        found = np.bincount(readings.addresses[:, column], minlength=known.values) / len(readings)
+        assert np.abs(found - expected).max() < 5 * np.sqrt(0.25 / 20_000)
+    assert (readings.prior_addresses == MISSING).all()
+    again = sample_readings(model, 20_000, seed=3)
+    assert np.array_equal(again.addresses, readings.addresses)
+    assert not np.array_equal(sample_readings(model, 20_000, seed=4).addresses, readings.addresses)
+
+
+def test_readings_depend_on_the_selected_prior():
+    readings = sample_readings(corridor(select=True), 3000, seed=1)
+    near, far = (readings.addresses[readings.prior_addresses == row, 0].mean() for row in (0, 1))
+    assert near + 5 < far
+
+
+def test_a_frame_for_the_model_and_for_the_machine():
+    model = corridor(select=True, missing=True)
+    machine = machine_of(model)
+    readings = sample_readings(model, 2, seed=1)
+    readings.addresses[1, 0] = MISSING
+    readings.prior_addresses[1] = MISSING
+    assert readings.of_model(1) == ((None, int(readings.addresses[1, 1])), None)
+    addresses, row = readings.of_machine(1, machine)
+    assert addresses == (machine.parameters.missing_address(1), int(readings.addresses[1, 1]))
+    assert row == 3  # the top one: the prior without a selection
+    assert readings.of_machine(0, machine)[1] == readings.of_model(0)[1]
+
+
+@pytest.mark.parametrize("select", [False, True])
+def test_a_model_is_found_again_in_its_codes(select):
+    model = corridor(select=select)
+    found = model_of_codes("again", model.searched, model.variables, machine_of(model, prob_bits=16))
+    for ours, theirs in zip(found.known, model.known, strict=True):
+        assert 0.5 * np.abs(ours.table - theirs.table).sum(axis=0).max() < 0.06
+    assert np.abs(found.prior_distribution - model.prior_distribution).max() < 1e-3
+    assert (found.prior_select is not None) == select
+
+
+def test_recorded_readings(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text(
+        "t,range_m,loud\n" + "".join(f"{i},{i / 2},{i % 2}\n" for i in range(15)) + "15,,1\n16,1,7\n"
+    )
+    model = corridor()
+    readings = recorded_readings(path, model.variables, ["range=range_m", "loud=loud"], frames=100)
+    assert readings.addresses.tolist() == [[i, i % 2] for i in range(15)]
+    assert readings.source.startswith("15 of 17 rows of run.csv, ")
+    assert "range" in readings.source
+    spread = recorded_readings(path, model.variables, ["range=range_m", "loud=loud"], frames=3)
+    assert spread.addresses[:, 0].tolist() == [0, 8]  # the last row is refused
+    alone = recorded_readings(path, corridor(missing=True).variables, ["range=range_m"], frames=100)
+    assert (alone.addresses[:, 1] == MISSING).all()
+
+
+def test_what_a_recording_may_not_be(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text("range,loud\n9,7\n")
+    variables = corridor().variables
+    with pytest.raises(ModelError, match="loud: 7"):
+        recorded_readings(path, variables, [], frames=5)
+    with pytest.raises(BuildError, match="--frames is 0"):
+        recorded_readings(path, variables, [], frames=0)
+    with pytest.raises(BuildError, match="--reading sonar"):
+        recorded_readings(path, variables, ["sonar=a"], frames=5)
+
+
+def test_patterns_of_columns():
+    names = ["range_1", "range_12", "bearing_1"]
+    assert reading_columns(names, []) == {name: name for name in names}
+    assert reading_columns(names, ["range_*=r*_m", "bearing_1=b"]) == {
+        "range_1": "r1_m",
+        "range_12": "r12_m",
+        "bearing_1": "b",
+    }
 
 
 def boards_of(machine, count=1, *, target=255, limit=2**15, stop=Stop.SLICES):

@@ -8,7 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,11 +17,10 @@ from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.corridor import corridor
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis.logic import DEVICES
-from toolchain.analysis.results import Point, Results, check_pictures_possible, pareto
+from toolchain.analysis.results import Point, Results, pareto
 from toolchain.analysis.sweep import Frames, Sweep, run_sweep, run_task, tasks
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
-from toolchain.models.model import Known, Model, dimension
 
 D8 = DEVICES["proce-v-d8"]
 
@@ -82,19 +80,6 @@ def test_keys_name_what_the_figures_depend_on():
     assert len(everything) == 2 * 4 * (2 + 1 + 1)
     for each in (first, keys(**columns), keys(**cell), keys(**threshold), keys(replicas=(2,))):
         assert set(each) < set(everything)
-
-
-def test_keys_are_those_of_older_files():
-    """A file of results that was begun before machines had replicas is gone on with."""
-    model = Model(
-        name="m",
-        searched=(dimension("s", size=2),),
-        known=(Known(name="k", table=np.array([[0.75, 0.25], [0.25, 0.75]])),),
-    )
-    found = tasks(model, sweep(prob_bits=(8,), target_counts=(15,)), Frames(model, 5, seed=1), D8)
-    assert [task.key for task in found] == [
-        "bad1e94345aea384a7ae6766e4c80ed994df62360984350b021d98f9b80fe967"
-    ]
 
 
 def test_a_machine_that_two_combinations_make_is_one():
@@ -160,14 +145,6 @@ def test_what_is_not_on_the_front_is_beaten_by_what_is(figures):
         beaten = any(other != own and all(a <= b for a, b in zip(other, own, strict=True)) for other in best)
         assert beaten == (each.key not in front)
     assert pareto([point(1, None)]) == []
-
-
-def test_a_network_is_explored_too(network):
-    question = ["--searched", "grass", "--known", "shoes"]
-    lists = ["--prob-bits", "8", "--targets", "15", "--rngs", "lfsr16,table", "--scales", "none"]
-    result = done(run(network, *question, *lists))
-    assert "none     table" in result.stdout
-    assert_refused(run(network.parent, *question), "--searched")
 
 
 def test_the_command(case):
@@ -241,14 +218,6 @@ def test_an_unwritable_file_is_refused_before_anything_is_measured(case, option,
     assert_refused(result, case.parent / name)
     results = case.parent / "r.jsonl"
     assert not results.exists() or not results.stat().st_size
-
-
-def test_looking_whether_a_picture_can_be_written_leaves_nothing(tmp_path):
-    pytest.importorskip("matplotlib")
-    (tmp_path / "old.png").write_bytes(b"a picture")
-    check_pictures_possible(tmp_path / "old.png")
-    check_pictures_possible(tmp_path / "new.png")
-    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"a picture"]
 
 
 @pytest.mark.parametrize(

@@ -63,8 +63,6 @@ def test_registers_are_counted_exactly():
     "more",
     [
         {"lines": 2048},
-        {"prob_bits": 12},
-        {"counter_bits": 16},
         {"sensor_bits": (7, 7, 7, 9, 9, 9, 9)},
         {"shared": False},
         {"rng": RngKind.TABLE, "steps_per_clock": 1},

@@ -102,7 +102,6 @@ def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
 @pytest.mark.parametrize(
     "changes",
     [
-        {"partitions": 0},
         {"partitions": 26},
         {"interface": (1, 1200)},
         {"interface": (2, 24)},
@@ -112,15 +111,10 @@ def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
         {"prob_bits": 8, "rng": RngKind.LFSR8},
         {"rng_table": np.arange(4, dtype=np.uint32)},
         {"target_count": 256},
-        {"target_count": 0},
-        {"max_cycles": 0},
-        {"counter_bits": 0},
-        {"rng_banks": 0},
         {"uri": "turtle:9090"},
         {"topic": ""},
         {"type": "Float64"},
         {"output": "/a b"},
-        {"output": "results"},
         {"tolerance_s": -1.0},
     ],
 )

@@ -1,4 +1,4 @@
-"""Codes and their loss, against loops that follow machines.md word for word."""
+"""Codes and their loss, and the division of lines among boards."""
 
 import math
 from dataclasses import replace
@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 
 from machines.encode import decode_code, encode_probability
 from machines.errors import ParameterError
+from toolchain.building.machine import partition_lines
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale
+from toolchain.errors import BuildError
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, dimension
 
@@ -148,3 +150,21 @@ def test_codes_of_one_bit_hold_no_floor():
 def test_codes_that_no_machine_has(prob_bits):
     with pytest.raises(ParameterError):
         with_floor(0.0, prob_bits)
+
+
+@given(st.data())
+def test_blocks_cover_all_lines_in_order(data):
+    lines = data.draw(st.integers(1, 5000))
+    count = data.draw(st.integers(1, min(lines, 50)))
+    blocks = partition_lines(lines, count)
+    assert [line for block in blocks for line in range(block.offset, block.end)] == list(range(lines))
+    sizes = [block.lines for block in blocks]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes.count(lines // count + 1) == lines % count
+    assert len(blocks) == count
+
+
+@pytest.mark.parametrize("count", [0, -1, 5])
+def test_what_cannot_be_split(count):
+    with pytest.raises(BuildError, match="expected 1 to 4 partitions"):
+        partition_lines(4, count)

@@ -8,7 +8,7 @@ from bridge.errors import PathError
 from bridge.fields import parse_path
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.building.options import read_sources
-from toolchain.deployment import Variable, deployment_hash, load_deployment, write_deployment
+from toolchain.deployment import Variable, load_deployment
 from toolchain.deployment.sections import MESSAGE_PATH
 from toolchain.errors import BuildError
 
@@ -82,16 +82,6 @@ def test_a_build_from_several_topics(tmp_path, written):
     assert {each.compression for each in load_deployment(tmp_path / "out").sources} == {"none"}
 
 
-def test_a_source_without_compression_has_the_hash_that_it_always_had(tmp_path):
-    done(build(tmp_path, "--uri", "ws://one:9090", "--topic", "/t", "--type", "a/B"))
-    deployment = load_deployment(tmp_path / "out")
-    assert "compression" not in (tmp_path / "out" / "deployment.toml").read_text()
-    source = deployment.sources[0].model_copy(update={"compression": "cbor"})
-    asked = deployment.model_copy(update={"sources": (source,)})
-    assert deployment_hash(asked) == deployment.hash
-    assert write_deployment(tmp_path, asked).sources[0].compression == "cbor"
-
-
 def test_a_prior_of_one_of_them(tmp_path, written):
     text = FILE.replace('type = "sensor_msgs/Imu"', 'type = "a/B"\nprior = "data"')
     flags = ("--sources", str(written(text)), "--uri", "ws://one:9090")
@@ -108,16 +98,12 @@ def test_a_prior_of_one_of_them(tmp_path, written):
         ("near = ", "naer = ", 4),
         ("near = ", "q = ", 4),
         ("left = ", "near = ", 11),
-        ("compression", "compresion", 10),
-        ('"cbor"', '"cbr"', 10),
         ("ranges[3]", "ranges[-3]", 11),
         ("/scan", "scan me", 8),
         ("ws://two:9090", "two:9090", 7),
         ('topic = "/imu"', 'topic = "/scan"', 15),
         ('{ left = "ranges[3]" }', "{}", 11),
         ('variables = { left = "ranges[3]" }\n', "", 14),
-        ("\n[[source]]\n", "\n[[sources]]\n", 6),
-        ("[[source]]", "[[source", 1),
         ("variables = { ", 'prior = "p"\nvariables = { ', 12),
         ('{ near = "range" }', '{ near = "range", turn = "x" }', 13),
     ],

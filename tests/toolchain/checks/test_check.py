@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 from machines.bm1 import Start, StopReason
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
-from tests.toolchain.running import OPTIONS, assert_refused, toolchain
+from tests.toolchain.deployments import boat
+from tests.toolchain.running import OPTIONS, toolchain
 from toolchain.building.build import assemble, build_deployment
 from toolchain.building.machine import plan_machine
-from toolchain.checks.check import check_deployment, check_model
+from toolchain.checks.check import check_deployment, check_model, source_findings
 from toolchain.checks.codes import line_name, reading
 from toolchain.checks.finding import Check, Severity
-from toolchain.deployment import Scale
+from toolchain.deployment import Scale, Source, Variable
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
 from toolchain.outputs.mif import mif_lines
@@ -388,9 +389,28 @@ def test_json_stays_json_when_a_model_prints(case):
     assert result.stderr == "an import\na call\n"
 
 
-def test_a_deployment_by_the_command(deployment, tmp_path):
-    result = toolchain("check", deployment)
-    assert (result.exit_code, result.stdout) == (0, "")
-    for flag, value in (("--prob-bits", 8), ("--set", "a=1")):
-        assert_refused(toolchain("check", deployment, flag, value), f"{flag} ")
-    assert_refused(toolchain("check", tmp_path), tmp_path)
+def deployment_of(*types, tolerance_s):
+    return boat(
+        sources=tuple(Source(uri="ws://a:1", topic=f"/t{at}", type=each) for at, each in enumerate(types)),
+        variables=tuple(Variable(name=f"D{at}", source=at, bits=7, values=101) for at in range(len(types))),
+        tolerance_s=tolerance_s,
+    )
+
+
+@pytest.mark.parametrize(
+    ("types", "tolerance_s", "severity"),
+    [
+        (["std_msgs/msg/Float64"], 0.0, None),
+        (["sensor_msgs/Imu", "sensor_msgs/LaserScan"], 0.0, None),
+        (["std_msgs/msg/Float64", "sensor_msgs/msg/Imu"], 0.05, Severity.NOTE),
+        (["geometry_msgs/Twist", "sensor_msgs/Imu"], 0.05, Severity.NOTE),
+        (["geometry_msgs/TwistStamped", "sensor_msgs/Imu"], 0.05, None),
+        (["std_msgs/Float64", "std_msgs/Float64"], 0.05, None),
+        (["std_msgs/Float64", "std_msgs/Float64"], 0.001, Severity.WARNING),
+    ],
+)
+def test_topics_that_pair_by_receipt(types, tolerance_s, severity):
+    findings = list(source_findings(deployment_of(*types, tolerance_s=tolerance_s)))
+    assert [(each.check, each.severity) for each in findings] == (
+        [(Check.PAIRING, severity)] if severity else []
+    )

@@ -93,10 +93,6 @@ def test_mistakes(case, deployment, arguments, named):
     assert_refused(look(deployment, *[argument.format(case=case) for argument in arguments]), *named)
 
 
-def test_no_deployment(tmp_path):
-    assert_refused(look(tmp_path), tmp_path)
-
-
 def test_a_build_on_a_device_takes_its_own_number_of_boards(case):
     result = build(case, "--device", "proce-v-d8")
     assert "\nAll 12 lines fit one Gidel Proce V D8 (Stratix V GS D8):" in result.stdout

@@ -167,9 +167,7 @@ def test_a_key_of_an_earlier_version_is_to_be_deleted(folder, key):
     assert "delete this line" in refused(folder)
 
 
-@pytest.mark.parametrize(
-    "new", ["format = 2", 'format = "1"', "format = true", "format = 7\nwarp = true", ""]
-)
+@pytest.mark.parametrize("new", ["format = true", "format = 7\nwarp = true", ""])
 def test_another_format_is_reported_before_anything_else(folder, new):
     edit(folder, "format = 1\n", new + "\n")
     refused(folder, DeploymentVersionError)
@@ -182,31 +180,23 @@ def test_another_format_is_reported_before_anything_else(folder, new):
         ("\nname =", "\nnmae =", 4, ("nmae",)),
         ("[machine]", "[mahcine]", 51, ("mahcine",)),
         ("[[source]]", "[[sources]]", 9, ("sources",)),
-        ("rng_banks", "banks", 60, ("machine", "banks")),
         ("prob_bits", "zzzz", 55, ("machine", "zzzz")),
         ('"clamp"', '"clmp"', 23, ("variable", 0, "on_range")),
-        ('"slices"', '"slice"', 66, ("machine", "stop")),
         ('"lfsr32"', '"lfsr64"', 59, ("machine", "rng")),
         ("bits = 9", 'bits = "9"', 31, ("variable", 1, "bits")),
-        ("bits = 9", "bits = 9.0", 31, ("variable", 1, "bits")),
-        ("bits = 9", "bits = true", 31, ("variable", 1, "bits")),
         ("bits = 9", "bits = 17", 31, ("variable", 1, "bits")),
         ("bits = 9\n", "", 26, ("variable", 1, "bits")),
         ('path = "bearings[0]"', 'path = "bearings[0"', 29, ("variable", 1, "path")),
         ("values = 360", "values = 512", 26, ("variable", 1)),
         ("ws://a:9090", "http://a:9090", 10, ("source", 0, "uri")),
-        ("ws://a:9090", "ws://a:90900", 10, ("source", 0, "uri")),
-        ("ws://a:9090", "robot: ", 10, ("source", 0, "uri")),
         ("ws://a:9090", "robot:9090", 10, ("source", 0, "uri")),
         ("ws://a:9090", "ws://[::1", 10, ("source", 0, "uri")),
         ("max_cycles = 131072", f"max_cycles = {2**63}", 65, ("machine", "max_cycles")),
         ("boat_msgs/Sensors", "Sensors", 12, ("source", 0, "type")),
         ("step = 2.0", "step = 0.0", 43, ("searched", 0, "step")),
-        ("step = 2.0", "step = nan", 43, ("searched", 0, "step")),
         ("target_count = 255", "target_count = 256", 51, ("machine",)),
         ("20x1200", "20 by 1200", 54, ("machine", "interface")),
         ("boards/board1.bm", "../board1.bm", 76, ("board", 1, "image")),
-        ("std_msgs/Float64MultiArray", "std_msgs/Float64", 84, ("output", 0, "type")),
         ("[[variable]]", "[[variable", 14, ()),
         ("tolerance_s = 0.05", "tolerance_s = -1", 7, ("tolerance_s",)),
     ],

@@ -113,14 +113,6 @@ def test_mistakes_in_the_file(case, text, line):
     assert "\n" not in str(caught.value)
 
 
-def test_refusals_of_the_file_keep_their_sentence(case):
-    folder = case(
-        "from toolchain.errors import ModelError\ndef model():\n    raise ModelError('size is odd')"
-    )
-    with pytest.raises(ModelError, match=r"^size is odd$"):
-        load_model(folder, {})
-
-
 def test_no_folder_and_no_model(tmp_path):
     with pytest.raises(ModelError, match=r"has no model\.py"):
         load_model(tmp_path, {})

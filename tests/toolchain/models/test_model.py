@@ -1,10 +1,27 @@
-"""A model's parts belong together, or the error says which does not."""
+"""Models, their limits, and exact fusion; symbols and their types."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from toolchain.errors import ModelError
-from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
+from tests.toolchain.running import OPTIONS, refused_within
+from toolchain.building.machine import partition_lines, plan_machine
+from toolchain.errors import BuildError, ModelError
+from toolchain.models.conditional import normal, wrapped_normal
+from toolchain.models.distribution import conditional_normal, potential, table
+from toolchain.models.joint import JointDistribution
+from toolchain.models.model import (
+    Known,
+    Model,
+    PriorSelect,
+    cell_centres,
+    dimension,
+    exact_posterior,
+    fuse,
+    interval,
+)
+from toolchain.models.symbol import IntegerType, IntervalType, LabelType, Symbol
 
 
 def known(name="K", values=3, lines=4, **fields):
@@ -63,7 +80,6 @@ def model_with(**fields):
         lambda: Known(name="K", table=changed((1, 2), 0.4)),
         lambda: Known(name="K", table=changed((1, 2), np.nan)),
         lambda: Known(name="K", table=changed((slice(None), 1), [1.5, -0.5])),
-        lambda: known(name=""),
         lambda: known(name="a\x1b[2J"),
         lambda: known(step=0.0),
         lambda: known(values=65536),
@@ -73,17 +89,12 @@ def model_with(**fields):
         lambda: model_with(searched=(dimension("x", size=2), dimension("x", size=2))),
         lambda: model_with(searched=()),
         lambda: model_with(searched=(dimension("x", size=50_000), dimension("y", size=50_000))),
-        lambda: model_with(name=""),
         lambda: model_with(name="a\nb"),
-        lambda: model_with(name="x" * 201),
         lambda: model_with(name=3),
         lambda: model_with(prior=np.full(3, 1 / 3)),
         lambda: model_with(prior=np.full(4, 0.3)),
         lambda: interval("x", 1, 1, cells=3),
-        lambda: interval("x", 0, 1, cells=0),
-        lambda: dimension("x", size=0),
         lambda: dimension("", size=1),
-        lambda: dimension("a\nb", size=1),
     ],
 )
 def test_refused_parts_of_a_model(make):
@@ -91,9 +102,181 @@ def test_refused_parts_of_a_model(make):
         model_with(known=(make(),))
 
 
-def test_a_notebook_shows_a_model_in_a_line():
-    select = PriorSelect(name="hour", table=np.full((3, 4), 0.25))
-    searched = (dimension("y", size=2), dimension("x", size=2))
-    model = Model(name="m", searched=searched, known=(known("k"),), prior_select=select)
-    assert repr(model) == "Model('m', P(y[2], x[2] | k, hour))"
-    assert "array" not in repr(model.known[0]) + repr(select)
+AXIS = dimension("x", size=5000)
+
+
+def view(*shape):
+    """Return an array of this shape that takes no memory."""
+    return np.broadcast_to(1 / shape[0], shape)
+
+
+def model_of_views(lines, bits):
+    known = Known(name="K", table=np.full((2, 1), 0.5), bits=bits)
+    object.__setattr__(known, "table", view(2, lines))
+    return Model(name="m", searched=(dimension("s", size=lines),), known=(known,), prior=view(lines))
+
+
+def question(lines, *sizes):
+    symbols = [Symbol(f"k{i}", IntegerType(1, size)) for i, size in enumerate(sizes)]
+    searched = Symbol("s", IntegerType(1, lines))
+    factors = [table(each, view(each.size)) for each in (searched, *symbols)]
+    return JointDistribution("j", tuple(factors)).ask([searched], symbols)
+
+
+@pytest.mark.parametrize(
+    "too_large",
+    [
+        lambda: interval("x", 0, 1, cells=10**9),
+        lambda: dimension("x", size=2**24 + 1),
+        lambda: cell_centres(AXIS, AXIS),
+        lambda: normal("K", mean=np.zeros(2), sigma=1, values=10**9),
+        lambda: normal("K", mean=np.zeros(5000), sigma=1, values=2**16 - 1),
+        lambda: wrapped_normal("K", mean=np.zeros(2), sigma=1, values=10**9),
+        lambda: Known(name="K", table=view(2, 10**9)),
+        lambda: PriorSelect(name="K", table=view(10**9, 2)),
+        lambda: Model(name="m", searched=(dimension("s", size=4),), known=(), prior=view(10**9)),
+        lambda: Symbol("n", IntegerType(0, 10**9)),
+        lambda: Symbol("n", IntervalType(0.0, 1.0, 10**9)),
+        lambda: conditional_normal(
+            Symbol("n", IntegerType(0, 9999)), [Symbol("m", IntegerType(0, 9999))], mean=0, sigma=1
+        ),
+    ],
+)
+def test_a_model_part_above_its_limit_is_refused_unmade(too_large):
+    with refused_within(4 << 20, ModelError):
+        too_large()
+
+
+def searched_together(count):
+    """A question for symbols of 16 values each that are joined by one that is summed over."""
+    hidden = Symbol("h", IntegerType(0, 1))
+    symbols = [Symbol(f"s{at}", IntegerType(0, 15)) for at in range(count)]
+    joint = JointDistribution("many", tuple(potential([each, hidden], np.ones((16, 2))) for each in symbols))
+    return joint.ask(symbols[:4] if count == 5 else symbols, symbols[4:] if count == 5 else ())
+
+
+@pytest.mark.parametrize(
+    "too_large", [question(1501, *[10_000] * 20), question(5000, 2, 10_000), searched_together(7)]
+)
+def test_a_question_with_tables_that_are_too_large_is_refused_unmade(too_large):
+    with refused_within(64 << 20, ModelError):
+        too_large.model()
+
+
+def test_codes_that_no_memory_holds_are_refused_before_they_are_made():
+    assert plan_machine(model_of_views(2**14, 16), OPTIONS).parameters.lines == 2**14
+    with pytest.raises(BuildError):
+        plan_machine(model_of_views(2**14 + 1, 16), OPTIONS)
+
+
+def test_a_board_for_every_line_takes_linear_time():
+    assert partition_lines(2**18, 2**18)[-1].end == 2**18
+
+
+def random_model(seed, lines=5, sensors=3, values=4):
+    random = np.random.default_rng(seed)
+    return Model(
+        name="random",
+        searched=(dimension("s", size=lines),),
+        known=tuple(
+            Known(name=f"K{i}", table=random.dirichlet(np.ones(values), size=lines).T) for i in range(sensors)
+        ),
+        prior=random.dirichlet(np.ones(lines)),
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.lists(st.none() | st.integers(0, 3), min_size=3, max_size=3))
+def test_the_product_normalised_and_missing_readings_left_out(seed, addresses):
+    model = random_model(seed)
+    product = model.prior_distribution.copy()
+    for known, address in zip(model.known, addresses, strict=True):
+        if address is not None:
+            product *= known.table[address]
+    assert exact_posterior(model, addresses) == pytest.approx(product / product.sum(), rel=1e-9)
+
+
+def test_it_does_not_underflow():
+    factors = [np.array([1e-300, 2e-300])] * 40
+    assert fuse(np.array([0.5, 0.5]), factors) == pytest.approx([1 / (1 + 2.0**40), 1 / (1 + 2.0**-40)])
+
+
+def test_refused_readings():
+    model = random_model(1)
+    with pytest.raises(ModelError, match="2 readings for the 3 known variables"):
+        exact_posterior(model, [0, 1])
+    with pytest.raises(ModelError, match="K1: address 4 is not one of its 4"):
+        exact_posterior(model, [0, 4, 0])
+    with pytest.raises(ModelError, match="impossible on every line"):
+        fuse(np.array([1.0, 0.0]), [np.array([0.0, 1.0])])
+
+
+def numbers(type_):
+    return Symbol("s", type_).values().tolist()
+
+
+@pytest.mark.parametrize(
+    ("type_", "expected"),
+    [
+        (IntegerType(-1, 2), [-1, 0, 1, 2]),
+        (IntervalType(0, 10, 4), [1.25, 3.75, 6.25, 8.75]),
+        (LabelType("low", "middle", "high"), [0, 1, 2]),
+        (LabelType("10", "20", "30"), [10, 20, 30]),
+        (LabelType("2", "1", "0"), [2, 1, 0]),
+        (LabelType("0.5", "1", "1.5"), [0.5, 1, 1.5]),
+        (LabelType("1", "2", "4"), [0, 1, 2]),
+        (LabelType("7"), [0]),
+        (LabelType("<5", "5-12", "12+"), [0, 1, 2]),
+        (LabelType("yes", "no"), [1, 0]),
+        (LabelType("No", "Yes"), [0, 1]),
+        (LabelType("True", "False"), [1, 0]),
+        (LabelType("off", "on"), [0, 1]),
+        (LabelType("yes", "no", "maybe"), [0, 1, 2]),
+        (LabelType("1_0", "2_0"), [0, 1]),
+    ],
+)
+def test_values_of_symbols(type_, expected):
+    assert numbers(type_) == pytest.approx(expected)
+    assert Symbol("s", type_).size == len(expected)
+
+
+def test_a_circle_has_a_period():
+    assert Symbol("b", IntervalType(0, 360, 36, wraps=True)).period == 36
+    assert Symbol("b", IntegerType(0, 359, wraps=True)).period == 360
+    assert Symbol("d", IntegerType(0, 100)).period is None
+
+
+@given(st.integers(-50, 50), st.integers(0, 30), st.integers(-100, 100))
+def test_a_number_is_its_value_or_refused(low, more, number):
+    symbol = Symbol("n", IntegerType(low, low + more))
+    if low <= number <= low + more:
+        assert symbol.index(str(number)) == number - low
+    else:
+        with pytest.raises(ModelError, match=f"n is never '{number}'; expected {low} to {low + more}"):
+            symbol.index(str(number))
+
+
+def test_a_label_is_its_value_or_the_labels_are_listed():
+    symbol = Symbol("smoke", LabelType("yes", "no"))
+    assert [symbol.index(label) for label in ("yes", "no")] == [0, 1]
+    with pytest.raises(ModelError, match="smoke is never 'maybe'; expected yes, no"):
+        symbol.index("maybe")
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: IntegerType(3, 2),
+        lambda: IntegerType(0, 3.5),
+        lambda: IntervalType(0, 1, 4.0),
+        lambda: IntervalType(1, 1, 3),
+        lambda: IntervalType(0, 1, 0),
+        lambda: IntervalType(float("-inf"), 1, 2),
+        LabelType,
+        lambda: LabelType("a", "a"),
+        lambda: LabelType("a", ""),
+        lambda: Symbol("", IntegerType(0, 1)),
+    ],
+)
+def test_refused_symbols(make):
+    with pytest.raises(ModelError):
+        make()

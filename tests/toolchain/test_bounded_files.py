@@ -33,19 +33,19 @@ READERS = {
 }
 
 
+KINDS = {"fifo": os.mkfifo, "endless": lambda path: path.symlink_to("/dev/zero"), "folder": Path.mkdir}
+
+
 @pytest.mark.parametrize("name", READERS)
-@pytest.mark.parametrize("kind", ["fifo", "endless", "folder", "absent"])
-def test_nothing_but_a_regular_file_is_read(tmp_path, name, kind):
+def test_nothing_but_a_regular_file_is_read(tmp_path, name):
     read, error = READERS[name]
-    path = tmp_path / name
-    if kind == "fifo":
-        os.mkfifo(path)
-    elif kind == "endless":
-        path.symlink_to("/dev/zero")
-    elif kind == "folder":
-        path.mkdir()
     with pytest.raises(error):
-        read(path)
+        read(tmp_path / name)
+    for kind, make in KINDS.items():
+        (tmp_path / kind).mkdir()
+        make(tmp_path / kind / name)
+        with pytest.raises(error):
+            read(tmp_path / kind / name)
 
 
 def test_a_file_is_read_up_to_its_bound(tmp_path):
