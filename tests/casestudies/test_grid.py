@@ -23,12 +23,6 @@ def grids(draw):
 
 
 @given(grids(), st.data())
-def test_a_centre_lies_in_its_own_cell(grid, data):
-    line = data.draw(st.integers(0, grid.cells - 1))
-    assert grid.line(*grid.centre(line)) == line
-
-
-@given(grids(), st.data())
 def test_a_point_is_at_most_half_a_cell_from_its_cells_centre(grid, data):
     x = data.draw(st.floats(grid.x_low, grid.x_high))
     y = data.draw(st.floats(grid.y_low, grid.y_high))
@@ -66,8 +60,3 @@ def test_a_grid_needs_cells_and_an_area():
         Grid(x_low=0, x_high=1, y_low=0, y_high=1, width=0, height=1)
     with pytest.raises(ValueError, match="grid"):
         Grid(x_low=1, x_high=1, y_low=0, y_high=1, width=1, height=1)
-
-
-def test_lines_that_are_not_there():
-    with pytest.raises(IndexError):
-        BOAT.centre(1024)

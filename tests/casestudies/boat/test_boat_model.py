@@ -1,6 +1,7 @@
-"""The boat's tables against its formulas written out for single cells (boat.md, thesis 2.1.2.1)."""
+"""The boat: its map, its tables beside the formulas (boat.md, thesis 2.1.2.1), its simulator, and their agreement."""
 
 import math
+import statistics
 
 import numpy as np
 import pytest
@@ -8,10 +9,36 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from casestudies.boat.model import model
-from casestudies.boat.sensors import BEACONS, SENSOR_NAMES, bearing, distance, distance_sigma, map_grid
+from casestudies.boat.normaliser import normalise
+from casestudies.boat.sensors import (
+    BEACONS,
+    BEARING_SIGMA,
+    SENSOR_NAMES,
+    bearing,
+    distance,
+    distance_sigma,
+    map_grid,
+)
+from casestudies.boat.simulator import Boat
 from machines.parameters import BM1Parameters
+from tests.casestudies.figures import coverage, distances, means
 from toolchain.building.quantise import quantise
 from toolchain.errors import ModelError
+from toolchain.models.model import exact_posterior
+
+on_map = st.floats(-50, 50)
+
+
+@given(on_map, on_map, st.sampled_from(BEACONS))
+def test_distance_and_bearing_lead_back_to_the_boat(x, y, beacon):
+    length, angle = distance(x, y, beacon), math.radians(bearing(x, y, beacon))
+    assert beacon[0] + length * math.cos(angle) == pytest.approx(x, abs=1e-9)
+    assert beacon[1] + length * math.sin(angle) == pytest.approx(y, abs=1e-9)
+
+
+def test_just_below_the_axis_is_not_a_full_turn():
+    assert bearing(0.0, -1e-300, BEACONS[1]) == 0.0
+
 
 BOAT = model()
 GRID = map_grid()
@@ -106,3 +133,64 @@ def test_codes_keep_the_missing_address_and_lose_little():
     assert not quantised.warnings
     assert max(loss.mass for loss in quantised.losses) < 1e-3
     assert max(loss.kl_bits for loss in quantised.losses) < 1e-2
+
+
+@given(st.integers(0, 1000), st.floats(0, 500), st.floats(0.001, 1))
+def test_the_boat_stays_on_the_map_and_within_its_speed(seed, speed, seconds):
+    boat = Boat(seed, speed)
+    for _ in range(30):
+        before = (boat.x, boat.y)
+        boat.sail(seconds)
+        assert -50 <= boat.x <= 50
+        assert -50 <= boat.y <= 50
+        assert math.dist(before, (boat.x, boat.y)) <= speed * seconds * (1 + 1e-9)
+
+
+def test_it_gets_about():
+    boat = Boat(3, 60)
+    seen = set()
+    for _ in range(400):
+        boat.sail(0.1)
+        seen.add((boat.x > 0, boat.y > 0))
+    assert len(seen) == 4
+
+
+def test_a_seed_is_a_journey():
+    def journey(seed):
+        boat = Boat(seed, 60)
+        steps = []
+        for _ in range(20):
+            boat.sail(0.1)
+            steps.append((boat.x, boat.y, boat.measure()))
+        return steps
+
+    assert journey(7) == journey(7)
+    assert journey(7) != journey(8)
+
+
+def test_the_noise_is_the_models():
+    boat = Boat(11, 0)
+    measured = [boat.measure() for _ in range(4000)]
+    for column, beacon in enumerate(BEACONS):
+        distances = [values[column] for values in measured]
+        sigma = distance_sigma(distance(0, 0, beacon))
+        assert statistics.fmean(distances) == pytest.approx(distance(0, 0, beacon), abs=0.08 * sigma)
+        assert statistics.stdev(distances) == pytest.approx(sigma, rel=0.06)
+        bearings = [math.degrees(values[3 + column]) for values in measured]
+        assert statistics.fmean(bearings) == pytest.approx(bearing(0, 0, beacon), abs=0.8)
+        assert statistics.stdev(bearings) == pytest.approx(BEARING_SIGMA, rel=0.06)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_float64_fusion_covers_the_truth(seed):
+    the_model, grid, boat = model(), map_grid(), Boat(seed, 60)
+    lines, posteriors = [], []
+    for _ in range(500):
+        boat.sail(0.5)
+        readings = normalise(boat.measure())
+        posteriors.append(exact_posterior(the_model, readings))
+        lines.append(grid.line(boat.x, boat.y))
+    exact = np.array(posteriors)
+    assert coverage(lines, exact) == pytest.approx(0.95, abs=0.03)
+    truth = np.stack(np.divmod(lines, grid.width)[::-1], axis=1)
+    assert np.median(distances(means(exact, grid.width), truth)) < 3

@@ -172,8 +172,3 @@ def test_files_that_hold_no_landmarks(tmp_path, text, place):
     file.write_bytes(text.encode("latin-1"))
     with pytest.raises(ModelError, match=place):
         read_landmarks(file)
-
-
-def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(ModelError, match="nowhere.csv"):
-        read_landmarks(tmp_path / "nowhere.csv")

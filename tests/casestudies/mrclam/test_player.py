@@ -1,7 +1,4 @@
-"""The player against a pretend master: lock-step, lost and impossible frames, a late start.
-
-player  ->  fake server  ->  pretend master  ->  fake server  ->  player
-"""
+"""Recordings of a robot among landmarks, and their player with a pretend master."""
 
 import asyncio
 import json
@@ -10,7 +7,8 @@ import sys
 
 import pytest
 
-from bridge.errors import BridgeError
+from casestudies import DataFileError
+from casestudies.mrclam.model import X_LIMITS, Y_LIMITS
 from casestudies.mrclam.player import (
     LOST_DISTANCE,
     SIGHTINGS_TOPIC,
@@ -21,6 +19,8 @@ from casestudies.mrclam.player import (
     area_grid,
     median_distance,
     play,
+    read_recording,
+    sightings_message,
 )
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.posterior import Posterior
@@ -28,6 +28,82 @@ from tests.casestudies.pretend_stack import PretendStack, certain
 from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import FACTOR, PROCESS_PATIENCE
+
+HEADING = "time_s,ref_x_m,ref_y_m,ref_std_m,heading_rad,range_6_m,bearing_6_rad,range_20_m,bearing_20_rad"
+FIRST = "1248272277.018,4.392,2.407,0.041,-2.0698,,,6.712,-1.8623"
+SECOND = "1248272278.018,-1.5,-6.25,0.035,-2.0624,6.794,-2.2450,,"
+
+
+def file(tmp_path, *lines):
+    path = tmp_path / "recording.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_frames_are_read_with_what_was_seen(tmp_path):
+    frames = read_recording(file(tmp_path, HEADING, FIRST, SECOND))
+    assert frames == (
+        RecordedFrame(
+            number=1,
+            time_s=1248272277.018,
+            x=4.392,
+            y=2.407,
+            sightings=(Sighting(landmark=20, range_m=6.712, bearing_rad=-1.8623),),
+        ),
+        RecordedFrame(
+            number=2,
+            time_s=1248272278.018,
+            x=-1.5,
+            y=-6.25,
+            sightings=(Sighting(landmark=6, range_m=6.794, bearing_rad=-2.2450),),
+        ),
+    )
+
+
+def test_what_was_not_seen_is_absent_from_the_message(tmp_path):
+    first, second = read_recording(file(tmp_path, HEADING, FIRST, SECOND))
+    header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}
+    assert sightings_message(first, header) == {"header": header, "range_20": 6.712, "bearing_20": -1.8623}
+    assert set(sightings_message(second, header)) == {"header", "range_6", "bearing_6"}
+
+
+@pytest.mark.parametrize(
+    ("lines", "place"),
+    [
+        (["landmark,x_m,y_m", "6,5.7093,4.9640"], "time_s"),
+        (["time_s,ref_x_m,ref_y_m,ref_std_m,heading_rad", "1,2,3,4,5"], "range_N_m"),
+        ([HEADING.replace(",bearing_20_rad", ""), FIRST], "bearing_20_rad"),
+        ([HEADING.replace("_6_", "_3_"), FIRST], "landmark 3"),
+        ([HEADING], "recording.csv"),
+        ([""], "time_s"),
+        ([HEADING, FIRST, SECOND.replace("6.794", "far")], "line 3: range_6_m"),
+        ([HEADING, FIRST.replace("4.392", "nan")], "line 2: ref_x_m"),
+        ([HEADING, FIRST, SECOND[:-3]], "line 3"),
+        ([HEADING, FIRST.replace("6.712", "")], "line 2: landmark 20"),
+    ],
+)
+def test_wrong_files_are_refused_with_the_place(tmp_path, lines, place):
+    with pytest.raises(DataFileError, match=place):
+        read_recording(file(tmp_path, *lines))
+
+
+def test_paths_that_are_not_files(tmp_path):
+    with pytest.raises(DataFileError, match="no-such.csv"):
+        read_recording(tmp_path / "no-such.csv")
+    with pytest.raises(DataFileError):
+        read_recording(tmp_path)
+    binary = tmp_path / "picture.csv"
+    binary.write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(DataFileError, match="picture.csv"):
+        read_recording(binary)
+
+
+def test_the_area_is_the_models():
+    grid = area_grid()
+    assert ((grid.x_low, grid.x_high), (grid.y_low, grid.y_high)) == (X_LIMITS, Y_LIMITS)
+    assert grid.centre(0) == pytest.approx((-2 + 9 / 64, -7 + 14 / 64))
+    assert grid.cells == 1024
+
 
 GRID = area_grid()
 
@@ -118,24 +194,12 @@ async def test_something_else_on_the_result_topic():
             await playing
 
 
-async def test_no_server(monkeypatch):
-    monkeypatch.setattr("bridge.client.session.FIRST_DELAY", 3600)  # the first attempt is the last
-    with pytest.raises(BridgeError):
-        await play("ws://127.0.0.1:1", FRAMES)
-
-
 def test_the_median_counts_frames_without_a_result():
     result = Posterior(probabilities=tuple(certain(40)), labels=("y", "x"), sizes=(32, 32), heard_ns=0)
     good = PlayedFrame(frame=FRAMES[0], posterior=result, cycles=1, outcome="")
     lost = PlayedFrame(frame=FRAMES[0], posterior=None, cycles=None, outcome="")
     assert median_distance([good, lost, lost]) == LOST_DISTANCE
     assert median_distance([good, good, lost]) == pytest.approx(0, abs=1e-9)
-
-
-def test_a_posterior_of_something_else():
-    result = Posterior(probabilities=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0)
-    with pytest.raises(BadResultError):
-        PlayedFrame(frame=FRAMES[0], posterior=result, cycles=1, outcome="").estimate()
 
 
 @pytest.mark.process

@@ -334,7 +334,9 @@ from pathlib import Path
 from tests.toolchain.outputs.test_memories import model
 from tests.toolchain.running import OPTIONS
 from toolchain.building.build import build_deployment
-build_deployment(plan_machine(model(), replace(OPTIONS, partitions=2, build_date="2020-02-02T02:02:02Z")), Path(sys.argv[1]))
+from toolchain.building.machine import plan_machine
+options = replace(OPTIONS, partitions=2, build_date="2020-02-02T02:02:02Z")
+build_deployment(plan_machine(model(), options), Path(sys.argv[1]))
 """
 
 

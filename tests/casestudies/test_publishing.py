@@ -1,4 +1,4 @@
-"""The status sockets of the case studies' processes, asked as a health check asks them."""
+"""Readiness of a case study's process, and publications that a server refuses."""
 
 import asyncio
 import json
@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from casestudies import publishing
 from casestudies import publishing as module
 from casestudies.publishing import Readiness, serve_readiness
 from terminal.health import is_ready, read_status, status_socket
@@ -51,9 +52,21 @@ async def test_is_a_status_of_the_stack(tmp_path, readiness):
     assert status["pid"] > 0
 
 
-@pytest.mark.parametrize("directory", ["", "missing"])
-async def test_works_without_a_place_for_it(tmp_path, monkeypatch, capsys, directory):
-    monkeypatch.setenv("BM_RUN_DIRECTORY", str(tmp_path / directory) if directory else "")
-    async with serve_readiness("boat-simulator", Readiness(WORK)):
-        pass
-    assert ("boat-simulator: warning: " in capsys.readouterr().err) is bool(directory)
+TYPE = "boat_msgs/Raw"
+
+
+class Server:
+    def __init__(self, known):
+        self._known = known
+
+    async def topic_type(self, _topic):
+        return self._known
+
+
+@pytest.mark.parametrize(
+    ("known", "warnings"), [(None, 0), ("", 1), ("boat_msgs/msg/Raw", 0), ("std_msgs/String", 1)]
+)
+async def test_a_refused_topic_is_reported_as_far_as_rosapi_tells(known, warnings, capsys, monkeypatch):
+    monkeypatch.setattr(publishing, "SETTLED_S", 0)
+    await publishing.report_refused(Server(known), "/boat/raw", TYPE)
+    assert capsys.readouterr().err.count("warning: ") == warnings
