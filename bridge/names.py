@@ -10,6 +10,7 @@ from typing import Literal
 from bridge.errors import NameFormError
 
 Kind = Literal["msg", "srv", "action"]
+RosVersion = Literal[1, 2]
 
 MAX_NAME = 255
 """Maximum length of a name in characters; ROS 2 allows 255 for a topic."""
@@ -57,7 +58,7 @@ def same_type(one: str, other: str) -> bool:
     return (package_1, own_1) == (package_2, own_2) and (kind_1 == kind_2 or not kind_1 or not kind_2)
 
 
-def ros_version_of_type(name: str) -> Literal[1, 2] | None:
+def ros_version_of_type(name: str) -> RosVersion | None:
     """Return the ROS version of a type name, or None if the name is malformed."""
     try:
         return 2 if split_type(name)[1] else 1

@@ -76,6 +76,7 @@ def decode(
     except (cbor2.CBORError, ValueError, OverflowError, RecursionError) as error:
         why = error.__cause__ if isinstance(error.__cause__, DecodeError) else error
         raise DecodeError(f"a message that is not usable CBOR arrived ({why}): {excerpt(data)}") from None
+    # Trailing bytes would be a second message, which nobody reads.
     if type(message) is not dict or source.tell() != len(data):
         raise DecodeError(f"a message that is not a single CBOR map arrived: {excerpt(data)}")
     _check(message, arrays, data)

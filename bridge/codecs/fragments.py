@@ -100,6 +100,7 @@ class Reassembler:
         if begun is None:
             if total == 1:
                 return self._checked(data)
+            # The oldest gives way: a client that restarts must not be locked out by what it never completed.
             while len(self._sets) >= self._max_sets:
                 self._give_up(next(iter(self._sets)))
             begun = self._sets[key] = _Set(total, now)
@@ -114,6 +115,7 @@ class Reassembler:
         self._checked(data, begun.size)
         if len(begun.parts) == total:
             return self._join(key, begun)
+        # The message itself may be the oldest, if its fragments are so small that their overhead exceeds the bound.
         while self.waiting_bytes > 4 * (self._max_size + OVERHEAD):
             oldest = next(iter(self._sets))
             self._give_up(oldest)
@@ -132,6 +134,7 @@ class Reassembler:
         self.waiting_bytes = 0
 
     def _join(self, key: FragmentId, begun: _Set) -> bytes:
+        # Servers number from 0 or from 1; as many parts as `total` are complete in one of the two ways.
         first = 0 if 0 in begun.parts else 1
         self._forget(key)
         try:

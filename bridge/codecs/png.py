@@ -53,9 +53,11 @@ def decode(data: str, *, max_size: int = MAX_SIZE) -> bytes:
             "a png arrived that is not a message: expected 8 bits a channel, no palette, no interlacing"
         )
     line = width * channels
+    # The padding of a nearly square picture is less than a few lines.
     if line * height > max_size + 8 * line:
         raise DecodeError(f"a png arrived that holds more than {max_size} bytes")
     wanted = (line + 1) * height
+    # No more than announced is unpacked, whatever the data contains.
     unpacking = zlib.decompressobj()
     try:
         lines = unpacking.decompress(bytes(packed), wanted)

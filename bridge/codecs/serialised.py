@@ -5,10 +5,10 @@ others with the text of their `.msg` file. It is imported with the first message
 """
 
 from dataclasses import fields, is_dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 from bridge.errors import DecodeError, DefinitionError
-from bridge.names import ros2_type
+from bridge.names import RosVersion, ros2_type
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -26,7 +26,7 @@ class MessageTypes:
         scan = types.read(message.raw, "sensor_msgs/LaserScan")
     """
 
-    def __init__(self, ros_version: Literal[1, 2] | None = None) -> None:
+    def __init__(self, ros_version: RosVersion | None = None) -> None:
         """Start with the standard types.
 
         Args:
@@ -81,6 +81,7 @@ class MessageTypes:
             raise DefinitionError(
                 f"the type {type_name} is unknown: pass the text of its .msg to MessageTypes.register"
             )
+        # Bytes without a header of CDR are of ROS 1; with one, they may be of either version.
         if self._version is None and data[:4] not in _CDR:
             versions = (1,)
         for version in versions:

@@ -85,6 +85,7 @@ class AccessPolicy:
         return None if matches else HTTPStatus.UNAUTHORIZED
 
     def _is_for_this_machine(self, request: Request) -> bool:
+        # A request with several hosts could pass here with one and mean another.
         hosts = request.headers.get_all("Host")
         known = {origin.partition("://")[2] for origin in self.origins}
         return len(hosts) == 1 and (_LOCAL_HOST.fullmatch(hosts[0]) is not None or hosts[0] in known)
@@ -122,6 +123,7 @@ def read_tokens(path: Path) -> tuple[str, ...]:
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text"
         raise HubError(f"the hub cannot read its tokens in {path}: {why}") from None
+    # A token is a password: a file that others read has given it away already.
     if mode & 0o077:
         raise HubError(f"others may read the hub's tokens in {path}: run chmod 600 {path}")
     tokens = tuple(line.strip() for line in lines if line.strip() and not line.startswith("#"))
@@ -138,6 +140,7 @@ def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
     Raises:
         HubError: A file cannot be read, or the two do not belong together.
     """
+    # An error of `load_cert_chain` does not say which file cannot be read, so they are read first.
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     for path in (certificate, key):
         try:

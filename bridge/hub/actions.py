@@ -9,10 +9,10 @@ import orjson
 from bridge.client.protocol.events import GoalStatus
 from bridge.errors import BridgeError
 from bridge.hub.calls import Caller, Offers, filled
-from bridge.hub.definitions import Definitions
+from bridge.hub.definitions import MessageDefinitions
 from bridge.hub.dispatcher import Dispatcher
 from bridge.hub.graph import Client, Graph, Offer
-from bridge.hub.limits import HubLimits, Operation, RefusedError, flag, optional_text, text
+from bridge.hub.limits import HubLimits, Operation, RefusedOperationError, flag, optional_text, text
 from bridge.hub.outbox import Lane
 from bridge.names import absolute, ros2_type, same_type
 
@@ -37,7 +37,7 @@ class Actions:
     """The actions of one hub, and the goals that have not ended."""
 
     def __init__(
-        self, graph: Graph, limits: HubLimits, dispatcher: Dispatcher, definitions: Definitions
+        self, graph: Graph, limits: HubLimits, dispatcher: Dispatcher, definitions: MessageDefinitions
     ) -> None:
         """Start without actions."""
         self._graph = graph
@@ -53,6 +53,7 @@ class Actions:
     def leave(self, client: Client) -> None:
         """Cancel the goals that a disconnected client sent, and abort those that it executed."""
         self._offers.leave(client)
+        # Nobody hears of these results any more, so their servers may stop.
         for key in list(client.goals.values()):
             self._send_cancel(self._take(key))
         for key in list(client.tasks):
@@ -80,17 +81,17 @@ class Actions:
         client, name, args = caller.client, caller.name, operation.get("args")
         action = self._graph.actions.get(absolute(name))
         if action is None:
-            raise RefusedError(f"Action {name} does not exist")
+            raise RefusedOperationError(f"Action {name} does not exist")
         type_name = optional_text(operation, "action_type")
         if type_name is not None and not same_type(ros2_type(type_name, "action"), action.type):
-            raise RefusedError(f"{name} is of type {action.type}, not {type_name}")
+            raise RefusedOperationError(f"{name} is of type {action.type}, not {type_name}")
         server = action.client
         if caller.id in client.goals:
-            raise RefusedError(f"this client already has a goal with the id {str(caller.id)[:80]!r}")
+            raise RefusedOperationError(f"this client already has a goal with the id {str(caller.id)[:80]!r}")
         if len(client.goals) >= self._limits.goals_per_client:
-            raise RefusedError(f"this client already waits for {len(client.goals)} goals")
+            raise RefusedOperationError(f"this client already waits for {len(client.goals)} goals")
         if len(server.tasks) >= self._limits.goals_per_client:
-            raise RefusedError(f"{name} already executes {len(server.tasks)} goals")
+            raise RefusedOperationError(f"{name} already executes {len(server.tasks)} goals")
         wants_feedback = flag(operation, "feedback")
         key = f"action_goal:{action.name}:{next(self._numbers)}"
         request = {
@@ -102,6 +103,7 @@ class Actions:
             "feedback": wants_feedback,
         }
         payload = self._dispatcher.checked(orjson.dumps(request), f"the goal for {name}")
+        # Feedback may be dropped, so each goal has a lane of its own; the result may not.
         lane = Lane(self._limits.queue_length)
         lane.fragment_size = caller.fragment_size
         self.goals[key] = _Goal(key, caller, action, server, wants_feedback, lane)
@@ -116,7 +118,7 @@ class Actions:
         key = client.goals.get(goal_id) if isinstance(goal_id, str | int | None) else None
         goal = self.goals[key] if key is not None else None
         if goal is None or goal.action.name != absolute(name):
-            raise RefusedError(f"this client does not have a goal {str(goal_id)[:80]!r} of {name}")
+            raise RefusedOperationError(f"this client does not have a goal {str(goal_id)[:80]!r} of {name}")
         self._send_cancel(goal)
 
     def cancel_all(self, client: Client, service: str) -> dict[str, Any] | None:
@@ -134,7 +136,7 @@ class Actions:
         goal = self._goal_of(client, operation)
         values = operation.get("values", {})
         if not isinstance(values, dict):
-            raise RefusedError(f"the feedback of {goal.action.name} must be a JSON object")
+            raise RefusedOperationError(f"the feedback of {goal.action.name} must be a JSON object")
         if not goal.wants_feedback:
             return
         values = filled(goal.action.fillers.get("Feedback"), values, self._limits.message_bytes)
@@ -163,13 +165,13 @@ class Actions:
                 values = filled(goal.action.fillers.get("Result"), values, self._limits.message_bytes)
                 payload = goal.caller.operation(*_RESULT, values=values, status=status, result=True)
                 goal.caller.answer(self._dispatcher, payload)
-            except RefusedError as error:
+            except RefusedOperationError as error:
                 self._fail(goal.caller, str(error))
 
     def _goal_of(self, client: Client, operation: Operation) -> _Goal:
         key = operation.get("id")
         if not isinstance(key, str) or key not in client.tasks:
-            raise RefusedError(f"this client does not execute a goal {str(key)[:80]!r}")
+            raise RefusedOperationError(f"this client does not execute a goal {str(key)[:80]!r}")
         return self.goals[key]
 
     def _take(self, key: str) -> _Goal:

@@ -27,13 +27,14 @@ from bridge.codecs.json_codec import decode, is_deeper
 from bridge.errors import BridgeError
 from bridge.hub.actions import Actions
 from bridge.hub.calls import Calls
-from bridge.hub.definitions import Definitions, RosVersion
+from bridge.hub.definitions import MessageDefinitions
 from bridge.hub.dispatcher import Dispatcher
 from bridge.hub.graph import Client, Graph
-from bridge.hub.limits import HubLimits, Operation, RefusedError, is_logged, text
+from bridge.hub.limits import HubLimits, Operation, RefusedOperationError, is_logged, text
 from bridge.hub.outbox import Outbox
 from bridge.hub.rosapi import NODE, ROSOUT, Rosapi
 from bridge.hub.topics import TURN_WORK, Topics
+from bridge.names import RosVersion
 from bridge.stamps import stamp
 
 log = logging.getLogger(__name__)
@@ -66,7 +67,7 @@ class Broker:
         """
         self.limits = limits or HubLimits()
         self.graph = Graph()
-        self.definitions = Definitions(ros_version, wall_clock)
+        self.definitions = MessageDefinitions(ros_version, wall_clock)
         self._wall_clock = wall_clock
         self._ros_version: RosVersion = ros_version
         rosapi = Rosapi(self.graph, self.limits, self.definitions, wall_clock)
@@ -174,6 +175,7 @@ class Broker:
         dispatcher, outbox = self._dispatcher, client.outbox
         dispatcher.work = number = 0
         while number < len(messages):
+            # The client must read first: each operation may cause an answer, which cannot be dropped.
             if outbox.undroppable and outbox.congested:
                 break
             number = self._topics.publish_known(client, messages, number, now)
@@ -192,11 +194,12 @@ class Broker:
                 operation = orjson.loads(data)
             except orjson.JSONDecodeError:
                 operation = None
+        # Most messages are strict JSON; only the others pay for the lenient attempt.
         if type(operation) is not dict:  # `decode` accepts NaN, and raises for everything else
             operation = decode(data, max_size=self.limits.message_bytes, max_depth=self.limits.depth)
             raw = None
         elif is_deeper(data, self.limits.depth):
-            raise RefusedError(f"a message is nested deeper than {self.limits.depth} levels")
+            raise RefusedOperationError(f"a message is nested deeper than {self.limits.depth} levels")
         name = operation.get("op")
         self._operation_id = operation.get("id")
         if name == "publish":
@@ -206,7 +209,7 @@ class Broker:
         else:
             handler = self._operations.get(name) if isinstance(name, str) else None
             if handler is None:
-                raise RefusedError(f"unknown operation {str(name)[:60]!r}")
+                raise RefusedOperationError(f"unknown operation {str(name)[:60]!r}")
             handler(client, operation, now)
 
     def wake(self, now: float) -> None:
@@ -243,7 +246,7 @@ class Broker:
     def _set_level(self, client: Client, operation: Operation, _now: float) -> None:
         level = text(operation, "level")
         if level not in _LEVELS:
-            raise RefusedError(f"level {level[:60]!r} is not one of {', '.join(_LEVELS)}")
+            raise RefusedOperationError(f"level {level[:60]!r} is not one of {', '.join(_LEVELS)}")
         client.wants_status = _LEVELS[level]
 
     # --- refusals
@@ -254,11 +257,12 @@ class Broker:
             log.warning("%s of %s: refused (no. %d): %s", client.node, client.address, client.refused, why)
         if with_status:
             self._dispatcher.send_status(client, why, operation_id, self._now)
+        # The reference server's refusals appear on /rosout, where ROS users look for them.
         rosout = self.graph.topics.get(ROSOUT)
         # A refusal on /rosout itself is not reported there.
         if rosout is not None and rosout.subscriptions and not self._logging_to_rosout:
             self._logging_to_rosout = True
-            with contextlib.suppress(RefusedError):
+            with contextlib.suppress(RefusedOperationError):
                 self._topics.distribute(rosout, self._log_message(f"{client.node}: {why}"), self._now)
             self._logging_to_rosout = False
 

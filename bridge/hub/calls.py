@@ -23,16 +23,16 @@ from typing import Any, Final, Self
 import orjson
 
 from bridge.errors import BridgeError
-from bridge.hub.definitions import Definitions
+from bridge.hub.definitions import MessageDefinitions
 from bridge.hub.dispatcher import Dispatcher, fragment_size_of
-from bridge.hub.encodings import Compression, compression_of
+from bridge.hub.encodings import Encoding, encoding_of
 from bridge.hub.filling import Filler
 from bridge.hub.graph import Client, Graph, Offer
 from bridge.hub.limits import (
     HubLimits,
     Operation,
     OperationId,
-    RefusedError,
+    RefusedOperationError,
     checked_name,
     is_logged,
     number,
@@ -61,13 +61,13 @@ class Caller:
 
     @classmethod
     def of(cls, client: Client, operation: Operation, field: str) -> Self:
-        """Read the caller of an operation, which names a service or an action in `field`, or raise a RefusedError."""
+        """Read the caller of an operation, which names a service or an action in `field`, or raise a RefusedOperationError."""
         return cls(
             client,
             operation_id(operation),
             text(operation, field),
             fragment_size_of(number(operation, "fragment_size")),
-            compression_of(operation.get("compression")) is Compression.PNG,
+            encoding_of(operation.get("compression")) is Encoding.PNG,
         )
 
     def operation(self, op: str, kind: str, **fields: object) -> bytes:
@@ -76,7 +76,7 @@ class Caller:
         return orjson.dumps({"op": op, kind: self.name, **fields, **identity})
 
     def answer(self, dispatcher: Dispatcher, payload: bytes) -> None:
-        """Send an answer in the requested encoding, or raise a RefusedError if it is too large."""
+        """Send an answer in the requested encoding, or raise a RefusedOperationError if it is too large."""
         dispatcher.checked(payload, f"the answer of {self.name}")
         dispatcher.send(self.client, payload, fragment_size=self.fragment_size, png=self.png)
 
@@ -85,7 +85,7 @@ def filled(filler: Filler | None, values: Any, room: int) -> Any:
     """Return arguments or results with the defaults of absent fields, and named fields instead of a list.
 
     Raises:
-        RefusedError: They would grow by more than `room` bytes.
+        RefusedOperationError: They would grow by more than `room` bytes.
     """
     if values is None:
         values = {}
@@ -116,7 +116,8 @@ class Offers:
         name = checked_name(text(operation, self._kind))
         key, names = absolute(name), self._names_of(client)
         if key not in names and len(names) >= self._limit:
-            raise RefusedError(f"this client already offers {len(names)} {self._kind}s")
+            raise RefusedOperationError(f"this client already offers {len(names)} {self._kind}s")
+        # As in ROS 1, a node that starts again takes its services over, although the old one has not been missed yet.
         before = self._offers.get(key)
         if before is not None and before.client is not client:
             client.takeovers += 1
@@ -131,7 +132,7 @@ class Offers:
         name = text(operation, self._kind)
         names = self._names_of(client)
         if absolute(name) not in names:
-            raise RefusedError(f"this client does not offer {name}")
+            raise RefusedOperationError(f"this client does not offer {name}")
         names.discard(absolute(name))
         del self._offers[absolute(name)]
 
@@ -160,7 +161,7 @@ class Calls:
         graph: Graph,
         limits: HubLimits,
         dispatcher: Dispatcher,
-        definitions: Definitions,
+        definitions: MessageDefinitions,
         rosapi: Rosapi,
         answer_here: Callable[[Client, str], dict[str, Any] | None],
     ) -> None:
@@ -206,7 +207,7 @@ class Calls:
         """Perform `advertise_service`."""
         name, type_name = text(operation, "service"), text(operation, "type")
         if absolute(name).startswith(PREFIX):
-            raise RefusedError(f"{name} belongs to the hub")
+            raise RefusedOperationError(f"{name} belongs to the hub")
         type_name = self._rosapi.service_type_name(type_name)
         self._offers.add(client, operation, type_name, self._definitions.fillers(type_name, "srv"))
 
@@ -233,15 +234,17 @@ class Calls:
         if service is None:
             values = self._answer_here(caller.client, key)
             if values is None:
-                raise RefusedError(f"Service {name} does not exist")
+                raise RefusedOperationError(f"Service {name} does not exist")
             self._answer(caller, values)
             return
         client, server = caller.client, service.client
         if len(client.calls) >= self._limits.calls_per_client:
-            raise RefusedError(f"this client already waits for {len(client.calls)} calls")
+            raise RefusedOperationError(f"this client already waits for {len(client.calls)} calls")
+        # Both ends are bounded: a client could otherwise fill the outbox of a server that does not answer.
         if len(server.requests) >= self._limits.calls_per_client:
-            raise RefusedError(f"{name} already has {len(server.requests)} calls to answer")
+            raise RefusedOperationError(f"{name} already has {len(server.requests)} calls to answer")
         deadline = now + min(number(operation, "timeout") or inf, self._limits.call_timeout)
+        # Not a secret: only the client that got a request may answer it (`respond`).
         request_id = f"service_request:{key}:{next(self._numbers)}"
         args = filled(service.fillers.get("Request"), args, self._limits.message_bytes)
         payload = orjson.dumps({"op": "call_service", "id": request_id, "service": key, "args": args})
@@ -253,6 +256,7 @@ class Calls:
         self._dispatcher.send(server, payload)
 
     def _schedule(self, deadline: float, key: str) -> None:
+        # A flood of calls that are answered at once would otherwise leave their deadlines for a minute.
         if len(self._deadlines) > 2 * len(self.pending) + _ANSWERED:
             self._deadlines = [(call.deadline, key) for key, call in self.pending.items()]
             heapq.heapify(self._deadlines)
@@ -264,7 +268,7 @@ class Calls:
         """Perform `service_response`."""
         key = operation.get("id")
         if not isinstance(key, str) or key not in client.requests:
-            raise RefusedError(f"no client waits for the answer {str(key)[:80]!r}")
+            raise RefusedOperationError(f"no client waits for the answer {str(key)[:80]!r}")
         call = self._take(key)
         caller = call.caller
         values, result = operation.get("values", {}), operation.get("result", True)
@@ -278,7 +282,7 @@ class Calls:
         ):
             try:
                 self._answer(caller, filled(call.filler, values, self._limits.message_bytes))
-            except RefusedError as error:
+            except RefusedOperationError as error:
                 self._fail(caller, str(error))
         elif result is True:
             self._fail(caller, f"{caller.name} answered with values that are not a JSON object")

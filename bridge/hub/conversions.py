@@ -61,6 +61,7 @@ class Builder:
             raise TypeError(f"{place or 'the message'} is not an object")
         _constants, fields = self._store.fielddefs[name]
         self._count(len(fields))
+        # What is left at the end has no field.
         given = dict(message)
         values = {}
         for field, (kind, content) in fields:
@@ -84,6 +85,7 @@ class Builder:
         if element in _NUMBERS:
             import numpy as np
 
+            # Bytes from base64 become an array without a list of numbers in between.
             numbers = _numbers(value, element, length, place)
             if isinstance(numbers, bytes):
                 return np.frombuffer(numbers, np.uint8)

@@ -25,14 +25,12 @@ from bridge.hub.conversions import (
 )
 from bridge.hub.filling import FieldTypes, Filler, Types
 from bridge.hub.interfaces import PARTS, message_texts, part_name
-from bridge.hub.limits import RefusedError
-from bridge.names import ros1_type, ros2_type
+from bridge.hub.limits import RefusedOperationError
+from bridge.names import RosVersion, ros1_type, ros2_type
 
 if TYPE_CHECKING:
     from rosbags.typesys import Stores
     from rosbags.typesys.store import Typestore
-
-RosVersion = Literal[1, 2]
 
 # Bytes of the size limit per value of a serialised message; `{}` in an array can stand for dozens of
 # values.
@@ -42,7 +40,7 @@ _MISSING: Final = (
 )
 
 
-class Definitions:
+class MessageDefinitions:
     """The known message types of one ROS version."""
 
     def __init__(self, ros_version: RosVersion = 1, wall_clock: Callable[[], int] = time.time_ns) -> None:
@@ -103,17 +101,19 @@ class Definitions:
         return converted
 
     def serialise(self, type_name: str, message: dict[str, Any], max_size: int) -> bytes:
-        """Serialise a message as ROS 1's transport would, or as CDR with its header, or raise a RefusedError."""
+        """Serialise a message as ROS 1's transport would, or as CDR with its header, or raise a RefusedOperationError."""
         store, known = self._known(type_name)
         try:
             built = Builder(store, max_size // _BYTES_A_VALUE).message(known, message, "")
             serialise = store.serialize_cdr if self.ros_version == 2 else store.serialize_ros1
             return bytes(serialise(built, known))
         except Exception as error:  # rosbags, NumPy and struct raise their own errors for unsuitable values
-            raise RefusedError(f"a message does not fit its type {self.name(type_name)}: {error}") from None
+            raise RefusedOperationError(
+                f"a message does not fit its type {self.name(type_name)}: {error}"
+            ) from None
 
     def full_text(self, type_name: str) -> str:
-        """Return the definitions of a type and of its parts, as in bag files, or raise a RefusedError."""
+        """Return the definitions of a type and of its parts, as in bag files, or raise a RefusedOperationError."""
         text = self._texts.get(type_name)
         if text is None:
             store, known = self._known(type_name)
@@ -122,7 +122,7 @@ class Definitions:
         return text
 
     def details(self, type_name: str) -> list[dict[str, Any]]:
-        """Return the fields of a type and of its parts, as `rosapi_msgs/TypeDef`, or raise a RefusedError."""
+        """Return the fields of a type and of its parts, as `rosapi_msgs/TypeDef`, or raise a RefusedOperationError."""
         store, known = self._known(type_name)
         found: dict[str, dict[str, Any]] = {}
         waiting = [known]
@@ -166,10 +166,10 @@ class Definitions:
     def _known(self, type_name: str) -> "tuple[Typestore, str]":
         self.load()
         if self._store is None:
-            raise RefusedError(_MISSING)
+            raise RefusedOperationError(_MISSING)
         known = ros2_type(type_name)
         if not _define(self._store, known, self.ros_version):
-            raise RefusedError(f"the hub does not know the fields of {type_name}")
+            raise RefusedOperationError(f"the hub does not know the fields of {type_name}")
         return self._store, known
 
 

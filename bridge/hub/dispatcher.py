@@ -7,7 +7,7 @@ import orjson
 
 from bridge.hub.encodings import as_png
 from bridge.hub.graph import Client
-from bridge.hub.limits import HubLimits, RefusedError
+from bridge.hub.limits import HubLimits, RefusedOperationError
 from bridge.hub.outbox import Lane
 
 SMALLEST_FRAGMENT: Final = 256
@@ -48,10 +48,10 @@ class Dispatcher:
         """Return a payload of acceptable size.
 
         Raises:
-            RefusedError: It exceeds the limit; `what` names it.
+            RefusedOperationError: It exceeds the limit; `what` names it.
         """
         if len(payload) > self._limits.message_bytes:
-            raise RefusedError(f"{what} has more than {self._limits.message_bytes} bytes")
+            raise RefusedOperationError(f"{what} has more than {self._limits.message_bytes} bytes")
         return payload
 
     def send(self, client: Client, payload: bytes, *, fragment_size: int = 0, png: bool = False) -> None:
@@ -103,6 +103,7 @@ class Dispatcher:
         status: dict[str, object] = {"op": "status", "level": "error", "msg": sentence}
         if isinstance(operation_id, str | int) and not isinstance(operation_id, bool):
             status["id"] = operation_id
+        # Status messages may be dropped: a client that sends nonsense faster than it reads must not fill its outbox.
         if client.status_lane is None:
             client.status_lane = Lane(_STATUS_QUEUE)
         try:

@@ -12,11 +12,11 @@ import orjson
 
 from bridge.codecs.png import encode as to_picture
 from bridge.errors import BridgeError
-from bridge.hub.definitions import Definitions
-from bridge.hub.limits import RefusedError
+from bridge.hub.definitions import MessageDefinitions
+from bridge.hub.limits import RefusedOperationError
 
 
-class Compression(StrEnum):
+class Encoding(StrEnum):
     """Encodings, in ascending priority if a client's subscriptions differ, as on the reference server."""
 
     NONE = "none"
@@ -25,12 +25,12 @@ class Compression(StrEnum):
     CBOR_RAW = "cbor-raw"
 
 
-COMPRESSIONS: Final = tuple(Compression)
+ENCODINGS: Final = tuple(Encoding)
 
 
-def compression_of(requested: object) -> Compression:
+def encoding_of(requested: object) -> Encoding:
     """Return the requested encoding; an unknown one is plain JSON, as on the reference server."""
-    return next((known for known in Compression if known == requested), Compression.NONE)
+    return next((known for known in Encoding if known == requested), Encoding.NONE)
 
 
 def as_png(payload: bytes) -> bytes:
@@ -50,7 +50,7 @@ AROUND: Final = len(json_prefix("")) + 1
 
 
 @dataclass(eq=False, slots=True)
-class Message:
+class OutgoingMessage:
     """One published message, encoded on demand."""
 
     data: bytes
@@ -61,24 +61,25 @@ class Message:
     """Its type, or the empty string."""
     _time_ns: int
     """Its receipt in nanoseconds since 1970, for cbor-raw."""
-    _definitions: Definitions
+    _definitions: MessageDefinitions
     _max_size: int
     """Maximum of bytes on the wire."""
-    _payloads: dict[tuple[Compression, str], bytes | BridgeError] = field(default_factory=dict)
+    _payloads: dict[tuple[Encoding, str], bytes | BridgeError] = field(default_factory=dict)
 
-    def payload(self, compression: Compression, name: str) -> bytes:
+    def payload(self, compression: Encoding, name: str) -> bytes:
         """Return the message in one encoding, under the topic's name as a client uses it.
 
         Raises:
-            RefusedError: The encoding needs a definition that is unknown, or is larger than the limit.
+            RefusedOperationError: The encoding needs a definition that is unknown, or is larger than the limit.
             EncodeError: The message has no such encoding.
         """
+        # Payloads and failures are kept: each encoding is tried once, however many subscribers want it.
         payload = self._payloads.get((compression, name))
         if payload is None:
             try:
                 payload = self._encode(compression, name)
                 if len(payload) > self._max_size:
-                    raise RefusedError(
+                    raise RefusedOperationError(
                         f"a message of {name} as {compression} has more than {self._max_size} bytes"
                     )
             except BridgeError as error:
@@ -88,19 +89,20 @@ class Message:
             raise payload
         return payload
 
-    def _encode(self, compression: Compression, name: str) -> bytes:
-        if compression is Compression.NONE:
+    def _encode(self, compression: Encoding, name: str) -> bytes:
+        if compression is Encoding.NONE:
             return b"%b%b}" % (json_prefix(name), self.data)
-        if compression is Compression.PNG:
-            return as_png(self.payload(Compression.NONE, name))
+        if compression is Encoding.PNG:
+            return as_png(self.payload(Encoding.NONE, name))
         import cbor2
 
         if self._parsed is None:
             self._parsed = orjson.loads(self.data)
-        if compression is Compression.CBOR_RAW:
+        if compression is Encoding.CBOR_RAW:
             seconds, nanoseconds = divmod(self._time_ns, 10**9)
             serialised = self._definitions.serialise(self._type, self._parsed, self._max_size)
             msg = cbor2.dumps({"secs": seconds, "nsecs": nanoseconds, "bytes": serialised})
+        # A message of an unknown type, or one that does not fit its type: only floats show what they are.
         elif (typed := self._definitions.typed(self._type, self._parsed)) is not None:
             msg = cbor2.dumps(typed)  # of JSON, typed arrays and bytes, so it needs no check
         else:

@@ -14,14 +14,14 @@ the place of the last two braces. Only a message with an incomplete part is writ
 
 from base64 import b64encode
 from collections.abc import Callable, Container, Mapping
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import orjson
 
-from bridge.hub.limits import RefusedError
+from bridge.hub.limits import RefusedOperationError
+from bridge.names import RosVersion
 from bridge.stamps import stamp
 
-RosVersion = Literal[1, 2]
 FieldTypes = Mapping[str, tuple[str, int]]
 """The types of a message's fields or of their elements, and their lengths: -1 for a scalar, 0 for any."""
 
@@ -77,7 +77,7 @@ class Filler:
             is empty if nothing was absent, and None if the message must be written again.
 
         Raises:
-            RefusedError: They would grow by more.
+            RefusedOperationError: They would grow by more.
         """
         if len(message) == self.count:
             return None if self.parts and _fill_parts(self.parts, message, room) else b""
@@ -87,7 +87,7 @@ class Filler:
         return None if is_grown else tail
 
     def fill_part(self, message: dict[str, Any], room: int) -> int:
-        """Fill a message inside another one, and return the bytes by which it grew, or raise a RefusedError."""
+        """Fill a message inside another one, and return the bytes by which it grew, or raise a RefusedOperationError."""
         grown = _fill_parts(self.parts, message, room)
         if len(message) != self.count:
             absent, tail, _parts = self._known.get(tuple(message)) or self._look_up(message)
@@ -95,7 +95,9 @@ class Filler:
             grown += len(tail)
             # Checked at each message of an array: a megabyte of `{}` could become a gigabyte.
             if grown > room:
-                raise RefusedError("a message is too large with the default values of its absent fields")
+                raise RefusedOperationError(
+                    "a message is too large with the default values of its absent fields"
+                )
         return grown
 
     def _look_up(self, message: dict[str, Any]) -> _Absent:

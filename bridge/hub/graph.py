@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from bridge.codecs.fragments import Reassembler
-from bridge.hub.encodings import Compression
+from bridge.hub.encodings import Encoding
 from bridge.hub.filling import Filler
 from bridge.hub.limits import OperationId
 from bridge.hub.outbox import Lane, Outbox
@@ -26,7 +26,7 @@ class Client:
     outbox: Outbox
     advertisements: dict[str, "Advertisement"] = field(default_factory=dict)
     """By the topic's absolute name."""
-    subscriptions: dict[str, "Subscription"] = field(default_factory=dict)
+    subscriptions: dict[str, "TopicSubscription"] = field(default_factory=dict)
     """By the topic's absolute name."""
     open_advertisements: int = 0
     """Open advertise operations, over all topics."""
@@ -91,13 +91,13 @@ class SubscribeOptions:
     throttle: float
     """Minimum seconds between messages, 0 for none."""
     queue_length: int
-    compression: Compression = Compression.NONE
+    compression: Encoding = Encoding.NONE
     fragment_size: int = 0
     """Maximum bytes of a message in one fragment, 0 for whole messages."""
 
 
 @dataclass(eq=False, slots=True)
-class Subscription:
+class TopicSubscription:
     """A client's subscription to one topic, from all its subscribe operations."""
 
     client: Client
@@ -107,7 +107,7 @@ class Subscription:
     name: str
     """The topic's name as the client uses it."""
     lane: Lane = field(default_factory=Lane)
-    compression: Compression = Compression.NONE
+    compression: Encoding = Encoding.NONE
     typed: bool = False
     """True if the client named a type, which becomes the type of the topic."""
     options: dict[OperationId, SubscribeOptions] = field(default_factory=dict)
@@ -125,7 +125,7 @@ class Topic:
     type: str = ""
     """Type as this hub's ROS version writes it; empty until a client names it."""
     advertisements: dict[Client, Advertisement] = field(default_factory=dict)
-    subscriptions: dict[Client, Subscription] = field(default_factory=dict)
+    subscriptions: dict[Client, TopicSubscription] = field(default_factory=dict)
     latching: bool = False
     """True while one of its publishers latches."""
     latched: bytes | None = None
@@ -164,6 +164,7 @@ class Graph:
         topic.latching = any(advertisement.latching for advertisement in topic.advertisements.values())
         if not topic.latching:
             self.latch(topic, None)
+        # Until a publisher or a subscriber names a type, a topic has none, so another one may follow the last publisher's.
         if not topic.advertisements and not any(each.typed for each in topic.subscriptions.values()):
             topic.type = ""
         if not topic.advertisements and not topic.subscriptions:

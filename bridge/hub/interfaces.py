@@ -5,7 +5,9 @@ tutorials, `tf2_msgs`. Sources: the packages' own `.srv`, `.action` and `.msg` f
 """
 
 from functools import cache
-from typing import Final, Literal
+from typing import Final
+
+from bridge.names import RosVersion
 
 PARTS: Final = {"srv": ("Request", "Response"), "action": ("Goal", "Result", "Feedback")}
 
@@ -161,7 +163,7 @@ _ACTIONLIB: Final = {
 }
 
 
-def part_name(type_name: str, part: str, ros_version: Literal[1, 2]) -> str:
+def part_name(type_name: str, part: str, ros_version: RosVersion) -> str:
     """Return the name under which a part of a service or an action, such as its `Request`, is defined as a message.
 
     Args:
@@ -174,7 +176,7 @@ def part_name(type_name: str, part: str, ros_version: Literal[1, 2]) -> str:
 
 
 @cache
-def message_texts(ros_version: Literal[1, 2]) -> dict[str, str]:
+def message_texts(ros_version: RosVersion) -> dict[str, str]:
     """Return message definitions by name in ROS 2's form, including the parts of services and actions."""
     rosapi = "rosapi_msgs" if ros_version == 2 else "rosapi"
     own = _ROSAPI | (_ROSAPI_2 if ros_version == 2 else {})

@@ -1,6 +1,6 @@
 """What the hub refuses: its limits, its errors, and the validation of the fields of an operation.
 
-Functions that read a field raise a `RefusedError` if it is invalid, which the broker logs or, for a call, answers.
+Functions that read a field raise a `RefusedOperationError` if it is invalid, which the broker logs or, for a call, answers.
 """
 
 import re
@@ -39,7 +39,7 @@ class HubError(BridgeError):
     exit_code = 2
 
 
-class RefusedError(BridgeError):
+class RefusedOperationError(BridgeError):
     """Raised when the hub refuses an operation; the text is for the log, or for the answer to a call."""
 
 
@@ -124,7 +124,7 @@ class HubLimits:
 def checked_name(name: str) -> str:
     """Return the name of a topic, a service or an action."""
     if len(name) > MAX_NAME or _NAME.fullmatch(name) is None:
-        raise RefusedError(f"{name[:80]!r} cannot be a name: expected letters, digits, _ and /")
+        raise RefusedOperationError(f"{name[:80]!r} cannot be a name: expected letters, digits, _ and /")
     return name
 
 
@@ -132,7 +132,7 @@ def text(operation: Operation, field: str) -> str:
     """Return a required string, which must not be empty."""
     value = operation.get(field)
     if not isinstance(value, str) or not value:
-        raise RefusedError(f"{field} of {operation['op']} must be a string")
+        raise RefusedOperationError(f"{field} of {operation['op']} must be a string")
     return value
 
 
@@ -145,7 +145,7 @@ def flag(operation: Operation, field: str) -> bool:
     """Return a boolean; False if it is left out."""
     value = operation.get(field)
     if value is not None and not isinstance(value, bool):
-        raise RefusedError(f"{field} of {operation['op']} must be true or false")
+        raise RefusedOperationError(f"{field} of {operation['op']} must be true or false")
     return bool(value)
 
 
@@ -159,7 +159,7 @@ def number(operation: Operation, field: str) -> float:
     if value is None:
         return 0
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _HUGE:
-        raise RefusedError(f"{field} of {operation['op']} must be a number from 0 up")
+        raise RefusedOperationError(f"{field} of {operation['op']} must be a number from 0 up")
     return value
 
 
@@ -167,9 +167,9 @@ def operation_id(operation: Operation) -> OperationId:
     """Return the operation's id, or None if it is left out."""
     value = operation.get("id")
     if isinstance(value, bool) or not isinstance(value, str | int | None):
-        raise RefusedError(f"id of {operation['op']} must be a string or an integer")
+        raise RefusedOperationError(f"id of {operation['op']} must be a string or an integer")
     if isinstance(value, str) and len(value) > _LONGEST_ID:
-        raise RefusedError(f"id of {operation['op']} has more than {_LONGEST_ID} characters")
+        raise RefusedOperationError(f"id of {operation['op']} has more than {_LONGEST_ID} characters")
     return value
 
 
@@ -179,11 +179,13 @@ def quality(operation: Operation) -> Operation:
     if value is None:
         return {}
     if not isinstance(value, dict):
-        raise RefusedError(f"qos of {operation['op']} must be a JSON object")
+        raise RefusedOperationError(f"qos of {operation['op']} must be a JSON object")
     for policy, known in _POLICIES.items():
         chosen = value.get(policy)
         if chosen is not None and chosen not in known and chosen not in _ANY_POLICY:
-            raise RefusedError(f"{policy} in qos of {operation['op']} must be one of {', '.join(known)}")
+            raise RefusedOperationError(
+                f"{policy} in qos of {operation['op']} must be one of {', '.join(known)}"
+            )
     number(value | {"op": f"qos of {operation['op']}"}, "depth")
     return value
 

@@ -126,6 +126,7 @@ class Outbox:
         """Queue an answer or a request of a service or an action, which must not be dropped."""
         if self._bypass(payload, fragment_size):
             return
+        # Messages of topics are dropped for an answer, never the reverse.
         if self._make_room(len(payload)):
             self._entries.append(_Entry(payload, None, fragment_size))
             self.size += len(payload)
@@ -142,6 +143,7 @@ class Outbox:
             now: Monotonic seconds.
         """
         if lane.throttle:
+            # A message must not overtake the ones that are held.
             if now < lane.next_time or lane.held:
                 if lane.queue_length:
                     self._hold(lane, payload)
@@ -172,6 +174,7 @@ class Outbox:
             else:
                 entry.lane.queued.popleft()  # this entry, because a lane has the outbox's order
                 entry.payload = None
+                # Dropped and sent entries stay in `_droppable` until they are first, which keeps both operations cheap.
                 while self._droppable and self._droppable[0].payload is None:
                     self._droppable.popleft()
             if entry.fragment_size:
@@ -195,6 +198,7 @@ class Outbox:
 
     def adjust(self, lane: Lane, throttle: float, queue_length: int) -> None:
         """Change a lane's throttle and length, and queue or drop messages that are no longer held."""
+        # The next message was due one old interval after the last one; now it is one new interval.
         lane.next_time += throttle - lane.throttle
         lane.throttle, lane.queue_length = throttle, queue_length
         while lane.held and not throttle:
@@ -257,6 +261,7 @@ class Outbox:
         self.size -= len(entry.payload or b"")
         entry.payload = None
         self._gaps += 1
+        # Packing costs as much as the queue is long, so it waits for as many gaps as messages.
         if self._gaps > _GAPS + len(self):
             self._entries = deque(entry for entry in self._entries if entry.payload is not None)
             self._droppable = deque(entry for entry in self._droppable if entry.payload is not None)

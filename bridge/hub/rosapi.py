@@ -17,10 +17,10 @@ import orjson
 
 from bridge.codecs.json_codec import is_deeper
 from bridge.errors import NameFormError
-from bridge.hub.definitions import Definitions
+from bridge.hub.definitions import MessageDefinitions
 from bridge.hub.graph import Graph
 from bridge.hub.interfaces import PARTS, part_name
-from bridge.hub.limits import HubLimits, RefusedError
+from bridge.hub.limits import HubLimits, RefusedOperationError
 from bridge.names import MAX_NAME, absolute, ros1_type, ros2_type
 
 NODE: Final = "/rosapi"
@@ -36,7 +36,7 @@ _ACTIONLIB: Final = ("goal", "cancel", "status", "feedback", "result")
 _ROS2_FIELDS: Final = {"default": "default_value"}
 
 Values = dict[str, Any]
-Answer = Callable[..., Values]
+_Answer = Callable[..., Values]
 
 
 def rosout_type(ros_version: int) -> str:
@@ -48,9 +48,9 @@ class Rosapi:
     """The services of one hub."""
 
     def __init__(
-        self, graph: Graph, limits: HubLimits, definitions: Definitions, wall_clock: Callable[[], int]
+        self, graph: Graph, limits: HubLimits, definitions: MessageDefinitions, wall_clock: Callable[[], int]
     ) -> None:
-        """Answer about `graph`; `wall_clock` returns nanoseconds since 1970."""
+        """_Answer about `graph`; `wall_clock` returns nanoseconds since 1970."""
         self._graph = graph
         self._limits = limits
         self._definitions = definitions
@@ -59,7 +59,7 @@ class Rosapi:
         self._parameters: dict[str, bytes] = {}
         self._parameter_bytes = 0
         # short name -> type, arguments (all strings) in order, function
-        self._services: dict[str, tuple[str, tuple[str, ...], Answer]] = {
+        self._services: dict[str, tuple[str, tuple[str, ...], _Answer]] = {
             "action_servers": ("GetActionServers", (), self._action_servers),
             "action_type": ("ActionType", ("action",), self._action_type),
             "delete_param": ("DeleteParam", ("name",), self._delete_param),
@@ -97,25 +97,25 @@ class Rosapi:
         return service.startswith(PREFIX) and service.removeprefix(PREFIX) in self._services
 
     def call(self, service: str, args: object) -> Values:
-        """Answer one call of a service for which `offers` returned true, and return the answer's `values`.
+        """_Answer one call of a service for which `offers` returned true, and return the answer's `values`.
 
         `args` is an object, or a list in the order of the service's fields; an omitted field is an empty
         string, as in ROS.
 
         Raises:
-            RefusedError: The arguments are wrong, or a limit is reached.
+            RefusedOperationError: The arguments are wrong, or a limit is reached.
         """
         _type, names, answer = self._services[service.removeprefix(PREFIX)]
         if isinstance(args, list):
             args = dict(zip(names, args, strict=False))
         if not isinstance(args, dict):
-            raise RefusedError(
+            raise RefusedOperationError(
                 f"{service}: args must be an object with the fields {', '.join(names) or '(none)'}"
             )
         given = [args.get(name, args.get(_ROS2_FIELDS.get(name), "")) for name in names]
         for name, value in zip(names, given, strict=True):
             if not isinstance(value, str):
-                raise RefusedError(f"{service}: field {name} must be a string")
+                raise RefusedOperationError(f"{service}: field {name} must be a string")
         return answer(*given)
 
     def service_type_name(self, type_name: str) -> str:
@@ -137,7 +137,7 @@ class Rosapi:
         topics = self._all_topics()
         texts = {type_name: self._full_text(type_name) for type_name in set(topics.values())}
         if sum(len(texts[type_name]) for type_name in topics.values()) > self._limits.message_bytes:
-            raise RefusedError(f"the definitions have more than {self._limits.message_bytes} bytes")
+            raise RefusedOperationError(f"the definitions have more than {self._limits.message_bytes} bytes")
         return {
             "topics": list(topics),
             "types": list(topics.values()),
@@ -147,7 +147,7 @@ class Rosapi:
     def _full_text(self, type_name: str) -> str:
         try:
             return self._definitions.full_text(type_name) if type_name else ""
-        except RefusedError:
+        except RefusedOperationError:
             return ""
 
     def _topics_for_type(self, type_name: str) -> Values:
@@ -158,6 +158,7 @@ class Rosapi:
 
     def _publishers(self, name: str) -> Values:
         topic = self._graph.topics.get(absolute(name))
+        # The hub publishes its refusals there, without being a client.
         own = [NODE] if absolute(name) == ROSOUT else []
         return {"publishers": own + ([client.node for client in topic.advertisements] if topic else [])}
 
@@ -256,7 +257,7 @@ class Rosapi:
         if self.ros_version == 2:
             return values | {"successful": not failure, "reason": failure}
         if failure:
-            raise RefusedError(failure)
+            raise RefusedOperationError(failure)
         return values
 
     def _get_param(self, name: str, default: str) -> Values:
@@ -272,6 +273,7 @@ class Rosapi:
 
     def _search_param(self, name: str) -> Values:
         key = absolute(name)
+        # As on the reference server for a name of a namespace, which has a parameter below it.
         below = any(each == key or each.startswith(key + "/") for each in self._parameters)
         return {"global_name": key if below else ""}
 

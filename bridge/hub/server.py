@@ -29,10 +29,10 @@ from websockets.server import ServerProtocol
 
 from bridge.hub.access import AccessPolicy, choose_subprotocol, is_loopback
 from bridge.hub.broker import Broker
-from bridge.hub.definitions import RosVersion
 from bridge.hub.graph import Client, Graph
 from bridge.hub.limits import HubError, HubLimits
 from bridge.hub.outbox import Outbox
+from bridge.names import RosVersion
 from bridge.transport.websocket import MESSAGE_BYTES_HEADER, WebSocketTransport
 
 log = logging.getLogger(__name__)

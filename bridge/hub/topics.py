@@ -8,22 +8,22 @@ import orjson
 
 from bridge.codecs.json_codec import BRACE, envelope_of, is_deeper, topic_of
 from bridge.errors import BridgeError
-from bridge.hub.definitions import Definitions
+from bridge.hub.definitions import MessageDefinitions
 from bridge.hub.dispatcher import Dispatcher, fragment_size_of
 from bridge.hub.encodings import (
     AROUND,
-    COMPRESSIONS,
-    Compression,
-    Message,
-    compression_of,
+    ENCODINGS,
+    Encoding,
+    OutgoingMessage,
+    encoding_of,
     json_prefix,
 )
-from bridge.hub.graph import Advertisement, Client, Graph, SubscribeOptions, Subscription, Topic
+from bridge.hub.graph import Advertisement, Client, Graph, SubscribeOptions, Topic, TopicSubscription
 from bridge.hub.limits import (
     HubLimits,
     Operation,
     OperationId,
-    RefusedError,
+    RefusedOperationError,
     checked_name,
     flag,
     number,
@@ -41,7 +41,7 @@ _ENVELOPE_KEYS: Final = 3
 _MESSAGE_WORK: Final = 20
 TURN_WORK: Final = 10_000
 """Units of work, of about a microsecond each, after which a client's turn ends."""
-_PLAIN: Final = Compression.NONE
+_PLAIN: Final = Encoding.NONE
 
 
 class Topics:
@@ -52,7 +52,7 @@ class Topics:
         graph: Graph,
         limits: HubLimits,
         dispatcher: Dispatcher,
-        definitions: Definitions,
+        definitions: MessageDefinitions,
         refuse: Callable[[Client, str, OperationId], None],
     ) -> None:
         """Start without topics; `refuse` reports a message that cannot be encoded for a subscriber."""
@@ -85,7 +85,7 @@ class Topics:
         name, own_id = text(operation, "topic"), operation_id(operation)
         advertisement = client.advertisements.get(absolute(name))
         if advertisement is None:
-            raise RefusedError(f"this client does not advertise {name}")
+            raise RefusedOperationError(f"this client does not advertise {name}")
         if own_id is None or advertisement.ids == {own_id}:
             self._end_advertisement(advertisement)
         elif own_id in advertisement.ids:
@@ -103,7 +103,7 @@ class Topics:
         """
         name, parsed = text(operation, "topic"), operation.get("msg", {})
         if type(parsed) is not dict:
-            raise RefusedError(f"the message for {name} is not a JSON object")
+            raise RefusedOperationError(f"the message for {name} is not a JSON object")
         advertisement = client.advertisements.get(name if name[0] == "/" else "/" + name)
         if advertisement is None:
             # As on the reference server, publishing also advertises, if the type is given here or already
@@ -145,6 +145,7 @@ class Topics:
             data = messages[index]
             if dispatcher.work > TURN_WORK:
                 return index
+            # A publisher of several topics changes between their envelopes; all proven ones are kept.
             if not data.startswith(envelope):
                 advertisement = client.envelopes.get(envelope_of(data))
                 if advertisement is None:
@@ -152,6 +153,7 @@ class Topics:
                 client.last_published = advertisement
                 topic, filler, envelope = advertisement.topic, advertisement.filler, advertisement.envelope
                 begin = len(envelope)
+            # What follows a proven envelope is a message and a brace, or it is parsed in full (and perhaps refused there).
             if data[-1] != BRACE:
                 return index
             message = data[begin:-1]
@@ -166,12 +168,13 @@ class Topics:
                 try:
                     if filler is not None:
                         tail = filler.fill(parsed, room)
+                        # With white space between the last braces, the tail has no place.
                         if tail is None or (tail and data[-2] != BRACE):
                             data = b"%b%b}" % (envelope, orjson.dumps(parsed))
                         elif tail:
                             data = data[:-2] + tail
                     self._deliver(topic, parsed, data, envelope, now)
-                except RefusedError:
+                except RefusedOperationError:
                     return index
         return len(messages)
 
@@ -187,15 +190,16 @@ class Topics:
         dispatcher = self._dispatcher
         # Rewriting can lengthen a message (1e15 becomes 1000000000000000.0).
         if size > topic.largest:
-            raise RefusedError(
+            raise RefusedOperationError(
                 f"the message for {topic.name} has more than {self._limits.message_bytes} bytes"
             )
+        # A message that is not latched for its size also ends the latching of the one before.
         if topic.latching:
             room = self._limits.latched_bytes - self._graph.latched_bytes + len(topic.latched or b"")
             self._graph.latch(topic, payload[len(prefix) : -1] if size <= room else None)
         dispatcher.work += _MESSAGE_WORK + 2 * len(topic.subscriptions)
         # Subscribers that use the same name for the topic share one payload.
-        message: Message | None = None
+        message: OutgoingMessage | None = None
         for subscription in topic.subscriptions.values():
             if subscription.compression is _PLAIN:
                 if subscription.prefix != prefix:
@@ -211,12 +215,12 @@ class Topics:
                 message = message or self._message(topic, payload[len(prefix) : -1], parsed)
                 self._deliver_encoded(subscription, message, now)
 
-    def _message(self, topic: Topic, data: bytes, parsed: dict[str, Any] | None) -> Message:
-        return Message(
+    def _message(self, topic: Topic, data: bytes, parsed: dict[str, Any] | None) -> OutgoingMessage:
+        return OutgoingMessage(
             data, parsed, topic.type, time.time_ns(), self._definitions, self._limits.message_bytes
         )
 
-    def _deliver_encoded(self, subscription: Subscription, message: Message, now: float) -> None:
+    def _deliver_encoded(self, subscription: TopicSubscription, message: OutgoingMessage, now: float) -> None:
         client, lane = subscription.client, subscription.lane
         if not client.outbox.accepts(lane, now):
             return
@@ -236,6 +240,7 @@ class Topics:
         """Perform `subscribe`."""
         name, type_name = text(operation, "topic"), optional_text(operation, "type")
         own_id, qos = operation_id(operation), quality(operation)
+        # A client of ROS 2 says `depth` where one of ROS 1 says `queue_length`.
         queue_length = int(number(operation, "queue_length"))
         if not queue_length and qos:
             keeps_all = qos.get("history") == "keep_all"
@@ -243,18 +248,22 @@ class Topics:
         options = SubscribeOptions(
             number(operation, "throttle_rate") / 1000,
             queue_length,
-            compression_of(operation.get("compression")),
+            encoding_of(operation.get("compression")),
             fragment_size_of(number(operation, "fragment_size")),
         )
         subscription = client.subscriptions.get(absolute(name))
+        # Repeating a subscribe operation changes its options; only a new one counts, and gets the latched message.
         is_new = subscription is None or own_id not in subscription.options
         if is_new and client.open_subscriptions >= self._limits.subscriptions_per_client:
-            raise RefusedError(f"this client already has {client.open_subscriptions} subscriptions")
+            raise RefusedOperationError(f"this client already has {client.open_subscriptions} subscriptions")
         topic = self._join(name, type_name, type_needed=False)
         if subscription is None:
-            subscription = topic.subscriptions[client] = Subscription(client, topic, json_prefix(name), name)
+            subscription = topic.subscriptions[client] = TopicSubscription(
+                client, topic, json_prefix(name), name
+            )
             client.subscriptions[topic.name] = subscription
         client.open_subscriptions += is_new
+        # The type of a topic without publishers lasts as long as a subscriber that named it (`Graph.tidy`).
         subscription.typed = subscription.typed or type_name is not None
         subscription.options[own_id] = options
         self._apply_options(subscription)
@@ -266,7 +275,7 @@ class Topics:
         name, own_id = text(operation, "topic"), operation_id(operation)
         subscription = client.subscriptions.get(absolute(name))
         if subscription is None:
-            raise RefusedError(f"this client is not subscribed to {name}")
+            raise RefusedOperationError(f"this client is not subscribed to {name}")
         if own_id is None or (len(subscription.options) == 1 and own_id in subscription.options):
             self._end_subscription(subscription)
         elif own_id in subscription.options:
@@ -274,14 +283,15 @@ class Topics:
             client.open_subscriptions -= 1
             self._apply_options(subscription)
 
-    def _apply_options(self, subscription: Subscription) -> None:
+    def _apply_options(self, subscription: TopicSubscription) -> None:
         options = subscription.options.values()
         self._dispatcher.work += 2 * len(options)
         throttle = min(each.throttle for each in options)
         queue_length = min(each.queue_length for each in options)
+        # With a throttle, 0 means to drop what comes too early; without one, it only means that the client does not care.
         if queue_length == 0 and not throttle:
             queue_length = self._limits.queue_length
-        subscription.compression = max({each.compression for each in options}, key=COMPRESSIONS.index)
+        subscription.compression = max({each.compression for each in options}, key=ENCODINGS.index)
         lane, outbox = subscription.lane, subscription.client.outbox
         lane.fragment_size = min((each.fragment_size for each in options if each.fragment_size), default=0)
         outbox.adjust(lane, throttle, min(queue_length, self._limits.longest_queue))
@@ -301,13 +311,14 @@ class Topics:
         if key == ROSOUT:
             known = rosout_type(self._definitions.ros_version)
         if type_name is not None and known and not same_type(type_name, known):
-            raise RefusedError(f"{name} is of type {known}, not {type_name}")
+            raise RefusedOperationError(f"{name} is of type {known}, not {type_name}")
         if type_needed and not known and type_name is None:
-            raise RefusedError(f"the type of {name} is unknown: advertise it first")
+            raise RefusedOperationError(f"the type of {name} is unknown: advertise it first")
         if topic is None:
+            # Names are checked where they would be stored; a name that is known was checked before.
             checked_name(name)
             if len(self._graph.topics) >= self._limits.topics:
-                raise RefusedError(f"the hub already has {self._limits.topics} topics")
+                raise RefusedOperationError(f"the hub already has {self._limits.topics} topics")
             topic = self._graph.topics[key] = Topic(key, self._limits.message_bytes - len(key) - AROUND)
         topic.type = known or type_name or ""
         return topic
@@ -318,7 +329,9 @@ class Topics:
         advertisement = client.advertisements.get(absolute(name))
         is_new = advertisement is None or own_id not in advertisement.ids
         if is_new and client.open_advertisements >= self._limits.advertisements_per_client:
-            raise RefusedError(f"this client already has {client.open_advertisements} advertisements")
+            raise RefusedOperationError(
+                f"this client already has {client.open_advertisements} advertisements"
+            )
         topic = self._join(name, type_name, type_needed=True)
         if advertisement is None:
             filler = self._definitions.filler(topic.type)
@@ -338,7 +351,7 @@ class Topics:
         _forget_envelope(advertisement)
         self._graph.tidy(topic)
 
-    def _end_subscription(self, subscription: Subscription) -> None:
+    def _end_subscription(self, subscription: TopicSubscription) -> None:
         client, topic = subscription.client, subscription.topic
         client.open_subscriptions -= len(subscription.options)
         client.outbox.forget(subscription.lane)

@@ -63,6 +63,7 @@ def whole_messages(
     last = min(size - 1, until)
     bit, key = (_MASKED, 4) if masked else (0, 0)
     while at < last and count > 0:
+        # A wrong mask bit makes the length 128 or more, which ends the loop below.
         length = data[at + 1] ^ bit
         if data[at] not in _WHOLE or length >= _MASKED:
             break
@@ -81,6 +82,7 @@ def whole_messages(
         end = body + length
         if end > size or length > largest:
             break
+        # The masking key is in the four bytes before the payload.
         take(unmask(data[body:end], data[body - 4 : body]) if masked else data[body:end])
         at = end
         count -= 1
@@ -150,6 +152,7 @@ class Masker:
     def encode(self, payloads: Sequence[bytes]) -> bytes:
         """Return the frames of the messages."""
         keys = self._keys
+        # One system call for many keys: each takes longer than masking a small message.
         if len(keys) < len(payloads):
             keys += mask_keys(max(_KEYS, len(payloads)))
         if len(payloads) == 1:  # in half the time

@@ -233,6 +233,7 @@ class WebSocketTransport(asyncio.Protocol):
             rest += data if at == len(data) else data[:at]
             if len(rest) < self._wanted:
                 return
+            # Frames after the completed one, if any, follow in the same turn.
             begun = bytes(rest)
             rest.clear()
             # The frame alone, because copying what follows it would take longer than reading that.
@@ -289,6 +290,7 @@ class WebSocketTransport(asyncio.Protocol):
         at = end + len(_END_OF_HEADERS) - len(before)
         self._in_handshake = False
         self._give_library(data[:at])
+        # A refusal may have a body, which is not a frame.
         self._quick = self.is_open
         if at < len(data):
             self._read_turn(data, at)
@@ -306,6 +308,7 @@ class WebSocketTransport(asyncio.Protocol):
     def _interrupt(self, data: bytes, at: int) -> None:
         """Stop reading until other tasks had their turn and reading is no longer blocked."""
         if not self.is_closing:
+            # Otherwise asyncio would read more before the rest of this turn is handled.
             cast("asyncio.Transport", self._transport).pause_reading()
             self._interrupted = data, at
             self.proceed()

@@ -24,6 +24,6 @@ the deviations of servers from it (`docs/reference/rosbridge-differences.md`).
 
 from bridge.client.protocol.client_core import ClientCore
 from bridge.client.protocol.subscriptions import Compression, Delivery
-from bridge.client.protocol.wire import RosVersion
+from bridge.names import RosVersion
 
 __all__ = ["ClientCore", "Compression", "Delivery", "RosVersion"]

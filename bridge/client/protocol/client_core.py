@@ -11,11 +11,12 @@ from bridge.client.protocol.events import Event, StatusReceived, UnusableReceive
 from bridge.client.protocol.publications import Publications
 from bridge.client.protocol.services import PendingCalls, ServedServices
 from bridge.client.protocol.subscriptions import Subscriptions
-from bridge.client.protocol.wire import RosVersion, Wire
+from bridge.client.protocol.wire import Wire
 from bridge.codecs import cbor_codec, png
 from bridge.codecs.fragments import Reassembler
 from bridge.codecs.json_codec import MAX_DEPTH, MAX_SIZE, decode, excerpt, text_of
 from bridge.errors import DecodeError
+from bridge.names import RosVersion
 
 
 class ClientCore:

@@ -11,11 +11,11 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 import orjson
 
 from bridge.client.protocol.events import MessageDiscarded, MessageReceived, UnusableReceived
-from bridge.client.protocol.wire import RosVersion, Wire, check_fragment_size
+from bridge.client.protocol.wire import Wire, check_fragment_size
 from bridge.codecs.cbor_codec import Arrays, with_arrays, with_lists
 from bridge.codecs.json_codec import BRACE, envelope_of, excerpt, is_deeper, topic_of
 from bridge.errors import OptionError, TypeConflictError
-from bridge.names import absolute, check_name, same_type, split_type
+from bridge.names import RosVersion, absolute, check_name, same_type, split_type
 from bridge.qos import Qos
 from bridge.stamps import ros_version_of_message
 

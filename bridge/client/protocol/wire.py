@@ -2,14 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from itertools import count
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from bridge.codecs.fragments import split
 from bridge.codecs.json_codec import encode
 from bridge.errors import OptionError
-from bridge.names import Kind, ros1_type, ros2_type
-
-RosVersion = Literal[1, 2]
+from bridge.names import Kind, RosVersion, ros1_type, ros2_type
 
 SMALLEST_LIMIT: Final = 2048
 """Smallest limit of a server that is believed, so that subscriptions and advertisements can always be sent."""

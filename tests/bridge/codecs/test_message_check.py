@@ -12,7 +12,7 @@ from bridge.codecs.message_check import (
     definitions_from_rosapi,
 )
 from bridge.errors import MessageTypeError
-from bridge.hub.definitions import Definitions
+from bridge.hub.definitions import MessageDefinitions
 
 TWIST = "geometry_msgs/Twist"
 ODOMETRY = "nav_msgs/Odometry"
@@ -30,7 +30,7 @@ def check(request, version):
     def make(type_name: str) -> MessageCheck:
         if request.param == "bundled":
             return MessageCheck(type_name, bundled_definitions(type_name, version))
-        answer = {"typedefs": Definitions(version).details(type_name)}
+        answer = {"typedefs": MessageDefinitions(version).details(type_name)}
         return MessageCheck(type_name, definitions_from_rosapi(answer))
 
     return make

@@ -15,9 +15,9 @@ from rosbags.typesys import Stores, get_typestore
 from bridge.codecs import cbor_codec, png
 from bridge.codecs.fragments import Reassembler
 from bridge.hub import topics
-from bridge.hub.definitions import Definitions
-from bridge.hub.encodings import Compression, Message
-from bridge.hub.limits import RefusedError
+from bridge.hub.definitions import MessageDefinitions
+from bridge.hub.encodings import Encoding, OutgoingMessage
+from bridge.hub.limits import RefusedOperationError
 from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, publisher_and_subscriber
 
 ARRAY = "std_msgs/Float64MultiArray"
@@ -136,18 +136,20 @@ def test_a_png_that_is_larger_than_may_be_is_refused() -> None:
     assert subscriber.client.refused == 1
 
 
-@pytest.mark.parametrize("compression", list(Compression))
-def test_the_limit_of_a_message_is_exact(compression: Compression) -> None:
-    definitions = Definitions()
+@pytest.mark.parametrize("compression", list(Encoding))
+def test_the_limit_of_a_message_is_exact(compression: Encoding) -> None:
+    definitions = MessageDefinitions()
     message = {"data": "x" * 100}
 
     def payload(max_size: int) -> bytes:
         data = json.dumps(message).encode()
-        return Message(data, message, "std_msgs/String", 0, definitions, max_size).payload(compression, "/t")
+        return OutgoingMessage(data, message, "std_msgs/String", 0, definitions, max_size).payload(
+            compression, "/t"
+        )
 
     size = len(payload(10_000))
     assert len(payload(size)) == size
-    with pytest.raises(RefusedError):
+    with pytest.raises(RefusedOperationError):
         payload(size - 1)
 
 
@@ -224,7 +226,7 @@ def test_of_several_wishes_the_last_form_and_the_least_size_count() -> None:
 def test_a_dropped_message_is_not_encoded(monkeypatch: pytest.MonkeyPatch) -> None:
     publisher, subscriber = publisher_and_subscriber("a/B", compression="cbor", throttle_rate=1000)
     publisher.publish("/t", {"data": [1.5]})
-    monkeypatch.setattr(topics.Message, "payload", None)
+    monkeypatch.setattr(topics.OutgoingMessage, "payload", None)
     publisher.publish("/t", {"data": [2.5]})
     assert subscriber.messages() == [{"data": [1.5]}]
 

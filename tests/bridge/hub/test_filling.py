@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.codecs import cbor_codec, png
-from bridge.hub.definitions import Definitions
+from bridge.hub.definitions import MessageDefinitions
 from bridge.hub.filling import _KNOWN, HEADER
 from bridge.names import ros2_type
 from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer, publisher_and_subscriber
@@ -163,7 +163,7 @@ _LEAVES = st.sampled_from(
 class Slow:
     """Filling as the reference server does it: field by field, for each message."""
 
-    def __init__(self, definitions: Definitions) -> None:
+    def __init__(self, definitions: MessageDefinitions) -> None:
         self.types = definitions._types
 
     def filled(self, name: str, value: Any) -> Any:
@@ -196,7 +196,7 @@ class Slow:
         return default | {"stamp": now} if self.types.fields(name)[field] == (HEADER, -1) else default
 
 
-def _messages(definitions: Definitions, name: str) -> st.SearchStrategy[Any]:
+def _messages(definitions: MessageDefinitions, name: str) -> st.SearchStrategy[Any]:
     """Return messages of a type, mostly of its form, with some of the fields."""
     types = definitions._types
     fields: dict[str, st.SearchStrategy[Any]] = {"more": _LEAVES}
@@ -213,8 +213,8 @@ def _messages(definitions: Definitions, name: str) -> st.SearchStrategy[Any]:
 
 
 @cache
-def _known(ros_version: Any) -> Definitions:
-    definitions = Definitions(ros_version, lambda: WALL_CLOCK)
+def _known(ros_version: Any) -> MessageDefinitions:
+    definitions = MessageDefinitions(ros_version, lambda: WALL_CLOCK)
     definitions.load()
     return definitions
 
