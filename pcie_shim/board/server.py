@@ -85,6 +85,9 @@ class Board(Protocol):
     def release(self) -> None:
         """Stop a running machine and disable interrupts, because the host has disconnected."""
 
+    def close(self) -> None:
+        """End what runs outside of this process, such as a simulation."""
+
 
 class StopSignal:
     """Stop request for `serve_board`, from a signal handler or a thread; create it after a fork."""

@@ -88,9 +88,9 @@ class DeployedBoards:
         """Start a frame, whose result `collect` returns; after a BoardError call `find_lost_boards`."""
         self._whole_cluster().post(self._input(frame))
 
-    def collect(self, seconds: float = 0) -> FrameOutput | None:
+    def collect(self) -> FrameOutput | None:
         """Return the posted frame's result, or None while boards run; after a BoardError, call `find_lost_boards`."""
-        return self._whole_cluster().collect(seconds)
+        return self._whole_cluster().collect(0)
 
     @property
     def awaited(self) -> int | None:

@@ -32,7 +32,12 @@ def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> Fram
     addresses: tuple[int | None, ...] | npt.NDArray[np.int64]
     row: PriorRow = 0
     if machine.is_plain:
-        addresses = tuple(_one(address) for address in frame.addresses)
+        addresses = tuple(each for each in frame.addresses if not isinstance(each, list))
+        if len(addresses) != len(frame.addresses):
+            raise FrameInputError(
+                "The frame has several readings of a variable; this machine takes one of each"
+            )
+        # too few or too many are the driver's error, which names both numbers
         if deployment.prior_select is not None and len(addresses) == len(deployment.variables):
             addresses, row = deployment.machine_addresses(addresses)
     else:
@@ -50,19 +55,8 @@ def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> Fram
     )
 
 
-def _one(address: int | list[int] | None) -> int | None:
-    if isinstance(address, list):
-        raise FrameInputError(
-            f"The frame has {len(address)} readings of one variable; this machine takes one of each"
-        )
-    return address
-
-
 def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.NDArray[np.int64], PriorRow]:
-    """Return the inputs of a frame in which replicas or lines have their own readings.
-
-    Returns:
-        The inputs of the sensors, -1 for a missing one, and the row of the prior's table.
+    """Return the inputs of sensors (-1: missing) and the prior's row, where replicas or lines have their own readings.
 
     Raises:
         FrameInputError: There are too few or too many variables, or a row has another length than expected.
@@ -81,6 +75,7 @@ def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.ND
         if variable.kind == "sensor":
             sensors.append(array.reshape(replicas, -1))
         else:
+            # the top row is the prior without a selection
             rows = np.where(array == -1, 2**variable.bits - 1, array)
             row = tuple(rows.tolist()) if rows.ndim else int(rows)
     per_line = (machine.lines,) if machine.sensor_mode is not SensorMode.COLUMN else ()
@@ -90,6 +85,7 @@ def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.ND
 
 
 def _row(deployment: Deployment, variable: Variable, given: int | list[int] | None) -> npt.NDArray[np.int64]:
+    # numbers from a pipe or another program: the deployment's own readings have been checked by the subscriber
     shape = deployment.reading_shape(variable)
     if given is None:
         return np.full(shape, -1, dtype=np.int64)

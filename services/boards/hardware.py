@@ -27,12 +27,7 @@ class SimulatedHardware:
     """The simulator of an engine, and the boards that use it."""
 
     def __init__(self, engine: Engine, folder: Path, images: Mapping[int, Image]) -> None:
-        """Choose the simulator (for `rtl` Verilator if it is installed, otherwise GHDL), and compile the images.
-
-        Args:
-            engine: Not `EMULATED`.
-            folder: Folder of compiled hardware.
-            images: Images with which boards will be programmed, by the numbers of the boards, as far as known.
+        """Choose the simulator, and compile the images of boards into the folder, as far as they are known.
 
         Raises:
             SettingsError: The simulator is not installed, or the VHDL is missing.
@@ -40,6 +35,8 @@ class SimulatedHardware:
         """
         self._images = images
         self._folder = folder
+
+        # `rtl` is Verilator if it is installed, and GHDL also if Verilator cannot compile an image.
         self._is_any = engine is Engine.RTL
         if self._is_any:
             self._simulator = Simulator.GHDL if missing(Simulator.VERILATOR.tools) else Simulator.VERILATOR
@@ -53,14 +50,9 @@ class SimulatedHardware:
             self._compiled(image)
 
     def board(self, index: int) -> RtlBoard:
-        """Return a blank board, which has started the hardware of its image if that is known.
-
-        Raises:
-            SimulationError: The hardware cannot be compiled or started.
-        """
+        """Return a blank board, which has started the hardware of its image if that is known (SimulationError)."""
         board = RtlBoard(self._simulate)
-        image = self._images.get(index)
-        if image is not None:
+        if (image := self._images.get(index)) is not None:
             board.prepare(image)
         return board
 

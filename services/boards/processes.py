@@ -1,17 +1,18 @@
 """Processes of emulated boards: a single one, or a mini-cluster forked from a process with loaded kernels."""
 
 import asyncio
-import contextlib
 import os
 import signal
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Final, NoReturn
 
-from pcie_shim.board.rtl_board import RtlBoard
+from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.board.server import Board, StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint, is_served
 from services.boards.hardware import SimulatedHardware
@@ -25,7 +26,7 @@ from services.supervision.service_manager import ServiceManager
 from terminal.logs import PARENT_VARIABLE, name_process
 from terminal.output import say
 from terminal.private_directory import remove_stale_sockets
-from terminal.signals import check_signals, run_async
+from terminal.signals import ENDING_SIGNALS, check_signals, run_async, stopped_error
 
 _ENDING_TIME: Final = 5.0
 """Seconds in which boards of a killed process of the same master end, even if they are stopped for a moment."""
@@ -40,58 +41,51 @@ def serve_one(
     index: int,
     directory: Path | None,
     *,
-    board: RtlBoard | None = None,
+    board: Board,
     metrics: str = "",
     restarts: int = 0,
     on_ready: Callable[[], None],
     on_alive: Callable[[], None] = lambda: None,
-) -> int:
-    """Serve one board in this process until a signal, and return the signal's number.
+) -> NoReturn:
+    """Serve one board in this process until a signal (a StoppedError), and close it.
 
-    `board` is None for an emulated one, and is closed at the end; `directory` is the folder of its status socket,
-    if any; `on_ready` is called when both its sockets are listening, and `on_alive` every second while the board
-    is not stuck.
+    `directory` is the folder of its status socket, if any; `on_ready` is called when both its sockets are listening,
+    and `on_alive` every second while the board is not stuck.
     """
     stop = StopSignal()
     ended_by: list[int] = []
+    listening = threading.Event()
 
     def end(number: int, _frame: object) -> None:
         ended_by.append(number)
         stop.set()
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    # in this thread, which serves; the status is answered in another one
+    for number in ENDING_SIGNALS:
         signal.signal(number, end)
-    listening: list[Board] = []
 
     def status() -> ProcessStatus:
-        image = listening[0].image_hash if listening else ""
-        blank = not image.strip("0")
-        state = "starting" if not listening else "blank" if blank else "programmed"
-        board = BoardStatus(
-            index=index, endpoint=str(endpoint), state=state, image="" if blank else image, restarts=restarts
-        )
-        where = f"listening at {endpoint}, {state}" if listening else f"starting at {endpoint}"
-        return ProcessStatus(ready=bool(listening), why=where, boards=[board])
+        image = board.image_hash if board.image_hash.strip("0") else ""
+        state = "starting" if not listening.is_set() else "programmed" if image else "blank"
+        where = f"listening at {endpoint}, {state}" if listening.is_set() else f"starting at {endpoint}"
+        own = BoardStatus(index=index, endpoint=str(endpoint), state=state, image=image, restarts=restarts)
+        return ProcessStatus(ready=listening.is_set(), why=where, boards=[own])
 
-    def ready(board: Board) -> None:
-        listening.append(board)
+    def ready(_board: Board) -> None:
+        listening.set()
         on_ready()
 
     def is_alive() -> bool:
-        turned = listening[0].turned if listening else 0.0
-        is_alive = not turned or time.monotonic() - turned < STUCK_S
+        # 0 before it serves: its start has limits of its own
+        is_alive = not board.turned or time.monotonic() - board.turned < STUCK_S
         if is_alive:
             on_alive()
         return is_alive
 
     name = f"board{index}"
-    try:
-        with serve_status_in_thread(directory, name, status, metrics=metrics, is_alive=is_alive):
-            serve_board(endpoint, index=index, stop=stop, board=board, on_ready=ready)
-    finally:
-        if board is not None:
-            board.close()
-    return ended_by[0] if ended_by else 0
+    with closing(board), serve_status_in_thread(directory, name, status, metrics=metrics, is_alive=is_alive):
+        serve_board(endpoint, index=index, stop=stop, board=board, on_ready=ready)
+    raise stopped_error(ended_by[0])
 
 
 def _await_free(endpoint: Endpoint, limit: float) -> None:
@@ -186,24 +180,23 @@ class BoardProcesses:
                 raise BoardFailedError(f"{child.failure()}{often}")
             say(f"{child.failure()}; restarting it")
 
-    def _serve(self, at: int) -> int:
-        """Serve a board in its process, and return the exit code."""
+    def _serve(self, at: int) -> NoReturn:
+        """Serve a board in its process."""
         name_process(f"board{at}")
-        ended_by = serve_one(
+        serve_one(
             self._endpoints[at],
             at,
             self._settings.run_directory,
-            board=None if self._hardware is None else self._hardware.board(at),
+            board=EmulatedBoard() if self._hardware is None else self._hardware.board(at),
             metrics=shifted(self._settings.metrics, at),
             restarts=self._children[at].restarts,
             on_ready=lambda: self._sign(_LISTENS + at),
             on_alive=lambda: self._sign(at),
         )
-        return 128 + ended_by if ended_by else 0
 
     def _sign(self, sign: int) -> None:
         """Write a sign of a board, in its process; the parent reads them all the time."""
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             os.write(self._write_sign, bytes([sign]))
 
     def _take_signs(self) -> None:
@@ -230,6 +223,7 @@ class BoardProcesses:
 
     def _report(self) -> None:
         """Tell the service manager how many boards listen, and that none of them is stuck."""
+        # a board that has not been heard yet counts from its start
         count, now = len(self._endpoints), time.monotonic()
         self._manager.report(
             f"{len(self._listening)} of {count} boards listen",
@@ -241,7 +235,7 @@ class BoardProcesses:
         """Remove the sockets that killed boards have left behind."""
         for endpoint in self._endpoints:
             for each in (endpoint, endpoint.programming):
-                with contextlib.suppress(OSError):
+                with suppress(OSError):
                     Path(each.path).unlink()
         if self._settings.run_directory is not None:
             outlive_parent()

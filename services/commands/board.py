@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.credentials import read_key
 from pcie_shim.endpoint import Endpoint
 from services.boards.deployed import images_of
@@ -24,7 +25,7 @@ from services.supervision.parent import leave_private_directory
 from terminal.command_line import CommandLine
 from terminal.logs import PARENT_VARIABLE, name_process
 from terminal.output import say
-from terminal.signals import check_signals, stopped_error
+from terminal.signals import check_signals
 
 app = CommandLine(
     help="Emulate boards of the mini-cluster. They start blank; pcie-app or the loader programs them.\n\n"
@@ -106,17 +107,8 @@ def board(
         if PARENT_VARIABLE not in os.environ:  # a master monitors its boards itself
             say(f"board {index} listens at {endpoint}")
 
-    ended_by = serve_one(
-        endpoint,
-        index,
-        run_directory,
-        board=None if simulated is None else simulated.board(index),
-        metrics=settings.metrics,
-        on_ready=on_ready,
-    )
-    if ended_by:
-        raise stopped_error(ended_by)
-    return 0
+    served = EmulatedBoard() if simulated is None else simulated.board(index)
+    serve_one(endpoint, index, run_directory, board=served, metrics=settings.metrics, on_ready=on_ready)
 
 
 def _simulated(
