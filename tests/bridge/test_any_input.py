@@ -427,6 +427,7 @@ published = (_right | _any).map(b"".join)
 
 
 @settings(max_examples=200)
+@example([_ENVELOPES[0] + b"{}}", _ENVELOPES[0] + b"null}"], Delivery())
 @given(st.lists(published, max_size=8), st.sampled_from((Delivery(), Delivery(arrays="numpy"))))
 @example(
     [
@@ -462,6 +463,7 @@ _AGAIN = [b'{"op":"unadvertise","topic":"/a"}', b'{"op":"advertise","topic":"/a"
 
 @settings(max_examples=200)
 @given(st.lists(st.lists(published, max_size=3) | st.just(_AGAIN), max_size=8))
+@example([[_ENVELOPES[0] + b"{}}", _ENVELOPES[0] + b"null}"]])
 @example([[_ENVELOPES[0] + b"{}}", _ENVELOPES[1] + _LONG + b"}"], [_ENVELOPES[1] + _LONG + b"}"] * 2])
 @example(
     [[_ENVELOPES[4] + _DEEP + b"}"]] * 3 + [[_ENVELOPES[4] + b'{"a":1}}'], [_ENVELOPES[6] + _DEEP + b"}"]]
