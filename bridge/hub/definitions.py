@@ -7,7 +7,8 @@ without it CBOR packs only floats, and the last two are refused.
 
 import contextlib
 import time
-from collections.abc import Callable
+from base64 import b64encode
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -23,10 +24,11 @@ from bridge.hub.conversions import (
     fields_of,
     typed_converter,
 )
-from bridge.hub.filling import FieldTypes, Filler, Types
+from bridge.hub.filling import Filler
 from bridge.hub.interfaces import PARTS, message_texts, part_name
 from bridge.hub.limits import RefusedOperationError
 from bridge.names import RosVersion, ros1_type, ros2_type
+from bridge.stamps import stamp
 
 if TYPE_CHECKING:
     from rosbags.typesys import Stores
@@ -35,6 +37,10 @@ if TYPE_CHECKING:
 # Bytes of the size limit per value of a serialised message; `{}` in an array can stand for dozens of
 # values.
 _BYTES_A_VALUE: Final = 16
+_HEADER: Final = "std_msgs/msg/Header"
+_TIME_FIELDS: Final = {1: ("secs", "nsecs"), 2: ("sec", "nanosec")}
+# The only field of the common ROS 2 messages whose default is not zero.
+_ONE: Final = {("geometry_msgs/msg/Quaternion", "w"): 1.0}
 _MISSING: Final = (
     "the hub has no message definitions: install rosbags (pip install rosbags) and start the hub again"
 )
@@ -49,9 +55,13 @@ class MessageDefinitions:
         # None before `load`, and also afterwards if rosbags is not installed.
         self._store: Typestore | None = None
         self._is_loaded = False
+        self._wall_clock = wall_clock
+        # What was derived from the definitions, by the names of types as they were asked for.
         self._typed: dict[str, Convert] = {}
-        self._types = Types(self._field_types, DEFAULTS, TIMES, ros_version, wall_clock)
         self._texts: dict[str, str] = {}
+        # And by the names that rosbags uses.
+        self._fillers: dict[str, Filler] = {}
+        self._defaults: dict[str, dict[str, Any]] = {}
 
     def load(self) -> None:
         """Import rosbags and its types, unless that was done; it takes a tenth of a second."""
@@ -72,17 +82,69 @@ class MessageDefinitions:
             _store, known = self._known(type_name)
         except BridgeError:
             return None
-        return self._types.filler(known)
+        return self._filler(known)
 
     def fillers(self, type_name: str, kind: Literal["srv", "action"]) -> dict[str, Filler]:
         """Return the fillers of the parts of a service or an action, such as `Request`, without unknown parts."""
         fillers = {part: self.filler(part_name(type_name, part, self.ros_version)) for part in PARTS[kind]}
         return {part: filler for part, filler in fillers.items() if filler is not None}
 
-    def _field_types(self, name: str) -> FieldTypes:
+    def _filler(self, name: str) -> Filler:
+        if name not in self._fillers:
+            parts = tuple(
+                (field, self._filler(element), length >= 0)
+                for field, (element, length) in self.fields(name).items()
+                if element not in DEFAULTS and self.fields(element)
+            )
+            self._fillers[name] = Filler(
+                self.defaults(name), self._varying(name), parts, is_time=name in TIMES
+            )
+        return self._fillers[name]
+
+    def fields(self, name: str) -> Mapping[str, tuple[str, int]]:
+        """Return the types of a known message's fields or of their elements, and their lengths, as `element_of`."""
+        if name in TIMES:
+            return dict.fromkeys(_TIME_FIELDS[self.ros_version], ("uint32", -1))
         store, known = self._known(name)
-        fields = fields_of(store, known)
-        return {self._field(name, field): element_of(kind, content) for field, (kind, content) in fields}
+        return {field: element_of(kind, content) for field, (kind, content) in fields_of(store, known)}
+
+    def defaults(self, name: str) -> dict[str, Any]:
+        """Return the default of a known message, which must not be changed."""
+        if name not in self._defaults:
+            self._defaults[name] = {
+                field: self._default(name, field, element, length)
+                for field, (element, length) in self.fields(name).items()
+            }
+        return self._defaults[name]
+
+    def _default(self, name: str, field: str, element: str, length: int) -> Any:
+        one: Any = DEFAULTS[element] if element in DEFAULTS else self.defaults(element)
+        if self.ros_version == 2:
+            one = _ONE.get((name, field), one)
+        if length < 0:
+            return one
+        # The reference server writes bytes as base64.
+        return b64encode(bytes(length)).decode() if element in {"uint8", "char"} else [one] * length
+
+    def _varying(self, name: str) -> dict[str, Callable[[dict[str, Any]], Any]]:
+        """Return the fields of a type whose defaults depend on the time of receipt or on the message's other fields."""
+
+        def now(_message: object) -> dict[str, int]:
+            return stamp(self._wall_clock(), self.ros_version)
+
+        def of_other_version(field: str) -> Callable[[dict[str, Any]], int]:
+            return lambda message: given if type(given := message.get(field)) is int else 0
+
+        if name in TIMES:
+            own, other = _TIME_FIELDS[self.ros_version], _TIME_FIELDS[3 - self.ros_version]
+            return {field: of_other_version(theirs) for field, theirs in zip(own, other, strict=True)}
+        if name == _HEADER:
+            return {"stamp": now}
+        return {
+            field: lambda message: self.defaults(_HEADER) | {"stamp": now(message)}
+            for field, kind in self.fields(name).items()
+            if kind == (_HEADER, -1)
+        }
 
     def typed(self, type_name: str, message: dict[str, Any]) -> dict[str, Any] | None:
         """Convert a message's arrays of numbers to typed arrays, for CBOR.

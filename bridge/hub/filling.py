@@ -12,29 +12,18 @@ A message that only lacks outermost fields, as most do, keeps its own JSON: the 
 the place of the last two braces. Only a message with an incomplete part is written again.
 """
 
-from base64 import b64encode
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable
 from typing import Any, Final
 
 import orjson
 
 from bridge.hub.limits import RefusedOperationError
-from bridge.names import RosVersion
-from bridge.stamps import stamp
 
-FieldTypes = Mapping[str, tuple[str, int]]
-"""The types of a message's fields or of their elements, and their lengths: -1 for a scalar, 0 for any."""
-
-HEADER: Final = "std_msgs/msg/Header"
-_TIME: Final = {1: ("secs", "nsecs"), 2: ("sec", "nanosec")}
 # Number of combinations of absent fields that are remembered for one type.
 _KNOWN: Final = 32
-# The only field of the common ROS 2 messages whose default is not zero.
-_ONE: Final = {("geometry_msgs/msg/Quaternion", "w"): 1.0}
-
 
 _Parts = tuple[tuple[str, "Filler", bool], ...]
-"""The fields of a message that are messages, or arrays of messages, and whether they are arrays."""
+"""The fields of a message that are messages or arrays of messages, and whether they are arrays."""
 
 _Absent = tuple[dict[str, Any], bytes, _Parts]
 """The absent fields of a message and their defaults, which must not be changed; their tail; the present parts."""
@@ -43,23 +32,32 @@ _Absent = tuple[dict[str, Any], bytes, _Parts]
 class Filler:
     """The fields of one message type, and their defaults."""
 
-    def __init__(self, types: "Types", name: str) -> None:
-        """Prepare a known type and, recursively, the types of its fields."""
-        self._defaults = types.defaults(name)
-        # The defaults that differ from message to message: stamps, and the other ROS version's fields of a time.
-        self._varying = types.varying(name)
-        self.parts: _Parts = tuple(
-            (field, types.filler(element), length >= 0)
-            for field, (element, length) in types.fields(name).items()
-            if types.has_fields(element)
-        )
+    def __init__(
+        self,
+        defaults: dict[str, Any],
+        varying: dict[str, Callable[[dict[str, Any]], Any]],
+        parts: _Parts,
+        *,
+        is_time: bool,
+    ) -> None:
+        """Prepare a type.
+
+        Args:
+            defaults: The defaults of all fields, which must not be changed.
+            varying: Those that differ from message to message: stamps, and the other ROS version's fields of a time.
+            parts: The fields that are messages, or arrays of messages, with their fillers.
+            is_time: Whether the type is a time or a duration.
+        """
+        self._defaults = defaults
+        self._varying = varying
+        self.parts = parts
         # By the present fields. A publisher repeats the same few, so most messages are filled without a look at
         # single fields.
         self._known: dict[tuple[str, ...], _Absent] = {}
         # A message with as many fields as its type is complete. If it has unknown fields in place of absent ones,
         # the reference server refuses it; here its subscribers see what is wrong. Only the fields of a time may
         # replace each other, so its number of fields says nothing.
-        self.count = -1 if name in types.times else len(self._defaults)
+        self.count = -1 if is_time else len(defaults)
 
     def named(self, values: list[Any]) -> dict[str, Any]:
         """Return the message with these values in the order of the fields, as arguments of services may be given."""
@@ -130,94 +128,3 @@ def _fill_parts(parts: _Parts, message: dict[str, Any], room: int) -> int:
         elif type(part) is dict and (filler.parts or len(part) != filler.count):
             grown += filler.fill_part(part, room - grown)
     return grown
-
-
-class Types:
-    """Defaults and fillers of the types of one ROS version."""
-
-    def __init__(
-        self,
-        field_types: Callable[[str], FieldTypes],
-        scalars: Mapping[str, Any],
-        times: Container[str],
-        ros_version: RosVersion,
-        wall_clock: Callable[[], int],
-    ) -> None:
-        """Start without prepared types.
-
-        Args:
-            field_types: Returns the fields of a message; of a basic type, raises a KeyError.
-            scalars: Defaults of the basic types.
-            times: Names of the types of times.
-            ros_version: 1 or 2.
-            wall_clock: Returns nanoseconds since 1970.
-        """
-        self.times = times
-        self._field_types = field_types
-        self._scalars = scalars
-        self._ros_version = ros_version
-        self._wall_clock = wall_clock
-        self._defaults: dict[str, dict[str, Any]] = {}
-        self._fillers: dict[str, Filler] = {}
-
-    def filler(self, name: str) -> Filler:
-        """Return the filler of a known type."""
-        if name not in self._fillers:
-            self._fillers[name] = Filler(self, name)
-        return self._fillers[name]
-
-    def varying(self, name: str) -> dict[str, Callable[[dict[str, Any]], Any]]:
-        """Return the fields of a type whose defaults depend on the time of receipt or on the message's other fields."""
-
-        def now(_message: object) -> dict[str, int]:
-            return stamp(self._wall_clock(), self._ros_version)
-
-        def of_other_version(field: str) -> Callable[[dict[str, Any]], int]:
-            return lambda message: given if type(given := message.get(field)) is int else 0
-
-        if name in self.times:
-            own, other = _TIME[self._ros_version], _TIME[3 - self._ros_version]
-            return {field: of_other_version(theirs) for field, theirs in zip(own, other, strict=True)}
-        if name == HEADER:
-            return {"stamp": now}
-        return {
-            field: lambda message: self.defaults(HEADER) | {"stamp": now(message)}
-            for field, kind in self._field_types(name).items()
-            if kind == (HEADER, -1)
-        }
-
-    def defaults(self, name: str) -> dict[str, Any]:
-        """Return the default of a message, which must not be changed."""
-        known = self._defaults.get(name)
-        if known is None:
-            if name in self.times:
-                known = dict.fromkeys(_TIME[self._ros_version], 0)
-            else:
-                known = {
-                    field: self._default(name, field, element, length)
-                    for field, (element, length) in self._field_types(name).items()
-                }
-            self._defaults[name] = known
-        return known
-
-    def _default(self, name: str, field: str, element: str, length: int) -> Any:
-        if element not in self._scalars:
-            one: Any = self.defaults(element)
-        else:
-            one = self._scalars[element]
-            if self._ros_version == 2:
-                one = _ONE.get((name, field), one)
-        if length < 0:
-            return one
-        # as the reference server writes bytes
-        return b64encode(bytes(length)).decode() if element in {"uint8", "char"} else [one] * length
-
-    def fields(self, name: str) -> FieldTypes:
-        """Return the types of a message's fields, and their lengths."""
-        if name in self.times:
-            return dict.fromkeys(_TIME[self._ros_version], ("uint32", -1))
-        return self._field_types(name)
-
-    def has_fields(self, name: str) -> bool:
-        """Return whether a type is neither a basic one nor an empty message."""
-        return name not in self._scalars and bool(self.fields(name))

@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.codecs import cbor_codec, png
-from bridge.hub.definitions import MessageDefinitions
-from bridge.hub.filling import _KNOWN, HEADER
+from bridge.hub.conversions import DEFAULTS, TIMES
+from bridge.hub.definitions import _HEADER, MessageDefinitions
+from bridge.hub.filling import _KNOWN
 from bridge.names import ros2_type
 from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer, publisher_and_subscriber
 
@@ -164,7 +165,7 @@ class Slow:
     """Filling as the reference server does it: field by field, for each message."""
 
     def __init__(self, definitions: MessageDefinitions) -> None:
-        self.types = definitions._types
+        self.types = definitions
 
     def filled(self, name: str, value: Any) -> Any:
         """Return a message with all its fields, in the order of the text with the absent ones appended."""
@@ -174,9 +175,9 @@ class Slow:
         whole = dict(value)
         for field, (element, length) in fields.items():
             if field not in value:
-                if len(value) != len(fields) or name in self.types.times:
+                if len(value) != len(fields) or name in TIMES:
                     whole[field] = self.default(name, field, value)
-            elif element not in self.types._scalars:
+            elif element not in DEFAULTS:
                 whole[field] = (
                     self.filled(element, value[field]) if length < 0 else self.each(element, value[field])
                 )
@@ -186,22 +187,22 @@ class Slow:
         return [self.filled(element, value) for value in values] if type(values) is list else values
 
     def default(self, name: str, field: str, value: dict[str, Any]) -> Any:
-        now = _NOW[self.types._ros_version]
+        now = _NOW[self.types.ros_version]
         default = self.types.defaults(name)[field]
-        if name in self.types.times:
+        if name in TIMES:
             given = value.get({"sec": "secs", "secs": "sec", "nanosec": "nsecs", "nsecs": "nanosec"}[field])
             return given if type(given) is int else 0
-        if name == HEADER and field == "stamp":
+        if name == _HEADER and field == "stamp":
             return now
-        return default | {"stamp": now} if self.types.fields(name)[field] == (HEADER, -1) else default
+        return default | {"stamp": now} if self.types.fields(name)[field] == (_HEADER, -1) else default
 
 
 def _messages(definitions: MessageDefinitions, name: str) -> st.SearchStrategy[Any]:
     """Return messages of a type, mostly of its form, with some of the fields."""
-    types = definitions._types
+    types = definitions
     fields: dict[str, st.SearchStrategy[Any]] = {"more": _LEAVES}
     for field, (element, length) in types.fields(name).items():
-        if element in types._scalars:
+        if element in DEFAULTS:
             fields[field] = _LEAVES
         else:
             part = _messages(definitions, element)
