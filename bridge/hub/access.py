@@ -49,11 +49,7 @@ class AccessPolicy:
     tls: ssl.SSLContext | None = None
 
     def __post_init__(self) -> None:
-        """Refuse tokens that cannot be sent or are easy to guess.
-
-        Raises:
-            HubError: A token is too short, or has characters that a header does not accept.
-        """
+        """Refuse tokens that cannot be sent or are easy to guess, with a HubError."""
         for number, token in enumerate(self.tokens, 1):
             if _TOKEN.fullmatch(token) is None:
                 raise HubError(

@@ -58,13 +58,7 @@ class Broker:
         ros_version: RosVersion = 1,
         wall_clock: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Start without clients.
-
-        Args:
-            limits: Bounds of the hub.
-            ros_version: The emulated ROS version, which decides how types are written and what rosapi answers.
-            wall_clock: Returns nanoseconds since 1970, for `/rosapi/get_time` and stamps.
-        """
+        """Start without clients; `wall_clock` returns nanoseconds since 1970, for `/rosapi/get_time` and stamps."""
         self.limits = limits or HubLimits()
         self.graph = Graph()
         self.definitions = MessageDefinitions(ros_version, wall_clock)
@@ -145,13 +139,7 @@ class Broker:
         self._reassembling.discard(client)
 
     def receive(self, client: Client, data: bytes, now: float) -> None:
-        """Perform the operation in one message of a client.
-
-        Args:
-            client: Its sender.
-            data: A whole WebSocket message, text or binary, with any content.
-            now: Monotonic seconds.
-        """
+        """Perform the operation in a whole WebSocket message, text or binary, with any content."""
         self._now, self._operation_id = now, None
         self._dispatcher.work += _OPERATION_WORK + (len(data) >> 7)
         try:
@@ -160,16 +148,10 @@ class Broker:
             self._refuse(client, str(error), self._operation_id, with_status=client.wants_status)
 
     def receive_turn(self, client: Client, messages: list[bytes], now: float) -> int:
-        """Perform messages of a client in order, as many as one turn allows.
+        """Perform messages of a client in order, each of at most `limits.message_bytes`, as many as one turn allows.
 
-        Args:
-            client: Their sender.
-            messages: Whole WebSocket messages of at most `limits.message_bytes`.
-            now: Monotonic seconds.
-
-        Returns:
-            The number of messages performed. The others need another turn, after the client has read its answers if
-            its outbox is congested.
+        Returns the number of messages performed. The others need another turn, after the client has read its answers
+        if its outbox is congested.
         """
         self._now, self._operation_id = now, None
         dispatcher, outbox = self._dispatcher, client.outbox

@@ -82,11 +82,7 @@ class Caller:
 
 
 def filled(filler: Filler | None, values: Any, room: int) -> Any:
-    """Return arguments or results with the defaults of absent fields, and named fields instead of a list.
-
-    Raises:
-        RefusedOperationError: They would grow by more than `room` bytes.
-    """
+    """Return arguments or results with all fields, which may grow by `room` bytes, and named ones instead of a list."""
     if values is None:
         values = {}
     if filler is not None:

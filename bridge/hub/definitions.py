@@ -147,11 +147,7 @@ class MessageDefinitions:
         }
 
     def typed(self, type_name: str, message: dict[str, Any]) -> dict[str, Any] | None:
-        """Convert a message's arrays of numbers to typed arrays, for CBOR.
-
-        Returns:
-            The message, or None if its type is unknown or does not fit it.
-        """
+        """Convert a message's arrays of numbers to typed arrays, or return None if its type is unknown or does not fit."""
         try:
             convert = self._typed.get(type_name)
             if convert is None:

@@ -45,11 +45,7 @@ class Dispatcher:
         return ready
 
     def checked(self, payload: bytes, what: str) -> bytes:
-        """Return a payload of acceptable size.
-
-        Raises:
-            RefusedOperationError: It exceeds the limit; `what` names it.
-        """
+        """Return a payload, or raise a RefusedOperationError if it exceeds the limit; `what` names it."""
         if len(payload) > self._limits.message_bytes:
             raise RefusedOperationError(f"{what} has more than {self._limits.message_bytes} bytes")
         return payload

@@ -67,12 +67,7 @@ class OutgoingMessage:
     _payloads: dict[tuple[Encoding, str], bytes | BridgeError] = field(default_factory=dict)
 
     def payload(self, compression: Encoding, name: str) -> bytes:
-        """Return the message in one encoding, under the topic's name as a client uses it.
-
-        Raises:
-            RefusedOperationError: The encoding needs a definition that is unknown, or is larger than the limit.
-            EncodeError: The message has no such encoding.
-        """
+        """Return the message in one encoding, under the topic's name as a client uses it, or raise a BridgeError."""
         # Payloads and failures are kept: each encoding is tried once, however many subscribers want it.
         payload = self._payloads.get((compression, name))
         if payload is None:

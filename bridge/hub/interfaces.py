@@ -164,13 +164,7 @@ _ACTIONLIB: Final = {
 
 
 def part_name(type_name: str, part: str, ros_version: RosVersion) -> str:
-    """Return the name under which a part of a service or an action, such as its `Request`, is defined as a message.
-
-    Args:
-        type_name: The service or action: `std_srvs/SetBool`, `std_srvs/srv/SetBool`.
-        part: `Request`, `Response`, `Goal`, `Result` or `Feedback`.
-        ros_version: ROS 2 separates the part by an underscore.
-    """
+    """Return the name under which a part of a service or an action, such as its `Request`, is defined as a message."""
     package, _, name = type_name.partition("/")
     return f"{package}/msg/{name.rpartition('/')[2]}{'_' if ros_version == 2 else ''}{part}"
 

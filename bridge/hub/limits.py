@@ -100,11 +100,7 @@ class HubLimits:
     stuck_timeout: float = 20.0
 
     def __post_init__(self) -> None:
-        """Refuse bounds that are not positive or contradict each other.
-
-        Raises:
-            HubError: A bound is not positive, or two do not fit together.
-        """
+        """Refuse bounds that are not positive or contradict each other, with a HubError."""
         for field in fields(self):
             value = getattr(self, field.name)
             if not value > 0:

@@ -135,13 +135,7 @@ class Outbox:
             self.overflowed = True
 
     def offer(self, lane: Lane, payload: bytes, now: float) -> None:
-        """Queue a topic's message, hold it until its throttle admits it, or drop it.
-
-        Args:
-            lane: The lane of the subscription.
-            payload: The message as it goes onto the wire.
-            now: Monotonic seconds.
-        """
+        """Queue a topic's message, hold it until its throttle admits it, or drop it."""
         if lane.throttle:
             # A message must not overtake the ones that are held.
             if now < lane.next_time or lane.held:

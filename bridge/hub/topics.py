@@ -93,14 +93,7 @@ class Topics:
             client.open_advertisements -= 1
 
     def publish(self, client: Client, operation: Operation, raw: bytes | None, now: float) -> None:
-        """Perform `publish`.
-
-        Args:
-            client: The publisher.
-            operation: The operation.
-            raw: The operation as received, if it was strict JSON.
-            now: Monotonic seconds.
-        """
+        """Perform `publish`; `raw` is the operation as received, if it was strict JSON."""
         name, parsed = text(operation, "topic"), operation.get("msg", {})
         if type(parsed) is not dict:
             raise RefusedOperationError(f"the message for {name} is not a JSON object")
@@ -126,14 +119,8 @@ class Topics:
     def publish_known(self, client: Client, messages: Sequence[bytes], first: int, now: float) -> int:
         """Perform `publish` operations with known envelopes: only their messages are parsed, and forwarded as received.
 
-        Args:
-            client: The publisher.
-            messages: Any received data.
-            first: The index of the first one to perform.
-            now: Monotonic seconds.
-
-        Returns:
-            The index of the first one that was not performed: it must be parsed in full, or exceeds a turn.
+        `messages` are any data, performed from index `first` on. The result is the index of the first one that was
+        not performed, because it must be parsed in full or exceeds a turn.
         """
         advertisement = client.last_published
         if advertisement is None:
