@@ -2,10 +2,6 @@
 
 import contextlib
 import dataclasses
-import multiprocessing
-import os
-import select
-import signal
 import socket
 import struct
 import tempfile
@@ -27,7 +23,6 @@ from pcie_shim.programming_file import Image, Partition, interface_words
 from tests.patience import PATIENCE
 from tests.pcie_shim.misbehaving import serve_misbehaving
 
-_FORK = multiprocessing.get_context("fork")
 _PLACES: list[socket.socket] = []
 """Bound and never listening, until `free_places`."""
 
@@ -119,42 +114,7 @@ class ServedBoard:
         assert not self._thread.is_alive()
 
 
-class BoardProcess:
-    """An emulated board in a process of its own, which can be killed."""
-
-    def __init__(self, endpoint: str, *, index: int = 0) -> None:
-        self.endpoint = endpoint
-        ready, self._tell = os.pipe()
-        self.process = _FORK.Process(target=self._run, args=(index,), daemon=True)
-        self.process.start()
-        os.close(self._tell)
-        readable, _, _ = select.select([ready], [], [], PATIENCE)
-        said = os.read(ready, 1) if readable else b""
-        os.close(ready)
-        assert said, f"the board at {endpoint} did not start"
-
-    def _run(self, index: int) -> None:
-        stop = StopSignal()
-        signal.signal(signal.SIGTERM, lambda *_: stop.set())
-        serve_board(
-            self.endpoint,
-            index=index,
-            stop=stop,
-            on_ready=lambda _board: os.write(self._tell, b"r") and None,
-        )
-
-    def stop(self) -> int | None:
-        """End it in order; its exit code."""
-        self.process.terminate()
-        self.process.join(PATIENCE)
-        return self.process.exitcode
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.join(PATIENCE)
-
-
-def endpoints_of(boards: Sequence[ServedBoard | BoardProcess]) -> list[str]:
+def endpoints_of(boards: Sequence[ServedBoard]) -> list[str]:
     return [board.endpoint for board in boards]
 
 

@@ -1,5 +1,4 @@
 import tempfile
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -9,30 +8,30 @@ from tests.pcie_shim.boards import ServedBoard, free_places
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _kernels() -> None:
+def _kernels():
     """Loaded once, before boards are forked from this process, and before a board's thread would compile them."""
     warm_up()
 
 
 @pytest.fixture(autouse=True)
-def _places() -> Iterator[None]:
+def _places():
     yield
     free_places()
 
 
 @pytest.fixture
-def folder() -> Iterator[Path]:
+def folder():
     """A folder with a short name: a unix socket's path has 107 bytes at most."""
     with tempfile.TemporaryDirectory(prefix="bm") as name:
         yield Path(name)
 
 
 @pytest.fixture
-def start_board(folder: Path) -> Iterator[Callable[..., ServedBoard]]:
+def start_board(folder):
     """Serves boards in threads of this process, and ends them after the test."""
     started: list[ServedBoard] = []
 
-    def start(endpoint: str = "", *, index: int = 0, misbehave: str = "") -> ServedBoard:
+    def start(endpoint="", *, index=0, misbehave=""):
         board = ServedBoard(endpoint or f"unix:{folder}/board{index}.sock", index=index, misbehave=misbehave)
         started.append(board)
         return board

@@ -3,23 +3,20 @@
 The board misbehaves after AFTER successful starts and resumes (0: from the opening on), for TIMES answers (0: forever).
 """
 
-import hashlib
 import re
 import select
 import signal
 import sys
 import time
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Self
 
 from pcie_shim import framing
 from pcie_shim import register_map as rm
 from pcie_shim.board.connection import HostConnection
 from pcie_shim.board.emulated_board import EmulatedBoard
-from pcie_shim.board.server import Board, BoardServer, StopSignal
+from pcie_shim.board.server import BoardServer, StopSignal
 from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.framing import Frame
 from pcie_shim.register_layout import ALL_ONES
@@ -27,32 +24,20 @@ from pcie_shim.register_map import BoardState
 
 
 class Kind(StrEnum):
-    """The kind of fault."""
+    """The kind of fault; an answer is that to a request, or an interrupt."""
 
-    DROP = "drop"
-    """The board does not send an answer or interrupt."""
-    STALL = "stall"
-    """The board stops serving its host, but keeps the link open."""
-    SHORT_READ = "short-read"
-    """An answer to a read, or an interrupt, lacks one word."""
-    ENDLESS = "endless"
-    """A frame begins and does not end."""
-    WRONG_SEQUENCE = "wrong-sequence"
-    """An answer or interrupt has another sequence number."""
-    WRONG_CRC = "wrong-crc"
-    """An answer or interrupt has a wrong CRC."""
-    ALL_ONES = "all-ones"
-    """Every register reads all ones, as if the device were gone."""
-    WRONG_MAP = "wrong-map"
-    """The greeting contains another register map."""
-    NEVER_DONE = "never-done"
-    """The machine starts and never stops."""
-    DONE_TWICE = "done-twice"
-    """An interrupt is sent twice, as two interrupts with the same doorbell number."""
-    DONE_EARLY = "done-early"
-    """An interrupt is sent before the machine has run."""
-    STALE_RESULT = "stale-result"
-    """An interrupt has the doorbell number and the results of the previous one."""
+    DROP = "drop"  # an answer is not sent
+    STALL = "stall"  # the board stops serving its host, but keeps the link open
+    SHORT_READ = "short-read"  # an answer lacks one word
+    ENDLESS = "endless"  # an answer begins and does not end
+    WRONG_SEQUENCE = "wrong-sequence"  # an answer has another sequence number
+    WRONG_CRC = "wrong-crc"  # an answer has a wrong CRC
+    ALL_ONES = "all-ones"  # every register reads all ones, as if the device were gone
+    WRONG_MAP = "wrong-map"  # the greeting contains another register map
+    NEVER_DONE = "never-done"  # the machine starts and never stops
+    DONE_TWICE = "done-twice"  # an interrupt is sent twice, with the same doorbell number
+    DONE_EARLY = "done-early"  # an interrupt is sent before the machine has run
+    STALE_RESULT = "stale-result"  # an interrupt has the doorbell number and results of the previous one
 
 
 @dataclass(slots=True)
@@ -65,7 +50,7 @@ class Fault:
     occurred: int = 0
 
     @classmethod
-    def parse(cls, text: str) -> Self:
+    def parse(cls, text):
         match = re.fullmatch(r"([a-z-]+)(?::(\d+))?(?::(\d+))?", text)
         assert match is not None, text
         return cls(Kind(match[1]), int(match[2] or 0), int(match[3] or 0))
@@ -122,14 +107,10 @@ class MisbehavingServer(BoardServer):
         return self._fault.occurs(kind, self.board.starts + ahead)
 
     def _greeting(self, token: bytes) -> bytes:
-        decoder = framing.FrameDecoder()
-        greeting = super()._greeting(token)
-        decoder.room()[: len(greeting)] = greeting
-        decoder.received(len(greeting))
-        if not self._now(Kind.WRONG_MAP):
-            return greeting
-        other = framing.decode_greeting(decoder.next_frame())
-        return framing.encode_greeting(other._replace(map_hash=hashlib.sha256(b"another map").hexdigest()))
+        payload = super()._greeting(token)[framing.HEADER_BYTES :]
+        if self._now(Kind.WRONG_MAP):
+            payload = payload.replace(bytes.fromhex(rm.MAP_SHA256), bytes(32))
+        return framing.encode(framing.GREET, 0, 0, 0, len(payload) // 4, payload)
 
     def _serve_host(self, host: HostConnection) -> None:
         if host not in self._stalled:
@@ -159,9 +140,7 @@ class MisbehavingServer(BoardServer):
             self._interrupt(host)
         super()._access(host, frame)
 
-    def _send(
-        self, host: HostConnection, operation: int, flags: int, sequence: int, address: int, words: bytes
-    ) -> None:
+    def _send(self, host, operation, flags, sequence, address, words):
         if host in self._stalled or self._now(Kind.DROP):
             return
         if self._now(Kind.STALL):
@@ -193,9 +172,7 @@ def rings(address: int, octets: int) -> bool:
     return address <= rm.RESUME and address + octets > rm.START
 
 
-def serve_misbehaving(
-    endpoint: Endpoint | str, *, index: int, stop: StopSignal, fault: str, on_ready: Callable[[Board], object]
-) -> None:
+def serve_misbehaving(endpoint, *, index, stop, fault, on_ready):
     """Serve a board with this fault until `stop` is set."""
     where = parse_endpoint(endpoint) if isinstance(endpoint, str) else endpoint
     with closing(MisbehavingServer(where, index, stop, Fault.parse(fault))) as server:
@@ -203,14 +180,16 @@ def serve_misbehaving(
         server.run()
 
 
-def main(endpoint: str, index: str, fault: str) -> None:
+def main(endpoint, index, fault):
     stop = StopSignal()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-
-    def on_ready(_board: Board) -> None:
-        print(f"board {index} listens at {endpoint}", file=sys.stderr, flush=True)
-
-    serve_misbehaving(endpoint, index=int(index), stop=stop, fault=fault, on_ready=on_ready)
+    serve_misbehaving(
+        endpoint,
+        index=int(index),
+        stop=stop,
+        fault=fault,
+        on_ready=lambda _: print(f"board {index} listens at {endpoint}", file=sys.stderr, flush=True),
+    )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,5 @@
 """The committed constants and documentation, compared with the SystemRDL file."""
 
-from pathlib import Path
-
-import pytest
-
 from machines.bm1 import StopReason
 from machines.parameters import RngKind
 from pcie_shim import register_map
@@ -11,11 +7,11 @@ from pcie_shim.framing import MAX_PAYLOAD_WORDS
 from scripts.register_map import FILES, SOURCE, RegisterMap, main
 
 
-def test_every_generated_file_is_up_to_date() -> None:
+def test_every_generated_file_is_up_to_date():
     assert main(["--check"]) == 0, "run scripts/registers"
 
 
-def test_check_says_what_is_out_of_date(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_says_what_is_out_of_date(tmp_path, capsys):
     for name in FILES:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
     assert main(["--check"], root=tmp_path) == 1
@@ -24,10 +20,10 @@ def test_check_says_what_is_out_of_date(tmp_path: Path, capsys: pytest.CaptureFi
     assert main(["--check"], root=tmp_path) == 0
 
 
-def test_the_hash_covers_the_definition_and_not_the_words(tmp_path: Path) -> None:
+def test_the_hash_covers_the_definition_and_not_the_words(tmp_path):
     text = SOURCE.read_text()
 
-    def hash_with(old: str, new: str) -> str:
+    def hash_with(old, new):
         assert old in text
         (tmp_path / "other.rdl").write_text(text.replace(old, new, 1))
         return RegisterMap(tmp_path / "other.rdl").hash
@@ -37,14 +33,14 @@ def test_the_hash_covers_the_definition_and_not_the_words(tmp_path: Path) -> Non
     assert hash_with("OVERFLOW = 1", "OVERFLOW = 9") != register_map.MAP_SHA256
 
 
-def test_stop_reasons_and_rngs_are_the_machines() -> None:
+def test_stop_reasons_and_rngs_are_the_machines():
     assert {(each.name, each.value) for each in register_map.StopReason} == {
         (each.name, each.value) for each in StopReason
     }
     assert {each.name for each in register_map.RngKind} - {"NONE"} == {each.name for each in RngKind}
 
 
-def test_blocks_neither_overlap_nor_outgrow_a_frame() -> None:
+def test_blocks_neither_overlap_nor_outgrow_a_frame():
     end = 0
     for block in register_map.BLOCKS:
         assert block.address >= end

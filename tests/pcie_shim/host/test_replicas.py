@@ -2,7 +2,6 @@
 
 import dataclasses
 import struct
-from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -16,13 +15,12 @@ from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.endpoint import parse_endpoint
 from pcie_shim.errors import BoardGoneError, BoardMismatchError, FrameInputError
 from pcie_shim.host.driven_board import DrivenBoard
-from pcie_shim.host.frame import FrameInput, FrameOutput
+from pcie_shim.host.frame import FrameInput
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, image_bytes
 from pcie_shim.register_map import ErrorCode
 from tests.patience import PATIENCE
 from tests.pcie_shim.boards import (
-    ServedBoard,
     expected_of_replicas,
     image,
     images,
@@ -42,13 +40,13 @@ class Case:
     cluster: MiniCluster
 
     @property
-    def shape(self) -> tuple[int, ...]:
+    def shape(self):
         """Of a frame's inputs, over all boards."""
         parameters = self.parts[0].machine.parameters
         lines = self.parts[0].partition.total_lines
         return dataclasses.replace(parameters, lines=lines).input_shape
 
-    def frame(self, seed: int, **changed) -> FrameInput:
+    def frame(self, seed, **changed):
         parameters = self.parts[0].machine.parameters
         random = np.random.default_rng(seed)
         tops = (1 << np.array(parameters.sensor_bits)) - parameters.has_tables
@@ -61,7 +59,7 @@ class Case:
         settings_ = {"target_count": 100, "max_cycles": 3000} | changed
         return FrameInput(addresses=inputs, **settings_)
 
-    def check(self, frame: FrameInput) -> FrameOutput:
+    def check(self, frame):
         output = self.cluster.run(frame)
         wanted = expected_of_replicas(self.parts, frame)
         for number, board in enumerate(output.boards):
@@ -88,7 +86,7 @@ CASES = {
 
 
 @pytest.fixture(scope="module", params=CASES, ids=str)
-def case(request: pytest.FixtureRequest) -> Iterator[Case]:
+def case(request):
     """Boards opened once for many frames."""
     parts = CASES[request.param]
     with opened(parts) as cluster:
@@ -103,7 +101,7 @@ def case(request: pytest.FixtureRequest) -> Iterator[Case]:
     st.integers(0, 15),
     st.sampled_from(["slices", "own"]),
 )
-def test_frames_are_machines_that_run_alone(case: Case, seed, target, cycles, bank, stop) -> None:
+def test_frames_are_machines_that_run_alone(case, seed, target, cycles, bank, stop):
     parameters = case.parts[0].machine.parameters
     random = np.random.default_rng(seed)
     changed: dict = {}
@@ -115,7 +113,7 @@ def test_frames_are_machines_that_run_alone(case: Case, seed, target, cycles, ba
     case.check(case.frame(seed, target_count=target, max_cycles=cycles, bank=bank, stop=stop, **changed))
 
 
-def test_each_replica_stops_with_its_own_parts() -> None:
+def test_each_replica_stops_with_its_own_parts():
     """Replicas that lie on two boards: one may be over in the first slice, another goes on."""
     parts = images(7, (3, 3), replicas=8, zeros=0)
     with opened(parts) as cluster:
@@ -145,7 +143,7 @@ def test_each_replica_stops_with_its_own_parts() -> None:
         ("written priors", {"prior_codes": np.zeros((3, 6), np.uint16)}),
     ],
 )
-def test_a_frame_that_does_not_fit_is_refused(name: str, change: dict) -> None:
+def test_a_frame_that_does_not_fit_is_refused(name, change):
     case = Case(CASES[name], MiniCluster.__new__(MiniCluster))
     boards = [DrivenBoard(at, parse_endpoint("unix:/tmp/x.sock"), part) for at, part in enumerate(case.parts)]
     case.cluster.__init__(boards, timeout=1, slack=1)
@@ -153,7 +151,7 @@ def test_a_frame_that_does_not_fit_is_refused(name: str, change: dict) -> None:
         case.cluster.post(dataclasses.replace(case.frame(1), **change))
 
 
-def test_a_replaced_board_gets_the_prior_selects_again(start_board: Callable[..., ServedBoard]) -> None:
+def test_a_replaced_board_gets_the_prior_selects_again(start_board):
     parts = images(8, (4,), replicas=2, prior_bits=1, zeros=0)
     board = start_board()
     with MiniCluster.open([board.endpoint], parts, timeout=PATIENCE) as cluster:
@@ -172,7 +170,7 @@ def test_a_replaced_board_gets_the_prior_selects_again(start_board: Callable[...
 # ---- images and capabilities ----
 
 
-def test_capabilities_and_windows() -> None:
+def test_capabilities_and_windows():
     of = machine(1, lines=5, sensor_bits=(3, 2), replicas=3, sensor_mode=SensorMode.CELL, prior_bits=1)
     board = EmulatedBoard()
     with pytest.raises(RefusedError):
@@ -196,7 +194,7 @@ def test_capabilities_and_windows() -> None:
         board.read(rm.SENSORS, 1)
 
 
-def test_a_replica_that_is_not_there_is_not_halted() -> None:
+def test_a_replica_that_is_not_there_is_not_halted():
     """Run a frame as a host in any language would: inputs, settings, start, outcomes."""
     board = EmulatedBoard()
     board.load(image_bytes(image(machine(2, lines=4, sensor_bits=(3,), replicas=2, zeros=0))))
@@ -218,9 +216,7 @@ def test_a_replica_that_is_not_there_is_not_halted() -> None:
     ("replicas", "inputs"),
     [(2, 4), (3, 5000)],
 )
-def test_a_board_of_other_capabilities_is_refused(
-    start_board: Callable[..., ServedBoard], monkeypatch: pytest.MonkeyPatch, replicas: int, inputs: int
-) -> None:
+def test_a_board_of_other_capabilities_is_refused(start_board, monkeypatch, replicas, inputs):
     """A board that shows the right image hash and has fewer machines or words all the same."""
     (part,) = CASES["three replicas on one board"]
     endpoints = [start_board().endpoint]
