@@ -59,6 +59,7 @@ def master(
             raise SettingsError(
                 f"--connect {connect} is not a folder; name the one with the sockets of the running services"
             )
+        # as if each had been given by its own variable
         services = {"subscriber": "subscriber", "publisher": "publisher", "pcie_app": "pcie-app"}
         settings = settings.model_copy(
             update={setting: str(endpoint_in(connect, name)) for setting, name in services.items()}

@@ -22,6 +22,7 @@ def boards_command(boards: int, directory: Path, settings: Settings, *, once: bo
     """Return the command that starts the emulated boards; with `once` it does not restart them."""
     restarts = "0" if once else str(RESTARTS)
     return [
+        # one process for all of them, which loads the kernels once
         *(*own_command("board"), "--boards", str(boards)),
         *("--directory", str(directory), "--restarts", restarts),
         *_metrics(settings, "board"),

@@ -78,6 +78,7 @@ class Master:
             peers.prepare()
             run_directory = settings.run_directory or peers.directory
             more: dict[str, Any] = {}
+            # with --connect alone, the run has no folder, and its services are watched by who started them
             if run_directory is not None:
                 watch = ChildrenWatch(peers, run_directory)
                 self._begin_task(watch.run())
@@ -100,12 +101,14 @@ class Master:
                 await peers.start(self._flow)
                 await self._flow.end
             else:
-                from services.output.posterior_lines import drawing  # rich takes long to load
+                # rich takes long to load
+                from services.output.posterior_lines import drawing
 
                 with drawing() as show:
                     self._begin_task(self._keep_drawing(show))
                     await peers.start(self._flow)
                     await self._flow.end
+                    # the last one, which may be newer than the last picture
                     self._draw(show)
         finally:
             for task in self._tasks:
@@ -168,6 +171,7 @@ class Master:
 
     async def _expect_data(self) -> None:
         """End the run if no message arrives in time after its start."""
+        # before, nobody listens, and each phase of the start has its own limit
         await self._peers.begun.wait()
         limit = self._settings.first_data_timeout
         await asyncio.sleep(limit + _GRACE_PERIOD)
@@ -176,6 +180,7 @@ class Master:
             self._flow.fail(NoDataError(f"no reading came from {topics} within {limit:g} s"))
 
     async def _show_progress(self) -> None:
+        # as of the last line: its time, and the results published until then
         before, count = time.monotonic(), 0
         while True:
             await asyncio.sleep(_PROGRESS_EVERY)

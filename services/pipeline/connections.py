@@ -57,10 +57,12 @@ async def connect_all(
                 retry=True,
                 ca_file=settings.ca,
                 ros_version=settings.ros_version,
-                check_types=False,  # our own messages need no check
+                # messages of this project need no check
+                check_types=False,
                 on_state=None if on_state is None else partial(on_state, used),
                 **options,
             )
+            # entered one after the other, so that an error names the first server that is missing
             await stack.enter_async_context(by_uri[used])
     return by_uri
 
@@ -80,6 +82,7 @@ async def report_unpublished(ros: Ros, topic: str, report: Callable[[str], None]
     await asyncio.sleep(AFTER)
     if await ros.publishers(topic) != []:
         return  # or the server has no rosapi
+    # a topic of the same name in another namespace is the usual mistake
     others = {name for name in await ros.topics() or [] if name != absolute(topic)}
     near = difflib.get_close_matches(absolute(topic), others, 3, 0.6)
     perhaps = f"; did you mean {' or '.join(shown(name) for name in near)}?" if near else ""
@@ -120,6 +123,7 @@ async def _refusal(topic: AdvertisedTopic, *, settled: bool) -> str:
         return ""
     known = await topic.ros.topic_type(topic.name, ROSAPI_TIME)
     if known is None:
+        # no rosapi, or no answer in time
         return ""
     if known and not same_type(known, topic.type):
         return (

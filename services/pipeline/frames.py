@@ -56,6 +56,7 @@ class _SourceReader:
     def _address(self, variable: Variable, field: Field, message: dict[str, Any]) -> int | list[int] | None:
         present, value = field.value(message)
         if not present and variable.on_missing == "error":
+            # one error for all of them, because a message without one variable often lacks others too
             raise all_missing(self._missing(message), message)
         if variable.name not in self._arrays:
             return to_address(variable, value)
@@ -161,6 +162,7 @@ class FrameAssembler:
             addresses=addresses,
             prior_codes=prior_codes,
         )
+        # without other topics, no stamp can be wrong
         if len(self._readers) == 1:
             return [taken]
         self._newest[source] = taken.stamp_ns, stamp_ns is not None
@@ -184,6 +186,7 @@ class FrameAssembler:
             for column, address in zip(self._readers[source].columns, reading.addresses, strict=True):
                 addresses[column] = address
         self._since_pair = [0] * len(self._since_pair)
+        # the latency of a frame counts from the message that completed it
         last = max(chosen.values(), key=lambda each: each.received_tick)
         return Reading(
             stamp_ns=max(each.stamp_ns for each in chosen.values()),

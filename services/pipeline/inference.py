@@ -61,6 +61,7 @@ class Inference:
             )
             for replica in range(replicas)
         ]
+        # a replica without a posterior has zeros, so that the others keep their places
         lines = sum(of_board.shape[1] for of_board in counts)
         if any(joint is not None for joint in joints):
             self.posterior = np.concatenate([np.zeros(lines) if joint is None else joint for joint in joints])

@@ -162,12 +162,14 @@ class Publisher:
             self._link.notice("warning", sentence)
         elif state is State.CONNECTED and self._where:
             self._link.notice("info", f"{rosbridge} is back for results{topics}")
+        # before the topics are advertised, the master waits for `Ready` anyway
         if self._where:
             self._link.keep(Rosbridge(self._topics.is_connected))
 
     async def _publish_waiting(self) -> NoReturn:
         while True:
             publish = await self._waiting.get()
+            # before the only result, because afterwards nothing would tell why nobody has received it
             if self._once:
                 await self._check_delivery(settled=False)
             published = await self._topics.publish(publish, look=self._once)

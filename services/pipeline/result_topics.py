@@ -47,6 +47,7 @@ class ResultTopics:
 
     def __init__(self, settings: Settings, deployment: Deployment) -> None:
         self._settings = settings
+        # Spelling of the stamps in reports: that of the first server, unless a setting chooses it.
         self._ros_version: Literal[1, 2] = 2
         self._deployment = deployment
         self._layout = posterior_layout(deployment)
@@ -102,6 +103,7 @@ class ResultTopics:
     async def _seen(self, data: list[float], timeout: float) -> bool:
         if self._watched is None:
             return False
+        # results of other publishers of the topic may arrive before
         deadline = time.monotonic() + timeout
         while (left := deadline - time.monotonic()) > 0:
             try:
@@ -132,6 +134,7 @@ class ResultTopics:
         With `look`, wait until the result is seen on the wire, or until the timeout of the settings.
         """
         inference = Inference(publish.result)
+        # a server that does not accept the result in time is left out of it, with a warning
         ready = [publication.ready() for publication in self._connected()]
         for error in await asyncio.gather(*ready, return_exceptions=True):
             if isinstance(error, BridgeError):
@@ -172,6 +175,7 @@ class ResultTopics:
         now = time.monotonic_ns()
         self._previous_out_ns = now - started
         outcome = Outcome.PUBLISHED if posterior is not None else Outcome.NO_POSTERIOR
+        # a frame without a posterior has only its report
         if missed == len(self._outputs) or (posterior is None and not reported):
             outcome, missed = Outcome.ROSBRIDGE_AWAY, 0
         return Published(

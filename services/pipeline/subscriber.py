@@ -10,11 +10,12 @@ import asyncio
 import contextlib
 import time
 from functools import partial
+from typing import Any
 
 import msgspec
 
 from bridge.client import Message, Ros, State, Subscription
-from bridge.errors import BridgeError, NoMessageError, TopicLeftOutError
+from bridge.errors import NoMessageError, TopicLeftOutError
 from services.errors import RosbridgeLostError, VariableError
 from services.pipeline.connections import connect_all, reconnect_now, report_unpublished
 from services.pipeline.frames import FrameAssembler
@@ -191,28 +192,22 @@ class Subscriber:
                 for hint in hints:
                     stack.callback(hint.cancel)
                 await self._begun.wait()
-                async with asyncio.TaskGroup() as group:
-                    lost = group.create_task(self._watch_loss())
-                    tasks = [
-                        group.create_task(self._follow(rosbridges[at], at, source, hints[at]))
-                        for at, source in enumerate(sources)
-                    ]
-                    await asyncio.wait(tasks)
-                    lost.cancel()
-            except BaseExceptionGroup as group_error:
-                error: BaseException = group_error
-                while isinstance(error, BaseExceptionGroup):
-                    error = error.exceptions[0]
-                await report_failure(self._link, error)
-                raise error from None
-            except BridgeError as error:
+                tasks = [
+                    asyncio.ensure_future(self._follow(rosbridges[at], at, source, hints[at]))
+                    for at, source in enumerate(sources)
+                ]
+                for task in tasks:
+                    stack.callback(task.cancel)
+                # topics that may be missing can end without an error; the first error ends the service
+                followed: asyncio.Future[Any] = asyncio.gather(*tasks)
+                await asyncio.wait([followed, self._lost], return_when=asyncio.FIRST_COMPLETED)
+                for ended in (followed, self._lost):
+                    if ended.done():
+                        ended.result()
+            except Exception as error:
                 await report_failure(self._link, error)
                 raise
         return 0
-
-    async def _watch_loss(self) -> None:
-        if self._lost is not None:
-            await self._lost
 
     async def _follow(self, ros: Ros, at: int, source: Source, hint: asyncio.Future[None]) -> None:
         subscription = ros.subscribe(

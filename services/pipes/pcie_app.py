@@ -38,6 +38,7 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
         InputLineError: A line is not a reading for this deployment.
         BoardError: A board failed.
     """
+    # boards that compile their kernels take a minute
     with say_if_slow("waiting for the boards"):
         opened = boards.open()
     say(opened)

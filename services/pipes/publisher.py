@@ -92,6 +92,7 @@ async def publish_lines(settings: Settings, deployment: Deployment) -> int:
         say(where)
         outcomes: Counter[Outcome] = Counter()
         async for number, line in lines():
+            # a line that cannot be used ends the pipe, so that no later result takes its place
             value = result_from_line(line, number, machine.results, machine.replicas)
             if isinstance(value, list):
                 await topics.publish_array(value)

@@ -86,6 +86,7 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
         """Return the readings that the next message completes, or that are due before it."""
         deadline = frames.deadline
         wait = None if deadline is None else max(deadline - time.monotonic_ns(), 0) / 1e9
+        # only a set that waits for a topic that may be missing has a deadline
         try:
             async with asyncio.timeout(wait):
                 at, message = await arrived.get()
@@ -134,6 +135,7 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
         tasks = [asyncio.ensure_future(each) for each in work]
         try:
             ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            # the printing has ended, or one of them has failed
             for each in ended:
                 each.result()
         finally:

@@ -121,6 +121,7 @@ class RecordProtocol(asyncio.Protocol):
         """Handle the opened socket (asyncio)."""
         # uvloop's transports are not subclasses of asyncio's, but behave alike
         self._transport = cast("asyncio.Transport", transport)
+        # a record waits for no other one to fill a packet
         sock = transport.get_extra_info("socket")
         if sock is not None:
             no_delay(sock)

@@ -27,6 +27,9 @@ VERSION = version("rosbayes")
 """Version in every hello, which must be the same on both sides of a local socket."""
 
 
+# --- words that the user sees in `status`, in metrics and at the end of a run ----------------------
+
+
 class LossReason(StrEnum):
     """Reason why a reading has no result, or not on all topics, as shown by `status`."""
 
@@ -70,6 +73,9 @@ class FailureReason(StrEnum):
 # Arrays are shorter than maps and faster to decode. New fields go to the end, with a default.
 class Record(msgspec.Struct, array_like=True, frozen=True):
     """Base class of all records."""
+
+
+# --- any service -----------------------------------------------------------------------------------
 
 
 class Hello(Record, tag="hello", frozen=True):
@@ -117,6 +123,8 @@ class Trouble(Record, tag="trouble", frozen=True):
     exit_code: int
     sentence: str
 
+
+# --- a frame, in the order of its path -------------------------------------------------------------
 
 Addresses = list[int | list[int] | None]
 """Addresses of a frame's readings, in the order of the variables; None for a missing reading.

@@ -262,6 +262,7 @@ def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint
     Raises:
         SettingsError: A board has no endpoint, or there are too few or too many.
     """
+    # a flag or variable replaces all endpoints of the deployment, never some of them
     texts = settings.boards or tuple(board.endpoint for board in deployment.boards)
     if len(texts) == 1 and texts[0].startswith("unix:") and texts[0].endswith("/"):
         texts = tuple(f"{texts[0]}board{at}.sock" for at in range(len(deployment.boards)))

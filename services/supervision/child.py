@@ -135,6 +135,7 @@ class Child:
             ERROR_DESCRIPTOR: str(reports.writer),
             "PYTHONUNBUFFERED": "1",
         }
+        # a folder of status sockets that the user has chosen is that of all processes
         if self._directory is not None:
             environment[DIRECTORY_VARIABLE] = str(self._directory)
             if not environment.get(RUN_DIRECTORY_VARIABLE):
@@ -150,6 +151,7 @@ class Child:
                 os.close(pipe.writer)
 
     def _take_report(self, line: str) -> None:
+        # a child that was killed may have written half a line
         with contextlib.suppress(msgspec.MsgspecError):
             self._error = _decoder.decode(line).error
 
@@ -183,12 +185,14 @@ class Child:
         """Wait until the process has exited and its lines have been forwarded."""
         if self._process is not None:
             await self._process.wait()
+            # the pipes may stay open: a grandchild can hold them
             for pipe in self._pipes:
                 pipe.read(last=True)
 
     def failure(self) -> StackError:
         """Return the exit of the process as an error, with its own sentence and exit code if it gave any."""
         code = self.exit_code
+        # the exit code of an error decides whether a restart would help, so it must not be lost
         if self._error:
             return ReportedError(code if code and code > 0 else ExitCode.CHILD, self._error)
         return ReportedError(ExitCode.CHILD, f"{self.name} {describe_exit(code)}")
