@@ -193,8 +193,8 @@ def _cell(value: float | None, form: str) -> str:
 
 
 _DPI: Final = 75
-_COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
-_MARKERS: Final = "osD^v<>P"
+COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
+MARKERS: Final = "osD^v<>P"
 _SUFFIXES: Final = (".png", ".svg", ".pdf")
 _KINDS_INSIDE: Final = 5
 """Maximum length of a legend inside the picture, where a longer one would cover points."""
@@ -231,7 +231,7 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
     several = any(point.replicas > 1 for point in points)
     kinds = sorted({_kind(point) for point in shown})
     beside = len(kinds) > _KINDS_INSIDE
-    figure = _figure((10.2 if beside else 7.2, 4.8))
+    figure = new_figure((10.2 if beside else 7.2, 4.8))
     axes = figure.subplots()
     for at, kind in enumerate(kinds):
         of_kind = [point for point in shown if _kind(point) == kind]
@@ -239,8 +239,8 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
             [point.cycles_a_posterior for point in of_kind],
             [point.total_variation for point in of_kind],
             s=[20 + 120 * (point.alms or 0.0) / largest for point in of_kind],
-            color=_COLOURS[at % len(_COLOURS)],
-            marker=_MARKERS[at % len(_MARKERS)],
+            color=COLOURS[at % len(COLOURS)],
+            marker=MARKERS[at % len(MARKERS)],
             alpha=0.6,
             label=_label(kind),
         )
@@ -265,7 +265,7 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
         figure.legend(loc="outside right center", fontsize="small", frameon=False)
     else:
         axes.legend(fontsize="small", frameon=False)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _kind(point: Point) -> tuple[str, int, str, str]:
@@ -278,14 +278,15 @@ def _label(kind: tuple[str, int, str, str]) -> str:
     return f"{rng}, scale {scale}{others}"
 
 
-def _figure(size: tuple[float, float]) -> Any:
+def new_figure(size: tuple[float, float]) -> Any:
+    """Return a matplotlib figure of a size in inches, or raise a BuildError."""
     check_pictures_possible()
     from matplotlib.figure import Figure
 
     return Figure(figsize=size, layout="constrained")
 
 
-def _save(figure: Any, path: Path) -> None:
+def save_figure(figure: Any, path: Path) -> None:
     """Write a picture without matplotlib's version, so that the file changes only with the drawing."""
     try:
         figure.savefig(path, dpi=_DPI, metadata={"Software": None} if path.suffix == ".png" else None)

@@ -1,4 +1,4 @@
-"""The `toolchain explore` command: a sweep over machines for a model."""
+"""The `toolchain explore` command: a sweep over machines for a model, or the thesis's claims as experiments."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +13,6 @@ from toolchain.commands.flags import (
     Bits,
     MaxCycles,
     ModelFlags,
-    ModelPath,
     Partitions,
     ReadingFlags,
     StopWhen,
@@ -69,9 +68,15 @@ class SweepFlags(ModelFlags):
 
 
 def explore(
-    model: ModelPath,
     flags: SweepFlags,
     readings: ReadingFlags,
+    model: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net, .xdsl (.gz).",
+            metavar="[MODEL]",
+        ),
+    ] = None,
     frames: Annotated[int, typer.Option(help="Maximum number of frames.")] = 50,
     results: Annotated[
         Path,
@@ -82,12 +87,29 @@ def explore(
     plot: Annotated[
         Path | None, typer.Option(help="Picture of accuracy against cycles.", metavar="PNG")
     ] = None,
+    claims: Annotated[
+        Path | None,
+        typer.Option(
+            help="Instead of a sweep: the thesis's claims as experiments, with numbers and a picture in this folder.",
+            metavar="DIR",
+        ),
+    ] = None,
 ) -> None:
     """Sweep over machines for a model: accuracy against cycles and ALMs, with the Pareto front.
 
     For example `toolchain explore casestudies/boat --partitions 4 --prob-bits 6,8 --plot boat.png`; after
-    Ctrl-C, the same command resumes the sweep, whose points are in the results file.
+    Ctrl-C, the same command resumes the sweep, whose points are in the results file. `toolchain explore
+    --claims out/claims` tests the thesis's claims.
     """
+    if claims is not None:
+        if model is not None:
+            raise BuildError(f"--claims has its own model: omit {model}")
+        _run_claims(claims, frames=frames, seed=readings.seed)
+        return
+    if model is None:
+        raise BuildError(
+            "name a model to explore, such as 'toolchain explore casestudies/boat', or --claims DIR"
+        )
     from toolchain.analysis.logic import device_named
     from toolchain.analysis.readings import check_columns
     from toolchain.analysis.results import Results, check_pictures_possible, draw_sweep, pareto, table
@@ -186,3 +208,24 @@ def _name_of(point: "Point") -> str:
     name = f"{point.rng}, codes of {point.prob_bits} bits, target {point.target_count}, scale {point.scale}"
     name += "" if point.sensor_mode == "column" else f", {point.sensor_mode}"
     return name if point.replicas == 1 else f"{name}, {point.replicas} replicas"
+
+
+def _run_claims(directory: Path, *, frames: int, seed: int) -> None:
+    from toolchain.analysis.claims import draw_claims, experiments, run_claims
+    from toolchain.analysis.readings import check_frames
+    from toolchain.analysis.results import check_pictures_possible
+
+    figures, picture = directory / "claims.json", directory / "claims.png"
+    check_pictures_possible()
+    check_frames(frames)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        check_pictures_possible(picture)
+        with progress(experiments()) as advance:
+            claims = run_claims(frames=frames, seed=seed, advance=advance)
+        typer.echo(claims.as_text(), nl=False)
+        figures.write_text(claims.as_json(), encoding="utf-8")
+    except OSError as reason:
+        raise BuildError(f"{figures} cannot be written: {reason.strerror or reason}") from None
+    draw_claims(picture, claims)
+    typer.echo(f"Wrote {figures} and {picture}", err=True)
