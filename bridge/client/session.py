@@ -593,17 +593,19 @@ class Session:
         # One time for all messages that arrive together, because they have waited for each other in the socket.
         received_ns, received_monotonic_ns = time.time_ns(), time.monotonic_ns()
         now = received_monotonic_ns * 1e-9
-        receive, readers = self.core.receive, self.readers
+        receive_known, readers = self.core.receive_known, self.readers
         for data in messages:
-            event = receive(data, now)
-            if type(event) is MessageReceived:
-                topic, msg, subscriptions = event
-                # The constructor of a named tuple takes three times as long.
-                message = tuple.__new__(Message, (topic, msg, received_ns, received_monotonic_ns, 0.0))
-                for number in subscriptions:
-                    readers[number].receive(message)
-            else:
-                self._take_other(event)
+            received: Any = receive_known(data)
+            if received is None:
+                received = self.core.receive(data, now)
+                if type(received) is not MessageReceived:
+                    self._take_other(received)
+                    continue
+            topic, msg, subscriptions = received
+            # The constructor of a named tuple takes three times as long.
+            message = tuple.__new__(Message, (topic, msg, received_ns, received_monotonic_ns, 0.0))
+            for number in subscriptions:
+                readers[number].receive(message)
 
     def _take_other(self, event: Event | None) -> None:
         match event:

@@ -7,7 +7,7 @@ Nothing is collected without a connection.
 from typing import Any
 
 from bridge.client.protocol.actions import PendingGoals, ServedActions
-from bridge.client.protocol.events import Event, StatusReceived, UnusableReceived
+from bridge.client.protocol.events import Event, MessageReceived, StatusReceived, UnusableReceived
 from bridge.client.protocol.publications import Publications
 from bridge.client.protocol.services import PendingCalls, ServedServices
 from bridge.client.protocol.subscriptions import Subscriptions
@@ -40,7 +40,8 @@ class ClientCore:
         # What the program wants until it withdraws it: `restore` repeats it on each connection.
         self.publications = Publications(wire)
         self.subscriptions = Subscriptions(wire)
-        self._receive_known = self.subscriptions.receive_known
+        # The short way of most messages, for a caller that then need not ask `receive`.
+        self.receive_known = self.subscriptions.receive_known
         self.services = ServedServices(wire)
         self.actions = ServedActions(wire)
         # What waits for an answer of the server: `lost` drops it, as it drops requests and goals to the two above.
@@ -85,9 +86,12 @@ class ClientCore:
         exist.
         """
         # Nearly every message is one of a topic that was heard before.
-        event = self._receive_known(data)
-        if event is not None:
-            return event
+        known = self.receive_known(data)
+        if known is not None:
+            return MessageReceived(*known)
+        discarded = self.subscriptions.discard_known(data)
+        if discarded is not None:
+            return discarded
         # A CBOR map begins like this, but JSON does not. Without a subscription as CBOR none is expected.
         if self.subscriptions.binary and data[:1] >= b"\x80":
             return self._receive_cbor(data, now)
