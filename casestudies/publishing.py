@@ -15,7 +15,7 @@ from bridge.names import same_type
 from terminal.health import resources, serve_health
 from terminal.one_line import shown
 from terminal.output import say
-from terminal.private_directory import own_directory
+from terminal.run_directory import status_directory
 
 RECENT_S: Final = 10.0
 """Seconds without work after which a process is not ready."""
@@ -45,7 +45,7 @@ class Readiness:
 
 @contextlib.asynccontextmanager
 async def serve_readiness(name: str, readiness: Readiness) -> AsyncIterator[None]:
-    """Report the readiness within the context, on a socket in BM_RUN_DIRECTORY or in a private directory."""
+    """Report the readiness within the context, on a socket in the run directory."""
     started = time.monotonic()
 
     def answer() -> bytes:
@@ -56,9 +56,9 @@ async def serve_readiness(name: str, readiness: Readiness) -> AsyncIterator[None
         return json.dumps(status).encode()
 
     given = os.environ.get("BM_RUN_DIRECTORY")
-    with own_directory(Path(given) if given else None, name) as directory:
-        async with serve_health(directory, name, answer):
-            yield
+    directory = status_directory(Path(given) if given else None, name)
+    async with serve_health(directory, name, answer):
+        yield
 
 
 SETTLED_S: Final = 3.0

@@ -14,7 +14,7 @@ from services.sockets.reporting import serve_status
 from services.sockets.status import HubStatus, ProcessStatus
 from terminal.logs import log_libraries
 from terminal.output import say
-from terminal.private_directory import own_directory
+from terminal.run_directory import status_directory
 
 
 async def serve(
@@ -67,16 +67,16 @@ async def serve(
         on_graph=graphs.append,
         stop=asyncio.Event(),
     )
-    with own_directory(settings.run_directory, "hub") as directory:
-        async with serve_status(directory, "hub", status, metrics=settings.metrics):
-            announcing = None if announce is None else asyncio.ensure_future(announce_once_ready(announce))
-            tasks = [asyncio.ensure_future(hub), *([announcing] if announcing else [])]
-            try:
-                done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-                for task in done:
-                    task.result()
-            finally:
-                for task in tasks:
-                    task.cancel()
-                await asyncio.gather(*tasks, return_exceptions=True)
+    directory = status_directory(settings.run_directory, "hub")
+    async with serve_status(directory, "hub", status, metrics=settings.metrics):
+        announcing = None if announce is None else asyncio.ensure_future(announce_once_ready(announce))
+        tasks = [asyncio.ensure_future(hub), *([announcing] if announcing else [])]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
     return 0

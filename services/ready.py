@@ -9,7 +9,7 @@ import sys
 from terminal.health import NoHealthError, is_ready, status_socket
 
 _TIMEOUT = 2.0
-_USAGE = "usage: python -m services.ready NAME [--directory DIR]"
+_USAGE = "usage: python -m services.ready NAME [--run-directory DIR]"
 
 
 def main(arguments: list[str]) -> int:
@@ -18,10 +18,10 @@ def main(arguments: list[str]) -> int:
     names: list[str] = []
     rest = iter(arguments)
     for argument in rest:
-        if argument == "--directory":
+        if argument == "--run-directory":
             directory = next(rest, "")
-        elif argument.startswith("--directory="):
-            directory = argument.removeprefix("--directory=")
+        elif argument.startswith("--run-directory="):
+            directory = argument.removeprefix("--run-directory=")
         elif argument in {"-h", "--help"}:
             print(_USAGE)
             return 0
@@ -31,7 +31,7 @@ def main(arguments: list[str]) -> int:
         print(f"{_USAGE}; NAME is master, subscriber, publisher, pcie-app, hub or board0, board1, ...")
         return 1
     if not directory:
-        print("no run directory was given: set BM_RUN_DIRECTORY, or give --directory DIR")
+        print("no run directory was given: set BM_RUN_DIRECTORY, or give --run-directory DIR")
         return 1
     (name,) = names
     try:

@@ -87,8 +87,8 @@ class Settings(BaseSettings):
     )
     run_directory: Annotated[
         Path | None,
-        Flag(("--run-directory", "--directory"), "DIR", "the private folder of this user's run"),
-    ] = Field(default=None, description="Folder of the processes' status sockets.")
+        Flag(metavar="DIR", otherwise="$XDG_RUNTIME_DIR/rosbayes or /tmp/rosbayes-UID"),
+    ] = Field(default=None, description="Folder of the sockets of a run, which one master at a time can use.")
 
     # --- timeouts, in seconds ---
     connect_timeout: Seconds = Field(default=10, description="Seconds to reach the rosbridge server.")

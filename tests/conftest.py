@@ -1,12 +1,15 @@
 """Fixtures and rules for all tests: their kinds, their limits, and what they may leave behind."""
 
 import asyncio
+import atexit
 import contextlib
 import gc
 import os
 import resource
+import shutil
 import signal
 import sys
+import tempfile
 import threading
 import time
 from asyncio import runners
@@ -25,6 +28,10 @@ os.environ["PYTEST_TIMEOUT"] = str(TEST_LIMIT)
 # A shell that starts the tests in the background has Ctrl-C ignored for them, and so for every process that they start
 # and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# Masters of these tests do not share a run directory with those of other tests, or of the user.
+os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="rb-")
+atexit.register(shutil.rmtree, os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
 
 # Every run tries the same examples, and what one takes says something of the machine's load and not of the code.
 # `--hypothesis-profile=search` tries others each time.

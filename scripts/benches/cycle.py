@@ -181,6 +181,8 @@ async def bench(arguments: argparse.Namespace) -> int:
             for name, topic in STACKS.items():
                 await build("boat", where / f"boat-{name}", uri, topic, BOAT_TYPE)
                 flags = [*BOAT_FLAGS, *(["--fused"] if name == "fused" else [])]
+                (run := where / f"run-{name}").mkdir(mode=0o700)
+                flags += ["--run-directory", str(run)]
                 await masters[name].start("master", "-d", str(where / f"boat-{name}"), "--uri", uri, *flags)
             await echo.line("listening")
             for master in masters.values():

@@ -244,7 +244,9 @@ async def bench(arguments: argparse.Namespace) -> int:
             rows += [await attacked(uri, hub.pid, name, arguments.seconds) for name in ATTACKS]
             if arguments.minutes:
                 await build("boat", where / "boat", uri, BOAT_TOPIC, BOAT_TYPE)
-                await master.start("master", "-d", str(where / "boat"), "--uri", uri, *BOAT_FLAGS)
+                await master.start(
+                    "master", "-d", str(where / "boat"), "--uri", uri, *BOAT_FLAGS, "--run-directory", folder
+                )
                 await master.line("pcie-app: 4 boards")
                 rows += await minutes_of(uri, hub.pid, master.pid, arguments.minutes)
         finally:

@@ -94,7 +94,9 @@ async def run_stack(
     master, found = Process("master", where / f"master-{deployment.name}.log"), []
     try:
         await build("mrclam", deployment, uri, TOPIC, TYPE, "--max-cycles", str(MAX_CYCLES), *options)
-        await master.start("master", "--loop", "-d", str(deployment), "--uri", uri)
+        await master.start(
+            *("master", "--loop", "-d", str(deployment), "--uri", uri, "--run-directory", str(where))
+        )
         await master.line("pcie-app: 4 boards")
         for name in names:
             frames = read_recording(arguments.data / name)

@@ -17,6 +17,7 @@ import shutil
 import signal
 import socket
 import sys
+import tempfile
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
@@ -168,11 +169,14 @@ class Stand:
     async def master(self, form: str, *flags: str) -> AsyncIterator[Process]:
         """Run a master during the block."""
         process = Process("master", self._new_log("master"))
-        await process.start("master", "-d", str(self.deployments[form]), *flags)
-        try:
-            yield process
-        finally:
-            await process.end()
+        with tempfile.TemporaryDirectory(prefix="run-") as run:
+            await process.start(
+                *("master", "-d", str(self.deployments[form]), "--run-directory", run, *flags)
+            )
+            try:
+                yield process
+            finally:
+                await process.end()
 
     async def ended(self, master: Process, code: int) -> str:
         """Wait until a master has ended with this exit code, and return its output.

@@ -21,11 +21,10 @@ from services.settings import Settings, endpoint_in
 from services.sockets.reporting import STUCK_S, serve_status_in_thread, shifted
 from services.sockets.status import BoardStatus, ProcessStatus
 from services.supervision.child import ForkedChild, end_all
-from services.supervision.parent import outlive_parent
 from services.supervision.service_manager import ServiceManager
 from terminal.logs import PARENT_VARIABLE, name_process
 from terminal.output import say
-from terminal.private_directory import remove_stale_sockets
+from terminal.run_directory import remove_stale_sockets
 from terminal.signals import ENDING_SIGNALS, check_signals, run_async, stopped_error
 
 _ENDING_TIME: Final = 5.0
@@ -238,5 +237,4 @@ class BoardProcesses:
                 with suppress(OSError):
                     Path(each.path).unlink()
         if self._settings.run_directory is not None:
-            outlive_parent()
             remove_stale_sockets(self._settings.run_directory)

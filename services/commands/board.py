@@ -21,7 +21,6 @@ from services.settings import Settings
 from services.sockets.reporting import check_metrics
 from services.sockets.serving import deployment_for, endpoint_from
 from services.supervision.child import RESTARTS
-from services.supervision.parent import leave_private_directory
 from terminal.command_line import CommandLine
 from terminal.logs import PARENT_VARIABLE, name_process
 from terminal.output import say
@@ -143,7 +142,6 @@ def main() -> None:
     try:
         app()
     except SystemExit as end:
-        leave_private_directory()
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(end.code if isinstance(end.code, int) else int(end.code is not None))

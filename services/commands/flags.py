@@ -33,9 +33,6 @@ Listen: TypeAlias = Annotated[
 Insecure: TypeAlias = Annotated[
     bool, typer.Option("--insecure", help="Permit an unprotected address that other machines can reach.")
 ]
-Run: TypeAlias = Annotated[
-    str | None, typer.Option("--run", metavar="NAME", help="One of several runs of this user, by its name.")
-]
 Count: TypeAlias = Annotated[
     int | None,
     typer.Option("--count", "-n", min=1, help="Exit after this many results (subscriber: readings)."),

@@ -44,7 +44,7 @@ from services.sockets.status import PeerStatus
 from services.supervision.child import RESTARTS, Child, end_all
 from terminal.errors import ExitCode
 from terminal.output import say
-from terminal.private_directory import PrivateDirectory
+from terminal.run_directory import LockedRunDirectory
 from toolchain.deployment import Deployment
 
 if TYPE_CHECKING:
@@ -139,10 +139,10 @@ class Peers:
         self._once = once
         # Given to `start`; no record arrives before.
         self._events: PeerEvents
-        # Determined by `prepare`, in the order in which a frame meets them: the services by role, the folder of sockets
-        # if any of them is started here, the boards' process if the master starts it, and where boards listen.
+        # Determined by `prepare`, in the order in which a frame meets them: the services by role, the run
+        # directory if any of them is started here, the boards' process if the master starts it, and where boards listen.
         self._by_role: dict[str, Peer] = {}
-        self._private: PrivateDirectory | None = None
+        self._run: LockedRunDirectory | None = None
         self._boards: Child | None = None
         self.board_endpoints: tuple[str, ...] = ()
         # Tasks that keep peers and boards, which end at once; and services in this process, which get time to end.
@@ -172,8 +172,8 @@ class Peers:
 
     @property
     def directory(self) -> Path | None:
-        """The run's private folder, if it needs one."""
-        return None if self._private is None else self._private.path
+        """The folder of the processes' sockets, if the master starts any."""
+        return None if self._run is None else self._run.path
 
     @property
     def not_ready(self) -> list[str]:
@@ -196,7 +196,12 @@ class Peers:
     # --- starting and ending -------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Determine which peers are running, and how to start the others, or raise a SettingsError."""
+        """Determine which peers are running, and how to start the others.
+
+        Raises:
+            SettingsError: The endpoints are wrong.
+            OccupiedError: Another run uses the run directory.
+        """
         settings, deployment = self._settings, self._deployment
         given = {
             "subscriber": settings.subscriber,
@@ -204,7 +209,7 @@ class Peers:
             "pcie-app": settings.pcie_app,
         }
         if not all(given.values()):
-            self._private = PrivateDirectory()
+            self._run = LockedRunDirectory(settings.run_directory)
         directory = self.directory
         if settings.boards or any(board.endpoint for board in deployment.boards):
             board_endpoints(settings, deployment)  # check the list before anything starts
@@ -220,7 +225,7 @@ class Peers:
                 str(endpoint_in(directory, f"board{at}")) for at in range(len(endpoints))
             )
             command = boards_command(len(endpoints), directory, settings, once=self._once)
-            self._boards = Child("the boards' process", command, directory=directory)
+            self._boards = Child("the boards' process", command, directory=self._run)
         for role, text in given.items():
             self._by_role[role] = Peer(role, None, None) if settings.fused else self._peer(role, text)
 
@@ -236,7 +241,7 @@ class Peers:
             compiling_time=self._compiling_time,
             reprogram=self._boards is not None,  # only this run can have programmed its own boards
         )
-        return Peer(role, endpoint, Child(role, command, directory=self.directory))
+        return Peer(role, endpoint, Child(role, command, directory=self._run))
 
     @property
     def _compiling_time(self) -> float:
@@ -279,7 +284,7 @@ class Peers:
             update={
                 "boards": self.board_endpoints,
                 "peer_timeout": self._settings.peer_timeout + self._compiling_time,
-                "run_directory": self._settings.run_directory or self.directory,
+                "run_directory": self.directory,
             }
         )
 
@@ -300,7 +305,7 @@ class Peers:
             await asyncio.wait(self._inside, timeout=self._settings.stop_timeout)
 
     async def end(self) -> None:
-        """Stop the started processes, and remove the private directory."""
+        """Stop the started processes, and release the run directory."""
         children = [peer.child for peer in self if peer.child is not None]
         if self._boards is not None:
             children.append(self._boards)
@@ -310,8 +315,8 @@ class Peers:
         stop_timeout = self._settings.stop_timeout
         if killed := await end_all(children, stop_timeout):
             say(f"{' and '.join(killed)} did not end within {stop_timeout:g} s and had to be killed")
-        if self._private is not None:
-            self._private.remove()
+        if self._run is not None:
+            self._run.release()
 
     # --- processes and connections -------------------------------------------------------------
 

@@ -21,6 +21,7 @@ from terminal.errors import ExitCode
 from terminal.health import NoHealthError, status_socket
 from terminal.logs import get_logger
 from terminal.output import say, show_progress
+from terminal.run_directory import OccupiedError
 from toolchain.deployment import Deployment
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 ASK_EVERY = 5.0
 """Seconds between two questions to all children whether they make progress."""
 _ANSWER_TIME = 2.0
+_LOCK_EVERY = 0.05
 _PROGRESS_EVERY = 1.0
 _DRAWN_EVERY = 0.2
 """Minimum number of seconds between two pictures, so that drawing takes little time from the frames."""
@@ -75,8 +77,8 @@ class Master:
         settings, peers = self._settings, self._peers
         sockets = contextlib.AsyncExitStack()
         try:
-            peers.prepare()
-            run_directory = settings.run_directory or peers.directory
+            await self._prepare_peers()
+            run_directory = peers.directory or settings.run_directory
             more: dict[str, Any] = {}
             # with --connect alone, the run has no folder, and its services are watched by who started them
             if run_directory is not None:
@@ -120,6 +122,17 @@ class Master:
             if not self._once:
                 say(self.summary())
         return ExitCode.DONE
+
+    async def _prepare_peers(self) -> None:
+        """Prepare the peers; the processes of a run that was killed may take a moment to release the run directory."""
+        deadline = time.monotonic() + self._settings.stop_timeout
+        while True:
+            try:
+                return self._peers.prepare()
+            except OccupiedError:
+                if time.monotonic() >= deadline:
+                    raise
+            await asyncio.sleep(_LOCK_EVERY)
 
     def _begin_task(self, work: Coroutine[Any, Any, None]) -> None:
         self._tasks.append(asyncio.ensure_future(work))

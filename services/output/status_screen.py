@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from services.errors import SettingsError
-from services.sockets.stack import SilentProcess, StackStatus, ask_stack, no_run_error
+from services.sockets.stack import SilentProcess, StackStatus, ask_stack
 from services.sockets.status import BoardStatus, FrameCounts, ProcessStatus
 from terminal.errors import ExitCode
 
@@ -191,14 +191,14 @@ def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
     )
 
 
-async def show(directory: Path | None, others: Sequence[Path], *, watch: bool, json: bool) -> int:
-    """Print the status of a run and of other processes, once or every second.
+async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) -> int:
+    """Print the status of a run, once or every second.
 
     Returns:
         0 if everything is ready, otherwise 6.
 
     Raises:
-        SettingsError: There is no run, or no process answers, and `watch` is false.
+        SettingsError: No process answers, or not the master that is needed, and `watch` is false.
     """
     from rich.console import Console
     from rich.live import Live
@@ -220,12 +220,13 @@ async def show(directory: Path | None, others: Sequence[Path], *, watch: bool, j
         live.start()
     try:
         while True:
-            stack = await ask_stack(directory, others)
+            stack = await ask_stack(directory)
             if not stack.processes and not watch:
                 break
             put(stack)
-            if directory is None and not watch:
-                raise no_run_error()
+            names = [each.name for each in stack.processes] + [each.name for each in stack.silent]
+            if needs_master and "master" not in names and not watch:
+                raise SettingsError(f"no master runs in {directory}; start one, or name its --run-directory")
             if not watch:
                 return ExitCode.DONE if stack.ready else ExitCode.CHILD
             await asyncio.sleep(_WATCH_INTERVAL)
@@ -234,7 +235,7 @@ async def show(directory: Path | None, others: Sequence[Path], *, watch: bool, j
             live.stop()
     raise SettingsError(
         f"no rosbayes process answers in {directory}{_silence(stack.silent)}; "
-        "is the stack running, with this BM_RUN_DIRECTORY?"
+        "is the stack running, with this --run-directory?"
     )
 
 

@@ -25,7 +25,6 @@ from services.errors import SettingsError
 from services.settings import metrics_endpoint
 from services.sockets.records import VERSION
 from services.sockets.status import ProcessStatus, StageLatency
-from services.supervision.parent import leave_private_directory
 from services.supervision.service_manager import ServiceManager
 from terminal.health import in_thread, resources, serve_health
 
@@ -170,8 +169,5 @@ def serve_status_in_thread(
     directory: Path | None, name: str, get_status: GetStatus, **more: Any
 ) -> Iterator[None]:
     """Report from a thread within the context, for a process with one blocking thread."""
-    try:
-        with in_thread(lambda: serve_status(directory, name, get_status, **more)):
-            yield
-    finally:
-        leave_private_directory()
+    with in_thread(lambda: serve_status(directory, name, get_status, **more)):
+        yield

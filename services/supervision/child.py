@@ -19,10 +19,11 @@ from typing import Final, NoReturn
 import msgspec
 
 from services.errors import ReportedError, StackError
-from services.supervision.parent import DIRECTORY_VARIABLE, end_with_parent
+from services.supervision.parent import end_with_parent
 from terminal.errors import ExitCode, StoppedError, exit_code_of
 from terminal.logs import PARENT_VARIABLE
 from terminal.output import ERROR_DESCRIPTOR, relay, say_error
+from terminal.run_directory import LockedRunDirectory
 from terminal.signals import ENDING_SIGNALS, raise_on_signals
 
 RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
@@ -106,12 +107,13 @@ class Child:
         name: str,
         command: list[str],
         *,
-        directory: Path | None = None,
+        directory: LockedRunDirectory | None = None,
         ends: deque[float] | None = None,
     ) -> None:
         """Store the command; `ends`, one longer than the permitted restarts, may be shared with other children."""
         self.name = name
         self._command = command
+        # The run directory, whose lock the child holds too, so that the next run waits for its end.
         self._directory = directory
         # Of the last start: the process, its pipes (standard error and error reports), and its last report.
         self._process: asyncio.subprocess.Process | _Forked | None = None
@@ -137,9 +139,7 @@ class Child:
         }
         # a folder of status sockets that the user has chosen is that of all processes
         if self._directory is not None:
-            environment[DIRECTORY_VARIABLE] = str(self._directory)
-            if not environment.get(RUN_DIRECTORY_VARIABLE):
-                environment[RUN_DIRECTORY_VARIABLE] = str(self._directory)
+            environment[RUN_DIRECTORY_VARIABLE] = str(self._directory.path)
         try:
             self._process = await self._spawn(environment, lines.writer)
         except OSError as error:
@@ -156,12 +156,15 @@ class Child:
             self._error = _decoder.decode(line).error
 
     async def _spawn(self, environment: dict[str, str], lines: int) -> "asyncio.subprocess.Process | _Forked":
+        inherited = [int(environment[ERROR_DESCRIPTOR])]
+        if self._directory is not None:
+            inherited.append(self._directory.lock)
         return await asyncio.create_subprocess_exec(
             *self._command,
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=lines,
-            pass_fds=(int(environment[ERROR_DESCRIPTOR]),),
+            pass_fds=inherited,
             env=environment,
             start_new_session=True,
         )

@@ -109,6 +109,9 @@ async def test_a_signal_ends_all_and_leaves_nothing(stage, boat, how, number, co
 async def test_a_master_that_is_killed_leaves_nothing(stage, boat):
     _, _, master = await stage.loop(boat)
     master.send(signal.SIGKILL)
+    _, _, next_one = await stage.loop(boat)  # waits for the end of its processes, in the same directory
+    next_one.send(signal.SIGTERM)
+    assert await next_one.end() == 143
     await stage.nothing_left("hub")
     assert not list(stage.runs.iterdir())
 

@@ -198,7 +198,7 @@ def test_silence_has_a_reason(tmp_path):
 
 
 @pytest.mark.parametrize("is_ready", [True, False])
-@pytest.mark.parametrize("flag", [["--directory", "{}"], ["--directory={}"], []])
+@pytest.mark.parametrize("flag", [["--run-directory", "{}"], ["--run-directory={}"], []])
 def test_the_exit_code_is_the_health(tmp_path, capsys, monkeypatch, is_ready, flag):
     monkeypatch.setenv("BM_RUN_DIRECTORY", "" if flag else str(tmp_path))
     with Server("thread").serving(tmp_path, status(is_ready=is_ready, why="here"), "master"):

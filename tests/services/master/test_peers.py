@@ -135,7 +135,9 @@ ROLES = ("subscriber", "publisher", "pcie-app")
 
 @pytest.mark.parametrize("given", [(), ("publisher",), ("pcie-app",), ROLES])
 def test_peers_that_are_not_given_are_started(boat, tmp_path, given):
-    settings = Settings(**{role.replace("-", "_"): f"unix:/tmp/{role}.sock" for role in given})
+    settings = Settings(
+        run_directory=tmp_path, **{role.replace("-", "_"): f"unix:/tmp/{role}.sock" for role in given}
+    )
     peers = Peers(settings, boat, get_logger("test"), once=True)
     peers.prepare()
     try:
@@ -146,17 +148,17 @@ def test_peers_that_are_not_given_are_started(boat, tmp_path, given):
         places = {endpoint_from(each, "").path for each in peers.board_endpoints}  # each board has its own
         assert len(places) == (0 if "pcie-app" in given else len(boat.boards))
     finally:
-        if peers._private is not None:
-            peers._private.remove()
+        if peers._run is not None:
+            peers._run.release()
 
 
 @pytest.mark.parametrize("given", [{}, {"publisher": "unix:/tmp/publisher.sock"}])
 def test_a_fused_master_has_all_services_inside(boat, tmp_path, given):
-    settings = Settings(fused=True, boards=("unix:/tmp/board.sock",) * 4, **given)
+    settings = Settings(run_directory=tmp_path, fused=True, boards=("unix:/tmp/board.sock",) * 4, **given)
     peers = Peers(settings, boat, get_logger("test"), once=True)
     with pytest.raises(SettingsError) if given else nullcontext():
         peers.prepare()
-    peers._private.remove()
+    peers._run.release()
     assert [(peer.endpoint, peer.child) for peer in peers] == ([] if given else [(None, None)] * 3)
 
 

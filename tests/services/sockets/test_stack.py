@@ -5,7 +5,6 @@ import contextlib
 import io
 import socket
 import sys
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -112,7 +111,7 @@ async def test_thousands_of_silent_sockets_are_counted(tmp_path, monkeypatch):
         for number in range(1, 1000):
             listener(tmp_path, f"board{number}").close()
         with pytest.raises(SettingsError) as caught:
-            await show(tmp_path, [], watch=False, json=False)
+            await show(tmp_path, needs_master=False, watch=False, json=False)
     monkeypatch.setattr(status, "ANSWER_TIME", 30.0)  # now all have been killed, and the master answers
     async with served(tmp_path, master=process()):
         text = shown(await status.ask_stack(tmp_path))
@@ -171,54 +170,22 @@ async def test_what_a_process_says_can_not_write_over_the_terminal(tmp_path):
     assert len(text) < 3000
 
 
-@pytest.fixture
-def places(tmp_path, monkeypatch):
-    """The directory that is searched for runs; it contains only those of this test."""
-    monkeypatch.setattr(status.tempfile, "gettempdir", lambda: str(tmp_path))
-    monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
-    monkeypatch.delenv("BM_RUN_DIRECTORY", raising=False)
-    return tmp_path
-
-
-def make_run(places, name):
-    run = places / f"rosbayes-{name}"
-    run.mkdir()
-    return run
-
-
-async def test_the_only_live_run_is_found(places):
-    dead, one, two = (make_run(places, name) for name in ("dead", "one", "two"))
-    with pytest.raises(SettingsError, match=str(dead)):
-        await status.find_run()
-    async with served(one, master=process()):
-        assert await status.find_run() == (one, [])
-        async with served(two, master=process()):
-            with pytest.raises(SettingsError, match="2 runs"):
-                await status.find_run()
-            assert await status.find_run("two") == (two, [])
-            with pytest.raises(SettingsError, match="three"):
-                await status.find_run("three")
-
-
-async def test_processes_without_a_run_are_shown_with_it_and_alone(places):
-    run, hub, boat = (make_run(places, name) for name in ("run", "hub", "boat"))
-    listener(boat, "boat").close()
-    async with served(hub, hub=process(hub=HubStatus(3, 5, 7))):
-        assert await status.find_run() == (None, [hub])
-        async with served(run, master=process()):
-            found = await status.find_run()
-            assert found == (run, [hub])
-            stack = await status.ask_stack(*found)
-            assert [each.name for each in stack.processes] == ["hub", "master"]
-            assert (stack.ready, stack.silent, stack.directory) == (True, [], str(run))
+async def test_a_user_s_own_run_needs_a_master(tmp_path, capsys):
+    async with served(tmp_path, hub=process(hub=HubStatus(3, 5, 7))):
+        assert await show(tmp_path, needs_master=False, watch=False, json=False) == 0
+        with pytest.raises(SettingsError):
+            await show(tmp_path, needs_master=True, watch=False, json=False)
+        async with served(tmp_path, master=process()):
+            assert await show(tmp_path, needs_master=True, watch=False, json=True) == 0
+    assert '"clients":3' in capsys.readouterr().out
 
 
 @pytest.mark.process
-async def test_watching_prints_a_line_every_second_until_it_is_ended(places):
-    run = make_run(places, "it")
-    async with served(run, master=process()):
+async def test_watching_prints_a_line_every_second_until_it_is_ended(tmp_path):
+    async with served(tmp_path, master=process()):
         watching = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "services.commands.status", "--watch", "--json", "--directory", str(run)),
+            *(sys.executable, "-m", "services.commands.status", "--watch", "--json"),
+            *("--run-directory", str(tmp_path)),
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
         )
@@ -230,23 +197,3 @@ async def test_watching_prints_a_line_every_second_until_it_is_ended(places):
         watching.terminate()
         assert await asyncio.wait_for(watching.wait(), PROCESS_PATIENCE) == 143
         assert b"Traceback" not in await watching.stderr.read()
-
-
-def test_a_run_that_ends_while_runs_are_looked_for_is_none(places, monkeypatch):
-    ending, run = make_run(places, "aaaaaaaa"), make_run(places, "bbbbbbbb")
-    is_directory = Path.is_dir
-
-    def and_then_it_goes(path):
-        seen = is_directory(path)
-        if path == ending and seen:
-            path.rmdir()
-        return seen
-
-    monkeypatch.setattr(Path, "is_dir", and_then_it_goes)
-    assert status.run_directories() == [run]
-
-
-def test_a_link_to_a_run_is_not_another_run(places):
-    run = make_run(places, "aaaaaaaa")
-    run.with_name(run.name.replace("aaaaaaaa", "bbbbbbbb")).symlink_to(run)
-    assert status.run_directories() == [run]

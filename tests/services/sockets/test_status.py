@@ -19,7 +19,7 @@ from services.sockets.status import (
 )
 from services.supervision.service_manager import ServiceManager
 from terminal.health import NoHealthError, Silence, in_thread, serve_health, status_socket
-from terminal.private_directory import remove_stale_sockets
+from terminal.run_directory import remove_stale_sockets
 from tests.patience import PATIENCE
 
 
