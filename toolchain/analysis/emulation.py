@@ -57,7 +57,12 @@ class EmulatedBoards:
         self.stop = stop
         # Counters that never stop a run of a given length. Frames are stopped by the target, so their results
         # do not change.
-        self._kernels = [make_kernel(_wide(machine)) for machine in machines]
+        self._kernels = [
+            make_kernel(
+                replace(machine, parameters=replace(machine.parameters, counter_bits=COUNTER_BITS_MAX))
+            )
+            for machine in machines
+        ]
 
     @property
     def parameters(self) -> BM1Parameters:
@@ -142,13 +147,4 @@ def joined(machines: Sequence[BM1Machine]) -> BM1Machine:
             np.hstack([machine.tables[column] for machine in machines]) for column in range(len(first.tables))
         ),
         first.rng_table,
-    )
-
-
-def _wide(machine: BM1Machine) -> BM1Machine:
-    return BM1Machine(
-        replace(machine.parameters, counter_bits=COUNTER_BITS_MAX),
-        machine.prior,
-        machine.tables,
-        machine.rng_table,
     )

@@ -31,7 +31,7 @@ class Point(BaseModel):
         map_agreement: Share of frames with the same most probable line.
         z_rms: Root mean square of z-scores; 1 is ideal.
         without: Share of runs without a posterior.
-        cycles_median: Cycles of a frame, which computes one posterior per replica.
+        cycles_median: Cycles of a frame.
         cycles_95: Their 95th percentile.
         alms: ALMs of the largest board; None for generators that FPGAs do not have.
         blocks: Memory blocks of the largest board.
@@ -62,14 +62,6 @@ class Point(BaseModel):
     alms: float | None
     blocks: int | None
     fits: bool | None
-    # files of older sweeps do not have these
-    sensor_mode: Literal["column", "cell", "threshold"] = "column"
-    replicas: int = 1
-
-    @property
-    def cycles_a_posterior(self) -> float:
-        """Cycles of a frame, divided by its number of posteriors."""
-        return self.cycles_median / self.replicas
 
 
 class Results:
@@ -129,7 +121,7 @@ class Results:
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
-    """Return the Pareto front of total variation, cycles per posterior, ALMs and runs without a posterior."""
+    """Return the Pareto front of total variation, cycles, ALMs and runs without a posterior."""
     judged = [(point, figures) for point in points if (figures := _figures(point)) is not None]
     return [
         point
@@ -144,25 +136,19 @@ def _figures(point: Point) -> tuple[float, ...] | None:
     if point.total_variation is None:
         return None
     alms = math.inf if point.alms is None else point.alms
-    return (point.total_variation, point.cycles_a_posterior, alms, point.without)
+    return (point.total_variation, point.cycles_median, alms, point.without)
 
 
 def table(points: Sequence[Point], front: Sequence[Point]) -> str:
-    """Return the sweep as text; points on the Pareto front have a star.
-
-    Sensor modes and replicas are columns only if some machines differ from the defaults.
-    """
+    """Return the sweep as text; points on the Pareto front have a star."""
     keys = {point.key for point in front}
-    several = any(point.replicas > 1 for point in points)
-    modes = any(point.sensor_mode != "column" for point in points)
     rows = [
-        "  "
-        + ("cells      " if modes else "")
-        + ("replicas  " if several else "")
-        + "scale    rng     steps  codes  target  total variation (95 %)     by codes    KL bits  same MAP   z rms  without   cycles"
-        "      95 %" + ("  a posterior" if several else "") + "     ALMs  blocks  fits"
+        (
+            "  scale    rng     steps  codes  target  total variation (95 %)     by codes    KL bits  same MAP   z rms  without   cycles"
+            "      95 %     ALMs  blocks  fits"
+        )
     ]
-    for point in sorted(points, key=lambda each: (each.cycles_a_posterior, each.total_variation or 1.0)):
+    for point in sorted(points, key=lambda each: (each.cycles_median, each.total_variation or 1.0)):
         variation = (
             f"{point.total_variation:7.4f} ({point.total_variation_low:.4f}..{point.total_variation_high:.4f})"
             if point.total_variation is not None
@@ -170,19 +156,14 @@ def table(points: Sequence[Point], front: Sequence[Point]) -> str:
         )
         rows.append(
             ("* " if point.key in keys else "  ")
-            + (f"{point.sensor_mode:9}  " if modes else "")
-            + (f"{point.replicas:8d}  " if several else "")
             + f"{point.scale:8} {point.rng:7} {point.steps_per_clock:5d}  {point.prob_bits:5d}  "
             f"{point.target_count:6d}  {variation:>24}  {_cell(point.quantising, '.4f'):>9}  {_cell(point.kl_bits, '.4f'):>9}  "
             f"{_cell(point.map_agreement, '.0%'):>8}  {_cell(point.z_rms, '.2f'):>6}  {point.without:7.1%}  "
-            f"{point.cycles_median:7,.0f}  {point.cycles_95:8,.0f}  "
-            + (f"{point.cycles_a_posterior:11,.1f}  " if several else "")
-            + f"{_cell(point.alms, ',.0f'):>7}  {_cell(point.blocks, ','):>6}  "
+            f"{point.cycles_median:7,.0f}  {point.cycles_95:8,.0f}  {_cell(point.alms, ',.0f'):>7}  {_cell(point.blocks, ','):>6}  "
             f"{'-' if point.fits is None else 'yes' if point.fits else 'no':>4}"
         )
-    cycles = "cycles per posterior" if several else "cycles"
     rows.append(
-        f"* no other machine is better in one of total variation, {cycles}, ALMs and frames without a posterior, and as good "
+        "* no other machine is better in one of total variation, cycles, ALMs and frames without a posterior, and as good "
         "in the others"
     )
     return "\n".join(rows) + "\n"
@@ -228,24 +209,23 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
     """Draw accuracy against cycles, with ALMs as the size of points, and the Pareto front."""
     shown = [point for point in points if point.total_variation is not None]
     largest = max((point.alms or 0.0 for point in shown), default=0.0) or 1.0
-    several = any(point.replicas > 1 for point in points)
-    kinds = sorted({_kind(point) for point in shown})
+    kinds = sorted({(point.scale, point.rng) for point in shown})
     beside = len(kinds) > _KINDS_INSIDE
     figure = new_figure((10.2 if beside else 7.2, 4.8))
     axes = figure.subplots()
-    for at, kind in enumerate(kinds):
-        of_kind = [point for point in shown if _kind(point) == kind]
+    for at, (scale, rng) in enumerate(kinds):
+        of_kind = [point for point in shown if (point.scale, point.rng) == (scale, rng)]
         axes.scatter(
-            [point.cycles_a_posterior for point in of_kind],
+            [point.cycles_median for point in of_kind],
             [point.total_variation for point in of_kind],
             s=[20 + 120 * (point.alms or 0.0) / largest for point in of_kind],
             color=COLOURS[at % len(COLOURS)],
             marker=MARKERS[at % len(MARKERS)],
             alpha=0.6,
-            label=_label(kind),
+            label=f"{rng}, scale {scale}",
         )
     axes.scatter(
-        [point.cycles_a_posterior for point in front],
+        [point.cycles_median for point in front],
         [point.total_variation for point in front],
         s=220,
         facecolors="none",
@@ -256,7 +236,7 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
     axes.set(
         xscale="log",
         yscale="log",
-        xlabel="cycles of a frame (median)" if not several else "cycles of a frame / its posteriors (median)",
+        xlabel="cycles of a frame (median)",
         ylabel="total variation to exact inference (mean)",
         title=f"{name}: accuracy against cycles; the larger, the more ALMs",
     )

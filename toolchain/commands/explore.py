@@ -1,6 +1,5 @@
 """The `toolchain explore` command: a sweep over machines for a model, or the thesis's claims as experiments."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
-from machines.parameters import RngKind, SensorMode
+from machines.parameters import RngKind
 from toolchain.commands.flags import (
     Bits,
     MaxCycles,
@@ -22,10 +21,8 @@ from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
 
 if TYPE_CHECKING:
-    from toolchain.analysis.readings import Readings
     from toolchain.analysis.results import Point
     from toolchain.analysis.sweep import Sweep
-    from toolchain.models.model import Model
 
 Kind = TypeVar("Kind", bound=StrEnum)
 
@@ -48,16 +45,6 @@ class SweepFlags(ModelFlags):
             help="Part of a table that is divided by its maximum before quantising.", metavar="LIST"
         ),
     ] = "address,column"
-    sensor_modes: Annotated[
-        str,
-        typer.Option(
-            help="Input of a cell: the reading of its column, its own (cell), or its probability (threshold).",
-            metavar="LIST",
-        ),
-    ] = "column"
-    replicas: Annotated[
-        str, typer.Option(help="Numbers of machines on a board, which share the generators.", metavar="LIST")
-    ] = "1"
     steps: Annotated[
         str, typer.Option(help="Steps of a generator per cycle; 0: fresh bits.", metavar="LIST")
     ] = "0"
@@ -111,9 +98,9 @@ def explore(
             "name a model to explore, such as 'toolchain explore casestudies/boat', or --claims DIR"
         )
     from toolchain.analysis.logic import device_named
-    from toolchain.analysis.readings import check_columns
+    from toolchain.analysis.readings import check_columns, recorded_readings, sample_readings
     from toolchain.analysis.results import Results, check_pictures_possible, draw_sweep, pareto, table
-    from toolchain.analysis.sweep import Frames, run_sweep, run_task, tasks, with_resources
+    from toolchain.analysis.sweep import run_sweep, run_task, tasks, with_resources
     from toolchain.commands.request import read_model
 
     if plot is not None:
@@ -122,13 +109,16 @@ def explore(
     sweep = _sweep(flags)
     read = read_model(model, flags, flags.bits)
     check_columns(readings.readings, readings.reading)
-    drawn = Frames(read, frames, seed=readings.seed, recorded=_recorded(read, readings))
+    if readings.readings is None:
+        drawn = sample_readings(read, frames, seed=readings.seed)
+    else:
+        drawn = recorded_readings(readings.readings, read.variables, readings.reading or (), frames=frames)
     kept = Results(results)
     found = tasks(read, sweep, drawn, device)
     kept.check_writable()
     there = sum(task.key in kept.points for task in found)
     typer.echo(
-        f"{len(found)} machines of {read.name} over {drawn.columns(found[0].plan.options.replicas).source}"
+        f"{len(found)} machines of {read.name} over {drawn.source}"
         + (f"; {there} of them are in {results}" if there else ""),
         err=True,
     )
@@ -156,16 +146,6 @@ def explore(
                 typer.echo(f"Wrote {plot}", err=True)
 
 
-def _recorded(model: "Model", flags: ReadingFlags) -> "Callable[[int], Readings] | None":
-    """Return a function that reads a number of rows of the recording, if there is one."""
-    from toolchain.analysis.readings import recorded_readings
-
-    path = flags.readings
-    if path is None:
-        return None
-    return lambda frames: recorded_readings(path, model.variables, flags.reading or (), frames=frames)
-
-
 def _sweep(flags: SweepFlags) -> "Sweep":
     from toolchain.analysis.sweep import Sweep
 
@@ -176,8 +156,6 @@ def _sweep(flags: SweepFlags) -> "Sweep":
         target_counts=_numbers("--targets", flags.targets),
         rngs=_members("--rngs", flags.rngs, RngKind),
         scales=_members("--scales", flags.scales, Scale),
-        sensor_modes=_members("--sensor-modes", flags.sensor_modes, SensorMode),
-        replicas=_numbers("--replicas", flags.replicas),
         steps_per_clock=_numbers("--steps", flags.steps),
         partitions=flags.partitions,
         stop=flags.stop,

@@ -5,7 +5,7 @@ over the bin, not the density at the centre, so coarse bins are exact too.
 """
 
 import math
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -55,14 +55,18 @@ def normal(
     """
     shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
     table = normal_table(name, shape, values=values, offset=offset, step=step)
-    rule: dict[str, Any] = {
-        "bits": bits,
-        "offset": offset,
-        "step": step,
-        "on_missing": on_missing,
-        "path": path,
-    }
-    return Known(name=name, table=table, on_range=on_range, floor=floor, normal=shape, **rule)
+    return Known(
+        name=name,
+        table=table,
+        bits=bits,
+        offset=offset,
+        step=step,
+        on_range=on_range,
+        on_missing=on_missing,
+        path=path,
+        floor=floor,
+        normal=shape,
+    )
 
 
 def wrapped_normal(
@@ -88,14 +92,18 @@ def wrapped_normal(
     """
     shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
     table = wrapped_normal_table(name, shape, values=values, offset=offset, step=step)
-    rule: dict[str, Any] = {
-        "bits": bits,
-        "offset": offset,
-        "step": step,
-        "on_missing": on_missing,
-        "path": path,
-    }
-    return Known(name=name, table=table, period=values, floor=floor, normal=shape, **rule)
+    return Known(
+        name=name,
+        table=table,
+        bits=bits,
+        offset=offset,
+        step=step,
+        period=values,
+        on_missing=on_missing,
+        path=path,
+        floor=floor,
+        normal=shape,
+    )
 
 
 def normal_table(name: str, shape: Normal, *, values: int, offset: float, step: float) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@ import math
 import re
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, Literal, TypeAlias
+from typing import ClassVar, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ class IntegerType:
     high: int
     wraps: bool = False
     unit: str = ""
+    step: ClassVar[float] = 1.0
+    labels: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         if not (_is_whole(self.low) and _is_whole(self.high)):
@@ -47,16 +49,6 @@ class IntegerType:
         """The first value."""
         return float(self.low)
 
-    @property
-    def step(self) -> float:
-        """Difference between adjacent values."""
-        return 1.0
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """The values' names: none."""
-        return ()
-
 
 @dataclass(frozen=True, slots=True)
 class IntervalType:
@@ -70,6 +62,7 @@ class IntervalType:
     intervals: int
     wraps: bool = False
     unit: str = ""
+    labels: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         if not _is_whole(self.intervals):
@@ -94,11 +87,6 @@ class IntervalType:
         """The width of an interval."""
         return (self.high - self.low) / self.intervals
 
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """The values' names: none."""
-        return ()
-
 
 @dataclass(frozen=True, slots=True, init=False)
 class LabelType:
@@ -109,6 +97,8 @@ class LabelType:
     """
 
     labels: tuple[str, ...]
+    wraps: ClassVar[bool] = False  # named values are never on a circle
+    unit: ClassVar[str] = ""
 
     def __init__(self, *labels: str) -> None:
         if not labels or not all(labels) or len(set(labels)) < len(labels):
@@ -121,16 +111,6 @@ class LabelType:
     def size(self) -> int:
         """The number of values."""
         return len(self.labels)
-
-    @property
-    def wraps(self) -> bool:
-        """False, because named values are never on a circle."""
-        return False
-
-    @property
-    def unit(self) -> str:
-        """The unit of the values: none."""
-        return ""
 
     @property
     def offset(self) -> float:

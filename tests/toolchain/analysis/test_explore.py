@@ -12,13 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from machines.parameters import RngKind, SensorMode
+from machines.parameters import RngKind
 from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.corridor import corridor
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis.logic import DEVICES
+from toolchain.analysis.readings import sample_readings
 from toolchain.analysis.results import Point, Results, pareto
-from toolchain.analysis.sweep import Frames, Sweep, run_sweep, run_task, tasks
+from toolchain.analysis.sweep import Sweep, run_sweep, run_task, tasks
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
 
@@ -51,7 +52,7 @@ def point(key, variation=0.1, cycles=100.0, alms=1000.0, without=0.0, **others):
         "alms": alms,
         "fits": True,
     }
-    return Point(**{name: value for name, value in (fields | others).items() if name != "sensor_mode"})
+    return Point(**(fields | others))
 
 
 def run(case, *arguments):
@@ -61,29 +62,20 @@ def run(case, *arguments):
 
 def test_keys_name_what_the_figures_depend_on():
     model, columns = corridor(), {"scales": (Scale.COLUMN,)}
-    cell, threshold = (
-        columns | {"sensor_modes": (mode,)} for mode in (SensorMode.CELL, SensorMode.THRESHOLD)
-    )
 
     def keys(of=model, seed=1, **others):
-        return [task.key for task in tasks(of, sweep(**others), Frames(of, 5, seed=seed), D8)]
+        return [task.key for task in tasks(of, sweep(**others), sample_readings(of, 5, seed=seed), D8)]
 
     first = keys()
     assert first == keys()
-    others = [keys(corridor(sigma=1.1)), keys(**cell, seed=2)]
-    changes = [{"seed": 2}, {"max_cycles": 4097}, {"partitions": 2}, {"banks": 2}, {"replicas": (2,)}]
-    others += [keys(**each) for each in (*changes, columns, cell, threshold, cell | {"replicas": (2,)})]
-    assert len({key for each in (first, *others) for key in each}) == 4 * 12
+    changes = [{"seed": 2}, {"max_cycles": 4097}, {"partitions": 2}, {"banks": 2}, columns]
+    others = [keys(corridor(sigma=1.1)), *(keys(**each) for each in changes)]
+    assert len({key for each in (first, *others) for key in each}) == 4 * 7
     assert set(first) < set(keys(prob_bits=(4, 8, 12)))
-    everything = keys(sensor_modes=tuple(SensorMode), replicas=(1, 2), scales=(Scale.ADDRESS, Scale.COLUMN))
-    # address is left out where cells have inputs of their own
-    assert len(everything) == 2 * 4 * (2 + 1 + 1)
-    for each in (first, keys(**columns), keys(**cell), keys(**threshold), keys(replicas=(2,))):
-        assert set(each) < set(everything)
 
 
 def test_a_machine_that_two_combinations_make_is_one():
-    frames = Frames(corridor(), 3, seed=1)
+    frames = sample_readings(corridor(), 3, seed=1)
     each = tasks(corridor(), sweep(steps_per_clock=(0, 8), prob_bits=(8,), target_counts=(15,)), frames, D8)
     assert len(each) == 1
     kinds = (RngKind.TABLE, RngKind.IDEAL, RngKind.LFSR16)
@@ -93,7 +85,7 @@ def test_a_machine_that_two_combinations_make_is_one():
 
 def test_a_sweep_goes_on_where_it_stopped(tmp_path):
     model, measured = corridor(), []
-    readings = Frames(model, 5, seed=1)
+    readings = sample_readings(model, 5, seed=1)
     found = tasks(model, sweep(), readings, D8)
 
     def measure_two(task):
@@ -155,7 +147,6 @@ def test_the_command(case):
     # An LFSR of 8 bits is too narrow for codes of 8: three machines are left.
     assert result.stderr.startswith("3 machines of corridor over 5 frames drawn from the model (seed 1)\n")
     assert "3 of 3 machines are in" in result.stderr
-    assert "replicas" not in result.stdout
     assert (case.parent / "sweep.png").read_bytes().startswith(b"\x89PNG")
     rows = result.stdout.splitlines()
     assert len(rows) == 5
@@ -172,41 +163,11 @@ def test_the_command(case):
     assert again.stdout == result.stdout
 
 
-def test_sensor_modes_and_replicas(case):
-    lists = ["--prob-bits", "8", "--targets", "15", "--rngs", "lfsr16", "--scales", "address,column"]
-    done(run(case, *lists))
-    more = [*lists, "--sensor-modes", "column,cell,threshold", "--replicas", "1,3"]
-    result = done(run(case, *more, "--plot", case.parent / "sweep.png"))
-    # 2 scales of columns, 1 of the others, each with 1 and 3 replicas; the single machines of columns are there
-    assert result.stderr.startswith("8 machines of corridor over 5 frames")
-    assert "; 2 of them are in" in result.stderr
-    rows = result.stdout.splitlines()
-    assert rows[0].split()[:3] == ["cells", "replicas", "scale"]
-    assert "a posterior" in rows[0]
-    found = sorted(tuple(row[2:].split()[:3]) for row in rows[1:-1])
-    kinds = (("cell", "column"), ("column", "address"), ("column", "column"), ("threshold", "column"))
-    assert found == sorted((mode, replicas, scale) for mode, scale in kinds for replicas in "13")
-    points = {
-        (each.sensor_mode, each.scale, each.replicas): each
-        for each in Results(case.parent / "r.jsonl").points.values()
-    }
-    for mode, scale in kinds:
-        one, three = (points[mode, scale, replicas] for replicas in (1, 3))
-        assert (one.frames, three.frames) == (5, 5)
-        assert one.alms < three.alms
-        # without tables: seeds and inputs, and of several the prior's addresses
-        assert ((one.blocks, three.blocks) == (2, 3)) == (mode == "threshold")
-    assert run(case, *more).stdout == result.stdout
-
-
-def test_no_recording_has_readings_for_each_line(case):
+def test_a_recording_is_explored(case):
     recording = case.parent / "r.csv"
     recording.write_text("range,loud\n1.0,0\n2.0,1\n3.0,0\n")
-    result = run(case, "--readings", str(recording), "--sensor-modes", "cell", "--scales", "column")
-    assert_refused(result, "--sensor-modes cell")
-    few = run(case, "--readings", str(recording), "--replicas", "4", "--prob-bits", "8", "--targets", "15")
-    assert few.exit_code == 2
-    assert "3 of 3 rows of r.csv" in few.stderr
+    result = done(run(case, "--readings", str(recording), "--prob-bits", "8", "--targets", "15"))
+    assert "over 3 of 3 rows of r.csv" in result.stderr
 
 
 @pytest.mark.parametrize(
