@@ -17,7 +17,7 @@ from scripts.campaigning.accounts import (
     Overdue,
     judge,
 )
-from scripts.campaigning.expected import BANKS, LINES, BoardOutcome, Outcome, addresses_of
+from scripts.campaigning.expected import BANKS, LINES, BoardOutcome, Outcome
 from scripts.campaigning.faults import ENDS, MOST_ENDS, SHORT, Fault, Kind, Schedule, ended_roles, excuses_of
 from scripts.campaigning.observer import DEPLOYMENT, Flaw, Observer, Reading
 from scripts.campaigning.stack import Topology
@@ -101,11 +101,6 @@ class Recording:
         return {finding.flaw for finding in observer.findings}
 
 
-def swapped_boards(run):
-    data = run.message("result", 4)["data"]
-    data[:] = data[HALF:] + data[:HALF]
-
-
 def last_bit(run):
     run.message("result", 4)["data"][3] += 2**-54
 
@@ -123,16 +118,8 @@ def other_deployment(run):
     run.message("report", 4)["status"][0]["hardware_id"] = "other"
 
 
-def other_bank(run):
-    run.value(7, "number", "9")
-
-
 def slice_too_early(run):
     run.value(4, "cycles", "128", status=2)
-
-
-def sums_disagree(run):
-    run.value(4, "counts_total", "1")
 
 
 def duplicated(run):
@@ -177,24 +164,17 @@ def unknown_stamp(run):
     run.message("report", 4)["header"]["stamp"]["nsecs"] += 1000
 
 
-def without_report(run):
-    del run.events[3 * 4 + 1]
-
-
 def without_result(run):
     run.events[3 * 7 + 1 :] = []
     del run.events[3 * 4 + 2]
 
 
 BUGS = {
-    swapped_boards: Flaw.WRONG,
     last_bit: Flaw.WRONG,
     result_of_another_reading: Flaw.WRONG,
     other_tables: Flaw.WRONG,
     other_deployment: Flaw.WRONG,
-    other_bank: Flaw.WRONG,
     slice_too_early: Flaw.WRONG,
-    sums_disagree: Flaw.WRONG,
     duplicated: Flaw.DUPLICATE,
     out_of_order: Flaw.OUT_OF_ORDER,
     lost_uncounted: Flaw.UNCOUNTED,
@@ -204,7 +184,6 @@ BUGS = {
     passed_over_alone: Flaw.UNEXPLAINED,
     not_a_number: Flaw.MALFORMED,
     unknown_stamp: Flaw.UNKNOWN,
-    without_report: Flaw.UNREPORTED,
     without_result: Flaw.WITHOUT_RESULT,
 }
 
@@ -281,19 +260,6 @@ def test_only_a_crowd_and_an_unusable_value_are_lost_without_a_fault():
 def test_a_fault_excuses_only_its_own_losses(fault, reasons, readings, results):
     excuses = excuses_of((fault,), Topology.APART)
     assert (excuses.reasons, excuses.readings, excuses.results) == (reasons, readings, results)
-
-
-@pytest.mark.parametrize(
-    ("values", "addresses"),
-    [
-        ({"near": 2.5, "far": None}, (3, None)),
-        ({"near": float("nan")}, (None, None)),
-        ({"near": float("inf"), "far": -(10**400)}, (6, 0)),
-        ({"near": "three", "far": 1}, None),
-    ],
-)
-def test_addresses_are_those_of_the_deployment(values, addresses):
-    assert addresses_of(values) == addresses
 
 
 @pytest.mark.parametrize("topology", Topology)
