@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from scripts.campaigning.observer import Finding, Flaw, Reading
@@ -35,30 +35,6 @@ class Counters:
 
 
 @dataclass(frozen=True, slots=True)
-class Overdue:
-    """Readings without a result when a step was judged.
-
-    If the machine was busy, they are only late: then their results arrive and are counted in the next step.
-
-    Attributes:
-        readings: These readings.
-        uncounted: How many of them no counter included.
-        astray: How many were counted as published.
-        reasons: Reasons for losses that the faults of that step explain.
-    """
-
-    readings: Sequence[Reading] = ()
-    uncounted: int = 0
-    astray: int = 0
-    reasons: frozenset[str] = frozenset()
-
-    @property
-    def late(self) -> int:
-        """Number of uncounted readings whose results have arrived meanwhile."""
-        return min(self.uncounted, sum(each.arrived for each in self.readings))
-
-
-@dataclass(frozen=True, slots=True)
 class Excuses:
     """What the faults of a step explain.
 
@@ -68,8 +44,8 @@ class Excuses:
             killed subscriber or master, a cut connection).
         results: Whether results may be lost so on their way from the publisher.
         most: Maximum number of each; higher only if a process or connection was held before.
-        until: Time at which the stack had recovered; only readings published before it are excused.
-        overdue: What was missing when the step before was judged.
+        until: Time of publication of the first reading that has a result again. Those before it are either judged
+            by now or lost, because everything keeps its order; those after it have no excuse.
     """
 
     reasons: frozenset[str] = frozenset()
@@ -77,43 +53,31 @@ class Excuses:
     results: bool = False
     most: int = MOST_IN_TRANSIT
     until: float = 0.0
-    overdue: Overdue = Overdue()
 
 
-def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses) -> tuple[list[Finding], Overdue]:
-    """Compare the master's counters with the readings of the same time, when nothing is in flight.
-
-    Returns:
-        The findings, and what no counter includes, as it was cut off between two processes, or is late.
-    """
+def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses) -> list[Finding]:
+    """Compare the master's counters with the readings of the same time, when nothing is in flight."""
     findings = []
-    overdue, late = excuses.overdue, excuses.overdue.late
     given = [each for each in readings if each.forwarded]
     missing = [each for each in given if not each.arrived]
-    arrived = len(given) - len(missing) + late
     losses = sum(count for reason, count in added.lost.items() if reason != NOT_LOST)
-    uncounted, astray = len(given) + late - added.completed - losses, added.completed - arrived
-    most = min(sum(each.published <= excuses.until for each in missing), excuses.most)
-    slack = min(late, overdue.astray)  # of these, the readings were counted before
+    uncounted = len(given) - added.completed - losses
+    astray = added.completed - (len(given) - len(missing))
+    most = min(sum(each.published < excuses.until for each in missing), excuses.most)
     figures = f"{len(given)} readings, {len(missing)} without result; counted: {added}"
-    if uncounted > slack + (most if excuses.readings else 0):
+    if uncounted > (most if excuses.readings else 0):
         findings.append(Finding(Flaw.UNCOUNTED, f"{uncounted} readings: {figures}"))
-    if -uncounted > slack + overdue.uncounted - late:
+    if uncounted < 0:
         findings.append(Finding(Flaw.MISCOUNTED, f"{-uncounted} too many: {figures}"))
     if astray > (most if excuses.results else 0):
         findings.append(Finding(Flaw.UNCOUNTED, f"{astray} results are counted as published: {figures}"))
-    if -astray > slack + added.lost.get(WITH_PUBLISHER, 0):
+    if -astray > added.lost.get(WITH_PUBLISHER, 0):
         findings.append(Finding(Flaw.MISCOUNTED, f"{-astray} results that were not counted: {figures}"))
     explained = {
         PASSED_OVER: sum(each.crowded for each in given),
         UNUSABLE: sum(each.addresses is None for each in given),
     }
-    left = overdue.uncounted  # these may be counted only now, under a reason of the step before
     for reason, number in added.lost.items():
-        more = 0 if reason in excuses.reasons else max(0, number - explained.get(reason, 0))
-        if reason in overdue.reasons:
-            more, left = max(0, more - left), max(0, left - more)
-        if more:
-            findings.append(Finding(Flaw.UNEXPLAINED, f"{more} {reason}, which no fault explains; {figures}"))
-    reasons = excuses.reasons | {PASSED_OVER}
-    return findings, Overdue(missing, max(0, uncounted), max(0, astray), reasons)
+        if reason not in excuses.reasons and number > explained.get(reason, 0):
+            findings.append(Finding(Flaw.UNEXPLAINED, f"{reason}, which no fault explains: {figures}"))
+    return findings

@@ -124,7 +124,8 @@ def excuses_of(step: Step, topology: Topology, until: float = 0.0) -> Excuses:
         both = cut or fault.what == "files"
         readings |= both or ended in {"hub", "master", "subscriber"}
         results |= both or ended in {"hub", "master", "publisher"}
-    held = any(fault.what in {"stop", "hold", "slow", "delay", "burst"} for fault in step)
+    # after nonsense, a client may take its time to close a connection from which it does not read any more
+    held = any(fault.what in {"stop", "hold", "slow", "delay", "burst", "nonsense"} for fault in step)
     most = sys.maxsize if held else MOST_IN_TRANSIT
     return Excuses(frozenset(reasons), readings=readings, results=results, most=most, until=until)
 

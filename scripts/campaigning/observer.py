@@ -100,9 +100,9 @@ class Observer:
         self._previous: Reading | None = None
         # The report without its result so far. A connection that was restored forgets it.
         self._announced: _Announced | None = None
-        # Of the current master, which numbers frames from 1, and of all results.
+        # The number of the last frame of the current master, which begins with 1, and the newest reading with a result.
         self._last_number = 0
-        self._last_index = -1
+        self._newest: Reading | None = None
         # False from the beginning of a fault until the counters were judged after its end.
         self._undisturbed = True
         self.in_fault = False
@@ -147,9 +147,9 @@ class Observer:
         """Return whether the result of a reading has arrived."""
         return stamp in self._readings and self._readings[stamp].arrived
 
-    def has_result_since(self, index: int) -> bool:
-        """Return whether a result has arrived of a reading with this index or a later one."""
-        return self._last_index >= index
+    def newest_since(self, index: int) -> Reading | None:
+        """Return the newest reading with a result, if its index is this or higher."""
+        return self._newest if self._newest is not None and self._newest.index >= index else None
 
     def pending_readings(self) -> list[Reading]:
         """Return the readings since the last `settle`, and older ones that had not reached the stack then."""
@@ -200,10 +200,11 @@ class Observer:
             self.find(Flaw.DUPLICATE, f"frame {announced.number}: reading {reading.index} again")
             return
         reading.arrived = True
-        if reading.index <= self._last_index:
-            sentence = f"frame {announced.number}: reading {reading.index} after {self._last_index}"
+        if newer := self.newest_since(reading.index):
+            sentence = f"frame {announced.number}: reading {reading.index} after {newer.index}"
             self.find(Flaw.OUT_OF_ORDER, sentence)
-        self._last_index = max(self._last_index, reading.index)
+            return
+        self._newest = reading
 
     def _read_report(self, message: Any) -> _Announced | None:
         stamp = message["header"]["stamp"]

@@ -20,7 +20,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from scripts.campaigning.accounts import ROSBRIDGE_AWAY, Counters, Excuses, Overdue, judge
+from scripts.campaigning.accounts import ROSBRIDGE_AWAY, Counters, Excuses, judge
 from scripts.campaigning.connections import REPORTS, Client
 from scripts.campaigning.expected import POOL, Addresses, Outcome, addresses_of
 from scripts.campaigning.faults import Kind, Step, excuses_of
@@ -55,7 +55,6 @@ class RoundResult:
     steps: int = 0
     """Number of steps that were taken; the last one led to the findings."""
     losses: Counter[str] = field(default_factory=Counter)
-    """Counted losses, and readings and results that were between two processes when they were cut."""
     recoveries: list[tuple[float, str]] = field(default_factory=list)
     """Seconds until results arrived again after a step's end, which are only reported, and the step."""
     resources: dict[tuple[str, int], list[tuple[int, int]]] = field(default_factory=dict)
@@ -83,8 +82,8 @@ class Round:
         self._injector = Injector(self.stack, topology, folder / "clock", self._special)
         self._client = Client(self.stack.hub_port, self._take, self.observer.reconnected)
         self._result = RoundResult()
-        # The master's counters when they were last judged, and what was missing then.
-        self._base, self._overdue = Counters(), Overdue()
+        # The master's counters when they were last judged.
+        self._base = Counters()
         # Set by each message to the observer, which came at this time.
         self._news, self._arrived = asyncio.Event(), now()
         # While it is True, `_drive` does not publish.
@@ -156,8 +155,8 @@ class Round:
             await self.stack.start(observer.forwarded)
             await self._client.start()
             observer.fault()
-            await self._recover("start")
-            await self._settle(Excuses(frozenset({ROSBRIDGE_AWAY}), readings=True, results=True, until=now()))
+            until = await self._recover("start")
+            await self._settle(Excuses(frozenset({ROSBRIDGE_AWAY}), readings=True, results=True, until=until))
             await self._calm()
             for step in steps:
                 if observer.findings:
@@ -186,29 +185,29 @@ class Round:
             self._base = Counters()
             self.observer.master_started()
         begun = now()
-        await self._recover(name)
+        until = await self._recover(name)
         self._result.recoveries.append((now() - begun, name))
         self.observer.calm()
-        await self._settle(excuses_of(step, self._topology, until=now()))
+        await self._settle(excuses_of(step, self._topology, until))
         await self._calm()
 
-    async def _recover(self, name: str) -> None:
-        """Wait for the result of a reading that is published from now on."""
+    async def _recover(self, name: str) -> float:
+        """Wait for the result of a reading that is published from now on, and return the time of its publication."""
         begun, first = now(), self.observer.readings
-        while not self.observer.has_result_since(first):
+        while (reading := self.observer.newest_since(first)) is None:
             if now() - begun > _RECOVERY_LIMIT:
                 self.observer.find(Flaw.SILENT, f"no result {_RECOVERY_LIMIT:.0f} s after: {name}")
-                return
+                return now()
             if self.stack.is_over("master"):
                 words = await self.stack.wait("master")
                 self.observer.find(Flaw.ENDED, f"the master ended after: {name}: {words}")
-                return
+                return now()
             await self._some_news()
+        return reading.published
 
     async def _settle(self, excuses: Excuses) -> None:
         """Stop publishing until nothing is in flight, and compare the counters with the published readings."""
         self._paused = True
-        excuses = replace(excuses, overdue=self._overdue)
         strict = replace(excuses, readings=False, results=False)
         deadline, changed, last = now() + _SETTLE_LIMIT + _QUIET, now(), None
         while True:
@@ -218,14 +217,13 @@ class Round:
                 last, changed = state, now()
             if counters is not None:
                 added = counters.since(self._base)
-                findings, overdue = judge(added, readings, excuses)
+                findings = judge(added, readings, excuses)
                 is_quiet = not findings and now() - changed > _QUIET
-                if is_quiet or now() > deadline or not judge(added, readings, strict)[0]:
+                if is_quiet or now() > deadline or not judge(added, readings, strict):
                     self.observer.findings += findings
-                    self._base, self._overdue = counters, overdue
+                    self._base = counters
                     self.observer.settle()
-                    cut = {"readings cut off": overdue.uncounted, "results cut off": overdue.astray}
-                    self._result.losses.update({**added.lost, **cut})
+                    self._result.losses.update(added.lost)
                     break
             elif now() > deadline:
                 break  # the master has ended, which is a separate finding

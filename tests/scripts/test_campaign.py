@@ -10,16 +10,14 @@ from scripts.campaigning.accounts import (
     FAILED,
     PASSED_OVER,
     UNUSABLE,
-    WITH_APP,
     WITH_PUBLISHER,
     Counters,
     Excuses,
-    Overdue,
     judge,
 )
 from scripts.campaigning.expected import BANKS, LINES, BoardOutcome, Outcome
 from scripts.campaigning.faults import ENDS, MOST_ENDS, SHORT, Fault, Kind, Schedule, ended_roles, excuses_of
-from scripts.campaigning.observer import DEPLOYMENT, Flaw, Observer, Reading
+from scripts.campaigning.observer import DEPLOYMENT, Flaw, Observer
 from scripts.campaigning.stack import Topology
 
 HALF = LINES // 2
@@ -97,7 +95,7 @@ class Recording:
                 observer.fault()
             else:
                 getattr(observer, kind)(copy.deepcopy(what))
-        observer.findings += judge(self.counters, observer.pending_readings(), self.excuses)[0]
+        observer.findings += judge(self.counters, observer.pending_readings(), self.excuses)
         return {finding.flaw for finding in observer.findings}
 
 
@@ -216,32 +214,14 @@ def test_results_of_a_killed_publisher_may_arrive():
     assert run.play() == set()
 
 
-@pytest.mark.parametrize(
-    ("added", "arrives", "flaws"),
-    [
-        (Counters(8), True, set()),
-        (Counters(7, {WITH_APP: 1}), False, set()),
-        (Counters(7, {FAILED: 1}), False, {Flaw.UNEXPLAINED}),
-        (Counters(7), False, set()),
-        (Counters(8), False, {Flaw.UNCOUNTED}),
-        (Counters(7, {WITH_APP: 2}), False, {Flaw.MISCOUNTED, Flaw.UNEXPLAINED}),
-    ],
-)
-def test_a_reading_that_was_excused_too_early_is_counted_in_the_next_step(added, arrives, flaws):
-    late = Reading(0, (0, 0), 0.0, forwarded=True, settled=True, arrived=arrives)
-    others = [Reading(at, (0, 0), 0.0, forwarded=True, arrived=True) for at in range(1, 8)]
-    found, _ = judge(added, others, Excuses(overdue=Overdue([late], 1, reasons=frozenset({WITH_APP}))))
-    assert {each.flaw for each in found} == flaws
-
-
 def test_only_a_crowd_and_an_unusable_value_are_lost_without_a_fault():
     observer = Observer(outcome)
     for index, addresses in enumerate([(0, 0), (1, 1), None]):
         observer.published(stamp(index), addresses, 0.0)
         observer.forwarded(stamp(index))
     readings = observer.pending_readings()
-    assert judge(Counters(0, {PASSED_OVER: 2, UNUSABLE: 1}), readings, Excuses())[0] == []
-    (finding,) = judge(Counters(0, {PASSED_OVER: 1, UNUSABLE: 2}), readings, Excuses())[0]
+    assert judge(Counters(0, {PASSED_OVER: 2, UNUSABLE: 1}), readings, Excuses()) == []
+    (finding,) = judge(Counters(0, {PASSED_OVER: 1, UNUSABLE: 2}), readings, Excuses())
     assert finding.flaw is Flaw.UNEXPLAINED
 
 

@@ -19,7 +19,7 @@ import socket
 import struct
 import threading
 from collections import defaultdict
-from typing import Any, ClassVar
+from typing import Any
 
 import tornado.httpserver
 import tornado.ioloop
@@ -27,46 +27,29 @@ import tornado.netutil
 import tornado.web
 import tornado.websocket
 
-
-class Message:
-    """A ROS message: its fields by name, with their types."""
-
-    fields: ClassVar[dict[str, str]] = {}
-
-    def __init__(self) -> None:
-        """Give every field its default."""
-        for name, kind in self.fields.items():
-            setattr(self, name, [] if kind.endswith("[]") else "" if kind == "string" else 0)
-            if kind in TYPES:
-                setattr(self, name, TYPES[kind]())
-
-
-class Dimension(Message):
-    """std_msgs/MultiArrayDimension."""
-
-    fields: ClassVar[dict[str, str]] = {"label": "string", "size": "uint32", "stride": "uint32"}
-
-
-class Layout(Message):
-    """std_msgs/MultiArrayLayout."""
-
-    fields: ClassVar[dict[str, str]] = {"dim": "Dimension[]", "data_offset": "uint32"}
-    data_offset: int
-
-
-class Float64MultiArray(Message):
-    """std_msgs/Float64MultiArray."""
-
-    fields: ClassVar[dict[str, str]] = {"layout": "Layout", "data": "float64[]"}
-    layout: Layout
-    data: list[float]
-
-
-TYPES: dict[str, type[Message]] = {"Dimension": Dimension, "Layout": Layout}
+FIELDS = {
+    "Dimension": {"label": "string", "size": "uint32", "stride": "uint32"},
+    "Layout": {"dim": "Dimension[]", "data_offset": "uint32"},
+    "Float64MultiArray": {"layout": "Layout", "data": "float64[]"},
+}
 PYTHON_TYPES = {"string": (str,), "uint32": (int,), "float64": (int, float)}
 
 
-def filled(message: Any, values: dict[str, Any]) -> Any:
+class Message:
+    """A ROS message with an attribute for each field, which is its default at first."""
+
+    layout: Message
+    data: list[float]
+    data_offset: int
+
+    def __init__(self, kind: str) -> None:
+        self.fields = FIELDS[kind]
+        for name, of in self.fields.items():
+            default: Any = [] if of.endswith("[]") else "" if of == "string" else 0
+            setattr(self, name, Message(of) if of in FIELDS else default)
+
+
+def filled(message: Message, values: dict[str, Any]) -> Message:
     """Return a message filled from JSON, or raise an error for a value that does not fit its type."""
     for name, value in values.items():
         setattr(message, name, fitting(message.fields[name], value))
@@ -77,8 +60,8 @@ def fitting(kind: str, value: Any) -> Any:
     """Return a value converted to a field's type."""
     if kind.endswith("[]"):
         return [fitting(kind[:-2], item) for item in value]
-    if kind in TYPES:
-        return filled(TYPES[kind](), value)
+    if kind in FIELDS:
+        return filled(Message(kind), value)
     if not isinstance(value, PYTHON_TYPES[kind]):
         raise TypeError(kind)
     return value
@@ -122,7 +105,7 @@ class Connection(tornado.websocket.WebSocketHandler):  # type: ignore[misc]  # t
         while (text := self.incoming.get()) is not None:
             operation = json.loads(text)
             if operation["op"] == "publish":
-                message: Float64MultiArray = filled(Float64MultiArray(), operation["msg"])
+                message = filled(Message("Float64MultiArray"), operation["msg"])
                 count = len(message.data)  # as ROS 1 sends it, without dimensions
                 body = struct.pack(f"<III{count}d", 0, message.layout.data_offset, count, *message.data)
                 with lock:
@@ -141,7 +124,7 @@ class Connection(tornado.websocket.WebSocketHandler):  # type: ignore[misc]  # t
         """Forward the messages of a topic."""
         reader = source.makefile("rb")
         while size := reader.read(4):
-            body, message = reader.read(struct.unpack("<I", size)[0]), Float64MultiArray()
+            body, message = reader.read(struct.unpack("<I", size)[0]), Message("Float64MultiArray")
             _, message.layout.data_offset, count = struct.unpack_from("<III", body)
             message.data = list(struct.unpack_from(f"<{count}d", body, 12))
             self.send({"op": "publish", "topic": topic, "msg": taken_out(message)})

@@ -66,7 +66,12 @@ class Stack:
         return kept | extra | self.variables
 
     def docker(
-        self, *arguments: str, limit: float = COMMAND_LIMIT, check: bool = True, codes: Collection[int] = (0,)
+        self,
+        *arguments: str,
+        limit: float = COMMAND_LIMIT,
+        check: bool = True,
+        codes: Collection[int] = (0,),
+        streams: str = "output",
     ) -> str:
         """Run docker and return its output.
 
@@ -96,7 +101,7 @@ class Stack:
             raise CheckError(
                 f"{what} ended with exit code {done.returncode}:\n      " + "\n      ".join(output)
             )
-        return done.stdout
+        return done.stdout + (done.stderr if streams == "both" else "")
 
     def compose(self, *arguments: str, limit: float = COMMAND_LIMIT) -> str:
         """Run docker compose."""
@@ -183,57 +188,46 @@ class Stack:
         """Return the name of a service's container."""
         return f"rosbayes-{service}-1"
 
-    def inspect(self, *services: str) -> list[dict[str, Any]]:
-        """Return the engine's state of services' containers."""
-        found: list[dict[str, Any]] = json.loads(self.docker("inspect", *map(self.container, services)))
-        return found
+    def inspect(self) -> dict[str, dict[str, Any]]:
+        """Return the engine's view of the project's containers, by service."""
+        ids = self.compose("ps", "--all", "--quiet").split()
+        found = json.loads(self.docker("inspect", *ids)) if ids else []
+        services = {each["Config"]["Labels"]["com.docker.compose.service"]: each for each in found}
+        return {service: each for service, each in services.items() if service != CHECK}
 
     def states(self) -> dict[str, dict[str, Any]]:
         """Return the states of the project's containers, by service."""
-        ids = self.compose("ps", "--all", "--quiet").split()
-        found = json.loads(self.docker("inspect", *ids)) if ids else []
-        states = {each["Config"]["Labels"]["com.docker.compose.service"]: each["State"] for each in found}
-        return {service: state for service, state in states.items() if service != CHECK}
+        return {service: each["State"] for service, each in self.inspect().items()}
+
+    def restarts(self) -> dict[str, int]:
+        """Return how often the engine has restarted each service."""
+        return {service: int(each["RestartCount"]) for service, each in self.inspect().items()}
 
     def kill(self, *services: str) -> None:
         """Kill the processes of services, and wait until the engine has restarted them."""
-        before = {service: self.restarts(service) for service in services}
+        before = self.restarts()
         for service in services:
             # after `docker kill` the engine would not restart it; with its process ends this shell
             kill = ("sh", "-c", "kill -KILL -1")
             self.docker("exec", self.container(service), *kill, codes=(0, KILLED))
 
-        def restarted() -> bool:
-            found = dict(zip(services, self.inspect(*services), strict=True))
-            return all(
-                each["RestartCount"] > before[service]
-                and each["State"]["Running"]
-                and not each["State"]["Restarting"]
-                for service, each in found.items()
-            )
+        def waited_for() -> list[str]:
+            found, restarts = self.states(), self.restarts()
+            is_new = {
+                each: restarts[each] > before[each] and found[each]["Status"] == "running"
+                for each in services
+            }
+            return [service for service in services if not is_new[service]]
 
-        until(restarted, lambda: f"not all of {services} are restarted")
+        until(lambda: not waited_for(), lambda: f"{waited_for()} are not restarted")
 
     def signal(self, pid: int, name: str) -> None:
         """Send a signal to a process inside the container of all boards, by the PID that `status` shows."""
         self.docker("exec", self.container("boards"), "sh", "-c", f"kill -{name} {pid}")
 
     def log(self, service: str, since: float = 0.0) -> str:
-        """Return the log of a service, or of a container outside the project, since a time."""
-        container = self.container(service) if service in {*SERVICES, CHECK} else service
-        return subprocess.run(
-            ["docker", "logs", "--since", f"{since:.3f}", container],
-            env=self.environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=COMMAND_LIMIT,
-            check=False,
-        ).stdout
-
-    def restarts(self, service: str) -> int:
-        """Return the number of times that the engine has restarted a service."""
-        return int(self.inspect(service)[0]["RestartCount"])
+        """Return the log of a service since a time."""
+        return self.docker("logs", "--since", f"{since:.3f}", self.container(service), streams="both")
 
     def save_logs(self, check: str) -> None:
         """Save all logs, as they are after a check, in the folder of results."""
