@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import time
 from functools import partial
-from typing import Any
 
 import msgspec
 
@@ -198,12 +197,10 @@ class Subscriber:
                 ]
                 for task in tasks:
                     stack.callback(task.cancel)
-                # topics that may be missing can end without an error; the first error ends the service
-                followed: asyncio.Future[Any] = asyncio.gather(*tasks)
-                await asyncio.wait([followed, self._lost], return_when=asyncio.FIRST_COMPLETED)
-                for ended in (followed, self._lost):
-                    if ended.done():
-                        ended.result()
+                # the first error ends the service; a topic that is left out ends without one
+                ended, _ = await asyncio.wait([*tasks, self._lost], return_when=asyncio.FIRST_EXCEPTION)
+                for each in ended:
+                    each.result()
             except Exception as error:
                 await report_failure(self._link, error)
                 raise
