@@ -248,16 +248,6 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
     save_figure(figure, path)
 
 
-def _kind(point: Point) -> tuple[str, int, str, str]:
-    return point.sensor_mode, point.replicas, point.scale, point.rng
-
-
-def _label(kind: tuple[str, int, str, str]) -> str:
-    mode, replicas, scale, rng = kind
-    others = ("" if mode == "column" else f", {mode}") + ("" if replicas == 1 else f", {replicas} replicas")
-    return f"{rng}, scale {scale}{others}"
-
-
 def new_figure(size: tuple[float, float]) -> Any:
     """Return a matplotlib figure of a size in inches, or raise a BuildError."""
     check_pictures_possible()

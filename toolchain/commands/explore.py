@@ -183,9 +183,7 @@ def _members(flag: str, text: str, kind: type[Kind]) -> tuple[Kind, ...]:
 
 
 def _name_of(point: "Point") -> str:
-    name = f"{point.rng}, codes of {point.prob_bits} bits, target {point.target_count}, scale {point.scale}"
-    name += "" if point.sensor_mode == "column" else f", {point.sensor_mode}"
-    return name if point.replicas == 1 else f"{name}, {point.replicas} replicas"
+    return f"{point.rng}, codes of {point.prob_bits} bits, target {point.target_count}, scale {point.scale}"
 
 
 def _run_claims(directory: Path, *, frames: int, seed: int) -> None:
