@@ -306,6 +306,7 @@ class EmulatedBoard:
         kernel = self._kernel
         if kernel is None:
             self._refuse(ErrorCode.BLANK, "the board is blank; program it first")
+        # a lost or repeated start must not compute a frame
         due = next_doorbell(self.done)
         if self.running or number != due:
             self._refuse(ErrorCode.DOORBELL, f"number {number} was written, {due} was expected")
@@ -402,6 +403,7 @@ class EmulatedBoard:
             self._chunk *= 2
         elif elapsed > CHUNK_S * 1.5e9:
             self._chunk = max(int(self._chunk * CHUNK_S * 1e9 / elapsed), _SHORTEST_CHUNK)
+        # after every chunk, so that a host can look at a running machine
         self._results[:] = kernel.counts
         if not self._is_plain and len(self._outcomes):
             self._outcomes["reason"] = kernel.replica_reasons

@@ -256,6 +256,7 @@ class BoardServer:
     def _is_held(self) -> bool:
         """Return whether a host holds the board, after handling the last frames of one that has disconnected."""
         host = self._host
+        # its end may have arrived, and not been served yet
         if host is not None and _has_left(host, self._access):
             self._drop_host(host)
         return self._host is not None
@@ -298,6 +299,7 @@ class BoardServer:
             self._interrupt(host)
 
     def _interrupt(self, host: HostConnection) -> None:
+        # numbered apart from the requests, so that the host notices a lost one
         host.interrupts = (host.interrupts + 1) & ALL_ONES
         words = self.board.interrupt_words()
         self._send(host, framing.IRQ, 0, host.interrupts, register_map.DONE, words)

@@ -68,9 +68,8 @@ class DrivenBoard:
         self.replicas = parameters.replicas
         self.inputs_at = rm.SENSORS if is_plain(parameters) else rm.INPUTS
         self.counts_bytes = 4 * self.replicas * self.lines
-        self.result_bytes = self.counts_bytes + (
-            self.replicas * REPLICA_OUTCOME.itemsize if self.replicas > 1 else 0
-        )
+        outcomes = self.replicas if self.replicas > 1 else 0
+        self.result_bytes = self.counts_bytes + outcomes * REPLICA_OUTCOME.itemsize
 
         # Either an open link, or None and the reason why.
         self.link: SocketLink | None = None
@@ -169,9 +168,8 @@ class DrivenBoard:
         parameters = self.image.machine.parameters
         words = struct.iter_unpack("<I", link.read_block(_CAPABILITIES.start, len(_CAPABILITIES)))
         capabilities = dict(zip(_CAPABILITIES, (word for (word,) in words), strict=True))
-        mode = (
-            capabilities[rm.CAP_MACHINE] & rm.CAP_MACHINE_SENSOR_MODE_MASK
-        ) >> rm.CAP_MACHINE_SENSOR_MODE_SHIFT
+        mode = capabilities[rm.CAP_MACHINE] & rm.CAP_MACHINE_SENSOR_MODE_MASK
+        mode >>= rm.CAP_MACHINE_SENSOR_MODE_SHIFT
         room = capabilities[rm.CAP_INTERFACE] & 0xFFFF, capabilities[rm.CAP_INTERFACE] >> 16
         inputs, results = interface_words(parameters)
         wanted = rm.SensorMode[parameters.sensor_mode.name]

@@ -41,6 +41,7 @@ def program(
         LinkError: The board is unreachable, or the link is broken.
     """
     where = parse_endpoint(endpoint) if isinstance(endpoint, str) else endpoint
+    # everything is read and checked before the board is touched
     content, expected = _content(image)
     with SocketLink.open(where.programming, timeout=timeout) as link:
         begin = framing.ProgramBegin(size=len(content), sha256=hashlib.sha256(content).digest(), token=token)

@@ -321,6 +321,7 @@ class MiniCluster:
     def _abandon(self) -> None:
         """Drop the frame, and stop the boards that are still computing it by closing their links."""
         self._progress = None
+        # only closing its link stops a board; those that are done stay open
         for board in self._boards:
             if board.waiting:
                 self._close(board, "another board failed the frame")

@@ -390,6 +390,7 @@ class SocketLink:
             self._give_up(self.timeout_error(self.timeout, "accept the data"))
         # A board sends the reason before it closes: an ERROR may be in the buffer.
         frame = None
+        # what came before it does not matter any more
         with suppress(LinkError):
             deadline = time.monotonic() + self.timeout
             while (frame := self._receive(deadline, self.timeout, "")).operation != framing.ERROR:

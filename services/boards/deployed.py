@@ -62,6 +62,7 @@ class DeployedBoards:
 
     def status(self, output: FrameOutput | None) -> list[BoardStatus]:
         """Return the state of each board, with its part of the last output; for use in another thread."""
+        # a copy, because the boards' thread changes it meanwhile
         gone = dict(self.gone)
         return [
             BoardStatus(
@@ -113,28 +114,23 @@ class DeployedBoards:
 
     def find_lost_boards(self, error: BoardError) -> None:
         """Find all boards that are gone after a failure, so that several deaths at once fail one frame."""
+        # that of a board which is already known to be gone
         if self._cluster is None or isinstance(error, BoardAwayError):
             return
-        if not self._cluster.is_open(error.board):
-            self._is_gone(error.board, error)
-        for board in range(len(self._endpoints)):
-            if board != error.board and board not in self.gone:
-                # reopening tells whether it is alive; a board that answers is as good as before
-                try:
-                    self._cluster.reopen(board, timeout=TICK)
-                except BoardError as other:
-                    self._is_gone(board, other)
-
-    def _is_gone(self, board: int, error: BoardError) -> None:
-        self.gone[board] = str(error)
-        self._times_gone[board] += 1
+        # a board that only refused an access is still open
+        lost = {} if self._cluster.is_open(error.board) else {error.board: error}
+        for board in sorted(set(range(len(self._endpoints))) - {error.board, *self.gone}):
+            # only reopening tells whether it is alive
+            try:
+                self._cluster.reopen(board, timeout=TICK)
+            except BoardError as other:
+                lost[board] = other
+        for board, reason in lost.items():
+            self.gone[board] = str(reason)
+            self._times_gone[board] += 1
 
     def recover(self) -> list[int]:
-        """Try once to reopen the missing boards, and return the numbers of those that are back.
-
-        Raises:
-            BoardMismatchError: A board is back with another image, so waiting would not help.
-        """
+        """Try once to reopen the missing boards, and return the numbers of those that are back (BoardMismatchError)."""
         back: list[int] = []
         if self._cluster is None:
             return back
@@ -142,6 +138,7 @@ class DeployedBoards:
             try:
                 self._cluster.reopen(board, timeout=TICK)
             except BoardMismatchError:
+                # another image: waiting would not help
                 raise
             except BoardError as error:
                 self.gone[board] = str(error)

@@ -56,11 +56,7 @@ def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> Fram
 
 
 def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.NDArray[np.int64], PriorRow]:
-    """Return the inputs of sensors (-1: missing) and the prior's row, where replicas or lines have their own readings.
-
-    Raises:
-        FrameInputError: There are too few or too many variables, or a row has another length than expected.
-    """
+    """Return the inputs of sensors (-1: missing) and the prior's row, where replicas or lines have their own readings."""
     variables = deployment.variables
     if len(addresses) != len(variables):
         raise FrameInputError(

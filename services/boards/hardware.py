@@ -46,6 +46,7 @@ class SimulatedHardware:
             check_tools(self._simulator)
         except HardwareToolError as error:
             raise SettingsError(f"--engine {engine}: {error}") from None
+        # now, because a loader would not wait for it
         for image in images.values():
             self._compiled(image)
 

@@ -215,10 +215,9 @@ class BoardProcesses:
             return
         if is_back:
             say(f"board {at} listens again at {self._endpoints[at]}")
-        elif len(self._endpoints) == 1:
-            say(f"board 0 listens at {self._endpoints[0]}")
-        else:
-            say(f"{len(self._endpoints)} boards listen at {self._endpoints[0]} ... {self._endpoints[-1]}")
+            return
+        first, last, count = self._endpoints[0], self._endpoints[-1], len(self._endpoints)
+        say(f"board 0 listens at {first}" if count == 1 else f"{count} boards listen at {first} ... {last}")
 
     def _report(self) -> None:
         """Tell the service manager how many boards listen, and that none of them is stuck."""
@@ -232,9 +231,8 @@ class BoardProcesses:
 
     def _remove_sockets(self) -> None:
         """Remove the sockets that killed boards have left behind."""
-        for endpoint in self._endpoints:
-            for each in (endpoint, endpoint.programming):
-                with suppress(OSError):
-                    Path(each.path).unlink()
+        for path in [each.path for one in self._endpoints for each in (one, one.programming)]:
+            with suppress(OSError):
+                Path(path).unlink()
         if self._settings.run_directory is not None:
             remove_stale_sockets(self._settings.run_directory)
