@@ -1,33 +1,160 @@
 """Verification of the VHDL: comparison with the emulated board, and proofs (scripts/verify hdl).
 
-random machines --> GHDL, driven through AXI4-Lite --> what the emulated board answers?
-the boat        --> GHDL or Verilator, behind the link   --> what four emulated boards answer?
-units           --> GHDL                           --> values that no machine reaches
-VHDL            --> Verilog (GHDL) --> yosys        --> properties for every input
+random machines --> GHDL, driven through AXI4-Lite     --> what the emulated board answers?
+the boat        --> GHDL or Verilator, behind the link --> what four emulated boards answer?
+units           --> GHDL                               --> values that no machine reaches
+VHDL            --> Verilog (GHDL) --> yosys           --> properties for every input
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
+import select
+import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from functools import partial
+from pathlib import Path
+from typing import Final
 
 from hdl.test.mutants import MUTANTS, Mutant, caught_by
 from hdl.test.project import HardwareToolError
-from hdl.test.verification import Check, formal, sessions, units
-from scripts.running.flags import ScriptParser
+from hdl.test.verification import formal, sessions, units
+from pcie_shim import register_map
+from pcie_shim.endpoint import parse_endpoint
+from pcie_shim.errors import PcieShimError
+from pcie_shim.host.frame import FrameInput
+from pcie_shim.host.mini_cluster import MiniCluster
+from pcie_shim.host.socket_link import SocketLink
+from pcie_shim.programming_file import Image, read_image
+from scripts.running.flags import ROOT, ScriptParser
+from scripts.verifications.checks import Tally
 from scripts.verifications.installation import install_programs
-from scripts.verifications.simulated_boat import FRAMES, SimulatedBoat
 from services.errors import SettingsError
 from toolchain.hardware.simulation import Simulator
 
-_Item = TypeVar("_Item")
-
-SESSIONS = 60
+SESSIONS: Final = 60
 """Number of random machines in the matrix."""
+BOARD: Final = 1
+"""The partition of the boat that is simulated: 256 lines, in the middle of the map."""
+_COMPILING_S: Final = 1200.0
+_ENDING_S: Final = 30.0
+_ANSWER_S: Final = 120.0
+_BIN: Final = Path(sys.executable).parent
+
+
+# The boat on simulated hardware, whose counts must be those of emulated boards
+
+
+def boat_failure(engine: str, count: int) -> str | None:
+    """Run frames on emulated boards, and with one of them simulated; return why they differ, or None."""
+    source = ("--uri", "ws://localhost:9090", "--topic", "/boat", "--type", "boat_msgs/Sensors")
+    boat = ROOT / "casestudies" / "boat"
+    with tempfile.TemporaryDirectory(prefix="hdl-boat-") as where:
+        folder, deployment = Path(where), Path(where) / "boat"
+        command = [
+            str(_BIN / "toolchain"),
+            "build",
+            str(boat),
+            "-o",
+            str(deployment),
+            "--partitions",
+            "4",
+            *source,
+        ]
+        subprocess.run(command, check=True, capture_output=True, timeout=_COMPILING_S)
+        images = [read_image(deployment / "boards" / f"board{at}.bm") for at in range(4)]
+        frames = _frames(images[BOARD], count)
+        endpoints = [f"unix:{folder}/boards/board{at}.sock" for at in range(4)]
+        simulated = f"unix:{folder}/simulated.sock"
+        hardware = ("--engine", engine, "--hardware", str(ROOT / "build" / "hardware"))
+        with (
+            _board("--boards", "4", "--directory", str(folder / "boards")),
+            _board(*hardware, "-d", str(deployment), "--index", str(BOARD), "--listen", simulated),
+        ):
+            emulated, emulated_s = _outcomes(endpoints, images, frames)
+            speeds = [_speed(endpoints[BOARD])]
+            endpoints[BOARD] = simulated
+            found, simulated_s = _outcomes(endpoints, images, frames)
+            speeds.append(_speed(simulated))
+    cycles = sum(frame[BOARD][1] for frame in found)
+    print(
+        f"     {speeds[1]} cycles/s in {engine}, {speeds[0]} emulated, when all lines count; "
+        f"{cycles} cycles of {len(frames)} frames in {simulated_s:.2f} s, emulated in {emulated_s:.3f} s",
+        flush=True,
+    )
+    wrong = [at for at, (one, other) in enumerate(zip(found, emulated, strict=True)) if one != other]
+    return f"frames {wrong} differ" if wrong else None
+
+
+def _frames(image: Image, count: int) -> list[FrameInput]:
+    """Return frames, each with the most likely readings of a line of this board; in some, one is missing."""
+    machine = image.machine
+    frames = []
+    for at in range(count):
+        line = (2 * at + 1) * machine.parameters.lines // (2 * count)
+        readings: list[int | None] = [int(table[:-1, line].argmax()) for table in machine.tables]
+        if at % 3 == 2:
+            readings[at % len(readings)] = None
+        bank = at % machine.parameters.rng_banks
+        frames.append(FrameInput(addresses=tuple(readings), target_count=255, max_cycles=1 << 17, bank=bank))
+    return frames
+
+
+@contextlib.contextmanager
+def _board(*flags: str) -> Iterator[None]:
+    """Run the command `board` until the end of the block, which begins when it listens."""
+    process = subprocess.Popen([str(_BIN / "board"), *flags], stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stderr is not None
+        deadline = time.monotonic() + _COMPILING_S
+        said = ""
+        while "listen" not in said:
+            if not select.select([process.stderr], [], [], max(0.0, deadline - time.monotonic()))[0]:
+                raise HardwareToolError(f"board {' '.join(flags)} does not listen")
+            said = process.stderr.readline()
+            if not said or "error" in said:
+                raise HardwareToolError(f"board {' '.join(flags)} ended: {said.strip()}")
+        yield
+    finally:
+        process.terminate()
+        process.communicate(timeout=_ENDING_S)
+
+
+def _outcomes(
+    endpoints: Sequence[str], images: Sequence[Image], frames: Sequence[FrameInput]
+) -> tuple[list[list[tuple[bytes, int, int]]], float]:
+    """Return counts, cycles and reason of each board in each frame, and the seconds of all frames."""
+    with MiniCluster.open(endpoints, images, timeout=_ANSWER_S, slack=_ANSWER_S) as cluster:
+        cluster.run(frames[0])  # the first frame also warms up
+        began = time.monotonic()
+        outputs = [cluster.run(frame) for frame in frames]
+        elapsed = time.monotonic() - began
+    found = [
+        [(board.words, board.cycles, int(board.reason)) for board in output.boards] for output in outputs
+    ]
+    return found, elapsed
+
+
+def _speed(endpoint: str) -> int:
+    """Return a board's own measurement of its cycles per second."""
+    with SocketLink.open(parse_endpoint(endpoint), timeout=_ANSWER_S) as link:
+        return link.read32(register_map.CAP_SPEED)
+
+
+# All checks, or all mutants
+
+
+def mutant_failure(mutant: Mutant) -> str | None:
+    """Return why no check finds a mutant, or None."""
+    found = caught_by(mutant)
+    if found is not None:
+        print(f"     {mutant.name}: found by {found[0].name}", flush=True)
+    return "not found" if found is None else None
 
 
 def main() -> int:
@@ -41,57 +168,33 @@ def main() -> int:
     arguments = parser.parse_args()
     try:
         install_programs(
-            {"ghdl": "ghdl"} if arguments.mutants else {tool: tool for tool in Simulator.VERILATOR.tools}
+            {"ghdl": "ghdl"} if arguments.mutants else {each: each for each in Simulator.VERILATOR.tools}
         )
     except SettingsError as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2
-    began = time.monotonic()
+        return error.exit_code
+    checks: dict[str, Callable[[], str | None]]
     if arguments.mutants:
-        mutants = [each for each in MUTANTS if arguments.only in each.name]
-        verdicts = _together(_try_mutant, mutants)
+        checks = {each.name: partial(mutant_failure, each) for each in MUTANTS}
     else:
-        boat = [SimulatedBoat("verilator", FRAMES), SimulatedBoat("ghdl", 1)]
-        every: list[Check | SimulatedBoat] = [*boat, *units(), *formal(), *sessions(arguments.sessions)]
-        checks = [each for each in every if arguments.only in each.name]
-        verdicts = _together(_try_check, checks)
-    passed = sum(verdicts)
-    if not verdicts:
-        print(f"error: nothing has {arguments.only!r} in its name", file=sys.stderr)
-    print(f"{passed} passed, {len(verdicts) - passed} failed ({time.monotonic() - began:.0f} s)")
-    return 0 if verdicts and all(verdicts) else 1
+        checks = {
+            "boat: 10 frames with one of four boards in verilator": partial(boat_failure, "verilator", 10),
+            "boat: a frame with one of four boards in ghdl": partial(boat_failure, "ghdl", 1),
+            **{each.name: each.failure for each in (*units(), *formal(), *sessions(arguments.sessions))},
+        }
+    tally = Tally()
 
+    def run(name: str) -> None:
+        began = time.monotonic()
+        try:
+            why = checks[name]()
+        except (HardwareToolError, PcieShimError, OSError, subprocess.SubprocessError, ValueError) as error:
+            why = str(error)
+        tally.report(name, began, why)
 
-def _together(run: Callable[[_Item], bool], items: Sequence[_Item]) -> list[bool]:
-    """Run all checks, one per core at a time."""
-    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        return list(pool.map(run, items))
-
-
-def _try_check(check: Check | SimulatedBoat) -> bool:
-    began = time.monotonic()
-    try:
-        why = check.failure()
-    except HardwareToolError as error:
-        why = str(error)
-    verdict = "ok  " if why is None else "FAIL"
-    print(
-        f"{verdict} {check.name}{'' if why is None else f': {why}'} ({time.monotonic() - began:.1f} s)",
-        flush=True,
-    )
-    return why is None
-
-
-def _try_mutant(mutant: Mutant) -> bool:
-    began = time.monotonic()
-    try:
-        found = caught_by(mutant)
-    except (HardwareToolError, ValueError) as error:
-        print(f"FAIL {mutant.name}: {error}", flush=True)
-        return False
-    said = "FAIL not found" if found is None else f"ok   found by {found[0].name}"
-    print(f"{said}: {mutant.name} ({time.monotonic() - began:.1f} s)", flush=True)
-    return found is not None
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:  # one per core at a time
+        list(pool.map(run, [name for name in checks if arguments.only in name]))
+    return tally.end()
 
 
 if __name__ == "__main__":
