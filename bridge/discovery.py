@@ -99,8 +99,8 @@ async def discover(
             if robot is not None:
                 from_name[robot.name] = robot
 
-        # The browser names robots; each is then asked for its address, all at the same time, because one that has just
-        # left does not answer.
+        # The browser finds names; all are asked for their addresses at the same time, because a robot that has just left
+        # does not answer.
         browser = AsyncServiceBrowser(zeroconf.zeroconf, SERVICE_TYPE, handlers=[on_change])
         asking: set[asyncio.Task[None]] = set()
         try:
@@ -281,7 +281,7 @@ def _robot(info: AsyncServiceInfo) -> Robot | None:
     # A certificate contains a name, rarely an address.
     host = (info.server or "").rstrip(".") if tls else addresses[0] if addresses else ""
     path = properties.get("path") or "/"
-    # Anybody on the network may announce anything, and the URI goes to logs and into a request.
+    # Anybody on the network may announce anything, so nothing unprintable may reach logs or a request.
     if not name or not name.isprintable() or not host or not 1 <= (info.port or 0) <= _LAST_PORT:
         return None
     if _PATH.fullmatch(path) is None or (tls and _HOST.fullmatch(host) is None):

@@ -60,7 +60,7 @@ class Field:
         Raises:
             FieldAmbiguousError: A bare name that was not found before occurs more than once.
         """
-        # A bare name is searched once; where it was found first, it stays for the life of the topic.
+        # A bare name is searched until it is found, and then has the same place in all messages.
         place = self.place
         if place is None:
             places = find_places(message, self.name)
@@ -73,7 +73,7 @@ class Field:
                     "give the path of one of them"
                 )
             self.place = place = places[0]
-        # Every step may fail: a field can be null in one message, and an array shorter.
+        # Every step may fail, because a field may be null in this message, or an array shorter.
         value: Any = message
         for step in place:
             if isinstance(step, str):
@@ -167,8 +167,8 @@ def format_place(place: Place) -> str:
 
 def find_places(message: dict[str, Any], name: str) -> list[Place]:
     """Return all places of a bare name, depth first in the order of the message, except inside arrays."""
-    # A stack instead of recursion, because a message may be nested as deep as its sender likes; reversed, so that
-    # places come in the order of the message.
+    # A stack instead of recursion, because messages may be deeply nested; reversed, so that places are in the order of
+    # the message.
     places: list[Place] = []
     inner: list[tuple[Place, dict[str, Any]]] = [((), message)]
     while inner:
@@ -220,14 +220,14 @@ def _length(value: Any) -> int | None:
 
 def _element(value: Any, index: int) -> Any:
     """Return one element; None if the text is not base64 at this place."""
-    # Only the four characters that hold the byte: an image would take longer to decode than to receive.
+    # Decodes only the four characters with this byte, and not the whole image.
     if isinstance(value, str):
         four = value[index // 3 * 4 : index // 3 * 4 + 4]
         try:
             return base64.b64decode(four, validate=True)[index % 3]
         except (ValueError, IndexError):
             return None
-    # NumPy's scalars would behave differently from the numbers of JSON in comparisons and in errors.
+    # A Python number, as from JSON, because NumPy's scalars behave differently.
     element = value[index]
     return element.item() if hasattr(element, "dtype") else element
 

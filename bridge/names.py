@@ -20,7 +20,7 @@ _TOPIC = re.compile(r"[~/]?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
 _EDGE_NAME_SIZE = 1024
 
 
-# Types are compared for each subscription and each answer of rosapi, and a robot has few of them.
+# Cached, because the few types of a robot are compared often.
 @lru_cache(maxsize=_EDGE_NAME_SIZE)
 def split_type(name: str) -> tuple[str, str, str]:
     """Return the package, kind (`msg`, `srv`, `action`, or empty in the ROS 1 form) and name of a type."""

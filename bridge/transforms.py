@@ -96,7 +96,7 @@ def interpolated(before: Transform, after: Transform, stamp: int) -> Transform:
     cosine = float(start @ end)
     if cosine < 0:
         end, cosine = -end, -cosine
-    # The sine of the angle, by which the other formula divides in effect, would be nearly zero.
+    # For nearly equal rotations, the sines below would be almost zero, and the norm inaccurate.
     if cosine > _NEARLY_PARALLEL:
         rotation = start + part * (end - start)
     else:
@@ -133,7 +133,7 @@ class _Frame:
         history = self.history
         if self.static:
             return history[0]
-        # An exact time needs no neighbour, so that the newest transform can be used at its own time.
+        # Without interpolation, so that the newest transform can be used at its own time.
         index = bisect_left(history, stamp, key=_stamp)
         if index < len(history) and history[index].stamp_ns == stamp:
             return history[index]
@@ -182,8 +182,8 @@ class TransformTree:
                 stamp = 0 if static else stamp_ns(header["stamp"])
                 translation = _numbers(body["translation"], "xyz")
                 rotation = _numbers(body["rotation"], "xyzw")
-                # Robots send quaternions that are not quite normal, or all zeros. Clipped first, because a square may
-                # overflow.
+                # Robots send quaternions that are not quite unit, or all zeros. Clipped first, because squares of large
+                # numbers overflow.
                 norm = float(np.linalg.norm(rotation.clip(-2, 2)))
                 usable = (
                     bool((np.abs(translation) <= LARGEST).all())
@@ -205,7 +205,7 @@ class TransformTree:
         if frame is None and len(self._frames) >= MAX_FRAMES:
             self.unusable += 1
             return
-        # What is known of the way to one parent says nothing of the way to another.
+        # Transforms to one parent must not be interpolated with those to another.
         if frame is None or frame.parent != parent or frame.static != static:
             self._stored -= len(frame.history) if frame is not None else 0
             self._frames[child] = frame = _Frame(parent, static=static)

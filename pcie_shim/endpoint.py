@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-from pcie_shim.errors import EndpointError, LinkTimeoutError, UnreachableError
+from pcie_shim.errors import EndpointError, LinkTimeoutError, LinkUnreachableError
 
 UNIX_PATH_BYTES: Final = 107
 """Maximum length in bytes of the path of a Unix socket on Linux."""
@@ -151,7 +151,7 @@ def connect(endpoint: Endpoint, *, timeout: float) -> socket.socket:
     """Connect to a board, and retry for `timeout` seconds until it listens.
 
     Raises:
-        UnreachableError: Nothing listens there.
+        LinkUnreachableError: Nothing listens there.
         LinkTimeoutError: The host of a TCP endpoint does not answer.
     """
     deadline = time.monotonic() + timeout
@@ -164,7 +164,7 @@ def connect(endpoint: Endpoint, *, timeout: float) -> socket.socket:
         except OSError as error:
             if time.monotonic() + _RETRY_S >= deadline:
                 reason = error.strerror or str(error)
-                raise UnreachableError(
+                raise LinkUnreachableError(
                     f"No board listens at {endpoint} ({reason}, for {timeout:g} s): is it started?"
                 ) from error
         time.sleep(_RETRY_S)

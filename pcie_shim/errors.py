@@ -49,7 +49,7 @@ class LinkError(PcieShimError):
     """An unusable link to a board."""
 
 
-class UnreachableError(LinkError):
+class LinkUnreachableError(LinkError):
     """Nothing listens at the board's endpoint."""
 
 

@@ -60,13 +60,13 @@ class Goal:
         self._session = session
         self._identity = identity
         self._sent_at = time.monotonic()  # for error messages: what the server has said since
-        # From `receive` to the iterating task, if one iterates at all; so it may be full without harm.
+        # Feedback between `receive` and the iteration. A program need not iterate, so the queue may fill up.
         self._feedback: deque[dict[str, Any]] = deque(maxlen=FEEDBACK_QUEUE_SIZE)
         self.lost = 0
-        # The task that waits for feedback or for the end, while it does.
+        # The iterating task, while it waits for feedback or for the end.
         self._reader: asyncio.Future[None] | None = None
-        # Done once: with the end, or with the loss of the connection. Shared by all who wait for the result, so each
-        # of them shields it.
+        # Done with the end of the goal, or with the loss of the connection. Several tasks may wait for it, so each
+        # shields it from its own cancellation.
         self._ended: asyncio.Future[GoalEnded] = asyncio.get_running_loop().create_future()
         session.goals[identity] = self
         session.flush()
@@ -127,7 +127,7 @@ class Goal:
         return self
 
     async def __anext__(self) -> dict[str, Any]:
-        # Feedback that came before the end is read first, however late the reader is.
+        # Feedback from before the end is returned first, however slow the reader is.
         while not self._feedback:
             if self._ended.done():
                 if (error := self._ended.exception()) is not None:
@@ -148,7 +148,7 @@ class Goal:
         return self
 
     async def __aexit__(self, *_exception: object) -> None:
-        # Whoever leaves the block early no longer wants what the robot is doing.
+        # A program that leaves the block early no longer wants the robot to go on.
         try:
             if not self.done:
                 await self.cancel()
@@ -176,12 +176,12 @@ class GoalRequest:
 
     def __init__(self, values: dict[str, Any], feed_back: FeedBack, end: End) -> None:
         self.values = values
-        # To the sender; they raise if what they get does not fit the action's type.
+        # They send to the goal's sender, and raise if the values do not fit the action's type.
         self._feed_back = feed_back
         self._end = end
         # Set by the server of the action when the sender asks for it, and never cleared.
         self._canceling = asyncio.Event()
-        # True from the first end that could be sent on: one that does not fit the type leaves room for another.
+        # True after the first end that was sent; one that does not fit the type raises, and does not count.
         self.ended = False
 
     @property

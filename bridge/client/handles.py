@@ -1,7 +1,7 @@
 """Handles for a program: subscriptions, publications and services.
 
-A handle is what the program holds of one wish. It registers with the session when it is made, and withdraws when it is
-closed; a lost connection does not end it.
+A handle registers its operation with the session when it is created, and withdraws it when it is closed. A lost
+connection does not end it.
 """
 
 import asyncio
@@ -49,7 +49,7 @@ class Handle:
         if session.state is State.CLOSED:
             raise DisconnectedError(f"the client of {session.uri} was closed: connect() makes a new one")
         self._session = session
-        # Set once, by `end`: by `close`, or by the session when the client is closed.
+        # Set once, by `end`, which `close` calls, or the session when the client is closed.
         self._closed = False
 
     def _register(self) -> None:
@@ -115,31 +115,31 @@ class Subscription(Handle):
         super().__init__(session)
         self.topic = topic
         self._type = type_name
-        # From `receive` to the reader. The bound is the deque's own; the size is kept because reading it is slower.
+        # The messages between `receive` and the reader. The deque drops the oldest itself; `_size` serves to count that.
         self._size = _check_queue_size(queue_size, topic)
         self._queue: deque[Message] = deque(maxlen=queue_size)
         self.lost = 0
         self.discarded = 0
 
-        # Time without a connection: `_blind` is what the next message has to carry. A subscription that is younger
-        # than the connection has missed less than that was away.
+        # Time without a connection, in total and not yet reported in a message. `_begun` limits it: a new subscription
+        # has not missed what was lost before it existed.
         self.blind_seconds = 0.0
         self._blind = 0.0
         self._begun = time.monotonic()
 
-        # The one reader, while it waits for a message. The alarm wakes it at its deadline; it may ring earlier, for a
-        # reader that has been served since, and is then set again. `_rings` is when it rings.
+        # The waiting reader, if any, and its deadline. The alarm rings at `_rings`, at the latest at the deadline: one that
+        # was set for an earlier wait is kept, and sets the next.
         self._waiter: asyncio.Future[None] | None = None
         self._deadline = inf
         self._alarm: asyncio.TimerHandle | None = None
         self._rings = inf
 
-        # Registered only after the core has accepted the subscription, which may raise.
+        # Registered only after the core has accepted the subscription, because it may raise.
         self._number = session.core.subscriptions.subscribe(
             topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length, delivery=delivery
         )
         session.readers[self._number] = self
-        # The end of a sentence once the topic is left out, also if that was before this subscription; else empty.
+        # The reason, as the end of a sentence, if the topic is left out; it may have been before this subscription.
         self._left_out = session.why_left_out() if session.core.subscriptions.has_left_out(topic) else ""
         self._register()
         session.watch_silence()
@@ -147,7 +147,7 @@ class Subscription(Handle):
     def receive(self, message: Message) -> None:
         """Queue a message."""
         queue = self._queue
-        # Both conditions are rare, and each message passes here: what follows from them is not worked out before.
+        # Every message passes here, so the two rare cases cost one comparison each.
         if self._blind:
             message = message._replace(blind_seconds=self._blind)
             self._blind = 0.0
@@ -189,7 +189,7 @@ class Subscription(Handle):
 
     async def __anext__(self) -> Message:
         queue = self._queue
-        # A loop, because another task may take the message between the wake and this task's turn.
+        # A loop, because another task may take the message before this one runs.
         while not queue:
             if self._closed:
                 raise StopAsyncIteration
@@ -276,7 +276,7 @@ class Subscription(Handle):
     async def _why_silent(self, begun: float) -> str:
         """Return the end of an error's sentence: the reason why the topic has been silent."""
         session = self._session
-        # What is known here first; only then the server is asked, which may itself be the reason.
+        # First what is known here; asking the server takes time, and it may be the reason itself.
         if self.discarded:
             return f"; {self.discarded} messages of the topic were larger than its limit, and were discarded"
         if session.state is not State.CONNECTED:
@@ -330,7 +330,7 @@ class Publication(Handle):
     ) -> None:
         super().__init__(session)
         self.topic = topic
-        # Publishers of this handle that wait for their turn; at most `_size`, then a further one is an error.
+        # Number of tasks that wait for their turn in `publish`; with more than `_size` it raises an error.
         self._size = _check_queue_size(queue_size, topic)
         self._waiting = 0
         self._publications = session.core.publications
@@ -364,7 +364,7 @@ class Publication(Handle):
                 await session.wait_turn(f"a message of {self.topic}", timeout)
             finally:
                 self._waiting -= 1
-        # Encoded only now: while it waited, the publication may have been closed, or the server's limit learnt.
+        # Encoded only now, because the publication may have been closed, or the server's limit learnt, during the wait.
         session.send_now(self._encode(msg))
         if session.should_yield():
             await asyncio.sleep(0)
@@ -434,7 +434,7 @@ class Service(Handle):
         except Exception as error:
             _log.exception("the handler of service %s failed", self.name)
             values = f"{self.name} failed: {type(error).__name__}"
-        # Nothing that the handler does may leave the caller without an answer, for which it would wait for ever.
+        # Whatever the handler did, the caller must get an answer; it may wait without a timeout.
         answer = self._session.core.services.answer
         try:
             if self.check is not None and not isinstance(values, str):

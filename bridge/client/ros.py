@@ -65,7 +65,7 @@ class Ros:
         # None if the program has switched the checks off.
         self._types = TypeChecks(session) if check_types else None
         self.params = Params(session)
-        # Whether anything was advertised, so that a server might drop messages when the client leaves (`close`).
+        # Whether anything was advertised; if so, `close` waits until the server has read the last messages.
         self._publishes = False
 
     async def __aenter__(self) -> Self:
@@ -398,7 +398,7 @@ class Ros:
             1 or 2; None if there is neither rosapi nor a message with a header, or after `timeout` seconds.
         """
         if self.ros_version is None:
-            # First what every server answers silently: a ROS 1 server without `get_ros_version` logs an error when it is asked
+            # The type of /rosout first: a ROS 1 server without `get_ros_version` logs an error when it is asked
             ends = time.monotonic() + timeout
             version, has_rosapi = await self._ask_rosout_type(timeout)
             if version is None and has_rosapi and self.ros_version is None:

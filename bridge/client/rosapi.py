@@ -93,7 +93,7 @@ class Params:
             DisconnectedError: There is no connection.
         """
         answer = await self._ask("get_param", timeout, name=name)
-        # JSON as a text, since a service of ROS has no field of any type.
+        # The value is JSON in a string, because a ROS service cannot have a field of any type.
         text = answer.get("value")
         try:
             value = orjson.loads(text) if isinstance(text, str) and text else None
@@ -107,7 +107,7 @@ class Params:
 
     async def set(self, name: str, value: Any, *, timeout: float = 5.0) -> None:
         """Set a parameter; errors as for `get`, and `ParamError` if the server refuses."""
-        # The codec writes objects alone, with all its checks, so the value is cut out of one.
+        # The codec encodes only objects, so the value is wrapped in one and cut out again.
         text = encode({"": value}, nonfinite="refuse")[4:-1].decode()
         self._require(name, await self._ask("set_param", timeout, name=name, value=text))
 
@@ -148,7 +148,7 @@ class TypeChecks:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        # Held while the server is asked, so that calls of one service at the same time ask once.
+        # Held during a question, so that simultaneous calls of one service ask only once.
         self._asking = asyncio.Lock()
         # Number of reconnections when the following was learnt: another connection may be to another server.
         self._connection = -1
@@ -170,7 +170,7 @@ class TypeChecks:
             args = {"type": session.core.wire.type_name(type_name)}
             definitions = definitions_from_rosapi(await self._ask("message_details", args, _ROSAPI_TIMEOUT))
         version = session.core.ros_version
-        # In a thread, because loading rosbags takes longer than a connection should be left alone.
+        # In a thread, because loading rosbags would block the event loop for too long.
         if not definitions and version is not None:
             definitions = await asyncio.to_thread(bundled_definitions, type_name, version)
         publications.define(type_name, definitions)

@@ -72,7 +72,7 @@ def make_route(
     Raises:
         OptionError: An option is invalid; the sentence names it, without secrets.
     """
-    # One place for the secret: a server that gets two would choose either.
+    # Only one source of credentials, because a server could use either of two.
     fields = dict(headers or {})
     authorized = any(name.lower() == "authorization" for name in fields)
     if token is not None:
@@ -99,7 +99,7 @@ def _tls(
     client_certificate: Path | tuple[Path, Path] | None,
     tls: ssl.SSLContext | None,
 ) -> ssl.SSLContext | None:
-    # An option without effect is refused: a program that gives a certificate relies on TLS.
+    # Refused without TLS, because a program that sets one of them relies on TLS.
     options = {"ca_file": ca_file, "client_certificate": client_certificate}
     given = [name for name, value in options.items() if value is not None]
     if not uri.secure:
@@ -158,7 +158,7 @@ async def connect_along(
     if passage is None or isinstance(passage, socket):
         end: dict[str, Any] = {"sock": passage} if passage else {"host": uri.host, "port": uri.port}
         return (await loop.create_connection(factory, **end, ssl=route.tls, server_hostname=hostname))[1]
-    # An HTTP proxy gives a transport that is connected already, so the protocol is put onto it by hand.
+    # An HTTP proxy returns a transport that is already connected, so the protocol must be attached by hand.
     try:
         connection = factory()
         passage.set_protocol(connection)

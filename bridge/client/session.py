@@ -75,7 +75,7 @@ StateCallback = Callable[[State, str], None]
 Server = Callable[[ServiceRequested], Coroutine[Any, Any, None]]
 
 
-# What a session hands events to. The handles import this module, so it cannot import them.
+# Receivers of a session's events. They are protocols, because the handles import this module.
 
 
 class Reader(Protocol):
@@ -151,13 +151,13 @@ class Message(NamedTuple):
 class Session:
     """The connection of a client, over its successive WebSockets.
 
-    It owns the clocks and the socket, and moves bytes between socket and `core`, which owns the meaning:
+    It owns the clocks and the socket, and moves bytes between the socket and `core`, which interprets them:
 
         handle  ->  core  ->  flush  ->  WebSocket  ->  server
         handle  <-  _take  <-  core  <-  WebSocket  <-  server
 
-    A published message takes the short way: it is encoded by the core, and goes to the socket at once, in its turn.
-    Everything happens in the event loop's thread; between two `await`s nothing changes but by the code itself.
+    A published message does not pass through the core's outbox: the core encodes it, and the session writes it to the
+    socket at once. Everything runs in the thread of the event loop, so state changes only at an `await`.
     """
 
     def __init__(
@@ -181,62 +181,63 @@ class Session:
         # The protocol state: what the program wants, and what waits for an answer.
         self.core = core
 
-        # State. `_set_state` alone changes `state`, and replaces the event, which wakes those who wait for a change.
+        # Only `_set_state` changes `state`; it also sets the event, which wakes the waiters, and replaces it.
         self.state = State.CONNECTING
         self._state_changed = asyncio.Event()
         self._on_state = on_state
-        # Set by `open`: the thread of the event loop, which alone may call. None before, when no loop runs yet.
+        # Set by `open`: the thread of the event loop, the only one that may call. None until then.
         self._entered = False
         self._thread: int | None = None
 
-        # The connection. There is a WebSocket exactly while the state is CONNECTED, and shortly before and after that.
+        # The connection. `_websocket` is set just before the state becomes CONNECTED, and cleared just before it changes
+        # again, so handles check it instead of the state.
         self._websocket: WebSocket | None = None
         self._connected_at = 0.0
         self._lost_at = 0.0
-        # When the lost connection was heard last, from which on messages may be missing.
+        # Time of the last data on the lost connection; messages after it may be missing.
         self._blind_since = 0.0
         # Number of completed reconnections.
         self.reconnections = 0
         # Reason of the lost connection or of the last failed attempt; it is kept after a reconnection.
         self.last_error = ""
 
-        # Reconnecting: one task from a loss to the next connection, then done. `_pause` is its present sleep, which
-        # `reconnect_now` cuts short; `_delay` is the next one, which doubles until a connection was steady.
+        # Reconnecting: one task, which runs from a loss until the next connection. `_pause` is its current sleep, which
+        # `reconnect_now` cancels; `_delay` is the length of the next one. It doubles, and a steady connection resets it.
         self._reconnecting: asyncio.Task[None] | None = None
         self._pause: asyncio.Future[None] | None = None
         self._delay = FIRST_DELAY
 
-        # Silent subscriptions. The timer runs while a topic is untyped and silent, or typed and silent on an open
-        # connection; the task asks rosapi about the latter, at most one at a time.
+        # Silent subscriptions: the timer runs while the connection is open and a topic has had no message. The task asks
+        # rosapi about those with a type; there is at most one.
         self._retry_timer: asyncio.TimerHandle | None = None
         self._renewal_delay = SILENCE
         self._looking: asyncio.Task[None] | None = None
 
-        # Sending. While the socket is full, or somebody waits already, senders wait in order: the lock is fair, and
-        # `_waiting` counts them, so that no later message overtakes them.
+        # Sending. Senders wait in order while the socket is full: the lock is fair. `_waiting` counts them, so that a
+        # later message waits too instead of overtaking them.
         self._turn = asyncio.Lock()
         self._waiting = 0
-        # Messages since a publisher last let other tasks run, which a full speed loop would starve.
+        # Number of messages since a publisher last yielded; without yielding, a tight loop would starve other tasks.
         self._burst = 0
-        # Size of the largest message on this connection: what a server closes with code 1009 was at most that.
+        # Size of the largest message sent on this connection: if the server closes it with code 1009, its limit is less.
         self._largest_sent = 0
 
-        # Whom the core's numbers, absolute names and ids mean. Each entry is made with its operation, and removed by
-        # its handle or by the event that ends it; `_fail_calls` empties calls and goals with the connection.
+        # The objects behind the numbers, absolute names and ids in the core's events. An entry is made when its operation
+        # is sent, and removed by its handle or by its last event; a lost connection empties goals and calls.
         self.readers: dict[int, Reader] = {}  # by number of the subscription
         self.servers: dict[str, Server] = {}  # by name of the service
         self.action_servers: dict[str, GoalExecutor] = {}  # by name of the action
         self.goals: dict[str, GoalReceiver] = {}  # by id
         self._calls: dict[str, asyncio.Future[CallAnswered]] = {}  # by id
-        # Tasks of requests to services; held here, because the event loop holds tasks only weakly.
+        # Tasks that serve requests; stored here, because the event loop has only weak references to tasks.
         self._serving: set[asyncio.Task[None]] = set()
-        # Callbacks of the handles that are open, for the final close.
+        # Callbacks of all open handles, for `close`.
         self.on_closed: set[Callable[[], object]] = set()
 
-        # Number of unusable messages received. They are the server's fault, and cost nobody else anything.
+        # Number of unusable messages received. They are ignored, and do not affect others.
         self.unusable = 0
-        # Latest status messages of the server, newest last, for error messages: a program that gets no answer should
-        # see what the server said meanwhile. The count is for the log, which gets fewer and fewer of them.
+        # Latest status messages of the server, newest last. Errors quote the last one: it often tells why an answer is
+        # missing. The count limits the lines in the log.
         self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
         self._status_at = 0.0
         self._status_count = 0
@@ -279,7 +280,7 @@ class Session:
         self.check_thread()
         if self.state is State.CLOSED:
             return
-        # Without a WebSocket nothing is sent any more, and its end is not taken for a loss.
+        # First, so that nothing more is sent, and the end of the connection does not count as a loss.
         websocket, self._websocket = self._websocket, None
         self.core.lost()
         if self._retry_timer is not None:
@@ -317,7 +318,7 @@ class Session:
             self.reconnections += 1
             for reader in self.readers.values():
                 reader.add_blind_seconds(self._connected_at - self._blind_since)
-        # All before the state changes: whoever waits for CONNECTED may publish at once, after the advertisement.
+        # Before the state changes, because a task that waits for CONNECTED may publish at once.
         self._largest_sent = 0
         if websocket.largest_accepted is not None:
             self.core.wire.limit(websocket.largest_accepted)
@@ -379,8 +380,8 @@ class Session:
 
     async def _reconnect(self) -> None:
         while True:
-            # Up to a fifth earlier, so that the clients of a server do not all reconnect at once. A future, because
-            # `reconnect_now` cancels the sleep alone and not this task.
+            # Up to a fifth earlier, so that the clients of a server do not all reconnect at once. The sleep is a future
+            # of its own, so that `reconnect_now` can cancel it without cancelling this task.
             self._pause = asyncio.ensure_future(asyncio.sleep(self._delay * random.uniform(0.8, 1.0)))
             try:
                 await asyncio.wait([self._pause])
@@ -389,7 +390,7 @@ class Session:
             self._delay = min(2 * self._delay, MAX_DELAY)
             try:
                 await self._connect(min(self._limits.connect_timeout, ATTEMPT_TIMEOUT))
-            except BridgeError as error:  # as long as the server is away, so it is not worth a line each time
+            except BridgeError as error:  # the server is still away
                 self.last_error = str(error)
                 _log.debug("reconnecting: %s", error)
             except Exception as error:
@@ -412,7 +413,7 @@ class Session:
 
     def _set_state(self, state: State, reason: str) -> None:
         self.state = state
-        # Each event is set once: a waiter that sleeps through two changes still sees that there was one.
+        # A new event for each change: clearing the old one could hide a change from a task that has yet to wake.
         self._state_changed.set()
         self._state_changed = asyncio.Event()
         if self._on_state is not None:
@@ -537,7 +538,7 @@ class Session:
 
     async def _renew(self, topics: list[str]) -> None:
         """Renew the subscriptions of those topics that somebody publishes."""
-        # A topic without a publisher is rightly silent, and a subscription that works should not be interrupted.
+        # Without a publisher, silence is normal, and renewing would only interrupt a working subscription.
         for topic in topics:
             answer = await self.ask_rosapi("publishers", {"topic": topic}, _ROSAPI_TIMEOUT)
             if not answer.get("publishers") or not self.is_open:
@@ -563,7 +564,7 @@ class Session:
         if self.must_wait():
             await self.wait_turn(f"a call of {service}", limit)
         begun = time.monotonic()
-        # The future is there before the call leaves, because the answer may come with the next bytes.
+        # The future exists before the call is sent, because the answer may arrive with the next bytes.
         call = self.core.calls.send(service, args)
         future = self._calls[call] = asyncio.get_running_loop().create_future()
         self.flush()
@@ -590,7 +591,7 @@ class Session:
     # Receiving
 
     def _take(self, messages: list[bytes]) -> None:
-        # One time for all messages that arrive together, because they have waited for each other in the socket.
+        # One time for all messages that arrived together: their order in the socket says nothing about their age.
         received_ns, received_monotonic_ns = time.time_ns(), time.monotonic_ns()
         now = received_monotonic_ns * 1e-9
         receive_known, readers = self.core.receive_known, self.readers

@@ -28,9 +28,9 @@ class Transforms:
     def __init__(self, ros: "Ros") -> None:
         self.tree = TransformTree()
         self._ros = ros
-        # Set by each message, and cleared by whoever waits before it looks again.
+        # Set by each message; `lookup` clears it before it waits for the next.
         self._news = asyncio.Event()
-        # One for each of the two topics, from entering to leaving; they own the subscriptions.
+        # One per topic, while the context is open; each owns its subscription.
         self._tasks: list[asyncio.Task[None]] = []
 
     async def __aenter__(self) -> Self:

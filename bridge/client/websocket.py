@@ -107,7 +107,7 @@ class WebSocket(WebSocketTransport):
 
         connect_along -> handshake() -> begin() -> messages ... -> close(), or the end by the server or the network
 
-    Until `begin`, nothing is called back: the caller of `handshake` gets the error.
+    There are no callbacks before `begin`: until then the caller of `handshake` gets the error.
     """
 
     def __init__(
@@ -128,13 +128,13 @@ class WebSocket(WebSocketTransport):
         self.largest_accepted: int | None = None
         # Messages that came together with the answer, until `begin` passes them on.
         self._early: list[bytes] = []
-        # Set by `begin`; from then on everything goes to the callbacks, and `on_lost` comes exactly once.
+        # Set by `begin`; from then on everything goes to the callbacks, and `on_lost` is called exactly once.
         self.opened = False
         self._on_messages = on_messages
         self._on_lost = on_lost
 
-        # The watchdog runs from `begin` to the end. It looks when the silence may have become too long, pings once,
-        # and then counts any data as an answer; `_silent_for` is set only if that did not come either.
+        # The watchdog runs from `begin` to the end. After a silence it pings once; any data counts as an answer. If there
+        # is none, it sets `_silent_for` and ends the connection.
         self._watchdog: asyncio.TimerHandle | None = None
         self._pinged_at: float | None = None
         self._silent_for = 0.0
@@ -168,7 +168,7 @@ class WebSocket(WebSocketTransport):
         """Close the connection after sending what was written before."""
         if self.is_open:
             self.start_closing(CloseCode.NORMAL_CLOSURE)
-        # Otherwise the last messages of a program that ends would be lost in the write buffer.
+        # Otherwise the last messages of a program would be lost in the write buffer.
         await self.drain()
         with suppress(TimeoutError):
             async with asyncio.timeout(CLOSE_TIMEOUT):
@@ -209,7 +209,7 @@ class WebSocket(WebSocketTransport):
     def loss(self) -> Loss:
         """Cause of the end of the connection."""
         closed = self._protocol.close_exc
-        # An impossible length is noise on the line, and says nothing about messages.
+        # An impossible length is a malformed frame, and not a large message.
         if isinstance(closed.__cause__, PayloadTooBig) and not is_impossible(self.refused):
             return Loss.RECEIVED_TOO_LARGE
         if closed.rcvd is not None and closed.rcvd.code == CloseCode.MESSAGE_TOO_BIG:
@@ -217,7 +217,7 @@ class WebSocket(WebSocketTransport):
         return Loss.OTHER
 
     def _why_lost(self, exc: Exception | None) -> str:
-        # What this client did itself first, because the rest follows from it.
+        # First the reasons for which this client ended it, because the others follow from them.
         if self._silent_for:
             return f"no data came from the server for {self._silent_for:.3g} s"
         if self.never_reads:
@@ -247,7 +247,7 @@ class WebSocket(WebSocketTransport):
         self._watchdog = asyncio.get_running_loop().call_later(seconds, self._check_liveness, due)
 
     def _check_liveness(self, due: float) -> None:
-        # Cheaper than a timer that each message sets back: it looks at the time of the last data when it is due.
+        # Not a timer that every message resets, which would take longer than reading the message.
         now = time.monotonic()
         silent = now - self.last_heard
         if not self.is_open:
@@ -306,7 +306,7 @@ async def open_websocket(
         if isinstance(error, BridgeError) or not isinstance(error, OSError | InvalidHandshake):
             raise
         raise _connect_error(error, shown_uri, heard, timeout, answered=answered) from error
-    # Between the handshake and here the connection may have ended, for which nobody was called back.
+    # It may have ended since the handshake, without a callback.
     if not websocket.is_open:
         raise UnreachableError(f"{shown_uri} is unreachable: it closed the connection at once")
     websocket.begin()
@@ -317,7 +317,7 @@ def _connect_error(
     error: Exception, uri: str, heard: bytes, seconds: float, *, answered: bool
 ) -> UnreachableError | NotRosbridgeError | AccessRefusedError:
     """Return the error for a connection that was not opened."""
-    # From what says most to what says least: an answer in HTTP, other bytes, TLS, and at last the network.
+    # From the most specific to the least: an answer in HTTP, other bytes, TLS, the network.
     if isinstance(error, InvalidStatus):
         response = error.response
         seen = f"HTTP {response.status_code} {response.reason_phrase[:80]}".rstrip()

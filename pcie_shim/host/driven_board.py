@@ -30,11 +30,11 @@ from pcie_shim.errors import (
     ImageMismatchError,
     LinkClosedError,
     LinkTimeoutError,
+    LinkUnreachableError,
     PcieShimError,
     SequenceError,
     ShortReadError,
     StaleHandleError,
-    UnreachableError,
 )
 from pcie_shim.host.frame import BoardResult, BoardWords
 from pcie_shim.host.loader import program
@@ -310,7 +310,7 @@ class DrivenBoard:
 
 
 _BOARD_ERRORS: Final[tuple[tuple[tuple[type[PcieShimError], ...], type[BoardError]], ...]] = (
-    ((UnreachableError,), BoardUnreachableError),
+    ((LinkUnreachableError,), BoardUnreachableError),
     ((HeldError,), BoardHeldError),
     ((StaleHandleError,), BoardStaleError),
     ((AccessError,), BoardRefusedError),

@@ -162,7 +162,7 @@ class SocketLink:
         The board has `connect_timeout` seconds (None: `timeout`) to listen and greet, and `timeout` for each answer.
 
         Raises:
-            UnreachableError: Nothing listens there.
+            LinkUnreachableError: Nothing listens there.
             HeldError: Another host holds the board.
             KeyRefusedError: Host and board do not have the same key.
             GreetingMismatchError: It has another protocol version, register map or BAR size.

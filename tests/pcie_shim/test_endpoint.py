@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from pcie_shim.endpoint import Endpoint, connect, listen, parse_endpoint
-from pcie_shim.errors import EndpointError, UnreachableError
+from pcie_shim.errors import EndpointError, LinkUnreachableError
 from tests.patience import PATIENCE
 
 
@@ -81,10 +81,10 @@ def test_a_port_in_use_and_a_missing_folder_are_reported(folder):
 
 
 def test_an_unused_endpoint_is_reported_in_time(folder):
-    with pytest.raises(UnreachableError):
+    with pytest.raises(LinkUnreachableError):
         connect(Endpoint(path=str(folder / "a.sock")), timeout=0.05)
     (folder / "b.sock").touch()
-    with pytest.raises(UnreachableError):
+    with pytest.raises(LinkUnreachableError):
         connect(Endpoint(path=str(folder / "b.sock")), timeout=0.05)
 
 

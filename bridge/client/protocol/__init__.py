@@ -12,11 +12,11 @@ A connection, as the core sees it (`->` is what `ClientCore.data_to_send` return
     ServiceRequested     <-  {"op": "call_service", "id": 7, "service": "/stop", "args": {}}
     services.answer()    ->  {"op": "service_response", "id": 7, "service": "/stop", "values": {}, "result": true}
     unsubscribe()        ->  {"op": "unsubscribe", "id": "subscribe:/pose:2", "topic": "/pose"}
-    lost()                   calls, goals and requests are gone; advertisements and subscriptions wait for restore()
+    lost()                   drops calls, goals and requests; keeps everything else for restore()
 
-There is no handshake of rosbridge, and no confirmation: a server that refuses an operation sends a status at most, so
-what a program wants is state here, which is sent again on each new connection. A message may also be CBOR, or be wrapped
-in fragments or a PNG. Goals of actions go the way of calls, with feedback in between.
+rosbridge has no handshake and no acknowledgements: at most, a server reports a refused operation in a status message. So
+the core stores what the program wants, and sends all of it again on a new connection. Messages may also be encoded as
+CBOR, or wrapped in fragments or a PNG. Goals of actions work like calls, with feedback before the result.
 
 Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite), and
 the deviations of servers from it (`docs/reference/rosbridge-differences.md`).

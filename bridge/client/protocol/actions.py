@@ -33,7 +33,7 @@ class PendingGoals:
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
-        # Names by id: events with another id are late, or nobody's, and are ignored. At most `MAX_GOALS`.
+        # Names by id, at most `MAX_GOALS`. An event with another id is late or stray, and is ignored.
         self._actions: dict[str, str] = {}
 
     def __len__(self) -> int:
@@ -85,7 +85,7 @@ class PendingGoals:
         del self._actions[goal]
         if operation.get("result", True) is False:
             return GoalEnded(goal, ok=False, status=GoalStatus.UNKNOWN, values=text_of(values))
-        # Some servers omit the status on success, and a number beyond the enumeration is not an error of this client.
+        # Some servers omit the status on success; an unknown number is accepted too.
         status = operation.get("status", GoalStatus.SUCCEEDED.value)
         known = type(status) is int and status in GoalStatus.__members__.values()
         return GoalEnded(
@@ -101,10 +101,10 @@ class ServedActions:
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
-        # By absolute name; what `restore` repeats.
+        # By absolute name; `restore` repeats them.
         self._types: dict[str, str] = {}
-        # Names of the actions by the goal's id, which the hub makes unique. Only goals of this connection, because
-        # servers forget who executes a goal.
+        # Names of the actions by the goal's id, only of the present connection, because servers forget who executes a
+        # goal.
         self._goals: dict[str, str] = {}
 
     def restore(self) -> None:
@@ -168,7 +168,7 @@ class ServedActions:
             return UnusableReceived(f"a goal with the id of another arrived: {excerpt(data)}")
         key = absolute(action)
         full = len(self._goals) >= MAX_SERVED_GOALS
-        self._goals[goal] = key  # also if it is refused, because `end` only answers goals that it knows
+        self._goals[goal] = key  # even if it is refused, because `end` ends only stored goals
         if key not in self._types:
             self.end(goal, GoalStatus.ABORTED, f"action {excerpt(action)} is not served here")
         elif full:

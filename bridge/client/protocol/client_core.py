@@ -22,8 +22,7 @@ from bridge.names import RosVersion
 class ClientCore:
     """State of a rosbridge client.
 
-    Numbers of advertisements, subscriptions and tickets are never reused, so that an event that is handled late cannot
-    reach something newer.
+    Numbers of advertisements, subscriptions and tickets are never reused, so a late event cannot reach a newer object.
     """
 
     def __init__(
@@ -37,17 +36,17 @@ class ClientCore:
         self.wire = wire = Wire(
             ros_version=ros_version, max_size=max_size, max_depth=max_depth, fragment_size=fragment_size
         )
-        # What the program wants until it withdraws it: `restore` repeats it on each connection.
+        # What the program has registered; `restore` repeats it on each connection.
         self.publications = Publications(wire)
         self.subscriptions = Subscriptions(wire)
-        # The short way of most messages, for a caller that then need not ask `receive`.
+        # The shortcut for most messages; if it returns None, `receive` handles the message.
         self.receive_known = self.subscriptions.receive_known
         self.services = ServedServices(wire)
         self.actions = ServedActions(wire)
-        # What waits for an answer of the server: `lost` drops it, as it drops requests and goals to the two above.
+        # What waits for an answer of the server; `lost` drops it.
         self.calls = PendingCalls(wire)
         self.goals = PendingGoals(wire)
-        # Parts of messages of this connection, bounded in number, size and age.
+        # Incomplete messages of this connection, bounded in number, size and age.
         self._fragments = Reassembler(max_size=max_size)
 
     @property
@@ -59,7 +58,7 @@ class ClientCore:
         """Start a new connection: put all registrations into the outbox, advertisements first."""
         self.wire.connected = True
         self.wire.clear()
-        # Advertisements first, so that a program that answers to messages can do so from the first one on.
+        # Advertisements first, so that the program can publish as soon as its first message arrives.
         self.publications.restore()
         self.services.restore()
         self.actions.restore()
@@ -85,14 +84,14 @@ class ClientCore:
         It is None for requests that were refused here, and for messages of topics or calls that no longer
         exist.
         """
-        # Nearly every message is one of a topic that was heard before.
+        # The usual case: a message of a topic that had one before.
         known = self.receive_known(data)
         if known is not None:
             return MessageReceived(*known)
         discarded = self.subscriptions.discard_known(data)
         if discarded is not None:
             return discarded
-        # A CBOR map begins like this, but JSON does not. Without a subscription as CBOR none is expected.
+        # A CBOR map begins like this, and JSON does not; it is expected only if a subscription requests CBOR.
         if self.subscriptions.binary and data[:1] >= b"\x80":
             return self._receive_cbor(data, now)
         try:
@@ -122,7 +121,7 @@ class ClientCore:
 
     def _receive_wrapped(self, operation: dict[str, Any], now: float) -> Event | None:
         """Handle a fragment or a PNG, which contain a message, possibly nested."""
-        # Servers send a PNG in fragments; more layers are made only by somebody who means harm.
+        # Servers send a PNG in fragments; deeper nesting could only be an attack.
         wrapped = ["fragment", "png"]
         data: bytes | str | None = None
         while (op := operation.get("op")) in wrapped:

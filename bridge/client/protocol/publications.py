@@ -16,22 +16,22 @@ from bridge.qos import Qos
 class _Advertised:
     """One topic on the wire, for one or more advertisements of this client."""
 
-    # As the first advertisement asked; all others must agree, but for the queue, which is ROS's affair.
+    # From the first advertisement. All others must agree, except for the queue size.
     topic: str
     type: str
     latch: bool
     queue_size: int
     qos: Qos | None
     wire_id: str
-    # Start of its messages on the wire, which end with a brace; the envelope is the same for all of them.
+    # Beginning of its messages on the wire, which is always the same; they end with a brace.
     prefix: bytes
     # Numbers of the advertisements; never empty while the topic is advertised.
     holders: set[int] = field(default_factory=set)
-    # The check of its type; None until `Publications.define` knows it, and for ever if nobody does.
+    # The check of its type; None while the type is unknown.
     check: MessageCheck | None = None
-    # The holders whose first message the check has still to see; empty without a check.
+    # Holders whose first message has not been checked yet; empty without a check.
     unchecked: set[int] = field(default_factory=set)
-    # The last message of a latched topic, because a server forgets it with the connection.
+    # The last message of a latched topic, which a server forgets with the connection.
     latched: bytes | None = None
 
 
@@ -40,9 +40,9 @@ class Publications:
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
-        # By type in the form of ROS 1; empty definitions for a type that nobody knows, which is not asked for again.
+        # By type in the form of ROS 1; empty for an unknown type, which is not asked for again.
         self._definitions: dict[str, Definitions] = {}
-        # By absolute name, and by the number that `advertise` has returned; several numbers share an entry.
+        # By absolute name, and by the number from `advertise`; all advertisements of a topic share an entry.
         self._advertised: dict[str, _Advertised] = {}
         self._advertisements: dict[int, _Advertised] = {}
 
@@ -50,7 +50,7 @@ class Publications:
         """Advertise everything on a new connection, and repeat the last message of latched topics."""
         for advertised in self._advertised.values():
             self._send_advertise(advertised)
-            # The new server may accept less, and would close the connection again for it.
+            # A server that has refused its size would close the connection again.
             if advertised.latched is not None and len(advertised.latched) <= self._wire.sendable:
                 self._wire.write_bytes(advertised.latched)
 
@@ -138,7 +138,7 @@ class Publications:
             )
         except EncodeError as error:
             raise type(error)(f"a message of {advertised.topic} cannot be published: {error}") from None
-        # The body is encoded alone, and so has its own path in an error; the envelope around it is bytes already.
+        # Only the body is encoded, so that the paths in errors are those of the message.
         data = prefix + body + b"}"
         if advertised.latch:
             advertised.latched = data

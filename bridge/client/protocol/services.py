@@ -24,7 +24,7 @@ class PendingCalls:
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
-        # The ids: an answer with another one is late, or nobody's, and is ignored. At most `MAX_CALLS`.
+        # Ids of the calls, at most `MAX_CALLS`. An answer with another id is late or stray, and is ignored.
         self._waiting: set[str] = set()
 
     def __len__(self) -> int:
@@ -36,7 +36,7 @@ class PendingCalls:
         if len(self._waiting) >= MAX_CALLS:
             raise SlowPeerError(f"{MAX_CALLS} service calls are pending, so {service} is not called")
         call = f"call_service:{service}:{self._wire.number()}"
-        # Writing may raise for the arguments, and then nothing waits.
+        # Written first, because it raises if the arguments cannot be encoded.
         self._wire.write(op="call_service", id=call, service=service, args=args)
         self._waiting.add(call)
         return call
@@ -69,10 +69,10 @@ class ServedServices:
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
-        # By absolute name; what `restore` repeats.
+        # By absolute name; `restore` repeats them.
         self._types: dict[str, str] = {}
-        # Name and id on the wire by ticket. The id is the caller's, of any JSON type, and two callers may use the same,
-        # so the program gets a ticket. Only requests of this connection: an answer to another server has no meaning.
+        # Name and id on the wire by ticket, only of the present connection. Ids are chosen by callers, and may be equal,
+        # so the program gets a ticket instead.
         self._requests: dict[int, tuple[str, Any]] = {}
 
     def __contains__(self, service: str) -> bool:
@@ -139,7 +139,7 @@ class ServedServices:
             return UnusableReceived(
                 f"a call_service without a service or with an invalid id arrived: {excerpt(data)}"
             )
-        # A ticket also for what is refused at once, because `answer` only answers requests that it knows.
+        # Stored even if it is refused at once, because `answer` answers only stored requests.
         ticket = self._wire.number()
         self._requests[ticket] = (service, wire_id)
         if absolute(service) not in self._types:

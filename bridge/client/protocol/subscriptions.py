@@ -83,23 +83,23 @@ class _Subscribed:
     # The subscriptions by number; never empty while the topic is subscribed to.
     wanted: dict[int, _Wanted] = field(default_factory=dict)
 
-    # What the server was asked for last, from `combine`: it follows `wanted` at each change of that.
+    # What the server was last asked for; `combine` updates all of these when `wanted` changes.
     throttle_rate: int = 0
     queue_length: int = 0
-    # The keys of `wanted`, ready for the event of a message, which nearly always goes to all of them.
+    # The keys of `wanted`: a message nearly always goes to all of them.
     all_numbers: tuple[int, ...] = ()
-    # Whether a subscription wants fewer messages than the server sends, so that each must be asked.
+    # Whether a subscription wants fewer messages than the server sends, and must be throttled here.
     has_throttled: bool = False
 
-    # About the present connection; `restore` sets them back.
-    # Whether a message has arrived, after which a silent topic is a topic without news.
+    # About the present connection; `restore` resets them.
+    # Whether a message has arrived; after that, silence is no reason to renew the subscription.
     has_messages: bool = False
     renewals: int = 0
 
-    # Number of envelopes learnt or refused; at `_ENVELOPES` the search ends.
+    # Number of envelopes tried, at most `_ENVELOPES`.
     envelopes_tried: int = 0
 
-    # These outlive a connection: the next one has the same server, and the same messages.
+    # These outlive a connection, because the messages stay the same.
     # Whether the subscription requests JSON instead of CBOR, because CBOR brought nothing.
     as_json: bool = False
     # Size of its largest message so far, at most `max_size`: only a larger one is compared with the limits.
@@ -155,28 +155,27 @@ _UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, Delivery(), "", s
 class Subscriptions:
     """All subscriptions of a client.
 
-    The way of a message is the busiest of the client: `receive_known` reads it if it begins with the envelope of an
-    earlier one, and `receive` if not, from the parsed operation. Everything that a message does not change is worked
-    out when subscriptions change, and both rely on it.
+    Receiving messages is the client's busiest path: `receive_known` handles those with the envelope of an earlier one,
+    and `receive` the others, after parsing. Both use values that are computed when subscriptions change.
     """
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
         self._inner_depth = wire.max_depth - 1  # of a message inside its operation
-        # By absolute name, and by the number that `subscribe` has returned; several numbers share an entry.
+        # By absolute name, and by the number from `subscribe`; all subscriptions of a topic share an entry.
         self._subscribed: dict[str, _Subscribed] = {}
         self._subscriptions: dict[int, _Subscribed] = {}
         # ROS version of the server according to header stamps in its messages; the first one decides.
         self.seen_version: RosVersion | None = None
-        # From the deliveries of all topics, so that a message is asked only if it may matter (`_note_deliveries`).
+        # Summaries of the deliveries of all topics, kept by `_note_deliveries`.
         # Whether any topic is subscribed as CBOR.
         self.binary = False
         # Whether any topic is subscribed with NumPy arrays.
         self.numpy = False
         # The known envelopes of messages; emptied when subscriptions or the connection change.
         self.envelopes: dict[bytes, _Known] = {}
-        # The last of these that was used: the next message is most likely one of the same topic. Never one that is
-        # not in `envelopes`, except for the placeholder.
+        # The one used last, because the next message is probably of the same topic. It is always in `envelopes`, except
+        # for the placeholder.
         self._known = _UNKNOWN
 
     def restore(self) -> None:
@@ -205,7 +204,7 @@ class Subscriptions:
         if type_name is not None:
             split_type(type_name)
         for name, value in (("throttle_rate", throttle_rate), ("queue_length", queue_length)):
-            # Servers silently drop a subscription with a float here, and `True` is not meant.
+            # Servers silently drop a subscription with a float here.
             if type(value) is not int or value < 0:
                 raise OptionError(
                     f"{name} of topic {topic} must be a whole number of at least 0, not {value!r}"
@@ -329,7 +328,7 @@ class Subscriptions:
         if subscribed is None or subscribed.has_messages:
             return False
         subscribed.renewals += 1
-        # The first renewal is for quality of service, so only the second one is for the encoding.
+        # The first renewal may fix the quality of service, so only the second one changes the encoding.
         gives_up_cbor = (
             subscribed.renewals > 1 and subscribed.delivery.compression == "cbor" and not subscribed.as_json
         )
@@ -341,8 +340,8 @@ class Subscriptions:
     def receive_known(self, data: bytes) -> tuple[str, dict[str, Any], tuple[int, ...]] | None:
         """Return the fields of `MessageReceived` for a message with a known envelope.
 
-        None if the message needs a closer look, which `ClientCore.receive` takes. They are a plain tuple, because
-        making a named one takes a tenth of the time of a small message.
+        None if `ClientCore.receive` has to handle it. The fields are a plain tuple, because creating a named one takes
+        a tenth of the time that a small message takes.
         """
         envelope, size, topic, subscribed = self._known
         if not data.startswith(envelope):
@@ -406,7 +405,7 @@ class Subscriptions:
         if not subscribed.has_messages:
             subscribed.has_messages = True
             self.seen_version = self.seen_version or ros_version_of_message(msg)
-        # A message out of CBOR, a fragment or a PNG has no envelope in `data`.
+        # A message from CBOR, fragments or a PNG has no envelope in `data`.
         if (
             type(data) is bytes
             and len(operation) == _OF_ENVELOPE
@@ -420,7 +419,7 @@ class Subscriptions:
         receivers = subscribed.receivers(now)
         if not receivers:
             return None
-        # Once a topic wants arrays, the CBOR of all topics is read with arrays, because the topic is not known before.
+        # CBOR is decoded with arrays for all topics if one wants them, because the topic is not known before.
         if self.numpy:
             if subscribed.delivery.arrays == "list":
                 msg = with_lists(msg) if from_cbor else msg

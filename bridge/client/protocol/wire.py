@@ -14,7 +14,7 @@ SMALLEST_LIMIT: Final = 2048
 
 
 class Wire:
-    """The outbox for all parts of a client's core, and what they must know of the connection."""
+    """The outbox for all parts of a client's core, and the properties of the connection that they share."""
 
     def __init__(
         self, *, ros_version: RosVersion | None, max_size: int, max_depth: int, fragment_size: int | None
@@ -25,15 +25,14 @@ class Wire:
         self.connected = False
         # ROS version of the server, as configured or detected; None while unknown.
         self.ros_version: RosVersion | None = ros_version
-        # Function that returns a new number at each call, for ids on the wire and for handles of the program.
+        # Returns a new number at each call, for ids on the wire and for handles.
         self.number: Callable[[], int] = count(1).__next__
         # Maximum number of characters in a message before `pieces` splits it; None for no limit.
         self.fragment_size = fragment_size
-        # Maximum size and nesting of a message in both directions, as the program has chosen them.
+        # Maximum size and nesting of a message in both directions, as configured.
         self.max_size = max_size
         self.max_depth = max_depth
-        # Maximum size of an outbound message: `max_size`, or what is known of the server's limit if that is less. It
-        # only falls: what a server has refused once it will refuse again.
+        # Maximum size of an outbound message: `max_size`, or the known limit of the server. It never increases.
         self.sendable = max_size
 
     def type_name(self, name: str, kind: Kind = "msg") -> str:
@@ -48,13 +47,13 @@ class Wire:
 
     def limit(self, size: int) -> None:
         """Refuse messages of more bytes from now on, unless they are sent in fragments."""
-        # Fragments are small whatever the message is, so the size of a refused one says nothing about messages.
+        # With fragments, the size of a message says nothing about what the server refused.
         if self.fragment_size is None:
             self.sendable = min(self.sendable, max(size, SMALLEST_LIMIT))
 
     def write_bytes(self, data: bytes) -> None:
         """Write an encoded message."""
-        # Without a connection nothing waits: `restore` writes what is wanted then, and not what was wanted meanwhile.
+        # Dropped without a connection, because `restore` writes everything that is wanted by then.
         if self.connected:
             self._outbox.append(data)
 
