@@ -80,12 +80,12 @@ def test_no_other_tag_is_taken(value):
         b"\xa1\x61a" + b"\x81" * 100_000,
     ],
 )
-@pytest.mark.parametrize("arrays", ["list", "numpy"])
-def test_malformed_messages_are_refused(data, arrays):
-    with pytest.raises(DecodeError) as caught:
-        decode(data, arrays=arrays)
-    assert len(str(caught.value)) < 300
-    assert "\n" not in str(caught.value)
+def test_malformed_messages_are_refused(data):
+    for arrays in ("list", "numpy"):
+        with pytest.raises(DecodeError) as caught:
+            decode(data, arrays=arrays)
+        assert len(str(caught.value)) < 300
+        assert "\n" not in str(caught.value)
 
 
 def test_limits_of_size_and_depth():
@@ -107,13 +107,13 @@ def test_limits_of_size_and_depth():
 
 
 @pytest.mark.parametrize("name", ["u1", "u2", "u4", "u8", "i1", "i2", "i4", "i8", "f4", "f8"])
-@pytest.mark.parametrize("order", "<>")
-def test_numpy_arrays_leave_as_typed_arrays(name, order):
-    values = np.array([[1, 2], [3, 100]], order + name)
-    found = decode(encode({"data": values}), arrays="numpy")["data"]
-    assert found.dtype == np.dtype("<" + name)
-    assert found.tolist() == [1, 2, 3, 100]
-    assert decode(encode({"data": values[:, 1]}), arrays="numpy")["data"].tolist() == [2, 100]
+def test_numpy_arrays_leave_as_typed_arrays(name):
+    for order in "<>":
+        values = np.array([[1, 2], [3, 100]], order + name)
+        found = decode(encode({"data": values}), arrays="numpy")["data"]
+        assert found.dtype == np.dtype("<" + name)
+        assert found.tolist() == [1, 2, 3, 100]
+        assert decode(encode({"data": values[:, 1]}), arrays="numpy")["data"].tolist() == [2, 100]
 
 
 def test_other_numpy_values():

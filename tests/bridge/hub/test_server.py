@@ -16,15 +16,15 @@ from tests.bridge.hub.sockets import RawClient, client, running_hub
 from tests.patience import PATIENCE
 
 
-@pytest.mark.parametrize("size", [0, 60, 80, 100, 200, 65_400, 65_500, 65_600, 200_000, (1 << 20) - 60])
-async def test_messages_of_every_length_arrive_whole(size: int) -> None:
+async def test_messages_of_every_length_arrive_whole() -> None:
     async with running_hub() as port, client(port) as ears:
         await ears.send(op="advertise", topic="/t", type="a/B")
         await ears.send(op="subscribe", topic="/t")
-        for text in ("x" * size, "y" * size):
-            await ears.send(op="publish", topic="/t", msg={"data": text})
-        assert (await ears.receive())["msg"]["data"] == "x" * size
-        assert (await ears.receive())["msg"]["data"] == "y" * size
+        for size in (0, 60, 80, 100, 200, 65_400, 65_500, 65_600, 200_000, (1 << 20) - 60):
+            for letter in "xy":
+                await ears.send(op="publish", topic="/t", msg={"data": letter * size})
+            for letter in "xy":
+                assert (await ears.receive())["msg"]["data"] == letter * size
 
 
 async def test_what_is_due_happens_by_itself() -> None:

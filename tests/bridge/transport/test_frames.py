@@ -19,10 +19,9 @@ URI = parse_uri("ws://localhost:9090")
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("masked", [True, False])
-@pytest.mark.parametrize("opcode", [Opcode.TEXT, Opcode.BINARY])
-def test_a_message_is_found_wherever_it_begins(size: int, masked: bool, opcode: Opcode) -> None:
+def test_a_message_is_found_wherever_it_begins(size: int, masked: bool) -> None:
     payload = b"x" * size
-    one = Frame(opcode, payload).serialize(mask=masked)
+    one = Frame(Opcode.BINARY, payload).serialize(mask=masked)
     data = b"before" + 3 * one + b"\x81"
     found, at = frames.whole_messages(data, 6, masked=masked, largest=size)
     assert (found, at) == ([payload] * 3, len(data) - 1)
@@ -50,8 +49,7 @@ def test_a_frame_that_is_not_all_there_is_waited_for(size: int, masked: bool) ->
 
 
 @pytest.mark.parametrize(
-    ("opcode", "size"),
-    [(opcode, size) for opcode in Opcode for size in SIZES if size < 126 or opcode < Opcode.CLOSE],
+    ("opcode", "size"), [*((Opcode.TEXT, size) for size in SIZES), (Opcode.CONT, 1), (Opcode.PING, 1)]
 )
 @pytest.mark.parametrize("masked", [True, False])
 def test_one_message_alone_is_found_as_among_others(opcode: Opcode, size: int, masked: bool) -> None:

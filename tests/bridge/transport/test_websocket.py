@@ -10,10 +10,12 @@ from hypothesis import strategies as st
 from websockets.client import ClientProtocol
 from websockets.frames import DATA_OPCODES, CloseCode, Frame, Opcode
 from websockets.protocol import State
+from websockets.server import ServerProtocol
 from websockets.uri import parse_uri
 from websockets.utils import accept_key
 
 from bridge.client.websocket import Limits, WebSocket
+from bridge.transport.websocket import WebSocketTransport
 
 LARGEST = 200
 """Bytes of a message at most, in what is generated here."""
@@ -27,6 +29,13 @@ class Ends(asyncio.Transport):
         super().__init__()
         self.written = b""
         self.ended = False
+        self.reads = True
+
+    def pause_reading(self) -> None:
+        self.reads = False
+
+    def resume_reading(self) -> None:
+        self.reads = True
 
     def write(self, data: Any) -> None:
         self.written += data
@@ -212,3 +221,40 @@ def parts(data: bytes, cuts: list[int]) -> Iterator[bytes]:
             yield data[at : at + cut]
         at += cut
     yield b""
+
+
+class Postponing(WebSocketTransport):
+    """A connection after its handshake that handles each message in the second turn."""
+
+    def __init__(self) -> None:
+        super().__init__(ServerProtocol(state=State.OPEN), max_size=LARGEST, write_limit=LARGEST)
+        self.is_open = self._quick = True
+        self._in_handshake = False
+        self.seen: list[bytes] = []
+        self.handled: list[bytes] = []
+
+    def messages_received(self, messages: list[bytes]) -> None:
+        new = [message for message in messages if message not in self.seen]
+        self.seen += new
+        self.handled += messages[: len(messages) - len(new)]
+        if new:
+            self.postpone(new)
+
+
+@pytest.mark.parametrize("together", [True, False])
+async def test_a_postponed_message_is_handled_before_later_data_is_read(together: bool) -> None:
+    connection, transport = Postponing(), Ends()
+    connection.connection_made(transport)
+    one, two = (Frame(Opcode.TEXT, letter).serialize(mask=True) for letter in (b"{one}", b"{two}"))
+    connection.data_received(one + two if together else one)
+    assert connection.handled == []
+    assert not transport.reads
+    await asyncio.sleep(0)
+    assert connection.handled[0] == b"{one}"
+    if not together:
+        assert transport.reads
+        connection.data_received(two)
+    for _ in range(3):
+        await asyncio.sleep(0)
+    assert connection.handled == [b"{one}", b"{two}"]
+    assert transport.reads
