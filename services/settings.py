@@ -173,6 +173,7 @@ def load_settings(**flags: Any) -> Settings:
         SettingsError: A `BM_*` variable is unknown, or a value is invalid.
         BridgeError: The robot in --uri does not announce itself.
     """
+    # a misspelt variable would otherwise be ignored, for example in a unit file
     known = {ENV_PREFIX + name.upper() for name in Settings.model_fields}
     for name in sorted(os.environ):
         if name.upper().startswith(ENV_PREFIX) and name.upper() not in known:
@@ -181,6 +182,7 @@ def load_settings(**flags: Any) -> Settings:
             raise SettingsError(
                 f"environment variable {name} is not a setting of rosbayes; {hint} (unset it, or rename it)"
             )
+    # flags that were not given leave their variables in force
     given = {name: value for name, value in flags.items() if value is not None and value != ()}
     try:
         settings = Settings(**given)
@@ -194,8 +196,10 @@ def load_settings(**flags: Any) -> Settings:
         )
         reason = _expected(name, str(first["msg"]))
         raise SettingsError(f"{where}: {reason} (got {first.get('input')!r})") from error
+    # later children inherit the variable
     if "log_format" in given:
         use_log_format(settings.log_format)
+    # looked up only where the server is used: a board would wait for a robot that it never asks
     if "uri" in flags and settings.uri is not None and settings.uri.startswith(ROBOT):
         from bridge.discovery import find_uri
 

@@ -73,6 +73,7 @@ def board(
     """Emulate boards of the mini-cluster."""
     check_metrics(settings.metrics, insecure=insecure)
     run_directory = settings.run_directory
+    # `board -d DIR --directory DIR`: as many as the deployment has
     if boards is None and listen is None and directory is not None:
         boards = len(deployment_for(settings).boards)
     if (listen is None) == (boards is None):
@@ -82,6 +83,7 @@ def board(
     if boards is not None:
         if directory is None:
             raise SettingsError("--boards needs --directory DIR, a folder for the boards' sockets")
+        # the sockets in it are the only protection of the boards
         try:
             directory.mkdir(mode=0o700, exist_ok=True)
         except OSError as error:

@@ -42,6 +42,7 @@ def discover(
     if pick and as_json:
         raise SettingsError("--pick and --json cannot be combined: omit one of them")
 
+    # filled in a coroutine of its own, so that a question to the user does not block an event loop
     robots: list[Robot] = []
 
     async def look() -> None:
@@ -55,6 +56,7 @@ def discover(
             f"no rosbridge server announced itself on this network within {timeout:g} s; "
             "the hub does with --announce NAME"
         )
+    # the table goes to standard error, because a shell takes standard output as the URI
     if pick:
         Console(stderr=True).print(_table(robots, numbered=True))
         print(f"{ROBOT}{_picked(robots).name}")

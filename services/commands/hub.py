@@ -76,6 +76,7 @@ def hub(
 ) -> int:
     """Serve rosbridge without ROS."""
     check_metrics(settings.metrics, insecure=insecure)
+    # read before anything listens: a wrong file must not open a hub without its protection
     access = _access_policy(tls_cert, tls_key, token_file, origin or [])
     if not is_loopback(host) and not insecure and (access.tls is None or not access.tokens):
         missing = " and ".join(
@@ -109,6 +110,7 @@ def _access_policy(
         raise SettingsError(
             "TLS needs both the certificate and its key: give --tls-cert FILE and --tls-key FILE"
         )
+    # a path would never match, since browsers send only scheme, host and port
     for page in origins:
         if page != "null" and (not page.startswith(("http://", "https://")) or page.count("/") != 2):
             raise SettingsError(

@@ -69,6 +69,7 @@ def listen(
     if server is None:
         raise SettingsError("give --uri ws://HOST:PORT, or --deployment DIR (listen --help shows examples)")
     where = topic or (output.topic if output is not None else RESULTS_TOPIC)
+    # opened before the connection: a run that cannot be saved would be lost
     with contextlib.ExitStack() as stack:
         file = open_result_file(save) if save is not None else None
         if file is not None:

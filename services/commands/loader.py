@@ -37,6 +37,7 @@ def loader(
         loaded = deployment_for(settings, images=True)
         images = [loaded.image_path(index) for index in range(len(loaded.boards))]
         endpoints = board_endpoints(settings, loaded)
+        # the second image would replace the first, and pcie-app would refuse the board later
         if twice := next((each for at, each in enumerate(endpoints) if each in endpoints[:at]), None):
             raise SettingsError(f"{twice} is named twice, and a board holds one image: name each board once")
     elif context.params["deployment"] is not None or context.params["boards"] is not None:  # as flags
@@ -47,6 +48,7 @@ def loader(
         )
     else:
         images, endpoints = [image], [board_endpoint(endpoint, "ENDPOINT", settings)]
+    # one after the other: if one fails, those before it keep their new images
     for path, board in zip(images, endpoints, strict=True):
         with say_if_slow(f"waiting for the board at {board}"):
             image_hash = program(board, path, timeout=settings.peer_timeout)

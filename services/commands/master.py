@@ -64,6 +64,7 @@ def master(
         settings = settings.model_copy(
             update={setting: str(endpoint_in(connect, name)) for setting, name in services.items()}
         )
+    # both before the checks of a run: they are for settings that do not work yet
     if print_config:
         print(orjson.dumps(settings.model_dump(mode="json"), option=orjson.OPT_INDENT_2).decode())
         return ExitCode.DONE
@@ -77,6 +78,7 @@ def master(
     if once and count is not None:
         raise SettingsError("--count requires --loop; --once computes one frame")
     check_metrics(settings.metrics, insecure=insecure)
+    # loaded before processes start, so that a damaged folder is reported at once
     loaded = deployment_for(settings)
     return run_async(run_master(settings, loaded, once=once, count=count, json=json, plot=plot))
 

@@ -43,6 +43,7 @@ def pcie_app(
     """Drive the boards of a mini-cluster."""
     loaded = deployment_for(settings, images=True)
     deployed = DeployedBoards(settings, loaded, board_endpoints(settings, loaded), reprogram=reprogram)
+    # the status is served from a thread, because the main one blocks while boards compute
     if listen is not None:
         check_metrics(settings.metrics, insecure=insecure)
         link = listening(own_endpoint(listen, insecure=insecure), ROLE, loaded)

@@ -27,6 +27,7 @@ app = CommandLine(
 def publisher(settings: Settings, listen: options.Listen = None, insecure: options.Insecure = False) -> int:
     """Publish posteriors over rosbridge."""
     loaded = deployment_for(settings)
+    # under a master the results come over the socket, alone over standard input
     if listen is not None:
         check_metrics(settings.metrics, insecure=insecure)
         link = listening(own_endpoint(listen, insecure=insecure), ROLE, loaded)

@@ -46,6 +46,7 @@ def subscriber(
     insecure: options.Insecure = False,
 ) -> int:
     """Extract variables from a ROS topic over rosbridge."""
+    # a deployment has all of these; to ignore a flag would read something else than the user named
     if settings.deployment is not None and (value := topic or type_ or variables):
         flag = "--topic" if topic else "--type" if type_ else "--variables"
         raise SettingsError(

@@ -32,6 +32,7 @@ class Axis:
         """Return the value of an index: a number in its unit, the name of a state, or the index itself."""
         if self.dimension is None:
             return index
+        # a mean over names has no meaning, so indices of states are whole
         if self.dimension.states:
             return self.dimension.states[round(index)]
         return self.dimension.value(index)
@@ -48,6 +49,7 @@ def axes_of(posterior: Posterior, deployment: Deployment | None) -> list[Axis]:
     """Return the dimensions of a received posterior; a ValueError if they differ from the deployment's."""
     if deployment is None:
         return [Axis(label, size) for label, size in zip(posterior.labels, posterior.sizes, strict=True)]
+    # another deployment's values would be shown with plausible units
     ours = [(dimension.label, dimension.size) for dimension in deployment.result_dimensions]
     theirs = list(zip(posterior.labels, posterior.sizes, strict=True))
     if ours != theirs:

@@ -40,9 +40,11 @@ async def show_frames(
         BridgeError: The server is unreachable, or is not a rosbridge server.
     """
     taken = 0
+    # Before the first frame, silence and a strange message mean a wrong topic, and end the command. Afterwards the
+    # stack may come back: without --timeout, each silence is reported once.
+    began = False
     silence_reported = False
     limit: float = settings.first_data_timeout
-    began = False
     async with (
         connect(
             await announced_uri(uri),
@@ -76,12 +78,14 @@ async def show_frames(
                     continue
                 began, silence_reported = True, False
                 axes: list[Axis] = []
+                # a frame without a posterior is shown, but does not count
                 if isinstance(one, Posterior):
                     taken += 1
                     try:
                         axes = axes_of(one, deployment)
                     except ValueError as error:
                         raise SettingsError(str(error)) from error
+                # saved first: the reader of standard output may end this command
                 if file is not None:
                     file.add(one, axes)
                 show(one, axes)

@@ -30,6 +30,7 @@ def print_json(record: Published, deployment: Deployment) -> None:
     try:
         print_json_line(result)
     except BrokenPipeError:
+        # the reader has enough, which is no error
         raise
     except OSError as error:
         raise StackError(f"standard output cannot be written: {error.strerror or error}") from error

@@ -89,6 +89,8 @@ class _Lines:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        # A descriptor instead of a file of Python, whose buffer would be written in parts. Readable, to look at what is
+        # there already: the last byte, and the columns of a table.
         try:
             self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
             size = os.fstat(self._file).st_size
@@ -103,6 +105,7 @@ class _Lines:
     def _write(self, line: bytes) -> None:
         written = 0
         try:
+            # a full disk takes a part of a line, and only then refuses
             while written < len(line):
                 written += os.write(self._file, line[written:])
         except OSError as error:
@@ -112,6 +115,7 @@ class _Lines:
     def _take_back(self, written: int) -> None:
         """Remove an incomplete line, unless another process has written since."""
         with contextlib.suppress(OSError):
+            # after an append the position is behind our own bytes, whatever others have appended before
             end = os.lseek(self._file, 0, os.SEEK_CUR)
             if written and os.fstat(self._file).st_size == end:
                 os.ftruncate(self._file, end - written)
@@ -132,6 +136,7 @@ class _CsvLines(_Lines):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
+        # Of the rows written so far; None before the first one, which writes them or compares them with the file.
         self._columns: list[str] | None = None
 
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
@@ -182,10 +187,13 @@ class _Archive:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        # All posteriors so far, which have one shape and the axes of the first: an archive cannot be appended to.
         self._posteriors: list[Posterior] = []
         self._axes: list[Axis] = []
+        # How many of them the archive on disk has, and when it is written again (monotonic, s).
         self._written = 0
         self._next = time.monotonic() + _EVERY
+        # now, instead of after the first seconds of a run that may not come again
         if not os.access(path.parent, os.W_OK):
             raise _not_writable(path, FileNotFoundError(2, "the folder is not writable"))
 
@@ -205,6 +213,7 @@ class _Archive:
             )
         self._posteriors.append(frame)
         if time.monotonic() >= self._next:
+            # the whole archive is written each time, so large ones are written less often
             begun = time.monotonic()
             self.close()
             ended = time.monotonic()
@@ -231,6 +240,7 @@ class _Archive:
         }
         for at, axis in enumerate(self._axes):
             arrays[f"axis{at}"] = np.array([axis.value(index) for index in range(axis.size)])
+        # a reader, or an interrupted run, finds either the last archive or this one
         partial = self._path.with_name(f".{self._path.name}.part")
         try:
             with partial.open("wb") as file:

@@ -90,6 +90,7 @@ def drawing() -> Iterator[Show]:
     if not console.is_terminal:
         yield lambda frame, axes: console.print(drawn(frame, axes), soft_wrap=True)  # do not wrap lines
         return
+    # The last frame, drawn at the end even if its turn had not come; and the time of the last picture (monotonic, s).
     newest: list[tuple[FrameOutcome, list[Axis]]] = []
     shown = -1.0
     with Live(console=console, auto_refresh=False) as live:
@@ -98,6 +99,7 @@ def drawing() -> Iterator[Show]:
             nonlocal shown
             newest[:] = [(frame, axes)]
             now = time.monotonic()
+            # a picture takes longer than a frame of a fast stack
             if now - shown >= 1 / _PICTURES_A_SECOND:
                 shown = now
                 live.update(drawn(frame, axes), refresh=True)

@@ -36,9 +36,11 @@ def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool,
 
     Of three or more dimensions, the two largest are drawn, and the others are summed out.
     """
+    # the words around the picture stay on the screen
     width, rows = min(width, WIDTH), max(min(rows, ROWS), 2)
     if len(axes) == 1:
         return _bars(posterior.values, axes[0], width, rows, colour)
+    # in the order of the deployment, so that y stays down and x across
     largest = sorted(sorted(range(len(axes)), key=lambda at: -axes[at].size)[:2])
     down, across = (axes[at] for at in largest)
     text = _heat(posterior.marginal(down.label, across.label), down, across, (width, rows), colour)
@@ -48,6 +50,7 @@ def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool,
 
 
 def _bars(values: npt.NDArray[np.float64], axis: Axis, width: int, rows: int, colour: bool) -> Text:
+    # blocks of cells instead of a window: every cell counts in the picture
     step = -(-axis.size // rows)
     blocks = _blocks(values, step, 0)
     names = [_range(axis, at * step, min((at + 1) * step, axis.size) - 1) for at in range(len(blocks))]
@@ -56,6 +59,7 @@ def _bars(values: npt.NDArray[np.float64], axis: Axis, width: int, rows: int, co
     text = Text(no_wrap=True, overflow="crop")
     text.append(printable(axis.label))
     for name, value in zip(names, blocks, strict=True):
+        # relative to the highest one: a flat posterior would be invisible otherwise
         share = float(value / blocks.max())
         bar = round(share * room)
         text.append(f"\n{name:>{wide}} ")
@@ -70,6 +74,7 @@ def _heat(
     width, rows = room
     ends = [down.shown(0), down.shown(down.size - 1)]
     margin = max(*map(len, ends), len(printable(down.label))) + 1
+    # a cell has two characters, because a character is twice as high as wide
     columns = max((width - margin - 2) // 2, 4)
     down_step, across_step = -(-down.size // rows), -(-across.size // columns)
     blocks = _blocks(_blocks(values, down_step, 0), across_step, 1)

@@ -11,8 +11,14 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from services.errors import SettingsError
-from services.sockets.stack import SilentProcess, StackStatus, ask_stack
-from services.sockets.status import BoardStatus, FrameCounts, ProcessStatus
+from services.sockets.status import (
+    BoardStatus,
+    FrameCounts,
+    ProcessStatus,
+    SilentProcess,
+    StackStatus,
+    ask_stack,
+)
 from terminal.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -40,6 +46,7 @@ def screen(stack: StackStatus) -> RenderableType:
     from rich.console import Group
     from rich.text import Text
 
+    # a table appears only if it has rows: a hub alone needs two lines
     parts: list[RenderableType] = [*_verdict(stack), _processes(stack)]
     if any(process.connections for process in stack.processes):
         parts += [Text(""), _connections(stack)]
@@ -73,6 +80,7 @@ def _verdict(stack: StackStatus) -> Iterator[RenderableType]:
 def _processes(stack: StackStatus) -> Table:
     from rich.text import Text
 
+    # a process does not know how often it was restarted: the master does, or the parent of a board
     restarts = {peer.name: peer.restarts for process in stack.processes for peer in process.peers}
     table = _table("process", "ready")
     for heading in ("pid", "up", "restarts", "CPU %", "MB", "received", "completed", "per s"):
@@ -160,6 +168,7 @@ def _boards_by_number(stack: StackStatus) -> list[BoardStatus]:
             if known is None:
                 boards[board.index] = board
                 continue
+            # pcie-app knows image and cycles; each counts the restarts that it has seen
             seen, own = (known, board) if known.image else (board, known)
             restarts = max(seen.restarts, own.restarts)
             boards[board.index] = msgspec.structs.replace(seen, restarts=restarts)
@@ -203,6 +212,7 @@ async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) 
     from rich.console import Console
     from rich.live import Live
 
+    # in a file or a pipe, lines are not wrapped to the width of a terminal, and nothing is overwritten
     terminal = sys.stdout.isatty()
     console = Console(width=None if terminal else _PLAIN_WIDTH, highlight=False)
     live = Live(console=console, auto_refresh=False, screen=True) if watch and terminal and not json else None
@@ -220,6 +230,7 @@ async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) 
         live.start()
     try:
         while True:
+            # with --watch, a stack that is gone may come back
             stack = await ask_stack(directory)
             if not stack.processes and not watch:
                 break

@@ -33,6 +33,7 @@ async def serve_metrics(
     address: Endpoint, name: str, get_status: Callable[[], ProcessStatus]
 ) -> AsyncIterator[None]:
     """Serve metrics within the context; an occupied port only causes a warning, because a robot's run goes on."""
+    # a registry of its own: the default one adds metrics of Python under names that are not ours
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_StatusCollector(get_status))
     try:
@@ -55,6 +56,7 @@ class _StatusCollector(Collector):
     """The metrics of the status, which the thread of a request gets from the event loop that owns it."""
 
     def __init__(self, get_status: Callable[[], ProcessStatus]) -> None:
+        # The function may be called only in the loop, whose state it reads.
         self._get_status = get_status
         self._loop = asyncio.get_running_loop()
 

@@ -56,6 +56,7 @@ class Report:
         is_alive: Callable[[], bool] = lambda: True,
         stages: Callable[[], list[StageLatency]] = list,
     ) -> None:
+        # What the process gave; the functions are called in the event loop that serves the status.
         self._name = name
         self._get_status = get_status
         self._is_alive = is_alive
@@ -66,6 +67,7 @@ class Report:
 
     def sample(self, manager: ServiceManager) -> None:
         """Take a sample for the rate, and report to the service manager."""
+        # not `status`, which would read /proc every second
         status = self._get_status()
         completed = status.frames.completed if status.frames is not None else 0
         self._samples.append((time.monotonic(), time.process_time(), completed))

@@ -1,4 +1,4 @@
-"""Status of a process: its records, read from its status socket (`terminal.health`)."""
+"""Status of processes: the records, and how one process or all of a run are asked (`terminal.health`)."""
 
 from __future__ import annotations
 
@@ -6,50 +6,65 @@ import asyncio
 import socket
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 
-from terminal.health import ANSWER_LIMIT, foreign_socket_error, silence_explained
+from terminal.health import ANSWER_LIMIT, SUFFIX, NoHealthError, foreign_socket_error, silence_explained
 
 if TYPE_CHECKING:
     # boards and pcie-app start without importing the bridge
     from bridge.client import Ros
 
+Reason = TypeVar("Reason", bound=str)
+
+ANSWER_TIME = 1.0
+"""Seconds in which all processes of a run must answer."""
+_AT_ONCE = 256
+"""Maximum number of processes asked at the same time."""
+_ORDER = ("hub", "master", "subscriber", "publisher", "pcie-app")
+
+
+# --- records ----------------------------------------------------------------------------------------
+
+# They are the format of the status sockets. A field that only some kinds of processes have gets a default.
+
 
 class ConnectionStatus(msgspec.Struct, frozen=True):
-    """A connection to a rosbridge server: `state` is connecting, connected, reconnecting or closed."""
+    """A connection to a rosbridge server."""
 
     uri: str
+    # connecting, connected, reconnecting or closed
     state: str
     reconnections: int
 
 
 class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """Counts of frames in one process.
+    """Counts of frames in one process, from zero when it is restarted."""
 
-    `received` and `completed` are messages and complete readings (subscriber), requested and computed frames
-    (pcie-app), requested and published results (publisher), readings and published results (master). `lost`
-    counts the others by `LossReason`. `last_number` is that of the last completed one (None before the first
-    one, and in the subscriber, which does not know numbers), `last_age_s` its age in seconds. `rate` is the
-    recent number of completed ones per second. `without` counts the readings that lack a topic which may be
-    missing and was alive, by topic (subscriber). All counts start from zero when a process is restarted.
-    """
-
+    # Subscriber: messages, and complete readings. Master: readings, and published results. pcie-app: requested, and
+    # computed frames. Publisher: requested, and published results.
     received: int
     completed: int
+    # The others, by `LossReason`.
     lost: dict[str, int]
+    # Of the last completed one: its number (None before the first one, and in the subscriber, which does not know
+    # numbers), and its age.
     last_number: int | None
     last_age_s: float | None
+    # Completed ones per second; `Report` adds it, because a process only counts.
     rate: float = 0.0
+    # Of the subscriber: readings without a topic that may be missing and was alive, by topic.
     without: dict[str, int] = msgspec.field(default_factory=dict)
 
 
 class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A board: `state` is starting, blank, programmed, or gone (as seen by pcie-app)."""
+    """A board, as it reports itself, or as pcie-app sees it."""
 
     index: int
     endpoint: str
+    # starting, blank, programmed, or (for pcie-app) gone, with the reason in `why`
     state: str
     image: str = ""
     restarts: int = 0
@@ -58,10 +73,11 @@ class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PeerStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A peer of the master; `pid` is 0 if the master did not start it."""
+    """A peer of the master."""
 
     name: str
     endpoint: str
+    # 0 if the master did not start it
     pid: int
     restarts: int
     ready: bool
@@ -72,15 +88,13 @@ BUCKETS_S = tuple(digit * 10.0**exponent for exponent in range(-5, 1) for digit 
 
 
 class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
-    """The latencies of a stage of frames; `frame` is the whole frame.
-
-    `p50_ms` and `p99_ms` are quantiles over the last 1000 published frames. `frames`, `sum_s` and `buckets`
-    cover all of them: a bucket has the number of frames up to its bound in `BUCKETS_S`, without those below.
-    """
+    """The latencies of a stage of frames; `frame` is the whole frame."""
 
     stage: str
+    # quantiles over the last 1000 published frames
     p50_ms: float
     p99_ms: float
+    # Over all of them; a bucket has the number of frames up to its bound in `BUCKETS_S`, without those below.
     frames: int
     sum_s: float
     buckets: list[int]
@@ -95,19 +109,15 @@ class HubStatus(msgspec.Struct, frozen=True):
 
 
 class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A process. `why` gives the cause while it is not ready, and its state when it is.
+    """A process."""
 
-    `alive` is false if it answers, but makes no progress (a blocking thread hangs, or a child of the master does).
-
-    `cpu_s` is its user and system time so far, `cpu_percent` that of the last seconds (100 is one core), and
-    `memory_bytes` its resident memory.
-
-    `deployment` is the hash of the deployment, and `folder` the folder from which the master has read it.
-    """
-
+    # Whether it does its work; then its state, otherwise the cause.
     ready: bool
     why: str
+    # False if it answers, but makes no progress: a blocking thread hangs, or a child of the master does.
     alive: bool = True
+    # `Report` adds who it is and what it uses. CPU time is user and system time so far, and the percentage that of the
+    # last seconds (100 is one core); the memory is the resident one.
     name: str = ""
     pid: int = 0
     version: str = ""
@@ -115,6 +125,7 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     cpu_s: float = 0.0
     cpu_percent: float = 0.0
     memory_bytes: int = 0
+    # The hash of its deployment and, of the master, the folder from which it has read it.
     deployment: str = ""
     folder: str = ""
     connections: list[ConnectionStatus] = msgspec.field(default_factory=list)
@@ -125,7 +136,25 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     stages: list[StageLatency] = msgspec.field(default_factory=list)
 
 
-Reason = TypeVar("Reason", bound=str)
+class SilentProcess(msgspec.Struct, frozen=True):
+    """A process with a status socket, or a peer of the master, that did not answer."""
+
+    name: str
+    why: str
+
+
+class StackStatus(msgspec.Struct, frozen=True, kw_only=True):
+    """All processes of a run."""
+
+    directory: str
+    ready: bool
+    # a sentence for each process that is not ready, the silent ones last
+    why: list[str]
+    processes: list[ProcessStatus]
+    silent: list[SilentProcess]
+
+
+# --- what processes say -----------------------------------------------------------------------------
 
 
 def seconds_since(tick: int) -> float | None:
@@ -155,6 +184,8 @@ def reasons(counts: Mapping[Reason, int]) -> dict[str, int]:
     """Return the counts that are not 0."""
     return {reason: count for reason, count in dict(counts).items() if count}
 
+
+# --- asking -----------------------------------------------------------------------------------------
 
 _decoder = msgspec.json.Decoder(ProcessStatus)
 _BACKLOG_EVERY = 0.01
@@ -190,3 +221,54 @@ def _connected(asking: socket.socket, path: str) -> bool:
     except BlockingIOError:
         return False
     return True
+
+
+def _status_sockets(directory: Path) -> list[Path]:
+    return list(directory.glob(f"*{SUFFIX}"))
+
+
+async def _ask(path: Path, turns: asyncio.Semaphore) -> ProcessStatus | SilentProcess:
+    name = path.name.removesuffix(SUFFIX)
+    try:
+        async with turns:
+            return msgspec.structs.replace(await read_process_status(str(path), ANSWER_TIME), name=name)
+    except NoHealthError as error:
+        return SilentProcess(name, f"it {error}")
+
+
+def _sort_key(name: str) -> tuple[int, int, str]:
+    """Return the sort key of a process: services in the order of a frame's path, then boards by number."""
+    if name in _ORDER:
+        return _ORDER.index(name), 0, name
+    digits = name.removeprefix("board")
+    return len(_ORDER), int(digits) if digits.isascii() and digits.isdigit() else 1 << 30, name
+
+
+async def ask_stack(directory: Path) -> StackStatus:
+    """Return the status of the processes in a run directory, queried in parallel.
+
+    Up to 256 processes take at most about a second.
+    """
+    turns = asyncio.Semaphore(_AT_ONCE)
+    answers = await asyncio.gather(*(_ask(path, turns) for path in _status_sockets(directory)))
+    processes = [each for each in answers if isinstance(each, ProcessStatus)]
+    silent = [each for each in answers if isinstance(each, SilentProcess)]
+    # a service that the master has not started may have no status socket at all
+    answered = {each.name for each in answers}
+    silent.extend(
+        SilentProcess(peer.name, f"the master waits for it at {peer.endpoint}")
+        for process in processes
+        for peer in process.peers
+        if peer.name not in answered and not peer.ready
+    )
+    processes.sort(key=lambda each: _sort_key(each.name))
+    silent.sort(key=lambda each: _sort_key(each.name))
+    why = [f"{each.name}: {each.why}" for each in processes if not each.ready]
+    why += [f"{each.name}: {each.why}" for each in silent]
+    return StackStatus(
+        directory=str(directory),
+        ready=bool(processes) and not why,
+        why=why,
+        processes=processes,
+        silent=silent,
+    )

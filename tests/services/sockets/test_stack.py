@@ -12,7 +12,7 @@ from rich.console import Console
 
 from services.errors import SettingsError
 from services.output.status_screen import screen, show
-from services.sockets import stack as status
+from services.sockets import status
 from services.sockets.reporting import serve_status
 from services.sockets.status import (
     BoardStatus,
