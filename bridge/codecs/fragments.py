@@ -1,7 +1,9 @@
 """Fragments of large messages: splitting and reassembly.
 
-A fragment is `{"op": "fragment", "id": ..., "data": ..., "num": ..., "total": ...}`; the `data` of a
-message's fragments, concatenated in the order of `num`, is its JSON. Servers differ
+    {"op":"fragment","id":"7","data":"{\"op\":\"publ","num":0,"total":2}
+    {"op":"fragment","id":"7","data":"ish\",...}","num":1,"total":2}
+
+The `data` of a message's fragments, concatenated in the order of `num`, is its JSON. Servers differ
 (`docs/reference/rosbridge-differences.md`): `num` counts from 0 or from 1, `total` may be a float with a
 fraction, either may be a string, ids are strings or integers and are reused. All of this is accepted.
 Fragments that cannot form a message are refused, and incomplete messages are bounded in number, bytes and

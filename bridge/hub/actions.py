@@ -1,4 +1,10 @@
-"""Actions between clients, as in ROS 2: goals with feedback, cancellation and exactly one result each."""
+"""Actions between clients, as in ROS 2: goals with feedback, cancellation and exactly one result each.
+
+caller ── send_action_goal ──▶ hub ── send_action_goal ──▶ server     with a key of the hub as id
+caller ◀── action_feedback ─── hub ◀── action_feedback ─── server     any number, the oldest may be dropped
+caller ─ cancel_action_goal ─▶ hub ─ cancel_action_goal ─▶ server     a wish: the server still ends the goal
+caller ◀─── action_result ──── hub ◀─── action_result ──── server     once; from the hub if the server leaves
+"""
 
 import itertools
 from dataclasses import dataclass, field

@@ -164,7 +164,7 @@ class Graph:
         topic.latching = any(advertisement.latching for advertisement in topic.advertisements.values())
         if not topic.latching:
             self.latch(topic, None)
-        # Until a publisher or a subscriber names a type, a topic has none, so another one may follow the last publisher's.
+        # After its last publisher a topic may get another type, unless a subscriber has named the present one.
         if not topic.advertisements and not any(each.typed for each in topic.subscriptions.values()):
             topic.type = ""
         if not topic.advertisements and not topic.subscriptions:
