@@ -1,4 +1,4 @@
-"""Fragments of large messages: splitting and reassembly.
+r"""Fragments of large messages: splitting and reassembly.
 
     {"op":"fragment","id":"7","data":"{\"op\":\"publ","num":0,"total":2}
     {"op":"fragment","id":"7","data":"ish\",...}","num":1,"total":2}
