@@ -29,27 +29,24 @@ def boards_command(boards: int, directory: Path, settings: Settings, *, once: bo
     ]
 
 
-def service_command(
-    role: str, endpoint: Endpoint, settings: Settings, *, compiling_time: float, reprogram: bool
-) -> list[str]:
-    """Return the command of a service; boards may take `compiling_time` seconds more to compile their kernels."""
-    command = [*own_command(role), "--listen", str(endpoint)]
-    command += ["--deployment", str(settings.deployment), "--log-level", settings.log_level]
-    # settings without a value here come from the environment, which children inherit
-    command += _metrics(settings, role)
-    if role == "pcie-app":
-        command += ["--boards", ",".join(settings.boards)] if settings.boards else []
-        command += ["--stop", settings.stop] if settings.stop else []
-        command += ["--peer-timeout", str(settings.peer_timeout + compiling_time)]
-        command += ["--board-timeout", str(settings.board_timeout)]
-        command += ["--key-file", str(settings.key_file)] if settings.key_file else []
-        return [*command, "--reprogram"] if reprogram else command
-    command += ["--uri", settings.uri] if settings.uri else []
-    command += ["--ros-version", settings.ros_version, "--connect-timeout", str(settings.connect_timeout)]
-    command += ["--ca", str(settings.ca)] if settings.ca else []
-    if role == "publisher":
-        return [*command, "--seen-timeout", str(settings.seen_timeout)]
-    command += ["--first-data-timeout", str(settings.first_data_timeout)]
-    command += ["--message-bytes", str(settings.message_bytes)]
-    command += ["--topic-bytes", str(settings.topic_bytes)] if settings.topic_bytes else []
-    return [*command, "--queue", settings.queue] if settings.queue else command
+_SETTINGS = {
+    "subscriber": (
+        *("uri", "ca", "ros_version", "connect_timeout", "first_data_timeout"),
+        *("message_bytes", "topic_bytes", "queue"),
+    ),
+    "publisher": ("uri", "ca", "ros_version", "connect_timeout", "seen_timeout"),
+    "pcie-app": ("boards", "stop", "peer_timeout", "board_timeout", "key_file"),
+}
+"""Settings of a service besides those of all services. They become flags, so that `ps` shows them."""
+
+
+def service_command(role: str, endpoint: Endpoint, settings: Settings, *, reprogram: bool) -> list[str]:
+    """Return the command of a service."""
+    command = [*own_command(role), "--listen", str(endpoint), *_metrics(settings, role)]
+    for name in ("deployment", "log_level", *_SETTINGS[role]):
+        value = getattr(settings, name)
+        # without a value, the child takes that of the deployment as this process does
+        if value not in (None, ()):
+            text = ",".join(value) if isinstance(value, tuple) else str(value)
+            command += [f"--{name.replace('_', '-')}", text]
+    return [*command, "--reprogram"] if reprogram else command

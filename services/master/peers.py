@@ -234,14 +234,18 @@ class Peers:
         if text or self.directory is None:
             return Peer(role, endpoint_from(text, f"--{role}"), None)
         endpoint = endpoint_in(self.directory, role)
-        command = service_command(
-            role,
-            endpoint,
-            self._settings.model_copy(update={"boards": self.board_endpoints}),
-            compiling_time=self._compiling_time,
-            reprogram=self._boards is not None,  # only this run can have programmed its own boards
-        )
+        # only this run can have programmed its own boards
+        reprogram = role == "pcie-app" and self._boards is not None
+        command = service_command(role, endpoint, self._service_settings, reprogram=reprogram)
         return Peer(role, endpoint, Child(role, command, directory=self._run))
+
+    @property
+    def _service_settings(self) -> Settings:
+        """Settings of the services that this master starts or contains."""
+        peer_timeout = self._settings.peer_timeout + self._compiling_time
+        return self._settings.model_copy(
+            update={"boards": self.board_endpoints, "peer_timeout": peer_timeout}
+        )
 
     @property
     def _compiling_time(self) -> float:
@@ -280,13 +284,7 @@ class Peers:
         """With `--fused`, run each service as a task in this process."""
         from services.master.fused import fused_services
 
-        settings = self._settings.model_copy(
-            update={
-                "boards": self.board_endpoints,
-                "peer_timeout": self._settings.peer_timeout + self._compiling_time,
-                "run_directory": self.directory,
-            }
-        )
+        settings = self._service_settings.model_copy(update={"run_directory": self.directory})
 
         def to_master(role: str) -> Callable[[AnyRecord], None]:
             peer = self._by_role[role]

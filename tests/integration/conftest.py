@@ -466,36 +466,21 @@ def build_boat(directory: Path, *options: str, cells: int = 8, partitions: int =
     return build(ROOT / "casestudies/boat", directory, "--partitions", str(partitions), *size, *options)
 
 
-def made_once(tmp_path_factory, name: str, make: Callable[[Path], object]) -> Path:
+def the_boat(tmp_path_factory) -> Path:
     """A folder that the first of all workers makes; nobody changes it."""
     shared = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         shared = shared.parent
-    done = shared / f"{name}.done"
-    with (shared / f"{name}.lock").open("w") as lock:
+    folder, done = shared / "boat-8x8", shared / "boat-8x8.done"
+    with (shared / "boat-8x8.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not done.exists():
-            make(shared / name)
+            build_boat(folder)
             done.touch()
-    return shared / name
-
-
-def the_boat(tmp_path_factory) -> Path:
-    return made_once(tmp_path_factory, "boat-8x8", build_boat)
+    return folder
 
 
 @pytest.fixture(scope="session")
 def boat(tmp_path_factory):
     """The boat on 8 x 8 cells, four boards."""
     return the_boat(tmp_path_factory)
-
-
-@pytest.fixture(scope="session")
-def other_boat(tmp_path_factory):
-    """The boat with other tables, another target, and the first two readings in each other's column."""
-
-    def make(folder: Path) -> None:
-        build_boat(folder, "--scale", "column", "--target-count", "100")
-        toolchain("regenerate", "deployment", folder, "--order", "D2,D1,D3,B1,B2,B3")
-
-    return made_once(tmp_path_factory, "other-boat", make)

@@ -73,7 +73,6 @@ async def robot(uri):
     ("key", "flags", "environment", "said"),
     [
         pytest.param("topic_bytes = 100000", ("--fused",), {}, "", marks=pytest.mark.process),
-        pytest.param("", ("--topic-bytes", "100000"), {}, "", marks=pytest.mark.thorough),
         pytest.param(
             "topic_bytes = 3000000", (), {"BM_TOPIC_BYTES": "100000"}, "", marks=pytest.mark.thorough
         ),

@@ -109,9 +109,6 @@ def board(counts, cycles, reasons) -> BoardResult:
     return BoardResult(words, max(cycles), reasons[0], tuple(cycles), tuple(reasons))
 
 
-OVERFLOW, SLICE, IMPOSSIBLE = StopReason.OVERFLOW, StopReason.SLICE, StopReason.IMPOSSIBLE
-
-
 def test_posteriors_are_normalised_over_boards_and_by_replica():
     # lines 0 and 1 on one board, line 2 on another; the last replica has no posterior
     counted = result(
