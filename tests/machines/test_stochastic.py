@@ -49,7 +49,7 @@ def exact(machine):
 
 
 @pytest.mark.parametrize("kind", [RngKind.LFSR24, RngKind.LFSR32])
-@pytest.mark.parametrize("columns", [2, 3, 4, 5, 7, 17, 21])
+@pytest.mark.parametrize("columns", [3, 5, 7, 17])
 def test_the_and_of_columns_is_the_product_within_its_standard_error(kind, columns):
     """Numbers of columns that divide the period are the ones that evenly spaced seeds would fail at."""
     shares = np.linspace(0.3, 0.9, 12) ** (2 / columns)

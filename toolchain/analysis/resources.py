@@ -89,11 +89,7 @@ def estimate(parameters: BM1Parameters, device: Device, *, table_length: int = L
 
 
 def boards_needed(
-    parameters: BM1Parameters,
-    device: Device,
-    *,
-    largest_lines: int = 4096,
-    table_length: int = LENGTH,
+    parameters: BM1Parameters, device: Device, *, largest_lines: int = 4096, table_length: int = LENGTH
 ) -> tuple[int, str]:
     """Return the minimum number of boards for a machine, and the reason as a sentence, or raise a BuildError."""
 

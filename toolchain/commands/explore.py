@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 from machines.parameters import RngKind
-from toolchain.commands.flags import (
-    Bits,
-    MaxCycles,
-    ModelFlags,
-    Partitions,
-    ReadingFlags,
-    StopWhen,
-)
+from toolchain.commands.flags import Bits, MaxCycles, ModelFlags, Partitions, ReadingFlags, StopWhen
 from toolchain.commands.progress import progress
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
