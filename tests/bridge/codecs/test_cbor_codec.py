@@ -7,7 +7,7 @@ import cbor2
 import numpy as np
 import pytest
 
-from bridge.codecs.cbor_codec import TYPED_ARRAYS, decode, encode, typed_array
+from bridge.codecs.cbor_codec import TYPED_ARRAYS, decode, encode, typed_array, with_arrays, with_lists
 from bridge.errors import DecodeError, EncodeError
 
 FORMATS = {69: "H", 70: "I", 71: "Q", 72: "b", 77: "h", 78: "i", 79: "q", 85: "f", 86: "d"}
@@ -157,3 +157,34 @@ def test_typed_arrays_of_anything():
     for values, elements in [([1], "f2"), ([300], "u1"), (["a"], "f8"), ([1.5], "i4"), (5, "f8")]:
         with pytest.raises(EncodeError):
             typed_array(values, elements)
+
+
+def test_lists_of_numbers_become_arrays():
+    message = with_arrays(
+        {
+            "floats": [1.5, 2, None],
+            "ints": [1, -2],
+            "large": [2**64 - 1, 0],
+            "beyond": [2**64 - 1, -1],
+            "texts": ["a"],
+            "flags": [True, False],
+            "nulls": [None],
+            "gaps": [1, None],
+            "empty": [],
+            "deep": [{"x": [1.5]}, [2.5, 3.5]],
+            "text": "abc",
+        }
+    )
+    floats = message["floats"]
+    assert (floats.dtype, floats[:2].tolist(), math.isnan(floats[2])) == (np.float64, [1.5, 2.0], True)
+    assert (message["ints"].dtype, message["ints"].tolist()) == (np.int64, [1, -2])
+    assert (message["large"].dtype, message["large"].tolist()) == (np.uint64, [2**64 - 1, 0])
+    assert message["deep"][0]["x"].tolist() == [1.5]
+    assert message["deep"][1].tolist() == [2.5, 3.5]
+    left = {"beyond", "texts", "flags", "nulls", "gaps", "empty"}
+    assert {name for name in message if isinstance(message[name], list)} == left | {"deep"}
+
+
+def test_arrays_become_lists():
+    message = {"a": np.array([1.5]), "b": [{"c": np.array([1, 2], np.uint8)}], "d": 1, "e": [np.array([3])]}
+    assert with_lists(message) == {"a": [1.5], "b": [{"c": b"\x01\x02"}], "d": 1, "e": [[3]]}
