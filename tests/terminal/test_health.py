@@ -1,6 +1,6 @@
 """The status socket: one JSON object per connection, only for its user, with hostile clients and servers.
 
-is_ready, read_status ──▶ NAME.status.sock ◀── serve_health (in a loop, or in_thread of a blocking process)
+is_ready, read_status ──▶ NAME.status.sock ◀── serve_health, in_thread of a blocking process
 """
 
 import asyncio
@@ -31,54 +31,22 @@ from terminal.health import (
 from tests.patience import PATIENCE
 
 
-class Server:
-    """A process's health, served from a thread or from the loop of one."""
-
-    def __init__(self, kind):
-        self.kind = kind
-
-    @contextlib.contextmanager
-    def serving(self, directory, status, name="board0"):
-        def answer():
-            return json.dumps(status).encode()
-
-        if self.kind == "thread":
-            with in_thread(lambda: serve_health(directory, name, answer)):
-                yield
-            return
-        loop = asyncio.new_event_loop()
-        begun, over = threading.Event(), asyncio.Event()
-
-        async def serve():
-            async with serve_health(directory, name, answer):
-                begun.set()
-                await over.wait()
-
-        thread = threading.Thread(target=loop.run_until_complete, args=(serve(),))
-        thread.start()
-        assert begun.wait(PATIENCE)
-        try:
-            yield
-        finally:
-            loop.call_soon_threadsafe(over.set)
-            thread.join(PATIENCE)
-            loop.close()
-
-
-@pytest.fixture(params=["thread", "loop"])
-def server(request):
-    return Server(request.param)
+@contextlib.contextmanager
+def serving(directory, status, name="board0"):
+    """A process's health, served from a thread."""
+    with in_thread(lambda: serve_health(directory, name, lambda: json.dumps(status).encode())):
+        yield
 
 
 def status(*, is_ready=True, why="programmed"):
     return {"ready": is_ready, "why": why}
 
 
-def test_every_connection_gets_one_object(server, tmp_path):
+def test_every_connection_gets_one_object(tmp_path):
     path = status_socket(tmp_path, "board0")
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(path)  # that of a killed process is replaced
-    with server.serving(tmp_path, status()), contextlib.ExitStack() as stack:
+    with serving(tmp_path, status()), contextlib.ExitStack() as stack:
         for _ in range(20):  # those that do not read keep nobody from asking
             stack.enter_context(socket.socket(socket.AF_UNIX)).connect(path)
         assert is_ready(path, PATIENCE) == (True, "programmed")
@@ -119,23 +87,23 @@ def test_a_client_that_goes_away_leaves_no_error_behind(tmp_path, new_loop):
     assert not failed  # the collector would report them
 
 
-def test_a_second_process_of_a_name_warns_and_leaves_it_to_the_first(server, tmp_path, capsys):
+def test_a_second_process_of_a_name_warns_and_leaves_it_to_the_first(tmp_path, capsys):
     path = status_socket(tmp_path, "board0")
-    with server.serving(tmp_path, status(why="first")):
-        with server.serving(tmp_path, status(why="second")):
+    with serving(tmp_path, status(why="first")):
+        with serving(tmp_path, status(why="second")):
             assert is_ready(path, PATIENCE)[1] == "first"
         assert is_ready(path, PATIENCE)[1] == "first"
     assert capsys.readouterr().err.count("warning") == 1
 
 
-def test_nothing_is_served_without_a_directory(server, tmp_path, monkeypatch):
+def test_nothing_is_served_without_a_directory(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with server.serving(None, status()):
+    with serving(None, status()):
         assert not list(tmp_path.iterdir())
 
 
 def test_the_thread_takes_no_signals(tmp_path):
-    with Server("thread").serving(tmp_path, status()):
+    with serving(tmp_path, status()):
         thread = [each for each in threading.enumerate() if each.name == "status"][-1]  # others may end yet
         lines = Path(f"/proc/self/task/{thread.native_id}/status").read_text().splitlines()
         blocked = next(line.split()[1] for line in lines if line.startswith("SigBlk"))
@@ -201,7 +169,7 @@ def test_silence_has_a_reason(tmp_path):
 @pytest.mark.parametrize("flag", [["--run-directory", "{}"], ["--run-directory={}"], []])
 def test_the_exit_code_is_the_health(tmp_path, capsys, monkeypatch, is_ready, flag):
     monkeypatch.setenv("BM_RUN_DIRECTORY", "" if flag else str(tmp_path))
-    with Server("thread").serving(tmp_path, status(is_ready=is_ready, why="here"), "master"):
+    with serving(tmp_path, status(is_ready=is_ready, why="here"), "master"):
         assert ready.main([*(part.format(tmp_path) for part in flag), "master"]) == (not is_ready)
     assert capsys.readouterr().out == "master: here\n"
 

@@ -27,20 +27,9 @@ def test_what_is_not_printable_is_seen():
     assert one_line("an ordinary line: 3 °C, Ω, 日本") == "an ordinary line: 3 °C, Ω, 日本"
 
 
-@pytest.mark.parametrize(
-    ("value", "seen"),
-    [
-        ("", "''"),
-        (" ", "' '"),
-        ("a ", "'a '"),
-        ("a b", "a b"),
-        ("\x1b", r"'\x1b'"),
-        (7, "7"),
-        ("x" * 1000, "x" * 80 + "..."),
-    ],
-)
-def test_a_value_is_seen(value, seen):
-    assert shown(value) == seen
+def test_a_value_is_quoted_if_it_could_be_overlooked_and_cut_if_it_is_long():
+    seen = {"": "''", "a ": "'a '", "a b": "a b", "\x1b": r"'\x1b'", 7: "7", "x" * 1000: "x" * 80 + "..."}
+    assert {value: shown(value) for value in seen} == seen
 
 
 def test_a_message_is_one_line(capsys):
