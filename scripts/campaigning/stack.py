@@ -129,7 +129,7 @@ class Stack:
         if role in BOARD_NAMES:
             endpoint, index = f"tcp://127.0.0.1:{self._board_ports[role][1]}", role.removeprefix("board")
             if misbehave:
-                return ["python", "-m", "tests.pcie_shim.misbehaving", endpoint, index, misbehave]
+                return ["python", "-m", "tests.misbehaving_board", endpoint, index, misbehave]
             return ["board", "--listen", endpoint, "--index", index]
         if role == "pcie-app":
             return [role, *deployment, *listen, *boards, *limits]

@@ -20,8 +20,8 @@ from pcie_shim.endpoint import Endpoint
 from pcie_shim.host.frame import FrameInput
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, Partition, interface_words
+from tests.misbehaving_board import serve_misbehaving
 from tests.patience import PATIENCE
-from tests.pcie_shim.misbehaving import serve_misbehaving
 
 _PLACES: list[socket.socket] = []
 """Bound and never listening, until `free_places`."""

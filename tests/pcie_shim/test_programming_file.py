@@ -45,7 +45,8 @@ def test_an_image_comes_back(of, tmp_path):
     found = read_image(path)
     for field in dataclasses.fields(Image):
         assert getattr(found, field.name) == getattr(written, field.name)
-    assert found.image_hash == written.image_hash
+    assert found.image_hash == written.image_hash == manifest_of(path.read_bytes())["image_hash"]
+    assert manifest_of(path.read_bytes())["emulated"] is True
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -147,15 +148,9 @@ def _section(shape, **others):
 @pytest.mark.parametrize(
     "change",
     [
-        _section([0, 10**30]),
-        _section([0, 2**31, 2**31, 2**31]),
-        _section([0, 8]),
-        _section([-1, 8]),
-        _section([1] * 100),
-        _section([1, 8], dtype="<u8"),
-        _section([1, 8], dtype="O"),
-        _section([1, 8], name="column 1"),
-        lambda identity: identity["sections"].pop(),
+        _section([0, 10**30]), _section([0, 2**31, 2**31, 2**31]), _section([0, 8]), _section([-1, 8]),
+        _section([1] * 100), _section([1, 8], dtype="<u8"), _section([1, 8], dtype="O"),
+        _section([1, 8], name="column 1"), lambda identity: identity["sections"].pop(),
         lambda identity: identity["sections"].clear(),
         lambda identity: identity["sections"].append(identity["sections"][0]),
         lambda identity: identity["parameters"].update(lines=2**32 - 1),
@@ -165,7 +160,7 @@ def _section(shape, **others):
         lambda identity: identity["partition"].update(total_lines=10**30),
         lambda identity: identity["interface"].update(results=10**30),
     ],
-)
+)  # fmt: skip
 def test_a_crafted_manifest_is_refused_before_anything_is_allocated(change):
     """A file whose hashes are right and whose sizes are not those of its parameters."""
     content = image_bytes(image(machine(1)))

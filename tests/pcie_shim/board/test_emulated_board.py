@@ -117,31 +117,20 @@ def test_capabilities_are_the_images():
 @pytest.mark.parametrize(
     ("address", "count", "code"),
     [
-        (rm.ID + 2, 1, ErrorCode.MISALIGNED),
-        (rm.RESUME + 4, 1, ErrorCode.OUTSIDE),
-        (rm.OUTCOMES, 1, ErrorCode.OUTSIDE),
-        (rm.PRIOR_SELECTS, 1, ErrorCode.OUTSIDE),
-        (rm.BAR_SIZE, 1, ErrorCode.OUTSIDE),
-        (0xFFFFFFFC, 1, ErrorCode.OUTSIDE),
-        (rm.ID, 0, ErrorCode.OUTSIDE),
-        (rm.ID, 5, ErrorCode.TOO_LONG),
-        (rm.ID, 0xFFFFFFFF, ErrorCode.TOO_LONG),
-        (rm.SENSORS, 21, ErrorCode.TOO_LONG),
-        (rm.RESULTS, 1201, ErrorCode.TOO_LONG),
-        (rm.RESULTS + 4 * 1200, 1, ErrorCode.OUTSIDE),
-        (rm.PRIOR_CODES, 1, ErrorCode.OUTSIDE),
-        (rm.BAR_SIZE - 4, 2, ErrorCode.OUTSIDE),
+        (rm.ID + 2, 1, ErrorCode.MISALIGNED), (rm.RESUME + 4, 1, ErrorCode.OUTSIDE),
+        (rm.OUTCOMES, 1, ErrorCode.OUTSIDE), (rm.PRIOR_SELECTS, 1, ErrorCode.OUTSIDE),
+        (rm.BAR_SIZE, 1, ErrorCode.OUTSIDE), (0xFFFFFFFC, 1, ErrorCode.OUTSIDE),
+        (rm.ID, 0, ErrorCode.OUTSIDE), (rm.ID, 5, ErrorCode.TOO_LONG),
+        (rm.ID, 0xFFFFFFFF, ErrorCode.TOO_LONG), (rm.SENSORS, 21, ErrorCode.TOO_LONG),
+        (rm.RESULTS, 1201, ErrorCode.TOO_LONG), (rm.RESULTS + 4 * 1200, 1, ErrorCode.OUTSIDE),
+        (rm.PRIOR_CODES, 1, ErrorCode.OUTSIDE), (rm.BAR_SIZE - 4, 2, ErrorCode.OUTSIDE),
         (rm.TARGET_COUNT + 1, bytes(4), ErrorCode.MISALIGNED),
-        (rm.RESUME + 4, bytes(4), ErrorCode.OUTSIDE),
-        (rm.SENSORS, b"", ErrorCode.OUTSIDE),
-        (rm.START, bytes(12), ErrorCode.TOO_LONG),
-        (rm.SENSORS, bytes(84), ErrorCode.TOO_LONG),
-        (rm.ID, bytes(4), ErrorCode.READ_ONLY),
-        (rm.RESULTS, bytes(4), ErrorCode.READ_ONLY),
-        (rm.DONE, bytes(4), ErrorCode.READ_ONLY),
-        (rm.LIVENESS, bytes(8), ErrorCode.READ_ONLY),
+        (rm.RESUME + 4, bytes(4), ErrorCode.OUTSIDE), (rm.SENSORS, b"", ErrorCode.OUTSIDE),
+        (rm.START, bytes(12), ErrorCode.TOO_LONG), (rm.SENSORS, bytes(84), ErrorCode.TOO_LONG),
+        (rm.ID, bytes(4), ErrorCode.READ_ONLY), (rm.RESULTS, bytes(4), ErrorCode.READ_ONLY),
+        (rm.DONE, bytes(4), ErrorCode.READ_ONLY), (rm.LIVENESS, bytes(8), ErrorCode.READ_ONLY),
     ],
-)
+)  # fmt: skip
 def test_accesses_outside_the_map_are_refused(board, address, count, code):
     """Reads of so many words, and writes of these bytes."""
     with refused(code):
@@ -348,16 +337,10 @@ def test_only_a_slice_can_be_resumed(board):
 @pytest.mark.parametrize(
     "bad",
     [
-        {"addresses": (8, 0)},
-        {"target": 0},
-        {"target": 256},
-        {"max_cycles": 0},
-        {"max_cycles": 2**63},
-        {"bank": 16},
-        {"prior": 1},
-        {"until": 2**63},
+        {"addresses": (8, 0)}, {"target": 0}, {"target": 256}, {"max_cycles": 0}, {"max_cycles": 2**63},
+        {"bank": 16}, {"prior": 1}, {"until": 2**63},
     ],
-)
+)  # fmt: skip
 def test_impossible_values_are_refused_at_the_start(board, bad):
     with refused(ErrorCode.BAD_VALUE):
         start(board, *bad.pop("addresses", (1, 1)), **bad)

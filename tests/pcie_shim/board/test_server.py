@@ -22,8 +22,10 @@ from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.endpoint import connect, listen, parse_endpoint
 from pcie_shim.errors import (
     AccessError,
+    DamagedImageError,
     EndpointError,
     HeldError,
+    ImageError,
     ImageMismatchError,
     LinkClosedError,
 )
@@ -252,6 +254,14 @@ def test_a_host_that_breaks_the_protocol_loses_its_link(start_board, nonsense):
         assert link.read32(rm.ID) == rm.ID_VALUE
 
 
+def test_the_host_hears_why_its_link_was_closed(start_board):
+    with open_link(start_board()) as link:
+        link._sequence += 1
+        with pytest.raises(AccessError):
+            link.read32(rm.ID)
+        assert not link.is_open
+
+
 # ---- starting and stopping ----
 
 
@@ -417,3 +427,28 @@ def test_a_host_that_opens_the_board_during_a_transfer_keeps_it(start_board):
         with pytest.raises(HeldError):
             loader.request(framing.PROGRAM, framing.END, len(content), 0)
         assert host.read_block(rm.IMAGE_HASH, 8) == bytes(32)
+
+
+# ---- the loader ----
+
+
+def test_a_damaged_or_missing_file_is_refused_before_the_board_is_touched(folder):
+    nowhere = f"unix:{folder}/nobody.sock"
+    path = folder / "board0.bm"
+    with pytest.raises(ImageError):
+        program(nowhere, path)
+    path.write_bytes(image_bytes(image(machine(1)))[:-2] + b"xx")
+    with pytest.raises(DamagedImageError):
+        program(nowhere, path)
+
+
+def test_a_board_that_does_not_become_what_was_loaded_is_an_error(start_board, monkeypatch):
+    board = start_board()
+    good = SocketLink.read_block
+
+    def other(link, address, count):
+        return bytes(4 * count) if address == rm.IMAGE_HASH else good(link, address, count)
+
+    monkeypatch.setattr(SocketLink, "read_block", other)
+    with pytest.raises(ImageMismatchError):
+        program(board.endpoint, image(machine(1)))

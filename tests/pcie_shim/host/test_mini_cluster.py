@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from machines.bm1 import StopReason
 from machines.parameters import PriorMode
 from pcie_shim import register_map as rm
+from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import (
     BoardGoneError,
@@ -149,20 +150,11 @@ def test_an_output_says_how_each_board_ended_and_where_the_time_went(cluster, mo
 @pytest.mark.parametrize(
     "bad",
     [
-        {"target_count": 0},
-        {"target_count": 256},
-        {"max_cycles": 0},
-        {"bank": 16},
-        {"bank": -1},
-        {"prior_address": 1},
-        {"prior_address": (0, 0)},
-        {"prior_codes": np.zeros(17, np.uint16)},
-        {"stop": "line"},
-        {"addresses": (1,)},
-        {"addresses": (8, 0)},
-        {"addresses": (0, -1)},
+        {"target_count": 0}, {"target_count": 256}, {"max_cycles": 0}, {"bank": 16}, {"bank": -1},
+        {"prior_address": 1}, {"prior_address": (0, 0)}, {"prior_codes": np.zeros(17, np.uint16)},
+        {"stop": "line"}, {"addresses": (1,)}, {"addresses": (8, 0)}, {"addresses": (0, -1)},
     ],
-)
+)  # fmt: skip
 def test_a_frame_that_does_not_fit_is_refused(cluster, bad):
     given_frame = {"addresses": (1, 1), "target_count": 5, "max_cycles": 10} | bad
     with pytest.raises(FrameInputError) as caught:
@@ -340,19 +332,14 @@ OWN = {"stop": "own"}
 @pytest.mark.parametrize(
     ("kind", "error", "on_opening"),
     [
-        ("drop", BoardSilentError, True),
-        ("stall", BoardSilentError, True),
-        ("never-done", BoardSilentError, False),
-        ("endless", BoardSilentError, True),
-        ("short-read", BoardLinkError, True),
-        ("wrong-sequence", BoardLinkError, True),
-        ("wrong-crc", BoardLinkError, True),
-        ("done-twice", BoardLinkError, False),
-        ("done-early", BoardLinkError, False),
-        ("stale-result", BoardLinkError, False),
+        ("drop", BoardSilentError, True), ("stall", BoardSilentError, True),
+        ("never-done", BoardSilentError, False), ("endless", BoardSilentError, True),
+        ("short-read", BoardLinkError, True), ("wrong-sequence", BoardLinkError, True),
+        ("wrong-crc", BoardLinkError, True), ("done-twice", BoardLinkError, False),
+        ("done-early", BoardLinkError, False), ("stale-result", BoardLinkError, False),
         ("all-ones", BoardGoneError, True),
     ],
-)
+)  # fmt: skip
 def test_a_misbehaving_board_fails_the_frame_and_comes_back(start_board, clock, kind, error, on_opening):
     boards = [start_board(index=0), start_board(index=1, misbehave=f"{kind}:1:1"), start_board(index=2)]
     parts = images(70, (3, 2, 2))
@@ -510,6 +497,22 @@ def test_a_frame_that_fails_leaves_boards_that_can_be_used_again(boards, breaks,
         assert outcome(cluster.run(frame(bank=5))) == expected(parts, frame(bank=5))
 
 
+def test_doorbell_numbers_go_round(start_board, monkeypatch):
+    good = EmulatedBoard.load
+
+    def load(board, content):
+        good(board, content)
+        board.done = 0xFFFFFFFD
+        board.reset()
+
+    monkeypatch.setattr(EmulatedBoard, "load", load)
+    parts = images(97, (3,))
+    with MiniCluster.open([start_board().endpoint], parts) as cluster:
+        for number in (0xFFFFFFFE, 0xFFFFFFFF, 1, 2):
+            assert outcome(cluster.run(frame(stop="own"))) == expected(parts, frame(stop="own"))
+            assert cluster._boards[0].number == number
+
+
 def test_an_interrupted_opening_leaves_boards_that_can_be_opened(boards, monkeypatch):
     open_board = DrivenBoard.open
 
@@ -524,3 +527,11 @@ def test_an_interrupted_opening_leaves_boards_that_can_be_opened(boards, monkeyp
             MiniCluster.open(endpoints_of(boards), parts)
     with MiniCluster.open(endpoints_of(boards), parts) as cluster:
         assert outcome(cluster.run(frame())) == expected(parts, frame())
+
+
+def test_a_closed_cluster_runs_nothing(boards):
+    cluster = MiniCluster.open(endpoints_of(boards), images(1, (3, 2)))
+    cluster.close()
+    cluster.close()
+    with pytest.raises(BoardGoneError):
+        cluster.run(frame())

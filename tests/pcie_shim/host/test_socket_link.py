@@ -97,6 +97,14 @@ def test_an_interrupt_without_all_its_registers_closes_the_link(folder, words):
             link.take_done()
 
 
+def test_an_interrupt_without_results_is_taken(folder):
+    with linked(folder) as (link, board):
+        for sequence in (1, 2):
+            board.sendall(interrupt(sequence, DONE_BLOCK.pack(7, 5, 2**40 + 1, 2**33)))
+            assert link.receive_done() == (7, 5, 2**40 + 1, 2**33, b"")
+            assert link.take_done() is None
+
+
 @pytest.mark.parametrize(
     ("number", "status", "gone"), [(ALL_ONES, ALL_ONES, True), (ALL_ONES, 5, False), (7, ALL_ONES, False)]
 )

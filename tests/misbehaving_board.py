@@ -1,4 +1,4 @@
-"""Boards that misbehave: `python -m tests.pcie_shim.misbehaving ENDPOINT INDEX KIND[:AFTER[:TIMES]]` serves one.
+"""Boards that misbehave: `python -m tests.misbehaving_board ENDPOINT INDEX KIND[:AFTER[:TIMES]]` serves one.
 
 The board misbehaves after AFTER successful starts and resumes (0: from the opening on), for TIMES answers (0: forever).
 """
