@@ -153,7 +153,7 @@ class Topics:
                 return index
             if topic.subscriptions or topic.latching:
                 try:
-                    if filler is not None:
+                    if filler is not None and (filler.parts or len(parsed) != filler.count):
                         tail = filler.fill(parsed, room)
                         # With white space between the last braces, the tail has no place.
                         if tail is None or (tail and data[-2] != BRACE):
@@ -173,8 +173,8 @@ class Topics:
         self, topic: Topic, parsed: dict[str, Any], payload: bytes, prefix: bytes, now: float
     ) -> None:
         """Deliver a message, which is in `payload` as JSON, after a prefix and before a brace."""
-        size = len(payload) - len(prefix) - 1
-        dispatcher = self._dispatcher
+        begin, dispatcher, subscriptions = len(prefix), self._dispatcher, topic.subscriptions
+        size = len(payload) - begin - 1
         # Rewriting can lengthen a message (1e15 becomes 1000000000000000.0).
         if size > topic.largest:
             raise RefusedOperationError(
@@ -184,15 +184,15 @@ class Topics:
         if topic.latching:
             room = self._limits.latched_bytes - self._graph.latched_bytes + len(topic.latched or b"")
             self._graph.latch(topic, payload[len(prefix) : -1] if size <= room else None)
-        dispatcher.work += _MESSAGE_WORK + 2 * len(topic.subscriptions)
+        dispatcher.work += _MESSAGE_WORK + 2 * len(subscriptions)
         # Subscribers that use the same name for the topic share one payload.
         message: OutgoingMessage | None = None
-        for subscription in topic.subscriptions.values():
+        for client, subscription in subscriptions.items():
             if subscription.compression is _PLAIN:
                 if subscription.prefix != prefix:
                     payload = subscription.prefix + payload[len(prefix) :]
                     prefix = subscription.prefix
-                client, lane = subscription.client, subscription.lane
+                lane = subscription.lane
                 client.outbox.offer(lane, payload, now)
                 if lane.throttle:
                     dispatcher.schedule_release(client)
