@@ -82,21 +82,19 @@ async def soon(awaited: Awaitable[Result], what: str) -> Result:
         raise StackError(f"{what} did not come within {LIMIT:.0f} s") from None
 
 
-def frame(operation: dict[str, Any]) -> bytes:
-    """Return a masked frame (with a mask of zeros)."""
-    return frame_of(json.dumps(operation, separators=(",", ":")).encode())
-
-
-def frame_of(payload: bytes) -> bytes:
-    """Return a masked frame of bytes."""
-    size = len(payload)
+def frame(operation: dict[str, Any] | bytes) -> bytes:
+    """Return a masked frame (with a mask of zeros) of an operation, or of its encoded form."""
+    encoded = (
+        operation if isinstance(operation, bytes) else json.dumps(operation, separators=(",", ":")).encode()
+    )
+    size = len(encoded)
     if size < 126:
         header = bytes((0x81, 0x80 | size))
     elif size < 1 << 16:
         header = b"\x81\xfe" + size.to_bytes(2, "big")
     else:
         header = b"\x81\xff" + size.to_bytes(8, "big")
-    return header + bytes(4) + payload
+    return header + bytes(4) + encoded
 
 
 def advertise(topic: str, kind: str = TYPE) -> bytes:

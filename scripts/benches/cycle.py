@@ -207,20 +207,15 @@ def show(all_: dict[str, Measured], seed: int, arguments: argparse.Namespace) ->
         "99 %, us": {name: quantile(each.times["cycle"], 0.99) for name, each in all_.items()},
         "frames a second": {name: each.per_second for name, each in all_.items()},
     }
-    for stage in STAGES:
-        rows[f"{stage.replace('_', ' ')}, us"] = {name: medians[name][stage] for name in STACKS}
-    for command in sorted({command for each in all_.values() for command in each.cpu}):
-        rows[f"CPU of {command}, us"] = {
-            name: each.cpu[command] for name, each in all_.items() if command in each.cpu
-        }
-    ratios = {
-        "median / (floor + compute)": {
-            name: medians[name]["cycle"] / (floor + medians[name]["compute"]) for name in STACKS
-        },
-        "(median - compute) / floor": {
-            name: (medians[name]["cycle"] - medians[name]["compute"]) / floor for name in STACKS
-        },
-    }
+    ratios: dict[str, dict[str, float]] = {"median / (floor + compute)": {}, "(median - compute) / floor": {}}
+    for name in STACKS:
+        cycle, compute = medians[name]["cycle"], medians[name]["compute"]
+        ratios["median / (floor + compute)"][name] = cycle / (floor + compute)
+        ratios["(median - compute) / floor"][name] = (cycle - compute) / floor
+        for stage in STAGES:
+            rows.setdefault(f"{stage.replace('_', ' ')}, us", {})[name] = medians[name][stage]
+        for command, used in all_[name].cpu.items():
+            rows.setdefault(f"CPU of {command}, us", {})[name] = used
     table = Table(title=f"one cycle, {arguments.frames} frames, 32 x 32 cells on four boards")
     for column in ("", *all_):
         table.add_column(column, justify="right" if column else "left")

@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bridge.client import connect
-from scripts.benches.bare import Bare, advertise, bare, frame, frame_of, publish, settled, subscribe
+from scripts.benches.bare import Bare, advertise, bare, frame, publish, settled, subscribe
 from scripts.benches.cycle import BOAT_FLAGS, WINDOW, message, processes_of, quantile, readings
 from scripts.running.flags import ScriptParser, output_file
 from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
@@ -152,7 +152,7 @@ ATTACKS = {
         pause=1.0,
         reads=False,
     ),
-    "empty arrays": Attack(advertise("/deep"), frame_of(EMPTY_ARRAYS), 0.1),
+    "empty arrays": Attack(advertise("/deep"), frame(EMPTY_ARRAYS), 0.1),
     "listings": Attack(
         b"".join(advertise(f"/listed/{at}") for at in range(4000)), call("/rosapi/topics") * 8
     ),

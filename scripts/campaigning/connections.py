@@ -105,29 +105,26 @@ class Proxy:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        task = asyncio.current_task()
-        assert task is not None
+    def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.create_task(self._pass(reader, writer))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
-        try:
-            await self._pass(reader, writer)
-        except (asyncio.CancelledError, OSError):
-            writer.transport.abort()
 
     async def _pass(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if isinstance(self._connect, int):
-            onwards = await asyncio.open_connection("127.0.0.1", self._connect)
-        else:
-            onwards = await asyncio.open_unix_connection(self._connect)
-        both = {writer, onwards[1]}
-        self._writers |= both
-        pumps = {
-            asyncio.ensure_future(self._pump(reader, onwards[1], to_client=False)),
-            asyncio.ensure_future(self._pump(onwards[0], writer, to_client=True)),
-        }
+        both = {writer}
+        pumps: list[asyncio.Task[None]] = []
         try:
+            if isinstance(self._connect, int):
+                onwards = await asyncio.open_connection("127.0.0.1", self._connect)
+            else:
+                onwards = await asyncio.open_unix_connection(self._connect)
+            both.add(onwards[1])
+            self._writers |= both
+            pumps.append(asyncio.create_task(self._pump(reader, onwards[1], to_client=False)))
+            pumps.append(asyncio.create_task(self._pump(onwards[0], writer, to_client=True)))
             await asyncio.wait(pumps, return_when=asyncio.FIRST_COMPLETED)
+        except OSError:
+            writer.transport.abort()
         finally:
             for pump in pumps:
                 pump.cancel()

@@ -208,8 +208,7 @@ class Observer:
 
     def _read_report(self, message: Any) -> _Announced | None:
         stamp = message["header"]["stamp"]
-        stamp_ns = (stamp.get("secs", 0) or stamp.get("sec", 0)) * 10**9
-        stamp_ns += stamp.get("nsecs", 0) or stamp.get("nanosec", 0)
+        stamp_ns = stamp["secs"] * 10**9 + stamp["nsecs"]  # the stack runs as with ROS 1
         first, *others = message["status"]
         values = {pair["key"]: pair["value"] for pair in first["values"]}
         number = int(values["number"])
