@@ -15,6 +15,7 @@ _USAGE = "usage: python -m services.ready NAME [--run-directory DIR]"
 def main(arguments: list[str]) -> int:
     """Return 0 if the process is ready, otherwise 1, also for a usage error (container engines reserve 2)."""
     directory = os.environ.get("BM_RUN_DIRECTORY", "")
+    # by hand: typer takes ten times as long to import as the check itself
     names: list[str] = []
     rest = iter(arguments)
     for argument in rest:
@@ -34,6 +35,7 @@ def main(arguments: list[str]) -> int:
         print("no run directory was given: set BM_RUN_DIRECTORY, or give --run-directory DIR")
         return 1
     (name,) = names
+    # one sentence in any case: a container engine keeps it as the log of the check
     try:
         ready, why = is_ready(status_socket(directory, name), _TIMEOUT)
     except NoHealthError as error:

@@ -131,6 +131,7 @@ class Settings(BaseSettings):
     @field_validator("boards", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
+        # commas as in a flag, also in a variable, where pydantic would expect JSON
         if isinstance(value, str):
             return tuple(part.strip() for part in value.split(",") if part.strip())
         return value
@@ -184,6 +185,7 @@ def load_settings(**flags: Any) -> Settings:
             )
     # flags that were not given leave their variables in force
     given = {name: value for name, value in flags.items() if value is not None and value != ()}
+    # of several mistakes the first is reported: the others may follow from it
     try:
         settings = Settings(**given)
     except ValidationError as error:

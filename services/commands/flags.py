@@ -15,6 +15,7 @@ def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., i
 
     def load(**flags: Any) -> Settings:
         end_with_parent()  # first, because the parent may have ended already
+        # None means not given, so that its variable holds
         return load_settings(**flags)
 
     def decorate(command: Callable[..., int]) -> Callable[..., int]:

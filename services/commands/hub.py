@@ -1,5 +1,7 @@
-"""The command `hub`."""
+"""The command `hub`: the embedded rosbridge server with status socket, metrics and announcement."""
 
+import asyncio
+import logging
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -7,14 +9,19 @@ import typer
 
 from bridge.codecs.json_codec import MAX_SIZE
 from bridge.hub.access import AccessPolicy, is_loopback, read_tokens, tls_context
+from bridge.hub.graph import Graph
 from bridge.hub.limits import HubLimits
+from bridge.hub.server import serve_hub
 from services.commands import flags as options
 from services.errors import SettingsError
-from services.hub_process import serve
 from services.settings import Settings
-from services.sockets.reporting import check_metrics
+from services.sockets.reporting import check_metrics, serve_status
+from services.sockets.status import HubStatus, ProcessStatus
 from terminal.command_line import CommandLine
+from terminal.logs import log_libraries
 from terminal.one_line import shown
+from terminal.output import say
+from terminal.run_directory import status_directory
 from terminal.signals import run_async
 
 app = CommandLine(
@@ -89,12 +96,14 @@ def hub(
         )
 
     return run_async(
-        serve(
+        _serve(
             host,
             port,
             access=access,
-            message_bytes=message_bytes,
-            clients=clients,
+            # room for several of the largest messages to a client that reads slowly
+            limits=HubLimits(
+                message_bytes=message_bytes, clients=clients, client_bytes=4 * max(message_bytes, MAX_SIZE)
+            ),
             ros_version=2 if ros_version == "2" else 1,
             announce=announce,
             settings=settings,
@@ -121,3 +130,68 @@ def _access_policy(
         tokens=read_tokens(tokens) if tokens is not None else (),
         origins=tuple(origins),
     )
+
+
+async def _serve(
+    host: str,
+    port: int,
+    *,
+    access: AccessPolicy,
+    limits: HubLimits,
+    ros_version: Literal[1, 2],
+    announce: str | None,
+    settings: Settings,
+) -> int:
+    """Serve rosbridge until cancelled; `port` 0 selects a free one, `announce` is the name on the network."""
+    # a refused client gets no explanation, as from the reference server; the reason is only in the log
+    log_libraries(logging.WARNING, "hub: %(message)s")
+    # The port, once the hub listens; and its graph, which exists from then on.
+    listening = asyncio.get_running_loop().create_future()
+    graphs: list[Graph] = []
+    scheme, address = "wss" if access.tls else "ws", f"[{host}]" if ":" in host else host
+
+    def where() -> str:
+        return f"listening on {scheme}://{address}:{listening.result()}"
+
+    def on_ready(at: int) -> None:
+        listening.set_result(at)
+        say(f"hub: {where()}")
+
+    def status() -> ProcessStatus:
+        counts = [HubStatus(len(each.clients), len(each.topics), len(each.services)) for each in graphs]
+        why = where() if listening.done() else "not listening yet"
+        return ProcessStatus(ready=listening.done(), why=why, hub=counts[0] if counts else None)
+
+    async def announce_once_ready(name: str) -> None:
+        from bridge.discovery import announced
+
+        # not before the hub listens: whoever sees the announcement connects at once
+        tls, token = access.tls is not None, bool(access.tokens)
+        async with announced(name, host, await listening, ros_version=ros_version, tls=tls, token=token):
+            say(f"hub: announced as robot:{name}")
+            await asyncio.Event().wait()
+
+    hub = serve_hub(
+        host,
+        port,
+        access=access,
+        limits=limits,
+        ros_version=ros_version,
+        on_ready=on_ready,
+        on_graph=graphs.append,
+        stop=asyncio.Event(),
+    )
+    directory = status_directory(settings.run_directory, "hub")
+    async with serve_status(directory, "hub", status, metrics=settings.metrics):
+        announcing = None if announce is None else asyncio.ensure_future(announce_once_ready(announce))
+        tasks = [asyncio.ensure_future(hub), *([announcing] if announcing else [])]
+        try:
+            # an announcement that fails ends the hub, since its users would wait in vain
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+    return 0

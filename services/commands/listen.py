@@ -62,6 +62,7 @@ def listen(
     if as_json and plot:
         raise SettingsError("--json and --plot both use standard output: give one of them")
     loaded = deployment_for(settings) if settings.deployment is not None else None
+    # the other outputs have the same posteriors
     output = loaded.outputs[0] if loaded is not None else None
     server = settings.uri or (
         loaded.output_uri(output) if loaded is not None and output is not None else None

@@ -60,6 +60,7 @@ def master(
                 f"--connect {connect} is not a folder; name the one with the sockets of the running services"
             )
         # as if each had been given by its own variable
+        # a flag, so it replaces the variables of the three endpoints
         services = {"subscriber": "subscriber", "publisher": "publisher", "pcie_app": "pcie-app"}
         settings = settings.model_copy(
             update={setting: str(endpoint_in(connect, name)) for setting, name in services.items()}
@@ -86,6 +87,7 @@ def master(
 def _check(settings: Settings) -> None:
     """Print that a run can start with these settings, or raise the error that would end it."""
     loaded = deployment_for(settings, images=True)
+    # a run would notice only after its processes have started
     if settings.boards:
         board_endpoints(settings, loaded)
     count = len(loaded.boards)

@@ -73,6 +73,7 @@ def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
 
 def printable(text: str) -> str:
     """Return received text without control characters, and shortened."""
+    # labels come over the wire: they must not fill the screen, nor control it
     text = text if len(text) <= _LABEL else text[: _LABEL - 3] + "..."
     return text if text.isprintable() else repr(text)
 

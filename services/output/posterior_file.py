@@ -62,6 +62,7 @@ def record(frame: FrameOutcome, axes: list[Axis]) -> dict[str, Any]:
             "cycles": frame.cycles,
             "outcome": frame.outcome,
         }
+    # names of states have no mean, and without a deployment there are only indices
     best, mean = frame.best(), frame.mean()
     known: dict[str, Any] = {}
     if any(axis.dimension for axis in axes):
@@ -143,6 +144,7 @@ class _CsvLines(_Lines):
         """Append one row, except for a frame without a posterior."""
         if not isinstance(frame, Posterior):
             return
+        # compared at every row: a stack that was started again may have another model
         columns = [
             *("frame", "stamp_ns", "cycles", "latency_us"),
             *(axis.label for axis in axes),
@@ -165,6 +167,7 @@ class _CsvLines(_Lines):
         )
 
     def _begin(self, columns: list[str]) -> None:
+        # columns go only into an empty file; rows of the same shape may be appended on another day
         if self._columns is None and not os.fstat(self._file).st_size:
             self._row(columns)
         else:

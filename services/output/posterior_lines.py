@@ -32,6 +32,7 @@ def line(frame: FrameOutcome, axes: list[Axis]) -> str:
     number = "-" if frame.number is None else str(frame.number)
     if not isinstance(frame, Posterior):
         return f"frame {number}: {frame.outcome if frame.outcome.isprintable() else repr(frame.outcome)}"
+    # replicas answer for themselves, so a mean over all of them says nothing
     if frame.replicas > 1:
         parts = [f"frame {number}: {frame.replicas} replicas"]
         parts += [_of_replica(frame, at, axes[1:]) for at in range(min(frame.replicas, _REPLICAS))]
@@ -77,6 +78,7 @@ def print_json(frame: FrameOutcome, axes: list[Axis]) -> None:
 @contextlib.contextmanager
 def drawing() -> Iterator[Show]:
     """Draw one picture that is updated on a terminal, and separate pictures elsewhere."""
+    # labels come from the robot's side, so neither brackets nor numbers in them are formatted
     console = Console(highlight=False, markup=False)
     colour = in_colour(console)
     rows = max(console.height - _WORDS, 2) if console.is_terminal else ROWS

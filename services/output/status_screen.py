@@ -187,6 +187,7 @@ def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
     """Return the columns received, completed, per second, last frame and lost."""
     if frames is None:
         return "", "", "", "", ""
+    # a subscriber knows no numbers, only the age
     number = "" if frames.last_number is None else f"{frames.last_number}, "
     last = "none yet" if frames.last_age_s is None else f"{number}{_duration(frames.last_age_s)} ago"
     counted = [f"{count} {plain(reason)}" for reason, count in frames.lost.items()]
@@ -224,6 +225,7 @@ async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) 
         elif live is not None:
             live.update(screen(stack), refresh=True)
         else:
+            # one screen after another, for a log
             console.print(screen(stack))
 
     if live is not None:
