@@ -19,6 +19,7 @@ from pcie_shim.programming_file import (
     build_date,
     image_bytes,
     image_from_bytes,
+    interface_room,
     read_image,
 )
 from tests.pcie_shim.boards import image, machine
@@ -184,11 +185,23 @@ def test_a_crafted_manifest_is_refused_before_anything_is_allocated(change):
 
 
 @pytest.mark.parametrize(
-    ("index", "count", "offset", "total"), [(1, 1, 0, 8), (-1, 1, 0, 8), (0, 1, 1, 8), (0, 1, -1, 8)]
+    ("index", "count", "offset", "total"),
+    [(1, 1, 0, 8), (-1, 1, 0, 8), (0, 1, 1, 8), (0, 1, -1, 8), (0, 1 << 16, 0, 8)],
 )
 def test_an_impossible_partition_is_refused(index, count, offset, total):
     with pytest.raises(ImageError):
         image(machine(1), index=index, count=count, offset=offset, total=total)
+
+
+def test_what_just_fits_is_accepted():
+    of = machine(1)
+    room = interface_room(of.parameters)
+    last = image(of, index=65534, count=65535, offset=92, total=100)
+    assert last.partition.line_offset == 100 - of.parameters.lines
+    largest = dataclasses.replace(last, interface_sensors=room[0], interface_results=room[1])
+    assert image_from_bytes(image_bytes(largest)).partition == last.partition
+    smallest = machine(1, lines=1, sensor_bits=(3,))
+    dataclasses.replace(image(smallest), interface_sensors=1, interface_results=1)
 
 
 def test_the_build_date_repeats_where_it_is_asked_to(monkeypatch):
