@@ -80,7 +80,7 @@ async def robot(uri):
             "",
             ("--message-bytes", "1000000"),
             {},
-            r"warning: .*/camera is left out",
+            r"/camera is left out: .* bytes",
             marks=pytest.mark.thorough,
         ),
     ],
