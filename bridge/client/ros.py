@@ -238,7 +238,7 @@ class Ros:
         """Return the transforms of `/tf` and `/tf_static`, which `async with` subscribes to."""
         from bridge.client.tf import Transforms  # needs NumPy
 
-        return Transforms(self)
+        return Transforms(self.subscribe)
 
     # Services
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, Self
 
@@ -10,7 +11,7 @@ from bridge.qos import Qos
 from bridge.transforms import Transform, TransformTree
 
 if TYPE_CHECKING:
-    from bridge.client.ros import Ros
+    from bridge.client.handles import Subscription
 
 _TYPE: Final = "tf2_msgs/TFMessage"
 _STATIC: Final = Qos(durability="transient_local", reliability="reliable")
@@ -25,9 +26,10 @@ class Transforms:
         tree: The frames received so far.
     """
 
-    def __init__(self, ros: "Ros") -> None:
+    def __init__(self, subscribe: "Callable[..., Subscription]") -> None:
+        """Take the client's method `subscribe`, not the client, which imports this module."""
         self.tree = TransformTree()
-        self._ros = ros
+        self._subscribe = subscribe
         # Set by each message; `lookup` clears it before it waits for the next.
         self._news = asyncio.Event()
         # One per topic, while the context is open; each owns its subscription.
@@ -51,7 +53,7 @@ class Transforms:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def _follow(self, topic: str, qos: Qos | None, *, static: bool) -> None:
-        async with self._ros.subscribe(topic, _TYPE, queue_size=_QUEUE, qos=qos) as messages:
+        async with self._subscribe(topic, _TYPE, queue_size=_QUEUE, qos=qos) as messages:
             async for message in messages:
                 self.tree.take(message.msg, static=static)
                 self._news.set()
