@@ -8,7 +8,6 @@ import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import TypeAlias
 
 import numpy as np
 
@@ -134,12 +133,8 @@ def opened(parts: Sequence[Image], *, tcp: bool = False) -> Iterator[MiniCluster
                 board.stop()
 
 
-Outcomes: TypeAlias = list[tuple[list[int], int, StopReason]]
-"""Counts, cycles and reason of each board."""
-
-
-def expected(parts: Sequence[Image], frame: FrameInput) -> Outcomes:
-    """Compute a frame here, with kernels and without boards."""
+def expected(parts: Sequence[Image], frame: FrameInput) -> list[tuple[list[int], int, StopReason]]:
+    """Compute counts, cycles and reason of each board here, with kernels and without boards."""
     kernels = [make_kernel(part.machine) for part in parts]
     sliced = frame.stop == "slices"
     end = 256 if sliced else 0
@@ -169,7 +164,7 @@ def expected(parts: Sequence[Image], frame: FrameInput) -> Outcomes:
     return [(kernel.counts.tolist(), kernel.cycles, kernel.reason) for kernel in kernels]
 
 
-def expected_of_replicas(parts: Sequence[Image], frame: FrameInput) -> list[Outcomes]:
+def expected_of_replicas(parts: Sequence[Image], frame: FrameInput):
     """Compute a frame for each replica with machines of one replica, which are independent of the others."""
     parameters = parts[0].machine.parameters
     alone = []

@@ -1,6 +1,7 @@
 """Boards over TCP: a shared key, and connections without it."""
 
 import socket
+import threading
 from dataclasses import replace
 
 import pytest
@@ -9,7 +10,7 @@ from pcie_shim import framing
 from pcie_shim import register_map as rm
 from pcie_shim.credentials import read_key
 from pcie_shim.endpoint import parse_endpoint
-from pcie_shim.errors import CredentialsError, KeyRefusedError
+from pcie_shim.errors import CredentialsError, KeyRefusedError, SequenceError
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import SocketLink
 from tests.patience import PATIENCE
@@ -72,6 +73,18 @@ def test_a_proof_does_not_fit_another_challenge(start_board):
             assert bytes(answers[0][20:]) not in received
             assert received[3] in {framing.AUTHENTICATE, 0}
             assert b"ROSBAYES" not in received  # the greeting
+
+
+def test_a_board_that_answers_another_request_is_named_once():
+    frames = [(0, 0), (framing.REPLY, 9)]  # the challenge, and the answer to no request
+    sent = b"".join(framing.encode(framing.AUTHENTICATE, *each, 0, 8, bytes(32)) for each in frames)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        peers, where = [], f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        threading.Thread(target=lambda: peers.append(server.accept()[0]) or peers[0].sendall(sent)).start()
+        with pytest.raises(SequenceError) as caught:
+            SocketLink.open(with_key(where, KEY), timeout=PATIENCE)
+        peers[0].close()
+    assert str(caught.value).count(where) == 1
 
 
 @pytest.mark.parametrize("content", [b"", b"short", b"has spaces in it, sixteen", b"x" * 2000, None])
