@@ -64,6 +64,7 @@ def subscriber(
         raise SettingsError(
             "give --uri, --topic and --type, or --deployment DIR (subscriber --help shows examples)"
         )
+    # checked as a source of a deployment is, so that the same mistakes have the same errors
     names = [name.strip() for name in variables.split(",") if name.strip()]
     try:
         source = Source(uri=settings.uri, topic=topic, type=type_)

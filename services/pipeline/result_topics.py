@@ -72,6 +72,7 @@ class ResultTopics:
             await connect_all(stack, settings, uris, by_uri, on_state=on_state, max_size=MAX_RESULT)
             for uri, output in zip(uris, deployment.outputs, strict=True):
                 self._outputs.append((by_uri[uri], await by_uri[uri].advertise(output.topic, output.type)))
+            # reports go to one server only, because a listener of several would get each twice
             first = by_uri[uris[0]]
             self._frames = await first.advertise(FRAME_TOPIC, FRAME_TYPE)
             if settings.ros_version == "auto":

@@ -57,6 +57,7 @@ def result_from_line(
         raise InputLineError(f"{where} has {found} values; expected {expected}")
     if isinstance(value, list):
         return value
+    # a single machine reports no cycles by replica
     each = replicas if replicas > 1 else 0
     for board in value.boards:
         if not len(board.replica_cycles) == len(board.replica_reasons) == each:

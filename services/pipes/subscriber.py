@@ -61,6 +61,7 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
                 message = await subscription.next(timeout=settings.first_data_timeout)
                 hint.cancel()
                 found = [(field, *field.value(message.msg)) for field in fields]
+                # one error for all of them
                 if missing := [field for field, present, _ in found if not present]:
                     raise all_missing(missing, message.msg)
                 values = {field.name: value for field, _, value in found}

@@ -141,6 +141,7 @@ class Reading(Record, tag="reading", frozen=True):
     the number of unpaired messages.
     """
 
+    # When it was read on the robot, when its last message arrived here, and when this record was sent.
     stamp_ns: int
     received_ns: int
     received_tick: int
@@ -185,6 +186,7 @@ class FrameFailed(Record, tag="failed", frozen=True):
     """pcie-app to master: a failed frame."""
 
     number: int
+    # The board that failed, and the exit code of a run that ends with this frame.
     board: int
     exit_code: int
     sentence: str
@@ -195,10 +197,12 @@ class Publish(Record, tag="publish", frozen=True):
     """Master to publisher: a result with the frame's own data."""
 
     result: FrameResult
+    # Those of its reading, for the report of the frame and its latency.
     stamp_ns: int
     received_ns: int
     received_tick: int
     reading_sent_tick: int
+    # Time that the reading waited in the master for the boards.
     waited_ns: int
 
 

@@ -152,6 +152,7 @@ class MasterLink(Link):
             )
             protocol.close()
             return
+        # nothing else from a peer counts before it is known to be a master of this version and deployment
         if not self._greeted:
             try:
                 check_hello(record, "master", self._deployment.hash, f"{self._role} at {self._endpoint}")
@@ -164,6 +165,7 @@ class MasterLink(Link):
                 raise
             self._greeted = True
             self.masters += 1
+            # first what was said on the way to the states that last
             for each in (*self._unsaid, *self._last.values()):
                 protocol.send(each)
             self._unsaid.clear()

@@ -303,6 +303,7 @@ async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
         async with asyncio.timeout(stop_timeout):
             for child in running:
                 await child.wait()
+    # a stopped process (SIGSTOP), or one in a system call that does not return
     stubborn = [child for child in running if child.is_running]
     for child in stubborn:
         child.kill()
