@@ -126,7 +126,8 @@ class Settings(BaseSettings):
     @field_validator("deployment", "ca", "key_file", "run_directory", mode="before")
     @classmethod
     def _no_directory(cls, value: object) -> object:
-        return value or None  # an empty variable means no folder, not the current one
+        # an empty variable means no folder, not the current one
+        return value or None
 
     @field_validator("boards", mode="before")
     @classmethod

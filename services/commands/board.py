@@ -105,7 +105,8 @@ def board(
     simulated = _simulated(engine, hardware, settings, (index,))
 
     def on_ready() -> None:
-        if PARENT_VARIABLE not in os.environ:  # a master monitors its boards itself
+        # a master monitors its boards itself
+        if PARENT_VARIABLE not in os.environ:
             say(f"board {index} listens at {endpoint}")
 
     served = EmulatedBoard() if simulated is None else simulated.board(index)

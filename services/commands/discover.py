@@ -81,6 +81,7 @@ def _picked(robots: list[Robot]) -> Robot:
     """Return the robot whose number a person enters, or raise a SettingsError."""
     check_signals()
     print(f"number of the server (1 to {len(robots)}): ", end="", file=sys.stderr, flush=True)
+    # bounded, because a pipe may send a line without end
     answer = sys.stdin.readline(_LONGEST_ANSWER).strip()
     if not re.fullmatch(r"[0-9]+", answer, re.ASCII) or not 1 <= int(answer) <= len(robots):
         raise SettingsError(f"{answer!r} is not a number from 1 to {len(robots)}; run discover again")
@@ -95,6 +96,7 @@ def _table(robots: list[Robot], *, numbered: bool = False) -> Table:
         token = "wanted" if robot.token else ""
         table.add_row(
             *([str(number)] if numbered else []),
+            # anybody on the network may announce any name
             escape(one_line(robot.name)),
             escape(one_line(robot.uri)),
             str(robot.ros_version or "?"),

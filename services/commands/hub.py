@@ -86,6 +86,7 @@ def hub(
     # read before anything listens: a wrong file must not open a hub without its protection
     access = _access_policy(tls_cert, tls_key, token_file, origin or [])
     if not is_loopback(host) and not insecure and (access.tls is None or not access.tokens):
+        # TLS without tokens lets everybody in, and tokens without TLS can be read on the way
         missing = " and ".join(
             flags
             for flags, there in (("--tls-cert and --tls-key", access.tls), ("--token-file", access.tokens))

@@ -53,6 +53,7 @@ async def show_frames(
             ca_file=settings.ca,
             ros_version=settings.ros_version,
             on_state=report_connection(uri),
+            # posteriors of fine grids are larger than other messages
             max_size=MAX_RESULT,
         ) as ros,
         posteriors(

@@ -90,7 +90,8 @@ def drawing() -> Iterator[Show]:
         return Group(words, picture(frame, axes, width=console.width, rows=rows, colour=colour))
 
     if not console.is_terminal:
-        yield lambda frame, axes: console.print(drawn(frame, axes), soft_wrap=True)  # do not wrap lines
+        # rows of a picture that were wrapped would be no picture
+        yield lambda frame, axes: console.print(drawn(frame, axes), soft_wrap=True)
         return
     # The last frame, drawn at the end even if its turn had not come; and the time of the last picture (monotonic, s).
     newest: list[tuple[FrameOutcome, list[Axis]]] = []

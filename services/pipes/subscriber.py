@@ -22,6 +22,7 @@ def _warn(sentence: str) -> None:
 
 
 def _report_state() -> OnState:
+    # One for each server, because each remembers whether its server was missing.
     reports: dict[str, Callable[[str, str], None]] = {}
 
     def on_state(uri: str, state: State, reason: str) -> None:
@@ -60,6 +61,7 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
             while count is None or printed < count:
                 message = await subscription.next(timeout=settings.first_data_timeout)
                 hint.cancel()
+                # all missing ones in one sentence, instead of one at each attempt
                 found = [(field, *field.value(message.msg)) for field in fields]
                 # one error for all of them
                 if missing := [field for field, present, _ in found if not present]:

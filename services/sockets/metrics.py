@@ -99,6 +99,7 @@ def _numbers(status: ProcessStatus) -> Iterator[_Family]:
         yield counter, "frames_without_topic", "Frames computed without this topic.", "topic", frames.without
         if (age := frames.last_age_s) is not None:
             yield gauge, "last_frame_age_seconds", "Time since the last completed one.", "", {"": age}
+    # families without samples would only confuse: a board has no rosbridge server
     if links := {link.uri: link for link in status.connections}:
         connected = {uri: link.state == "connected" for uri, link in links.items()}
         yield gauge, "rosbridge_connected", "Whether the server is connected.", "uri", connected

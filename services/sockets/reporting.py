@@ -119,6 +119,7 @@ def _check(directory: Path | None) -> None:
 
 def check_metrics(metrics: str, *, insecure: bool) -> None:
     """Raise a SettingsError if other machines could read metrics, and that was not permitted."""
+    # a host name counts as another machine, even if it resolves to this one
     if metrics and not insecure and not metrics_endpoint(metrics).is_loopback:
         raise SettingsError(
             f"--metrics {metrics} lets everybody on that network read the state of this process; "

@@ -66,10 +66,11 @@ class _Pipe:
 
     def __init__(self, take: Callable[[str], None]) -> None:
         self._take = take
+        # The writing end is the child's; its parent closes it after the start, otherwise the end would never come.
         self._reader, self.writer = os.pipe()
         self._is_open = True
+        # The begin of a line whose end has not arrived.
         self._pending = b""
-        """The begin of a line whose end has not arrived."""
         os.set_blocking(self._reader, False)
         asyncio.get_running_loop().add_reader(self._reader, self.read)
 
@@ -87,6 +88,7 @@ class _Pipe:
         *lines, self._pending = self._pending.split(b"\n")
         if last:
             lines, self._pending = [*lines, self._pending], b""
+        # a child may print anything, also bytes that are no text
         for line in lines:
             if text := line.decode("utf-8", "replace").rstrip():
                 self._take(text)
