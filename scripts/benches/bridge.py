@@ -9,7 +9,6 @@ Everything is measured in turns within one run, so that noise on the machine aff
 
 from __future__ import annotations
 
-import argparse
 import asyncio
 import json
 import os
@@ -28,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from scripts.benches.bare import advertise, bare, publish, settled, soon, subscribe
-from scripts.running.flags import ScriptParser, output_file
+from scripts.running.flags import ScriptParser
 from scripts.running.processes import Process, run_script
 from scripts.verifications.installation import install_roslibpy
 from services.errors import StackError
@@ -177,8 +176,8 @@ async def measure_turn(name: str, uri: str, topics: Iterator[str], found: Figure
                     found[values, quantity][column].append(figure)
 
 
-async def bench(arguments: argparse.Namespace) -> int:
-    """Measure everything, print the table, and write the JSON file."""
+async def bench() -> int:
+    """Measure everything, and print the table."""
     servers: defaultdict[str, list[float]] = defaultdict(list)
     found: Figures = defaultdict(lambda: defaultdict(list))
     topics = (f"/bench/turn{number}" for number in count())
@@ -199,18 +198,17 @@ async def bench(arguments: argparse.Namespace) -> int:
                     await measure_turn(name, uris["hub"], topics, found)
         finally:
             await asyncio.gather(hub.end(), tornado.end())
-    show(servers, found, arguments.json)
+    show(servers, found)
     return 0
 
 
-def show(servers: dict[str, list[float]], found: Figures, path: Path | None) -> None:
-    """Print medians and their ratios to the better of roslibpy's transports, and write them to a file."""
+def show(servers: dict[str, list[float]], found: Figures) -> None:
+    """Print medians and their ratios to the better of roslibpy's transports."""
     columns = (OURS, CBOR, *THEIRS)
     table = Table(title="clients on the hub (float64 values in a message; medians)")
     for column in ("values", "", *columns, "ours to roslibpy", "CBOR to roslibpy"):
         table.add_column(column, justify="right")
     rates = {name: statistics.median(each) for name, each in servers.items()}
-    written: dict[str, Any] = {"servers_per_s": rates, "clients": {}}
     for (values, quantity), by_client in found.items():
         middle = {name: statistics.median(by_client[name]) for name in columns}
         best = (max if quantity.endswith("/s") else min)(middle[name] for name in THEIRS)
@@ -219,9 +217,8 @@ def show(servers: dict[str, list[float]], found: Figures, path: Path | None) -> 
             f"{middle[name]:,.0f}" if middle[name] >= 100 else f"{middle[name]:.1f}" for name in columns
         ]
         table.add_row(str(values), quantity, *figures, *(f"{ratio:.2f}" for ratio in ratios))
-        written["clients"][f"{values} values, {quantity}"] = middle | {"ratios": ratios}
     Console(width=None if sys.stdout.isatty() else 120).print(table)
-    ratio = written["hub to Tornado double"] = rates["hub"] / rates["Tornado double"]
+    ratio = rates["hub"] / rates["Tornado double"]
     print(
         f"messages of 64 bytes a second, {IN_FLIGHT} in flight: hub {rates['hub']:,.0f}, "
         f"Tornado double {rates['Tornado double']:,.0f}; ratio {ratio:.1f}"
@@ -229,8 +226,6 @@ def show(servers: dict[str, list[float]], found: Figures, path: Path | None) -> 
     print(
         "The Tornado double is this project's own: the reference server's design for one type, without ROS."
     )
-    if path is not None:
-        path.write_text(json.dumps(written, indent=2) + "\n")
 
 
 def main() -> int:
@@ -239,9 +234,8 @@ def main() -> int:
         prog="scripts/bench bridge",
         description="Compare rosbridge clients on the hub, and the hub with a model of the reference server.",
     )
-    parser.add_argument("--json", type=output_file, help="write all figures")
-    arguments = parser.parse_args()
-    return run_script(lambda: bench(arguments), 300)
+    parser.parse_args()
+    return run_script(bench, 300)
 
 
 if __name__ == "__main__":

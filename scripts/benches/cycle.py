@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import math
 import os
 import random
@@ -25,7 +24,7 @@ from rich.table import Table
 
 from bridge.client import Publication, Ros, Subscription, connect
 from bridge.stamps import header, header_stamp_ns
-from scripts.running.flags import ScriptParser, output_file
+from scripts.running.flags import ScriptParser
 from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 
 STAGES = (
@@ -168,7 +167,7 @@ async def measure(ros: Ros, masters: dict[str, Process], some: list[dict[str, in
 
 
 async def bench(arguments: argparse.Namespace) -> int:
-    """Run everything, print the table and write the JSON file."""
+    """Run everything, and print the table."""
     seed = arguments.seed if arguments.seed is not None else random.randrange(2**32)
     with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
         where = Path(folder)
@@ -228,8 +227,6 @@ def show(all_: dict[str, Measured], seed: int, arguments: argparse.Namespace) ->
         f"aim: a cycle takes at most {BOUND:g} times what floor and boards take; times are medians, rosbridge out is "
         f"encoding and sending alone; {len(os.sched_getaffinity(0))} cores, seed {seed}"
     )
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps({"seed": seed, **ratios, **rows}, indent=2) + "\n")
 
 
 def main() -> int:
@@ -242,7 +239,6 @@ def main() -> int:
     parser.add_argument(
         "--seed", type=int, shown="a new one each time", help="seed of the positions of the boat"
     )
-    parser.add_argument("--json", type=output_file, help="write all figures")
     arguments = parser.parse_args()
     if arguments.frames < 1:
         parser.error("--frames must be 1 or more")

@@ -27,7 +27,7 @@ from rich.table import Table
 from bridge.client import connect
 from scripts.benches.bare import Bare, advertise, bare, frame, publish, settled, subscribe
 from scripts.benches.cycle import BOAT_FLAGS, WINDOW, message, processes_of, quantile, readings
-from scripts.running.flags import ScriptParser, output_file
+from scripts.running.flags import ScriptParser
 from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
 
 TOPICS, PUBLISHERS, SLOW = 200, 50, 50
@@ -233,7 +233,7 @@ async def minutes_of(uri: str, hub: int, master: int, count: int) -> list[Row]:
 
 
 async def bench(arguments: argparse.Namespace) -> int:
-    """Measure, print the table, and write the JSON file."""
+    """Measure, and print the table."""
     with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
         where = Path(folder)
         hub, master = Process("hub", where / "hub.log"), Process("master", where / "master.log")
@@ -255,7 +255,7 @@ async def bench(arguments: argparse.Namespace) -> int:
     columns = ("part", "phase", "per second", "p50 ms", "p99 ms", "max ms", "MiB", "p99 ratio", "MiB ratio")
     for column in columns:
         table.add_column(column, justify="left" if column in columns[:2] else "right")
-    written, first = [], rows[0]
+    first = rows[0]
     for row in rows:
         first = first if row.part == first.part else row
         p99, base = quantile(row.ms, 0.99), quantile(first.ms, 0.99)
@@ -269,10 +269,7 @@ async def bench(arguments: argparse.Namespace) -> int:
             row.mib / first.mib,
         )
         table.add_row(row.part, row.name, *(f"{figure:,.1f}" for figure in figures))
-        written.append(dict(zip(columns, (row.part, row.name, *figures), strict=True)))
     Console(width=None if sys.stdout.isatty() else 120).print(table)
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(written, indent=2) + "\n")
     return 0
 
 
@@ -285,7 +282,6 @@ def main() -> int:
     parser.add_argument("--clients", type=int, default=500, help="number of clients of the hub")
     parser.add_argument("--seconds", type=float, default=5.0, help="duration of each phase in seconds")
     parser.add_argument("--minutes", type=int, default=5, help="minutes of master --loop; 0 for none")
-    parser.add_argument("--json", type=output_file, help="write all figures")
     arguments = parser.parse_args()
     if arguments.clients <= PUBLISHERS + SLOW:
         parser.error(f"--clients must be more than {PUBLISHERS + SLOW}")

@@ -6,7 +6,6 @@ recording --> player --> hub --> master and its processes, one deployment for bo
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import tempfile
@@ -21,7 +20,7 @@ from rich.table import Table
 
 from casestudies.mrclam.model import Landmark, LandmarkReading, model, read_landmarks, unquantised_posterior
 from casestudies.mrclam.player import RecordedFrame, area_grid, median_distance, play, read_recording
-from scripts.running.flags import ScriptParser, output_file
+from scripts.running.flags import ScriptParser
 from scripts.running.processes import ROOT, Process, build, run_script
 from toolchain.deployment.address import to_address
 from toolchain.models import Model, exact_posterior
@@ -149,8 +148,6 @@ async def bench(arguments: argparse.Namespace) -> int:
             *(f"{each[key]:.3f}" if isinstance(each[key], float) else str(each[key]) for key in each)
         )
     Console(width=None if sys.stdout.isatty() else 140).print(table)
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(found, indent=2) + "\n")
     if fitted is not None:
         by_hand, learnt = found
         better = learnt["mean"] < by_hand["mean"]
@@ -181,7 +178,6 @@ def main() -> int:
         "learnt now and written to it",
     )
     parser.add_argument("--cells", type=int, default=32, help="number of cells along x, and along y")
-    parser.add_argument("--json", type=output_file, help="write all figures")
     arguments = parser.parse_args()
     if not 1 <= arguments.cells <= 128:  # four boards hold 4096 lines each
         parser.error("--cells must be 1 to 128")

@@ -1,22 +1,13 @@
 """The flags of the scripts, whose help has the style of the commands: NUMBER, a|b, [default: 10]."""
 
 import argparse
-import os
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def output_file(text: str) -> Path:
-    """Return the path of a file that a script writes at its end, or raise an ArgumentTypeError if that would fail."""
-    path = Path(text)
-    if path.is_dir() or not os.access(path if path.exists() else path.absolute().parent, os.W_OK):
-        raise argparse.ArgumentTypeError(f"{text} cannot be written; expected a file in an existing folder")
-    return path
-
-
-_KINDS: dict[Any, str] = {int: "NUMBER", float: "NUMBER", Path: "FILE", output_file: "FILE"}
+_KINDS: dict[Any, str] = {int: "NUMBER", float: "NUMBER", Path: "FILE"}
 
 
 class ScriptParser(argparse.ArgumentParser):
