@@ -130,6 +130,7 @@ async def resolve(
         UnknownRobotError: No robot of that name answers in time.
         DiscoveryError: `zeroconf` is not installed, there is no network, or the name is invalid.
     """
+    # Asked for directly, which is faster than listing all robots.
     _check_name(name)
     async with _zeroconf(interfaces) as zeroconf:
         robot = await _ask(zeroconf, f"{name}.{SERVICE_TYPE}", timeout)
@@ -177,6 +178,7 @@ async def announced(
         DiscoveryError: `zeroconf` is not installed, there is no network, or another server has the name.
     """
     _check_name(name)
+    # A hub on loopback is not announced to a network that cannot reach it.
     addresses = _addresses(host, interfaces)
     if interfaces is None and all(ipaddress.ip_address(address).is_loopback for address in addresses):
         interfaces = ("127.0.0.1",)  # other machines cannot reach it
@@ -230,6 +232,7 @@ def _addresses(host: str, interfaces: Sequence[str] | None) -> list[str]:
         address = ipaddress.ip_address("127.0.0.1" if host == "localhost" else host)
     except ValueError:
         return sorted({str(info[4][0]) for info in socket.getaddrinfo(host, None)})
+    # `0.0.0.0` is no address to connect to, so all real ones are announced.
     if not address.is_unspecified:
         return [str(address)]
     import ifaddr  # a dependency of zeroconf

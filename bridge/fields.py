@@ -124,6 +124,7 @@ def all_missing(fields: Sequence[Field], message: dict[str, Any]) -> FieldMissin
     first, *others = fields
     if not others:
         return first.missing(message)
+    # The message is listed once for all of them, because the list may be long.
     names = [repr(field.name) for field in fields[:MAX_LISTED]]
     more = f" and {len(fields) - MAX_LISTED} more" if len(fields) > MAX_LISTED else ""
     return FieldMissingError(

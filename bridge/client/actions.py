@@ -289,6 +289,7 @@ class ActionServer(Handle):
 
     def lost(self) -> None:
         """Cancel the handlers of a lost connection, because nobody waits for their results."""
+        # Each task removes its own entry when it has ended, so the dictionary does not change here.
         for _goal, task in self._goals.values():
             task.cancel()
 
@@ -298,6 +299,7 @@ class ActionServer(Handle):
         self.lost()
 
     def _withdraw(self) -> None:
+        # `end` has cancelled the handlers, so the goals are ended here, while the action is still advertised.
         for goal, _task in self._goals.values():
             goal.abort(f"action {self.name} is no longer served")
         del self._session.action_servers[absolute(self.name)]

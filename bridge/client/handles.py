@@ -232,6 +232,7 @@ class Subscription(Handle):
         self._alarm = asyncio.get_running_loop().call_later(max(self._deadline - now, 0), self._ring)
 
     def _ring(self) -> None:
+        # An alarm of an earlier wait is early for the present one, and sets the next; without a wait, none follows.
         self._alarm = None
         now = time.monotonic()
         if self._deadline <= now:
@@ -354,6 +355,7 @@ class Publication(Handle):
             EncodeError: It cannot be sent as JSON; for a NaN or infinity, the sentence gives its path.
         """
         session = self._session
+        # The usual case has no `await` at all: a task switch would take longer than sending.
         if session.must_wait():
             if self._waiting >= self._size:
                 raise SlowPeerError(
@@ -421,6 +423,7 @@ class Service(Handle):
 
     async def _serve(self, request: ServiceRequested) -> None:
         """Answer one request, even if its handler fails."""
+        # Other errors of the handler are reported by their type only, because their text may contain secrets.
         values: Mapping[str, Any] | str
         ok = False
         try:

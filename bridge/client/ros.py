@@ -174,6 +174,7 @@ class Ros:
             OptionError: The queue size is not positive.
             DisconnectedError: The client was closed.
         """
+        # The publication exists before its type is known, so that two tasks may advertise at the same time.
         self._publishes = True
         publication = Publication(self._session, topic, type, latch=latch, queue_size=queue_size, qos=qos)
         if self._types is not None:
@@ -334,6 +335,7 @@ class Ros:
             MessageTypeError: The goal has a field that its type does not have, or an array of another shape.
             EncodeError: The goal cannot be sent as JSON.
         """
+        # In its turn among messages, which it might depend on.
         if self._session.must_wait():
             await self._session.wait_turn(f"a goal of {action}", timeout)
         await self._require_ros_2(action, min(timeout, DETECT_TIMEOUT))
@@ -544,6 +546,7 @@ def connect(
         proxy=proxy,
     )
     core = ClientCore(ros_version=configured_version, max_size=max_size, fragment_size=fragment_size)
-    parsed = replace(parsed, username=None, password=None)  # the credentials are in the route
+    # The credentials are in the route, whose repr hides them.
+    parsed = replace(parsed, username=None, password=None)
     session = Session(parsed, shown(uri), core, limits, on_state, route=route, retry=retry)
     return Ros(session, check_types=check_types)

@@ -181,6 +181,7 @@ class TypeChecks:
         Raises:
             MessageTypeError: It has a field that the type does not have, or an array of another shape.
         """
+        # Requests to rosapi itself are made by this client, and asking about them would never end.
         name = absolute(service)
         if name.startswith(_ROSAPI) or not self._may_ask():
             return
@@ -221,6 +222,7 @@ class TypeChecks:
         return session.is_open and not self._unanswered
 
     async def _ask(self, question: str, args: Mapping[str, Any], limit: float) -> dict[str, Any]:
+        # Whatever fails here, the program's own message, call or goal is then sent unchecked.
         try:
             answer = await self._session.call(_ROSAPI + question, args, limit)
         except NoAnswerError:

@@ -88,6 +88,7 @@ def make_route(
             raise OptionError(f"{name!r} is not a header name")
         if not isinstance(value, str) or _HEADER_VALUE.fullmatch(value) is None:
             raise OptionError(f"the value of header {name} has characters that are not allowed in headers")
+    # Only a warning, because many robots have no certificate, and a network of their own.
     if (authorized or "Authorization" in fields) and not uri.secure and not _is_loopback(uri.host):
         _log.warning("credentials are sent to %s unencrypted: wss:// would protect them", uri.host)
     return Route(_tls(uri, ca_file, client_certificate, tls), tuple(fields.items()), _proxy(uri, proxy))
@@ -174,6 +175,7 @@ async def connect_along(
 
 
 async def _connect_proxy(proxy: Proxy, uri: WebSocketURI, shown_uri: str) -> socket | asyncio.Transport:
+    # Without the user and password of its URI.
     name = f"{proxy.scheme}://{proxy.host}:{proxy.port}"
     try:
         if proxy.scheme.startswith("socks"):

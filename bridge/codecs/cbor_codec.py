@@ -74,6 +74,7 @@ def decode(
             source, semantic_decoders=_decoders(arrays), max_depth=max_depth, strict_hashable_types=True
         ).decode()
     except (cbor2.CBORError, ValueError, OverflowError, RecursionError) as error:
+        # The library wraps errors of our tag decoders, whose own sentence says more.
         why = error.__cause__ if isinstance(error.__cause__, DecodeError) else error
         raise DecodeError(f"a message that is not usable CBOR arrived ({why}): {excerpt(data)}") from None
     # Trailing bytes would be a second message, which nobody reads.
@@ -105,15 +106,15 @@ def _decoder(tag: int, arrays: Arrays) -> _Decoder:
     size = array(code).itemsize
 
     def make(value: object, _immutable: bool) -> Any:
+        # A tag may stand before any value, and a length that is no multiple would be an error of NumPy.
         if type(value) is not bytes or len(value) % size:
             raise DecodeError(f"a typed array (tag {tag}) does not consist of {size}-byte elements")
         if arrays == "numpy":
             import numpy as np
 
             return np.frombuffer(value, name)
-        numbers = array(
-            code, value
-        )  # `_check` creates the list, so that a tag around it cannot use it as its content
+        # Not a list yet: `_check` creates it, so that another tag around this one cannot use it as its content.
+        numbers = array(code, value)
         if byteorder == "big":
             numbers.byteswap()
         return numbers
@@ -124,6 +125,7 @@ def _decoder(tag: int, arrays: Arrays) -> _Decoder:
 def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
     """Refuse decoded values that ROS messages cannot contain, and finish byte strings and arrays."""
     from_bytes = _decoders("numpy")[_BYTES_TAG] if arrays == "numpy" else None
+    # A stack instead of recursion, and types of whole containers at once: most are long lists of numbers.
     inner: list[Any] = [message]
     while inner:
         container = inner.pop()
@@ -211,6 +213,7 @@ def _prepare(value: Any, levels: int, pack_floats: bool) -> Any:
         return value
     if not isinstance(value, Mapping | list | tuple):
         return _from_numpy(value)
+    # Checked here, because the library has no such limit when it encodes.
     if levels < 1:
         raise EncodeError("the message is nested too deeply")
     if isinstance(value, Mapping):
@@ -239,6 +242,7 @@ def _from_numpy(value: Any) -> Any:
     dtype = getattr(value, "dtype", None)
     if dtype is None or dtype.kind not in "buifU":
         raise EncodeError(f"{type(value).__name__} is not a type of messages")
+    # Scalars, booleans and text have no typed arrays.
     if value.ndim == 0 or dtype.str[1:] not in _TAGS:
         return value.tolist()
     if dtype.byteorder == ">" or byteorder == "big":

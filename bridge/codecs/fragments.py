@@ -43,8 +43,11 @@ class _Set:
     """The fragments of one incomplete message."""
 
     total: int
+    # Time of its last fragment.
     touched: float
+    # By number, as the sender counts, from 0 or from 1.
     parts: dict[int, bytes] = field(default_factory=dict)
+    # Number of bytes in `parts`.
     size: int = 0
 
     @property
@@ -106,6 +109,7 @@ class Reassembler:
             while len(self._sets) >= self._max_sets:
                 self._give_up(next(iter(self._sets)))
             begun = self._sets[key] = _Set(total, now)
+        # A duplicate counts too: it shows that the sender has not given up.
         begun.touched = now
         if number in begun.parts:
             return None
@@ -186,6 +190,7 @@ def _ends(message: bytes, fragment_size: int) -> Iterator[int]:
     begin = 0
     while begin < len(message):
         end = min(begin + fragment_size, len(message))
+        # Back to the beginning of a character, because each fragment is a text of its own.
         while end < len(message) and message[end] & mask == inside:
             end -= 1
         if end == begin:  # a character with more bytes than a fragment

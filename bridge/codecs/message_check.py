@@ -74,6 +74,7 @@ def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
     except ImportError:
         return {}
     store = get_typestore(Stores.ROS2_JAZZY if ros_version == 2 else Stores.ROS1_NOETIC)
+    # The type, and in turn the types of its fields, each once.
     found: Definitions = {}
     waiting = [ros2_type(type_name)]
     while waiting:
@@ -122,6 +123,7 @@ class MessageCheck:
     def _check(self, type_name: str, msg: Any, place: str) -> None:
         if not isinstance(msg, Mapping):
             raise MessageTypeError(f"{place[:-1] or 'it'} is {_shown(msg)}, expected an object ({type_name})")
+        # Unknown parts are left to the server: rosapi does not describe all types of a message.
         fields = _TIME_FIELDS if type_name in _TIMES else self._definitions.get(type_name)
         if fields is None:
             return
@@ -142,10 +144,12 @@ class MessageCheck:
         return element in _TIMES or element in self._definitions
 
     def _check_array(self, type_name: str, field: FieldType, value: Any, place: str) -> None:
+        # Bytes and base64 text stand for `uint8[]`; the length of a text is not that of its bytes.
         if isinstance(value, str | bytes | bytearray):
             good = field.element in _BYTES or field.element not in _PRIMITIVES
             length = field.length if isinstance(value, str) else len(value)
         else:
+            # Elements are looked at only in lists, because NumPy's arrays of one dimension contain no arrays.
             flat = getattr(value, "ndim", 1) == 1 and not isinstance(value, Mapping) and _is_nested(value)
             good = flat and (
                 field.element not in _PRIMITIVES
@@ -155,6 +159,7 @@ class MessageCheck:
             length = len(value) if good else 0
         if not good or (field.length and length != field.length):
             raise _misshapen(type_name, place, field, value)
+        # Every element, because a program may build each from other data.
         if self._is_object(field.element):
             for index, item in enumerate(value):
                 self._check(field.element, item, f"{place}[{index}].")

@@ -38,6 +38,7 @@ def decode(data: str, *, max_size: int = MAX_SIZE) -> bytes:
         raise DecodeError("a png arrived that is not base64") from None
     if not picture.startswith(_SIGNATURE):
         raise DecodeError("a png arrived that is not a picture")
+    # Checksums and unknown chunks are ignored: the content is checked as JSON later.
     header, packed = b"", bytearray()
     for kind, content in _chunks(picture):
         if kind == b"IHDR":
@@ -70,6 +71,7 @@ def decode(data: str, *, max_size: int = MAX_SIZE) -> bytes:
 
 def encode(message: bytes) -> str:
     """Return the JSON of a message as a picture in base64, like the reference server."""
+    # Nearly square, three bytes a pixel, filled up with newlines, which JSON ignores.
     pixels = -(-len(message) // 3) or 1
     width = math.isqrt(pixels)
     height = -(-pixels // width)
@@ -104,6 +106,7 @@ def _chunk(kind: bytes, content: bytes) -> bytes:
 
 def _unfiltered(lines: bytes, line: int, channels: int) -> bytes:
     """Undo the filter of each line; its number precedes the line."""
+    # Servers that use Pillow choose a filter for each line. The line above the first one counts as zeros.
     pixels = bytearray()
     above = bytes(line)
     for at in range(0, len(lines), line + 1):

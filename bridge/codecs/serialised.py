@@ -33,7 +33,9 @@ class MessageTypes:
             ros_version: The ROS version of the messages; None to detect it for each message.
         """
         self._version = ros_version
+        # Definitions by name in the form of ROS 2.
         self._registered: dict[str, str] = {}
+        # rosbags' types by ROS version, each made when a message first needs it; a new definition empties this.
         self._stores: dict[int, Typestore] = {}
 
     def register(self, type_name: str, definition: str) -> None:
@@ -49,6 +51,7 @@ class MessageTypes:
             NameFormError: The name is malformed.
         """
         name = ros2_type(type_name)
+        # Parsed only to report an error at once; the stores parse it again.
         typesys = _rosbags()
         try:
             typesys.get_types_from_msg(definition, name)
@@ -110,6 +113,7 @@ class MessageTypes:
             )
             for name, definition in self._registered.items():
                 types = typesys.get_types_from_msg(definition, name)
+                # Otherwise messages of the standard type would be read wrongly.
                 if store.fielddefs.get(name, types[name]) != types[name]:
                     raise DefinitionError(f"{name} is a standard type with another definition")
                 store.register({n: t for n, t in types.items() if n not in store.fielddefs})
