@@ -1,6 +1,20 @@
+import asyncio
+from contextlib import asynccontextmanager
+
 import pytest
 
-from services.sockets.records import Notice
+from services.sockets.records import Notice, Ready
+from tests.patience import PATIENCE
+
+
+@asynccontextmanager
+async def running(service, link):
+    """A service's task, from the time when it is ready."""
+    task = asyncio.create_task(service.run())
+    await link.until(lambda: task.done() or link.of(Ready))
+    yield task
+    task.cancel()
+    await asyncio.wait([task])
 
 
 class RecordingLink:
@@ -27,6 +41,15 @@ class RecordingLink:
         return True
 
     keep = send
+
+    def of(self, kind):
+        """The records of a kind that were sent."""
+        return [each for each in self.sent if isinstance(each, kind)]
+
+    async def until(self, true):
+        async with asyncio.timeout(PATIENCE):
+            while not true():
+                await asyncio.sleep(0.001)
 
     def notice(self, level, sentence):
         self.send(Notice(level, sentence))

@@ -1,7 +1,6 @@
 """Results: in order, and to several servers, one of which may be away."""
 
 import asyncio
-import contextlib
 from contextlib import asynccontextmanager
 from types import MappingProxyType
 from unittest.mock import Mock
@@ -16,9 +15,10 @@ from services.pipeline.connections import NotReceivableError
 from services.pipeline.publisher import Publisher
 from services.pipeline.result_topics import ResultTopics
 from services.settings import Settings
-from services.sockets.records import Begin, FrameResult, Notice, Outcome, Publish, Published, Ready, Rosbridge
+from services.sockets.records import Begin, FrameResult, Notice, Outcome, Publish, Published, Rosbridge
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import FACTOR, PATIENCE
+from tests.services.pipeline.conftest import running
 from toolchain.deployment import Output
 
 REASON = 1
@@ -83,7 +83,7 @@ async def settled():
 async def test_results_stay_in_order_while_the_queue_drains(boat, link):
     publisher = Publisher(Settings(), boat, link.make)
     topics = publisher._topics = FakeTopics()
-    running = asyncio.create_task(publisher.run())
+    task = asyncio.create_task(publisher.run())
     await settled()
     for number in (1, 2, 3):
         link.take(result(boat, number))
@@ -101,29 +101,24 @@ async def test_results_stay_in_order_while_the_queue_drains(boat, link):
     link.take(result(boat, 5))  # at once: nothing waits any more
     assert topics.published == [1, 2, 3, 4, 5]
     assert publisher.status().frames.completed == 5
-    running.cancel()
+    task.cancel()
 
 
 async def test_the_master_learns_that_no_server_is_there_and_that_one_is_back(boat, link):
     async with FakeRosbridge() as fake:
         publisher = Publisher(Settings(uri=fake.uri), boat, link.make)
-        running = asyncio.create_task(publisher.run())
-        while not any(isinstance(each, Ready) for each in link.sent):
-            await asyncio.sleep(0.01)
-        assert (publisher.status().ready, publisher.status().why) == (True, publisher._where)
-        ros = publisher._topics.rosbridges[fake.uri]
-        ros._session._delay = 600.0  # unless the master says that one is back
-        await gone(publisher._topics, fake)
-        assert not publisher.status().ready
-        await fake.come_back()
-        assert [each.connected for each in link.sent if isinstance(each, Rosbridge)] == [False]
-        link.take(Rosbridge(connected=True))  # the subscriber has reached it
-        await ros.wait_for_state(State.CONNECTED, PATIENCE)
-        assert [each.connected for each in link.sent if isinstance(each, Rosbridge)] == [False, True]
-        assert [each.level for each in link.sent if isinstance(each, Notice)] == ["warning", "info"]
-        running.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await running
+        async with running(publisher, link):
+            assert (publisher.status().ready, publisher.status().why) == (True, publisher._where)
+            ros = publisher._topics.rosbridges[fake.uri]
+            ros._session._delay = 600.0  # unless the master says that one is back
+            await gone(publisher._topics, fake)
+            assert not publisher.status().ready
+            await fake.come_back()
+            assert [each.connected for each in link.of(Rosbridge)] == [False]
+            link.take(Rosbridge(connected=True))  # the subscriber has reached it
+            await ros.wait_for_state(State.CONNECTED, PATIENCE)
+            assert [each.connected for each in link.of(Rosbridge)] == [False, True]
+            assert [each.level for each in link.of(Notice)] == ["warning", "info"]
 
 
 @pytest.mark.parametrize(("level", "logged"), [("debug", 1), ("info", 0)])
@@ -207,18 +202,13 @@ async def test_the_largest_posterior_goes_out(boat):
         assert len(said["msg"]["data"]) == 64 * 4096
 
 
-async def running_publisher(boat, link, uri):
-    publisher = Publisher(Settings(uri=uri, seen_timeout=0.2 * FACTOR), boat, link.make)
-    running = asyncio.create_task(publisher.run())
-    while not running.done() and not any(isinstance(each, Ready) for each in link.sent):
-        await asyncio.sleep(0.01)
-    return publisher, running
+def publisher_of(boat, link, uri):
+    return running(Publisher(Settings(uri=uri, seen_timeout=0.2 * FACTOR), boat, link.make), link)
 
 
 async def outcome_of(link):
-    while not (found := [each for each in link.sent if isinstance(each, Published)]):
-        await asyncio.sleep(0.01)
-    return found[-1].outcome, found[-1].missed
+    await link.until(lambda: link.of(Published))
+    return link.of(Published)[-1].outcome, link.of(Published)[-1].missed
 
 
 def refuse_results(fake, other):
@@ -236,40 +226,37 @@ async def test_results_that_nobody_can_receive_are_lost(boat, link, monkeypatch,
     monkeypatch.setattr("services.pipeline.publisher.CHECK_INTERVAL", 0.01)
     async with FakeRosbridge(rosapi=True) as fake:
         refuse_results(fake, other)
-        _, running = await running_publisher(boat, link, fake.uri)
-        while not any(isinstance(each, Notice) for each in link.sent):
-            await asyncio.sleep(0.01)
-        link.take(result(boat, 1))
-        assert await outcome_of(link) == (Outcome.REFUSED, 0)
-        fake.types.pop("/BMresults", None)
-        fake.know("/BMresults", "std_msgs/msg/Float64MultiArray")
-        outcome, number = None, 2
-        while outcome != (Outcome.PUBLISHED, 0):  # as soon as the publisher has asked again
-            link.sent.clear()
-            link.take(result(boat, number))
-            outcome, number = await outcome_of(link), number + 1
-        running.cancel()
+        async with publisher_of(boat, link, fake.uri):
+            await link.until(lambda: link.of(Notice))
+            link.take(result(boat, 1))
+            assert await outcome_of(link) == (Outcome.REFUSED, 0)
+            fake.types.pop("/BMresults", None)
+            fake.know("/BMresults", "std_msgs/msg/Float64MultiArray")
+            outcome, number = None, 2
+            while outcome != (Outcome.PUBLISHED, 0):  # as soon as the publisher has asked again
+                link.sent.clear()
+                link.take(result(boat, number))
+                outcome, number = await outcome_of(link), number + 1
 
 
 async def test_reports_that_nobody_can_receive_cost_no_results(boat, link):
     async with FakeRosbridge(rosapi=True) as fake:
         fake.know("/bm/frame", "std_msgs/msg/Empty")
-        _, running = await running_publisher(boat, link, fake.uri)
-        (notice,) = [each for each in link.sent if isinstance(each, Notice)]
-        assert notice.sentence.startswith("/bm/frame ")
-        link.take(result(boat, 1))
-        assert await outcome_of(link) == (Outcome.PUBLISHED, 0)
-        running.cancel()
+        async with publisher_of(boat, link, fake.uri):
+            (notice,) = link.of(Notice)
+            assert notice.sentence.startswith("/bm/frame ")
+            link.take(result(boat, 1))
+            assert await outcome_of(link) == (Outcome.PUBLISHED, 0)
 
 
 @pytest.mark.parametrize("other", ["std_msgs/msg/String", ""])
 async def test_one_result_that_nobody_can_receive_is_an_error(boat, link, other):
     async with FakeRosbridge(rosapi=True) as fake:
         refuse_results(fake, other)
-        _, running = await running_publisher(boat, link, fake.uri)
-        link.take(Begin(once=True))
-        link.take(result(boat, 1))
-        with pytest.raises(NotReceivableError) as caught:
-            await running
+        async with publisher_of(boat, link, fake.uri) as task:
+            link.take(Begin(once=True))
+            link.take(result(boat, 1))
+            with pytest.raises(NotReceivableError) as caught:
+                await task
         assert caught.value.exit_code == 3
-        assert not any(isinstance(each, Published) for each in link.sent)
+        assert not link.of(Published)

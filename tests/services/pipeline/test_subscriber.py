@@ -13,10 +13,11 @@ from bridge.errors import TopicLeftOutError
 from services.errors import RosbridgeLostError
 from services.pipeline.subscriber import Subscriber
 from services.settings import Settings
-from services.sockets.records import Begin, LossReason, Notice, Reading, Ready, Rosbridge, Unusable
+from services.sockets.records import Begin, LossReason, Notice, Reading, Rosbridge, Unusable
 from tests.fake_rosbridge import FakeRosbridge
 from tests.integration.conftest import READING
 from tests.patience import PATIENCE
+from tests.services.pipeline.conftest import running
 
 BUSY = 1 << 19
 """Bytes that wait for a master that is too slow."""
@@ -99,18 +100,11 @@ async def test_a_topic_that_nobody_publishes_is_reported_with_similar_names(
     monkeypatch.setattr("services.pipeline.connections.AFTER", 0.05)
     async with FakeRosbridge(rosapi=True) as fake:
         fake.know(existing, "boat_msgs/Sensors")
-        subscriber = Subscriber(Settings(uri=fake.uri), boat, link.make)
-        running = asyncio.create_task(subscriber.run())
-        while not any(isinstance(each, Ready) for each in link.sent):
-            await asyncio.sleep(0.01)
-        while not any(isinstance(each, Notice) for each in link.sent):  # before the run begins
-            await asyncio.sleep(0.01)
-        (notice,) = (each for each in link.sent if isinstance(each, Notice))
+        async with running(Subscriber(Settings(uri=fake.uri), boat, link.make), link):
+            await link.until(lambda: link.of(Notice))  # before the run begins
+        (notice,) = link.of(Notice)
         assert notice.level == "warning"
         assert (existing in notice.sentence) is hinted
-        running.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await running
 
 
 @pytest.mark.parametrize(
@@ -119,40 +113,25 @@ async def test_a_topic_that_nobody_publishes_is_reported_with_similar_names(
 async def test_a_large_message_is_taken_up_to_the_limit_of_the_settings(boat, link, limit, expected):
     """As a camera beside the readings sends them; without its needed topic, the subscriber ends."""
     async with FakeRosbridge() as fake:
-        settings = Settings(uri=fake.uri, message_bytes=limit)
-        running = asyncio.create_task(Subscriber(settings, boat, link.make).run())
-        while not any(isinstance(each, Ready) for each in link.sent):
-            await asyncio.sleep(0.01)
-        link.take(Begin(once=False))
-        await fake.wait_for_op("subscribe", topic="/boat/sensors")
-        await fake.publish("/boat/sensors", READING | {"image": "x" * (2 << 20)})
-        with expected:
-            async with asyncio.timeout(PATIENCE):
-                while not any(isinstance(each, Reading) for each in link.sent):
-                    await asyncio.sleep(0.01)
-                    if running.done():
-                        running.result()
-        running.cancel()
-        await asyncio.wait([running])
+        subscriber = Subscriber(Settings(uri=fake.uri, message_bytes=limit), boat, link.make)
+        async with running(subscriber, link) as task:
+            link.take(Begin(once=False))
+            await fake.wait_for_op("subscribe", topic="/boat/sensors")
+            await fake.publish("/boat/sensors", READING | {"image": "x" * (2 << 20)})
+            with expected:
+                await link.until(lambda: link.of(Reading) or (task.done() and task.result()))
 
 
 async def test_a_message_above_the_limit_of_its_topic_is_counted(boat, link):
     async with FakeRosbridge() as fake:
         subscriber = Subscriber(Settings(uri=fake.uri, topic_bytes=1 << 16), boat, link.make)
-        running = asyncio.create_task(subscriber.run())
-        while not any(isinstance(each, Ready) for each in link.sent):
-            await asyncio.sleep(0.01)
-        link.take(Begin(once=False))
-        await fake.wait_for_op("subscribe", topic="/boat/sensors")
-        await fake.publish("/boat/sensors", READING | {"image": "x" * (1 << 17)})
-        await fake.publish("/boat/sensors", READING)
-        async with asyncio.timeout(PATIENCE):
-            while not any(isinstance(each, Reading) for each in link.sent):
-                await asyncio.sleep(0.01)
-        assert subscriber.status().frames.lost == {LossReason.TOO_LARGE: 1}
-        running.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await running
+        async with running(subscriber, link):
+            link.take(Begin(once=False))
+            await fake.wait_for_op("subscribe", topic="/boat/sensors")
+            await fake.publish("/boat/sensors", READING | {"image": "x" * (1 << 17)})
+            await fake.publish("/boat/sensors", READING)
+            await link.until(lambda: link.of(Reading))
+            assert subscriber.status().frames.lost == {LossReason.TOO_LARGE: 1}
 
 
 def test_the_status_shows_the_time_without_readings(boat, link, monkeypatch):
@@ -180,25 +159,22 @@ async def test_only_a_single_reading_needs_a_server_that_stays(boat, link, tmp_p
     monkeypatch.setattr("services.pipeline.subscriber.serve_status", serving)
     async with FakeRosbridge() as fake:
         subscriber = Subscriber(Settings(uri=fake.uri, run_directory=tmp_path), boat, link.make)
-        running = asyncio.create_task(subscriber.run())
-        while not any(isinstance(each, Ready) for each in link.sent):
-            await asyncio.sleep(0.01)
-        link.take(Begin(once=once))
-        await fake.wait_for_op("subscribe", topic="/boat/sensors")
-        assert serving.call_args.args == (tmp_path, "subscriber", subscriber.status)
-        await fake.vanish()
-        if once:
-            with pytest.raises(RosbridgeLostError):
-                await asyncio.wait_for(running, PATIENCE)
-            return
-        await fake.come_back()
-        async with asyncio.timeout(PATIENCE):
-            while Rosbridge(connected=True) not in link.sent:
+        async with running(subscriber, link) as task:
+            link.take(Begin(once=once))
+            await fake.wait_for_op("subscribe", topic="/boat/sensors")
+            assert serving.call_args.args == (tmp_path, "subscriber", subscriber.status)
+            await fake.vanish()
+            if once:
+                with pytest.raises(RosbridgeLostError):
+                    await asyncio.wait_for(task, PATIENCE)
+                return
+            await fake.come_back()
+
+            def is_back():
                 link.take(Rosbridge(connected=True))  # the publisher has reached it
-                await asyncio.sleep(0.01)
-        assert [each.connected for each in link.sent if isinstance(each, Rosbridge)] == [False, True]
-        assert [each.level for each in link.sent if isinstance(each, Notice)] == ["warning", "info"]
-        assert not running.done()
-        running.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await running
+                return Rosbridge(connected=True) in link.sent
+
+            await link.until(is_back)
+            assert [each.connected for each in link.of(Rosbridge)] == [False, True]
+            assert [each.level for each in link.of(Notice)] == ["warning", "info"]
+            assert not task.done()
