@@ -77,16 +77,18 @@ class LockedRunDirectory:
 
         Raises:
             OccupiedError: Another run uses it.
-            OutputError: It does not exist, or other users can enter it.
+            OutputError: It cannot be created in an existing folder, or other users can enter it.
         """
         self.path = run_directory(given)
         """Its path, which is absolute."""
+        with contextlib.suppress(OSError):  # whoever may not create it cannot open it either
+            self.path.mkdir(mode=0o700)
         # the descriptor of the lock, which children inherit
         try:
             self.lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except OSError as error:
             raise OutputError(
-                f"BM_RUN_DIRECTORY: {self.path} is not a folder ({error.strerror}); create it, or name an existing one"
+                f"BM_RUN_DIRECTORY: {self.path} is not a folder, and cannot be created ({error.strerror}); name another one"
             ) from error
         try:
             self._claim()

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import socket
+import stat
 import subprocess
 import sys
 import tempfile
@@ -63,9 +64,11 @@ def test_a_place_that_somebody_else_may_have_prepared_is_refused(place, kind, ca
     assert "hub: warning: " in capsys.readouterr().err
 
 
-def test_a_named_directory_must_exist_and_belong_to_this_user_alone(tmp_path):
+def test_a_named_directory_is_created_for_this_user_alone(tmp_path):
+    LockedRunDirectory(tmp_path / "new").release()
+    assert stat.S_IMODE((tmp_path / "new").stat().st_mode) == 0o700
     with pytest.raises(OutputError):
-        LockedRunDirectory(tmp_path / "missing")
+        LockedRunDirectory(tmp_path / "missing" / "new")
     tmp_path.chmod(0o750)
     with pytest.raises(OutputError):
         LockedRunDirectory(tmp_path)
@@ -75,7 +78,6 @@ def test_one_run_at_a_time_and_what_a_killed_one_left_is_removed(place):
     first = LockedRunDirectory(None)
     with pytest.raises(OccupiedError):
         LockedRunDirectory(None)
-    (place / "other").mkdir(mode=0o700)
     LockedRunDirectory(place / "other").release()  # another run is possible elsewhere
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(first.path / "master.status.sock"))
