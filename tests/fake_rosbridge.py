@@ -36,14 +36,12 @@ import json
 import math
 import socket
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from typing import Any, Self, TypeGuard
+from typing import Any
 
-from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
-from websockets.http11 import Request, Response
 
 from tests.patience import PATIENCE
 
@@ -71,7 +69,7 @@ class _Client:
     services: set[str] = field(default_factory=set)
 
 
-def _slashed(name: Any) -> str:
+def _slashed(name):
     return name if isinstance(name, str) and name.startswith("/") else f"/{name}"
 
 
@@ -90,18 +88,18 @@ class FakeRosbridge:
     def __init__(
         self,
         *,
-        port: int = 0,
-        ros: int = 2,
-        rosapi: bool = False,
-        statuses: bool = False,
-        refuses_null: bool = False,
-        zombies: bool = False,
-        escapes: bool = False,
-        silent: bool = False,
-        delay: float = 0.0,
-        refuses: int | None = None,
-        max_size: int | None = None,
-    ) -> None:
+        port=0,
+        ros=2,
+        rosapi=False,
+        statuses=False,
+        refuses_null=False,
+        zombies=False,
+        escapes=False,
+        silent=False,
+        delay=0.0,
+        refuses=None,
+        max_size=None,
+    ):
         self.port = port
         self.ros = ros
         self.rosapi = rosapi
@@ -113,39 +111,39 @@ class FakeRosbridge:
         self.delay = delay
         self.refuses = refuses
         self.max_size = max_size
-        self.received: list[Received] = []
+        self.received = []
         self.connections = 0
-        self.types: dict[str, str] = {}
-        self.latched: dict[str, dict[str, Any]] = {}
-        self.services: dict[str, Callable[[dict[str, Any]], Any]] = {}
-        self.fails_as_cbor: set[str] = set()
-        self.refused_topics: set[str] = set()
-        self._best_effort: dict[str, float] = {}
-        self._begun: dict[str, float] = {}
-        self._clients: set[_Client] = set()
-        self._server: Server | None = None
-        self._place: socket.socket | None = None
+        self.types = {}
+        self.latched = {}
+        self.services = {}
+        self.fails_as_cbor = set()
+        self.refused_topics = set()
+        self._best_effort = {}
+        self._begun = {}
+        self._clients = set()
+        self._server = None
+        self._place = None
         self._numbers = itertools.count(1)
-        self._calls: dict[str, tuple[_Client, Any]] = {}
+        self._calls = {}
         self._news = asyncio.Event()
-        self._late: set[asyncio.Task[None]] = set()
+        self._late = set()
 
     # Coming and going
 
     @property
-    def uri(self) -> str:
+    def uri(self):
         return f"ws://127.0.0.1:{self.port}"
 
-    async def __aenter__(self) -> Self:
+    async def __aenter__(self):
         await self.come_back()
         return self
 
-    async def __aexit__(self, *_exception: object) -> None:
+    async def __aexit__(self, *_exception):
         await self.vanish()
         if self._place is not None:
             self._place.close()
 
-    async def come_back(self) -> None:
+    async def come_back(self):
         """Listen, again if it vanished, without any earlier state."""
         assert self._server is None, "it is here already"
         if self._place is None:
@@ -168,7 +166,7 @@ class FakeRosbridge:
             reuse_address=True,
         )
 
-    async def vanish(self) -> None:
+    async def vanish(self):
         """Cut every connection without a closing handshake, and stop listening."""
         for task in self._late:
             task.cancel()
@@ -179,39 +177,39 @@ class FakeRosbridge:
         if server is not None:
             await asyncio.wait_for(server.wait_closed(), PATIENCE)
 
-    async def cut(self) -> None:
+    async def cut(self):
         """Cut every connection without a closing handshake, but continue listening."""
         for client in list(self._clients):
             client.connection.transport.abort()
         await self._until(lambda: not self._clients, PATIENCE, "all connections to be gone")
 
-    async def hang_up(self, code: int = 1001) -> None:
+    async def hang_up(self, code=1001):
         """Close every connection with a closing handshake."""
         for client in list(self._clients):
             await client.connection.close(code)
 
-    def freeze(self) -> None:
+    def freeze(self):
         """Stop reading from the present connections, even pings, as if the Wi-Fi were lost."""
         for client in self._clients:
             client.connection.transport.pause_reading()
 
-    def thaw(self) -> None:
+    def thaw(self):
         for client in self._clients:
             client.connection.transport.resume_reading()
 
-    async def _answer_http(self, connection: ServerConnection, _request: Request) -> Response | None:
+    async def _answer_http(self, connection, _request):
         if self.refuses is None:
             return None
         return connection.respond(HTTPStatus(self.refuses), "the fake refuses\n")
 
     # Queries and messages of a test
 
-    def start_best_effort(self, topic: str, type_name: str) -> None:
+    def start_best_effort(self, topic, type_name):
         """Begin publishing a topic best-effort: only subscriptions made from now on hear it."""
         self.types[_slashed(topic)] = type_name
         self._best_effort[_slashed(topic)] = time.monotonic()
 
-    def ops(self, op: str, **fields: Any) -> list[dict[str, Any]]:
+    def ops(self, op, **fields):
         """Return the received operations of one kind, with the given fields."""
         return [
             received.op
@@ -221,18 +219,16 @@ class FakeRosbridge:
             and all(received.op.get(name) == value for name, value in fields.items())
         ]
 
-    async def wait_for_op(
-        self, op: str, *, count: int = 1, timeout: float = PATIENCE, **fields: Any
-    ) -> dict[str, Any]:
+    async def wait_for_op(self, op, *, count=1, timeout=PATIENCE, **fields):
         """Wait for a number of operations of one kind, with the given fields, and return the last."""
         await self._until(lambda: len(self.ops(op, **fields)) >= count, timeout, f"{count} {op} {fields}")
         return self.ops(op, **fields)[count - 1]
 
-    async def wait_for_connections(self, count: int, timeout: float = PATIENCE) -> None:
+    async def wait_for_connections(self, count, timeout=PATIENCE):
         """Wait until a number of connections has been made."""
         await self._until(lambda: self.connections >= count, timeout, f"{count} connections")
 
-    async def _until(self, condition: Callable[[], bool], timeout: float, what: str) -> None:
+    async def _until(self, condition, timeout, what):
         try:
             async with asyncio.timeout(timeout):
                 while not condition():
@@ -243,26 +239,26 @@ class FakeRosbridge:
                 f"the fake waited {timeout} s for {what}; it received {[r.raw[:200] for r in self.received]}"
             ) from None
 
-    def know(self, topic: str, type_name: str) -> None:
+    def know(self, topic, type_name):
         """Register a topic as if a ROS node had advertised it."""
         self.types[_slashed(topic)] = type_name
 
-    async def publish(self, topic: str, msg: dict[str, Any]) -> int:
+    async def publish(self, topic, msg):
         """Publish as a ROS node would, and return the number of clients that got it."""
         return await self._publish(_slashed(topic), msg)
 
-    def serve(self, service: str, handler: Callable[[dict[str, Any]], Any]) -> None:
+    def serve(self, service, handler):
         """Serve a service: the handler returns the values, or a str to refuse, or None never to answer."""
         self.services[_slashed(service)] = handler
 
-    async def say(self, data: str | bytes | dict[str, Any]) -> None:
+    async def say(self, data):
         """Send any text to every client."""
         for client in list(self._clients):
             await self._say(client, data)
 
     # The server
 
-    async def _talk(self, connection: ServerConnection) -> None:
+    async def _talk(self, connection):
         client = _Client(next(self._numbers), connection)
         self._clients.add(client)
         self.connections += 1
@@ -275,7 +271,7 @@ class FakeRosbridge:
             self._clients.discard(client)
             self._news.set()
 
-    async def _hear(self, client: _Client, raw: str) -> None:
+    async def _hear(self, client, raw):
         try:
             op = json.loads(raw)
         except ValueError:
@@ -299,11 +295,11 @@ class FakeRosbridge:
         else:
             await method(client, op)
 
-    async def _complain(self, client: _Client, reason: str) -> None:
+    async def _complain(self, client, reason):
         if self.statuses:
             await self._say(client, {"op": "status", "level": "error", "msg": reason})
 
-    async def _say(self, client: _Client, data: str | bytes | dict[str, Any]) -> None:
+    async def _say(self, client, data):
         if isinstance(data, dict):
             data = json.dumps(_without_nan(data))
             if self.escapes:
@@ -315,21 +311,21 @@ class FakeRosbridge:
         else:
             await self._send(client, data)
 
-    async def _say_late(self, client: _Client, data: str | bytes) -> None:
+    async def _say_late(self, client, data):
         await asyncio.sleep(self.delay)
         await self._send(client, data)
 
-    async def _send(self, client: _Client, data: str | bytes) -> None:
+    async def _send(self, client, data):
         if self.silent or client.dead:
             return
         with contextlib.suppress(ConnectionClosed):
             await client.connection.send(data)
 
-    def _is_type(self, type_name: Any) -> TypeGuard[str]:
+    def _is_type(self, type_name):
         parts = type_name.split("/") if isinstance(type_name, str) else []
         return all(parts) and (len(parts) == 2 or (len(parts) == 3 and self.ros == 2))
 
-    async def _op_advertise(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_advertise(self, client, op):
         topic, type_name = _slashed(op.get("topic")), op.get("type")
         if topic in self.refused_topics:
             return
@@ -343,10 +339,10 @@ class FakeRosbridge:
         if op.get("latch"):
             self.latched.setdefault(topic, {})
 
-    async def _op_unadvertise(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_unadvertise(self, client, op):
         client.advertised.pop(_slashed(op.get("topic")), None)
 
-    async def _op_publish(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_publish(self, client, op):
         topic, msg = _slashed(op.get("topic")), op.get("msg")
         if not isinstance(msg, dict):
             await self._complain(client, "no message")
@@ -359,7 +355,7 @@ class FakeRosbridge:
                 self.latched[topic] = msg
             await self._publish(topic, msg)
 
-    async def _publish(self, topic: str, msg: dict[str, Any]) -> int:
+    async def _publish(self, topic, msg):
         reached = 0
         for client in list(self._clients):
             times = self._times(client, topic)
@@ -368,7 +364,7 @@ class FakeRosbridge:
                 await self._say(client, {"op": "publish", "topic": topic, "msg": msg})
         return reached
 
-    def _times(self, client: _Client, topic: str) -> int:
+    def _times(self, client, topic):
         """Return how often a client gets a message: mostly once or never."""
         subscriptions = client.subscribed.get(topic, {})
         if not subscriptions or self._best_effort.get(topic, 0.0) > self._begun[topic]:
@@ -385,7 +381,7 @@ class FakeRosbridge:
         client.heard[topic] = now
         return 2 if first and len(subscriptions) > 1 else 1
 
-    async def _op_subscribe(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_subscribe(self, client, op):
         topic, type_name = _slashed(op.get("topic")), op.get("type")
         if topic in self.refused_topics:
             return
@@ -404,7 +400,7 @@ class FakeRosbridge:
             if self.latched.get(topic):
                 await self._say(client, {"op": "publish", "topic": topic, "msg": self.latched[topic]})
 
-    async def _op_unsubscribe(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_unsubscribe(self, client, op):
         topic = _slashed(op.get("topic"))
         subscriptions = client.subscribed.get(topic, {})
         if op.get("id") is None:
@@ -412,13 +408,13 @@ class FakeRosbridge:
         subscriptions.pop(op.get("id"), None)
         client.heard.pop(topic, None)
 
-    async def _op_advertise_service(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_advertise_service(self, client, op):
         client.services.add(_slashed(op.get("service")))
 
-    async def _op_unadvertise_service(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_unadvertise_service(self, client, op):
         client.services.discard(_slashed(op.get("service")))
 
-    async def _op_call_service(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_call_service(self, client, op):
         service, args = _slashed(op.get("service")), op.get("args") or {}
         handler = self.services.get(service) or (self._rosapi(service) if self.rosapi else None)
         if handler is not None:
@@ -434,7 +430,7 @@ class FakeRosbridge:
                 return
         await self._respond(client, op, f"Service {service} does not exist", ok=False)
 
-    async def _op_service_response(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_service_response(self, client, op):
         """Pass an answer on like the reference server, in rosbridge_library/capabilities/service_response.py.
 
         `service_response_msg_fields` there requires `result`, and `values` that are an object; an answer without
@@ -448,26 +444,26 @@ class FakeRosbridge:
         if caller is not None:
             await self._respond(caller, call, values, ok=True)
 
-    async def _respond(self, client: _Client, call: dict[str, Any], values: Any, *, ok: bool) -> None:
+    async def _respond(self, client, call, values, *, ok):
         answer = {"op": "service_response", "service": call.get("service"), "values": values, "result": ok}
         if "id" in call:
             answer["id"] = call["id"]
         await self._say(client, answer)
 
-    async def _op_status(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_status(self, client, op):
         """Ignore operations that clients may send too."""
 
     # rosapi
 
-    def _rosapi(self, service: str) -> Callable[[dict[str, Any]], Any] | None:
+    def _rosapi(self, service):
         topics = {**self.types, "/rosout": "rosgraph_msgs/Log" if self.ros == 1 else "rcl_interfaces/msg/Log"}
 
-        def publishers(args: dict[str, Any]) -> dict[str, Any]:
+        def publishers(args):
             topic = _slashed(args.get("topic"))
             published = topic in self._best_effort or any(topic in c.advertised for c in self._clients)
             return {"publishers": ["/fake"] if published else []}
 
-        known: dict[str, Callable[[dict[str, Any]], Any]] = {
+        known = {
             "/rosapi/topics": lambda _args: {"topics": list(topics), "types": list(topics.values())},
             "/rosapi/topic_type": lambda args: {"type": topics.get(_slashed(args.get("topic")), "")},
             "/rosapi/publishers": publishers,
@@ -486,12 +482,12 @@ class FakeRosbridge:
         return known.get(service)
 
 
-def _bare(type_name: str) -> tuple[str, str]:
+def _bare(type_name):
     parts = type_name.split("/")
     return parts[0], parts[-1]
 
 
-def _without_nan(value: Any) -> Any:
+def _without_nan(value):
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
@@ -501,7 +497,7 @@ def _without_nan(value: Any) -> Any:
     return value
 
 
-def _has_null(value: Any) -> bool:
+def _has_null(value):
     if isinstance(value, dict):
         return any(map(_has_null, value.values()))
     if isinstance(value, list):

@@ -6,7 +6,6 @@ What client and hub remember of a publisher's messages changes nothing: each is 
 import contextlib
 import json
 import math
-from typing import Any
 
 import numpy as np
 import orjson
@@ -52,14 +51,14 @@ cbor_like = st.recursive(
 ).map(lambda value: cbor_codec.encode({"a": value}))
 
 
-def check_sentence(error: BridgeError) -> None:
+def check_sentence(error):
     said = str(error)
     assert said
     assert "\n" not in said
     assert len(said) <= LONGEST_SENTENCE
 
 
-def check_plain(value: Any, *, finite: bool, depth: int) -> None:
+def check_plain(value, *, finite, depth):
     """Check that a message has only types of ROS messages."""
     assert depth >= 0
     if isinstance(value, dict):
@@ -100,7 +99,7 @@ def test_json_gives_a_plain_message_that_survives_a_round_trip(data):
     bytes.fromhex("a26161d840563b000000000000001cffffffffd84d4600008100036161d840d840d84046000081000300")
 )
 def test_cbor_gives_the_same_message_as_lists_and_as_arrays(data):
-    forms: dict[str, Any] = {}
+    forms = {}
     for arrays in ("list", "numpy"):
         try:
             forms[arrays] = cbor_codec.decode(data, max_size=MAX_SIZE, max_depth=MAX_DEPTH, arrays=arrays)
@@ -192,7 +191,7 @@ def test_serialised_bytes_give_a_message_of_the_type(name, data):
 # The client's core between a user and a server that both may do anything
 
 TOPICS = st.sampled_from(("/a", "b", "/a/b"))
-ODD: tuple[Any, ...] = (
+ODD = (
     *(None, True, 0, -1, 3, 1.5, 1e300, 2**63, 2**70, "", "x", "/a", "9", [], [1.5, None], [[[]]]),
     *({}, {"a": [1]}),
 )
@@ -211,11 +210,11 @@ DELIVERIES = (
 )
 
 
-def no_constant(name: str) -> None:
+def no_constant(name):
     raise AssertionError(f"{name} left as JSON")
 
 
-def picture(text: bytes) -> bytes:
+def picture(text):
     return json.dumps({"op": "png", "data": png.encode(text)}).encode()
 
 
@@ -231,18 +230,18 @@ def refusals():
 class AnyServer(RuleBasedStateMachine):
     """Check that errors are the bridge's, memory is bounded, and output is strict JSON."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.core = ClientCore(max_size=MAX_SIZE, max_depth=MAX_DEPTH, fragment_size=50)
         self.now = 0.0
-        self.subscriptions: set[int] = set()
-        self.advertisements: list[int] = []
-        self.asked: list[str] = []
+        self.subscriptions = set()
+        self.advertisements = []
+        self.asked = []
         """Identities of calls and goals."""
-        self.tickets: list[int] = []
+        self.tickets = []
 
     @invariant()
-    def bounds_and_strict_json(self) -> None:
+    def bounds_and_strict_json(self):
         core = self.core
         for data in core.data_to_send():
             assert core.wire.connected
@@ -256,7 +255,7 @@ class AnyServer(RuleBasedStateMachine):
         assert len(core.goals) <= MAX_GOALS
         assert core._fragments.waiting_bytes <= 4 * (MAX_SIZE + 128)
 
-    def take(self, data: bytes | str) -> None:
+    def take(self, data):
         self.now += 0.5
         event = self.core.receive(data if isinstance(data, bytes) else data.encode(), self.now)
         if isinstance(event, MessageReceived | MessageDiscarded):
@@ -273,11 +272,11 @@ class AnyServer(RuleBasedStateMachine):
             assert "\n" not in event.reason
 
     @rule(data=st.binary(max_size=60) | json_like)
-    def receive_raw(self, data: bytes) -> None:
+    def receive_raw(self, data):
         self.take(data)
 
     @rule(draw=st.data(), form=st.sampled_from(("json", "json", "cbor", "fragments", "png", "both")))
-    def receive(self, draw: Any, form: str) -> None:
+    def receive(self, draw, form):
         """Receive an operation of which any field may be right, wrong or absent."""
         right = {
             "topic": TOPICS,
@@ -293,7 +292,7 @@ class AnyServer(RuleBasedStateMachine):
             "total": st.just(2),
             "data": st.just("x"),
         }
-        operation: dict[str, Any] = {"op": draw.draw(st.sampled_from(OPS))}
+        operation = {"op": draw.draw(st.sampled_from(OPS))}
         wrong = draw.draw(st.dictionaries(st.sampled_from(sorted(right)), st.sampled_from(ODD), max_size=2))
         absent = draw.draw(st.sets(st.sampled_from(sorted(right)), max_size=2))
         operation |= {name: draw.draw(value) for name, value in right.items() if name not in absent} | wrong
@@ -308,12 +307,12 @@ class AnyServer(RuleBasedStateMachine):
                 self.take(piece)
 
     @rule()
-    def connect(self) -> None:
+    def connect(self):
         self.core.lost()
         self.core.restore()
 
     @rule()
-    def lose(self) -> None:
+    def lose(self):
         self.core.lost()
 
     @rule(
@@ -322,7 +321,7 @@ class AnyServer(RuleBasedStateMachine):
         rate=st.sampled_from((0, 0, 700, -1)),
         delivery=st.sampled_from(DELIVERIES),
     )
-    def subscribe(self, topic: str, type_name: str | None, rate: int, delivery: Delivery) -> None:
+    def subscribe(self, topic, type_name, rate, delivery):
         with refusals():
             self.subscriptions.add(
                 self.core.subscriptions.subscribe(topic, type_name, throttle_rate=rate, delivery=delivery)
@@ -330,13 +329,13 @@ class AnyServer(RuleBasedStateMachine):
 
     @rule(draw=st.data())
     @precondition(lambda self: self.subscriptions)
-    def unsubscribe(self, draw: Any) -> None:
+    def unsubscribe(self, draw):
         number = draw.draw(st.sampled_from(sorted(self.subscriptions)))
         self.subscriptions.remove(number)
         self.core.subscriptions.unsubscribe(number)
 
     @rule(topic=TOPICS, type_name=st.sampled_from(("p/T", "p/msg/T", "q")), latch=st.booleans())
-    def advertise(self, topic: str, type_name: str, latch: bool) -> None:
+    def advertise(self, topic, type_name, latch):
         with refusals():
             self.advertisements.append(self.core.publications.advertise(topic, type_name, latch=latch))
 
@@ -344,32 +343,32 @@ class AnyServer(RuleBasedStateMachine):
         value=st.sampled_from((*ODD, "\ud800", math.nan, np.arange(3.0), np.array([math.inf]), b"x", {1: 2}))
     )
     @precondition(lambda self: self.advertisements)
-    def publish(self, value: Any) -> None:
+    def publish(self, value):
         with refusals():
             data = self.core.publications.publish(self.advertisements[-1], {"value": value})
             assert type(json.loads(data, parse_constant=no_constant)["msg"]) is dict
 
     @rule()
     @precondition(lambda self: self.advertisements)
-    def unadvertise(self) -> None:
+    def unadvertise(self):
         self.core.publications.unadvertise(self.advertisements.pop())
 
     @rule(name=st.sampled_from(("/s", "t")), value=st.sampled_from(ODD), forget=st.booleans())
-    def call(self, name: str, value: Any, forget: bool) -> None:
+    def call(self, name, value, forget):
         with refusals():
             self.asked.append(self.core.calls.send(name, {"x": value}))
             if forget:
                 self.core.calls.forget(self.asked[-1])
 
     @rule(value=st.sampled_from(ODD), then=st.sampled_from(("", "cancel", "forget")))
-    def send_goal(self, value: Any, then: str) -> None:
+    def send_goal(self, value, then):
         with refusals():
             self.asked.append(self.core.goals.send("/fly", "p/Fly", {"x": value}, feedback=True))
             if then:
                 getattr(self.core.goals, then)(self.asked[-1])
 
     @rule(service=st.sampled_from(("/s", "/t")))
-    def serve(self, service: str) -> None:
+    def serve(self, service):
         if service in self.core.services:
             self.core.services.unadvertise(service)
         else:
@@ -377,13 +376,13 @@ class AnyServer(RuleBasedStateMachine):
 
     @rule(value=st.sampled_from(ODD), ok=st.booleans())
     @precondition(lambda self: self.tickets)
-    def answer(self, value: Any, ok: bool) -> None:
+    def answer(self, value, ok):
         """Answer a request, perhaps one of a lost connection."""
         with refusals():
             self.core.services.answer(self.tickets.pop(), {"x": value}, ok=ok)
 
     @rule(seconds=st.sampled_from((0.0, 20.0)))
-    def pass_time(self, seconds: float) -> None:
+    def pass_time(self, seconds):
         self.now += seconds
         self.core.subscriptions.retry_untyped()
 
@@ -453,7 +452,7 @@ def test_a_client_that_knows_an_envelope_reads_what_one_does_that_parses_all(mes
         assert len(cores[0].subscriptions.envelopes) <= 16
 
 
-def _content(payload: bytes) -> str:
+def _content(payload):
     """Return the content of a payload: strict JSON, or CBOR."""
     return repr(orjson.loads(payload)) if payload[:1] == b"{" else payload.hex()
 

@@ -5,7 +5,6 @@ import os
 import sys
 from contextlib import AsyncExitStack
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import zeroconf.asyncio  # noqa: F401 - here, because it runs ldconfig when it is first imported, to find a library
@@ -17,15 +16,13 @@ from tests.patience import PATIENCE, PROCESS_PATIENCE
 LOOPBACK = ("127.0.0.1",)
 
 
-def _name(what: str) -> str:
+def _name(what):
     """A name that no other run of these tests announces at the same time."""
     return f"{what} {os.getpid()}"
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-async def test_a_robot_that_is_announced_is_found_and_then_gone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_a_robot_that_is_announced_is_found_and_then_gone(monkeypatch):
     monkeypatch.setattr(discovery, "_TAKEN_TIME", 0.5)
     name = _name("Röbot")
     with pytest.raises(UnknownRobotError, match=name):
@@ -40,7 +37,7 @@ async def test_a_robot_that_is_announced_is_found_and_then_gone(
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-async def test_a_name_that_is_taken_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_name_that_is_taken_is_refused(monkeypatch):
     name = _name("Twin")
     async with AsyncExitStack() as stack:
         monkeypatch.setattr(discovery, "_TAKEN_TIME", 0.5)
@@ -52,7 +49,7 @@ async def test_a_name_that_is_taken_is_refused(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize("name", ["", "x" * 64, "ü" * 32, "a.b", "a\nb", "a\x1b[31mb"])
-async def test_what_cannot_be_a_name_is_refused(name: str) -> None:
+async def test_what_cannot_be_a_name_is_refused(name):
     with pytest.raises(DiscoveryError, match="cannot be the name"):
         await resolve(name, 0.1, interfaces=LOOPBACK)
     with pytest.raises(DiscoveryError, match="cannot be the name"):
@@ -61,13 +58,13 @@ async def test_what_cannot_be_a_name_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("uri", ["robot:9090", "robot:9090/bridge"])
-async def test_a_port_instead_of_a_robots_name_is_refused_with_the_uri_that_was_meant(uri: str) -> None:
+async def test_a_port_instead_of_a_robots_name_is_refused_with_the_uri_that_was_meant(uri):
     with pytest.raises(DiscoveryError, match=f"ws://{uri}") as caught:
         await discovery.announced_uri(uri)
     assert caught.value.exit_code == 2
 
 
-async def test_without_zeroconf_one_sentence_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_without_zeroconf_one_sentence_says_so(monkeypatch):
     for module in ("zeroconf", "zeroconf.asyncio"):
         monkeypatch.setitem(sys.modules, module, None)
     for attempt in (discover(0.1), resolve("Robot", 0.1)):
@@ -78,22 +75,22 @@ async def test_without_zeroconf_one_sentence_says_so(monkeypatch: pytest.MonkeyP
 
 # zeroconf leaves the socket that listens when it finds none to send from
 @pytest.mark.filterwarnings("ignore:.*socket.socket:pytest.PytestUnraisableExceptionWarning")
-async def test_without_a_network_one_sentence_says_so() -> None:
+async def test_without_a_network_one_sentence_says_so():
     with pytest.raises(DiscoveryError, match="no network"):
         await discover(0.1, interfaces=("192.0.2.77",))
 
 
 @pytest.mark.thorough
-def test_importing_this_imports_no_zeroconf() -> None:
+def test_importing_this_imports_no_zeroconf():
     import subprocess
 
     code = "import sys, bridge.discovery, services.commands.discover; sys.exit('zeroconf' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=PROCESS_PATIENCE).returncode == 0
 
 
-def _announced(**properties: Any) -> Any:
+def _announced(**properties):
     """Return an announcement as read by zeroconf."""
-    said: dict[str, Any] = {
+    said = {
         "name": f"Robot.{discovery.SERVICE_TYPE}",
         "port": 9090,
         "server": "robot.local.",
@@ -124,11 +121,11 @@ def _announced(**properties: Any) -> Any:
         ({"name": f"R\x1b[31m.{discovery.SERVICE_TYPE}"}, None),
     ],
 )
-def test_what_the_network_says_is_checked(said: dict[str, Any], robot: Robot | None) -> None:
+def test_what_the_network_says_is_checked(said, robot):
     assert discovery._robot(_announced(**said)) == robot
 
 
-def test_the_addresses_that_are_announced() -> None:
+def test_the_addresses_that_are_announced():
     assert discovery._addresses("192.0.2.7", None) == ["192.0.2.7"]
     assert discovery._addresses("localhost", None) == ["127.0.0.1"]
     assert discovery._addresses("::", LOOPBACK) == ["127.0.0.1"]

@@ -113,8 +113,7 @@ def test_how_far_a_path_went(path, reason):
 
 
 @pytest.mark.parametrize(
-    "bad",
-    ["", ".", "a.", ".a", "a..b", "a[", "a[-1]", "[0]", "a.[0]", "a[0]b", "a b", "1a", "ä", "a.b\n"],
+    "bad", ["", ".", "a.", ".a", "a..b", "a[", "a[-1]", "[0]", "a.[0]", "a[0]b", "a b", "1a", "ä", "a.b\n"]
 )
 def test_what_is_neither_a_name_nor_a_path(bad):
     with pytest.raises(PathError) as caught:

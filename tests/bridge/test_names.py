@@ -47,10 +47,7 @@ def test_same_type(one, other, same):
 
 
 @pytest.mark.parametrize(
-    "bad",
-    [
-        *("", "String", "a/b/c", "a/msg/", "/String", "a//B", "1a/B", "a b/C", "a/B\n", "a/" + "B" * 300),
-    ],
+    "bad", [*("", "String", "a/b/c", "a/msg/", "/String", "a//B", "1a/B", "a b/C", "a/B\n", "a/" + "B" * 300)]
 )
 def test_malformed_types_are_refused(bad):
     with pytest.raises(NameFormError):

@@ -8,27 +8,18 @@ import pytest
 from bridge import transforms
 from bridge.errors import ExtrapolationError, FramesUnconnectedError, FrameUnknownError
 from bridge.stamps import header
-from bridge.transforms import (
-    MAX_ENTRIES,
-    MAX_NAME,
-    Transform,
-    TransformTree,
-    interpolated,
-    rotation_matrix,
-)
+from bridge.transforms import MAX_ENTRIES, MAX_NAME, Transform, TransformTree, interpolated, rotation_matrix
 
 SECOND = 10**9
 
 
-def turned(
-    x: float, degrees: float, stamp: int = 0, axis: tuple[float, float, float] = (0, 0, 1)
-) -> Transform:
+def turned(x, degrees, stamp=0, axis=(0, 0, 1)):
     half = math.radians(degrees) / 2
     rotation = np.array([*(math.sin(half) * np.array(axis)), math.cos(half)])
     return Transform(np.array([x, 0.0, 0.0]), rotation, stamp)
 
 
-def message(parent: str, child: str, transform: Transform) -> dict:
+def message(parent, child, transform):
     body = {
         "translation": dict(zip("xyz", transform.translation.tolist(), strict=True)),
         "rotation": dict(zip("xyzw", transform.rotation.tolist(), strict=True)),

@@ -1,20 +1,19 @@
 """A client's core, and the test in the place of its server."""
 
 import json
-from typing import Any
 
 from bridge.client.protocol import ClientCore
 
 
-def connected(**options: Any) -> ClientCore:
+def connected(**options):
     core = ClientCore(**options)
     core.restore()
     return core
 
 
-def sent(core: ClientCore) -> list[dict[str, Any]]:
+def sent(core):
     return [json.loads(data) for data in core.data_to_send()]
 
 
-def tell(core: ClientCore, now: float = 0.0, **operation: Any) -> Any:
+def tell(core, now=0.0, **operation):
     return core.receive(json.dumps(operation).encode(), now)

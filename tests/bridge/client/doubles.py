@@ -11,14 +11,13 @@ import io
 import itertools
 import json
 import math
-from typing import Any
 
 import cbor2
 import numpy as np
 from PIL import Image
 from rosbags.typesys import Stores, get_typestore
 
-from tests.fake_rosbridge import FakeRosbridge, _Client
+from tests.fake_rosbridge import FakeRosbridge
 
 _STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.LATEST)}
 
@@ -26,7 +25,7 @@ _STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.LATEST)
 class Double(FakeRosbridge):
     """One of the servers; publishes messages of ``std_msgs/Float64MultiArray`` in every form it knows."""
 
-    def __init__(self, server: str) -> None:
+    def __init__(self, server):
         super().__init__(
             ros=1 if server == "A" else 2,
             statuses=server == "R",
@@ -36,11 +35,11 @@ class Double(FakeRosbridge):
         )
         self.server = server
         self.known = {"none", "png", "cbor", "cbor-raw"}
-        self.fragment_sizes: dict[int, int] = {}
+        self.fragment_sizes = {}
         self._fragment_ids = itertools.count()
-        self._parts: dict[tuple[int, Any], dict[int, str]] = {}
+        self._parts = {}
 
-    async def _op_subscribe(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_subscribe(self, client, op):
         wanted = op.get("compression", "none")
         if wanted not in self.known:
             await self._complain(client, f"unsupported compression {wanted}")
@@ -50,14 +49,14 @@ class Double(FakeRosbridge):
             self.fragment_sizes[client.number] = op["fragment_size"]  # sticky, for all that follows
         await super()._op_subscribe(client, op)
 
-    async def _op_fragment(self, client: _Client, op: dict[str, Any]) -> None:
+    async def _op_fragment(self, client, op):
         parts = self._parts.setdefault((client.number, op["id"]), {})
         parts[op["num"]] = op["data"]
         if len(parts) == op["total"]:
             del self._parts[client.number, op["id"]]
             await self._hear(client, "".join(parts[num] for num in sorted(parts)))
 
-    async def _publish(self, topic: str, msg: dict[str, Any]) -> int:
+    async def _publish(self, topic, msg):
         reached = 0
         for client in sorted(self._clients, key=lambda client: client.number):
             subscribed = client.subscribed.get(topic, {}).values()
@@ -66,8 +65,8 @@ class Double(FakeRosbridge):
                 reached += await self._deliver(client, topic, msg, form)
         return reached
 
-    async def _deliver(self, client: _Client, topic: str, msg: dict[str, Any], form: str) -> int:
-        operation: dict[str, Any] = {"op": "publish", "topic": topic, "msg": msg}
+    async def _deliver(self, client, topic, msg, form):
+        operation = {"op": "publish", "topic": topic, "msg": msg}
         if form == "png":
             if self.server in "AR":
                 await self._say_in_pieces(client, {"op": "png", "data": _picture(json.dumps(operation))})
@@ -83,7 +82,7 @@ class Double(FakeRosbridge):
             await self._say_in_pieces(client, operation)
         return 1
 
-    async def _say_in_pieces(self, client: _Client, operation: dict[str, Any]) -> None:
+    async def _say_in_pieces(self, client, operation):
         size = self.fragment_sizes.get(client.number)
         text = json.dumps(_nulls(operation))
         if size is None or len(text) <= size:
@@ -100,7 +99,7 @@ class Double(FakeRosbridge):
             await self._say(client, {"op": "fragment", "id": key, "data": data, "num": num, "total": total})
 
 
-def serialised(msg: dict[str, Any], ros: int) -> bytes:
+def serialised(msg, ros):
     """A Float64MultiArray with one dimension, as the server's ROS writes it."""
     store = _STORES[ros]
     layout = store.types["std_msgs/msg/MultiArrayLayout"]([], 0)
@@ -109,7 +108,7 @@ def serialised(msg: dict[str, Any], ros: int) -> bytes:
     return bytes(write(message, "std_msgs/msg/Float64MultiArray"))
 
 
-def _picture(text: str) -> str:
+def _picture(text):
     pixels = text.encode()
     width = max(1, math.floor(math.sqrt(len(pixels) / 3)))
     height = math.ceil(len(pixels) / 3 / width)
@@ -119,5 +118,5 @@ def _picture(text: str) -> str:
     return base64.b64encode(buffer.getvalue()).decode()
 
 
-def _nulls(value: Any) -> Any:
+def _nulls(value):
     return json.loads(json.dumps(value), parse_constant=lambda _: None)

@@ -2,18 +2,15 @@
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Awaitable, Callable
 
 
 @contextlib.asynccontextmanager
-async def tcp_service(
-    serve: Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None] | None], port: int = 0
-) -> AsyncIterator[int]:
+async def tcp_service(serve, port=0):
     """Serve each connection on a port of this machine; at the end, cut those that `serve` has not closed."""
-    tasks: list[asyncio.Task[None] | None] = []
-    writers: list[asyncio.StreamWriter] = []
+    tasks = []
+    writers = []
 
-    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def talk(reader, writer):
         tasks.append(asyncio.current_task())
         writers.append(writer)
         with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError):

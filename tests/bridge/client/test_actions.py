@@ -2,12 +2,11 @@
 
 import asyncio
 import contextlib
-from typing import Any
 
 import numpy as np
 import pytest
 
-from bridge.client import GoalRequest, State, connect
+from bridge.client import State, connect
 from bridge.client.actions import FEEDBACK_QUEUE_SIZE
 from bridge.client.protocol.events import GoalFeedback, GoalStatus
 from bridge.errors import ActionlibError, ConcurrentReadError, DisconnectedError, GoalError, NoAnswerError
@@ -18,7 +17,7 @@ from tests.patience import PATIENCE
 FIBONACCI = "actionlib_tutorials/Fibonacci"
 
 
-async def count(goal: GoalRequest) -> dict[str, Any] | None:
+async def count(goal):
     """Count to the order of the goal, and end it in the way that its order says."""
     order = goal.values["order"]
     goal.feed_back({"sequence": [0, 1]})
@@ -48,11 +47,7 @@ async def serving():
 
 @pytest.mark.parametrize(
     ("order", "status", "sequence"),
-    [
-        (5, GoalStatus.SUCCEEDED, [0, 1, 2, 3, 4]),
-        (1, GoalStatus.ABORTED, [1]),
-        (2, GoalStatus.CANCELED, [2]),
-    ],
+    [(5, GoalStatus.SUCCEEDED, [0, 1, 2, 3, 4]), (1, GoalStatus.ABORTED, [1]), (2, GoalStatus.CANCELED, [2])],
 )
 async def test_a_goal_is_fed_back_and_ends(order, status, sequence):
     async with (
@@ -150,7 +145,7 @@ async def test_a_handler_that_fails_and_a_server_that_goes_away_end_the_goal():
 async def test_an_action_comes_back_with_its_connection_and_its_goals_do_not(fake, ros):
     started, cancelled = asyncio.Event(), asyncio.Event()
 
-    async def wait(goal: GoalRequest) -> None:
+    async def wait(goal):
         started.set()
         try:
             await goal.wait_canceling()

@@ -7,7 +7,6 @@ ClientCore ──data_to_send──▶ PaperServer (keeps what the wire said)
 
 import json
 import math
-from typing import Any
 
 import cbor2
 import pytest
@@ -25,13 +24,7 @@ from bridge.client.protocol.events import (
 )
 from bridge.client.protocol.services import MAX_CALLS, MAX_REQUESTS
 from bridge.codecs import png
-from bridge.errors import (
-    EncodeError,
-    NameFormError,
-    OptionError,
-    SlowPeerError,
-    TypeConflictError,
-)
+from bridge.errors import EncodeError, NameFormError, OptionError, SlowPeerError, TypeConflictError
 from bridge.names import absolute
 from bridge.qos import Qos
 from tests.bridge.client.cores import connected, sent, tell
@@ -282,7 +275,7 @@ def test_status_messages_are_taken(operation, level, text):
     assert tell(connected(), op="status", **operation) == StatusReceived(level, text)
 
 
-def wrapped(inner: bytes) -> bytes:
+def wrapped(inner):
     return json.dumps({"op": "fragment", "id": 1, "num": 0, "total": 1, "data": inner.decode()}).encode()
 
 
@@ -348,12 +341,12 @@ TOPICS = ["/a", "a", "/b", "c"]
 class PaperServer:
     """The state of a server, as known from the wire, in the simplest form."""
 
-    def __init__(self) -> None:
-        self.advertised: dict[str, dict[str, Any]] = {}
-        self.subscribed: dict[str, dict[str, dict[str, Any]]] = {}
-        self.services: set[str] = set()
+    def __init__(self):
+        self.advertised = {}
+        self.subscribed = {}
+        self.services = set()
 
-    def hear(self, operation: dict[str, Any]) -> None:
+    def hear(self, operation):
         operation["topic"] = absolute(operation.get("topic", ""))
         match operation["op"]:
             case "advertise":
@@ -376,32 +369,32 @@ class PaperServer:
 class Wishes(RuleBasedStateMachine):
     """Check that the client's requests and the server's state always agree while connected."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.core = ClientCore()
         self.server = PaperServer()
         self.now = 0.0
-        self.advertisements: dict[int, str] = {}
-        self.subscriptions: dict[int, tuple[str, int, int]] = {}
-        self.services: set[str] = set()
+        self.advertisements = {}
+        self.subscriptions = {}
+        self.services = set()
 
     @rule()
-    def connect(self) -> None:
+    def connect(self):
         self.core.lost()
         self.server = PaperServer()
         self.core.restore()
 
     @rule()
-    def lose(self) -> None:
+    def lose(self):
         self.core.lost()
 
     @rule(topic=st.sampled_from(TOPICS), type_name=st.sampled_from(["p/T", "p/msg/T"]))
-    def advertise(self, topic: str, type_name: str) -> None:
+    def advertise(self, topic, type_name):
         self.advertisements[self.core.publications.advertise(topic, type_name)] = absolute(topic)
 
     @rule(data=st.data())
     @precondition(lambda self: self.advertisements)
-    def unadvertise(self, data: Any) -> None:
+    def unadvertise(self, data):
         number = data.draw(st.sampled_from(sorted(self.advertisements)))
         self.core.publications.unadvertise(number)
         del self.advertisements[number]
@@ -412,20 +405,20 @@ class Wishes(RuleBasedStateMachine):
         rate=st.sampled_from([0, 100, 1000]),
         length=st.sampled_from([0, 5]),
     )
-    def subscribe(self, topic: str, type_name: str | None, rate: int, length: int) -> None:
+    def subscribe(self, topic, type_name, rate, length):
         number = self.core.subscriptions.subscribe(topic, type_name, throttle_rate=rate, queue_length=length)
         assert number not in self.subscriptions
         self.subscriptions[number] = (absolute(topic), rate, length)
 
     @rule(data=st.data())
     @precondition(lambda self: self.subscriptions)
-    def unsubscribe(self, data: Any) -> None:
+    def unsubscribe(self, data):
         number = data.draw(st.sampled_from(sorted(self.subscriptions)))
         self.core.subscriptions.unsubscribe(number)
         del self.subscriptions[number]
 
     @rule(service=st.sampled_from(["/s", "/t"]))
-    def toggle_service(self, service: str) -> None:
+    def toggle_service(self, service):
         if service in self.services:
             self.core.services.unadvertise(service)
         else:
@@ -433,13 +426,13 @@ class Wishes(RuleBasedStateMachine):
         self.services ^= {service}
 
     @rule()
-    def ask_again(self) -> None:
+    def ask_again(self):
         self.core.subscriptions.retry_untyped()
         for topic in self.core.subscriptions.silent():
             self.core.subscriptions.renew(topic)
 
     @rule(topic=st.sampled_from([*TOPICS, "/c"]), step=st.sampled_from([0.0, 0.05, 0.2, 2.0]))
-    def message(self, topic: str, step: float) -> None:
+    def message(self, topic, step):
         self.now += step
         event = self.core.receive(json.dumps({"op": "publish", "topic": topic, "msg": {}}).encode(), self.now)
         assert event is None or isinstance(event, MessageReceived)
@@ -453,7 +446,7 @@ class Wishes(RuleBasedStateMachine):
         assert fastest <= set(received) <= set(wanting)
 
     @invariant()
-    def the_server_knows_what_is_wanted(self) -> None:
+    def the_server_knows_what_is_wanted(self):
         for operation in sent(self.core):
             assert self.core.wire.connected
             self.server.hear(operation)

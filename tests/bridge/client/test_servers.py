@@ -5,13 +5,12 @@ Ros ◀──WebSocket──▶ Double (A, B or R), or hub ◀──WebSocket─
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator
 from itertools import product
 
 import numpy as np
 import pytest
 
-from bridge.client import Ros, connect
+from bridge.client import connect
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import DecodeError, NoAnswerError, NoMessageError, ServiceError
 from bridge.qos import Qos
@@ -28,13 +27,13 @@ SERVERS = pytest.mark.parametrize("double", ["A", "B", "R"], indirect=True)
 
 
 @pytest.fixture
-async def double(request: pytest.FixtureRequest) -> AsyncIterator[Double]:
+async def double(request):
     async with Double(request.param) as double:
         yield double
 
 
 @pytest.fixture
-async def ros(double: Double) -> AsyncIterator[Ros]:
+async def ros(double):
     async with connect(double.uri) as ros:
         yield ros
 

@@ -2,17 +2,11 @@
 
 import asyncio
 import math
-from typing import Any
 
 import pytest
 
 from bridge.client import State, connect
-from bridge.errors import (
-    DisconnectedError,
-    EncodeError,
-    NoAnswerError,
-    ServiceError,
-)
+from bridge.errors import DisconnectedError, EncodeError, NoAnswerError, ServiceError
 from tests.patience import PATIENCE
 
 
@@ -66,11 +60,11 @@ async def test_the_end_of_the_connection_fails_what_waits(fake, ros, end):
 
 
 async def test_a_service_of_this_client(fake, ros, caller):
-    async def double(args: dict[str, Any]) -> dict[str, Any]:
+    async def double(args):
         await asyncio.sleep(0)
         return {"n": 2 * args["n"]}
 
-    async def nothing(_args: dict[str, Any]) -> None:
+    async def nothing(_args):
         pass
 
     service = await ros.advertise_service("/double", "p/Double", double)
@@ -104,7 +98,7 @@ async def caller(fake):
     ],
 )
 async def test_a_handler_that_fails(fake, ros, caller, outcome, said, caplog):
-    async def handler(_args: dict[str, Any]) -> Any:
+    async def handler(_args):
         if isinstance(outcome, Exception):
             raise outcome
         if outcome is None:
@@ -124,7 +118,7 @@ async def test_a_handler_that_fails(fake, ros, caller, outcome, said, caplog):
 async def test_closing_ends_what_is_being_handled(fake, ros, caller):
     began, ended = asyncio.Event(), asyncio.Event()
 
-    async def handler(_args: dict[str, Any]) -> None:
+    async def handler(_args):
         began.set()
         try:
             await asyncio.sleep(60)
@@ -144,7 +138,7 @@ async def test_closing_ends_what_is_being_handled(fake, ros, caller):
 async def test_more_requests_than_can_be_handled_are_refused(fake, ros, caller):
     release = asyncio.Event()
 
-    async def handler(_args: dict[str, Any]) -> None:
+    async def handler(_args):
         await release.wait()
 
     await ros.advertise_service("/s", "p/T", handler)

@@ -59,7 +59,7 @@ def test_a_proven_envelope_says_the_same_around_any_message(middle):
             assert whole == {"op": "publish", "topic": topic, "msg": orjson.loads(message)}
 
 
-def core_that_knows() -> ClientCore:
+def core_that_knows():
     core = ClientCore(max_size=2000, max_depth=5)
     core.restore()
     core.subscriptions.subscribe("/t")

@@ -12,15 +12,15 @@ from bridge.codecs.fragments import MAX_FRAGMENTS, Reassembler, split
 from bridge.errors import DecodeError
 
 
-def fragment(num: object, data: str, total: object, key: object = "a") -> dict[str, object]:
+def fragment(num, data, total, key="a"):
     return {"op": "fragment", "id": key, "data": data, "num": num, "total": total}
 
 
-def pieces_of(message: str, size: int, key: object = "a") -> list[dict[str, object]]:
+def pieces_of(message, size, key="a"):
     return [json.loads(piece) for piece in split(message.encode(), size, key)]
 
 
-def take_all(box: Reassembler, fragments: list[dict[str, object]], now: float = 0.0) -> list[str]:
+def take_all(box, fragments, now=0.0):
     return [whole.decode() for each in fragments if (whole := box.take(each, now)) is not None]
 
 

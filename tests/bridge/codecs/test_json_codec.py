@@ -1,6 +1,5 @@
 import json
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -110,7 +109,7 @@ def test_the_limit_of_depth_is_exact_whatever_the_size(filling, text, leaf):
     head = '{"x":[' + ",".join(["0.12345"] * (filling // 8)) + "],"  # two levels, and two brackets
     for levels in (1, 2, 62, 63, 64, 65, 200):
         message = head + '"a":' + "[" * levels + leaf + "]" * levels + "}"
-        value: Any = {"x": [0.12345] * (filling // 8), "a": []}
+        value = {"x": [0.12345] * (filling // 8), "a": []}
         for _ in range(levels - 1):
             value["a"] = [value["a"]]
         if levels < MAX_DEPTH:
@@ -215,7 +214,7 @@ def test_the_limits_of_size_and_of_what_goes_out():
     with pytest.raises(EncodeError, match=size):
         encode({"a": "x" * (MAX_SIZE - 7)})
     encode(nested(MAX_DEPTH))
-    loop: dict[str, object] = {}
+    loop = {}
     loop["a"] = loop
     for message in (loop, *(nested(levels) for levels in (MAX_DEPTH + 1, 250, 260, 5000))):
         with pytest.raises(EncodeError):

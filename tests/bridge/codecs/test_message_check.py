@@ -27,7 +27,7 @@ def version(request):
 def check(request, version):
     """Return the check of a type, from either source."""
 
-    def make(type_name: str) -> MessageCheck:
+    def make(type_name):
         if request.param == "bundled":
             return MessageCheck(type_name, bundled_definitions(type_name, version))
         answer = {"typedefs": MessageDefinitions(version).details(type_name)}

@@ -14,14 +14,14 @@ from bridge.codecs.png import decode, encode
 from bridge.errors import DecodeError
 
 
-def picture(pixels: bytes, size: tuple[int, int], mode: str = "RGB", **options: object) -> str:
+def picture(pixels, size, mode="RGB", **options):
     buffer = io.BytesIO()
     Image.frombytes(mode, size, pixels).save(buffer, "png", **options)
     return base64.b64encode(buffer.getvalue()).decode()
 
 
-def by_hand(lines: bytes, header: tuple[int, ...], *, before: bytes = b"") -> str:
-    def chunk(kind: bytes, content: bytes) -> bytes:
+def by_hand(lines, header, *, before=b""):
+    def chunk(kind, content):
         return struct.pack(">I", len(content)) + kind + content + b"\0\0\0\0"
 
     data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", *header)) + before
@@ -49,7 +49,7 @@ def test_every_filter():
         assert decode(data) == expected
 
 
-def _with_sums(data: bytes) -> bytes:
+def _with_sums(data):
     """The picture with right checksums, which Pillow wants."""
     out, at = data[:8], 8
     while at < len(data):

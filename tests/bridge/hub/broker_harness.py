@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any, Literal
+from typing import Any
 
 from bridge.codecs import cbor_codec
 from bridge.hub.broker import Broker
@@ -14,7 +14,7 @@ from bridge.hub.outbox import is_text
 WALL_CLOCK = 1_700_000_000_123_456_789
 
 
-def _no_constant(name: str) -> Any:
+def _no_constant(name):
     raise AssertionError(f"{name} went onto the wire")
 
 
@@ -26,29 +26,29 @@ class Peer:
     client: Client
     arrived: list[dict[str, Any]] = field(default_factory=list)
 
-    def send(self, **operation: Any) -> None:
+    def send(self, **operation):
         self.send_raw(json.dumps(operation).encode())
 
-    def send_raw(self, data: bytes) -> None:
+    def send_raw(self, data):
         self.hub.broker.receive(self.client, data, self.hub.now)
         self.hub.check()
 
-    def advertise(self, topic: str, type_name: str = "a/B", **more: Any) -> None:
+    def advertise(self, topic, type_name="a/B", **more):
         self.send(op="advertise", topic=topic, type=type_name, **more)
 
-    def publish(self, topic: str, msg: Any = None, **more: Any) -> None:
+    def publish(self, topic, msg=None, **more):
         self.send(op="publish", topic=topic, msg={} if msg is None else msg, **more)
 
-    def subscribe(self, topic: str, **more: Any) -> None:
+    def subscribe(self, topic, **more):
         self.send(op="subscribe", topic=topic, **more)
 
-    def payloads(self) -> list[bytes]:
+    def payloads(self):
         """Drain its outbox, as a socket that accepts everything does."""
         payloads = list(iter(self.client.outbox.pop, None))
         assert all(len(payload) <= self.hub.broker.limits.message_bytes for payload in payloads)
         return payloads
 
-    def read(self) -> list[dict[str, Any]]:
+    def read(self):
         """Drain its outbox of operations."""
         return [
             json.loads(payload, parse_constant=_no_constant)
@@ -57,26 +57,26 @@ class Peer:
             for payload in self.payloads()
         ]
 
-    def messages(self, topic: str | None = None) -> list[Any]:
+    def messages(self, topic=None):
         """Drain its outbox of messages, of one topic or all; anything else is an error."""
         operations = self.read()
         assert all(set(operation) == {"op", "topic", "msg"} for operation in operations), operations
         assert {operation["op"] for operation in operations} <= {"publish"}
         return [operation["msg"] for operation in operations if topic in {None, operation["topic"]}]
 
-    def ask(self, service: str, args: Any = None, **more: Any) -> dict[str, Any]:
+    def ask(self, service, args=None, **more):
         """Call a service that the broker answers, and return the answer."""
         self.send(op="call_service", service=service, args={} if args is None else args, **more)
         (answer,) = self.read()
         assert answer["op"] == "service_response"
         return answer
 
-    def rosapi(self, service: str, /, **args: Any) -> Any:
+    def rosapi(self, service, /, **args):
         answer = self.ask(f"/rosapi/{service}", args)
         assert answer["result"] is True, answer
         return answer["values"]
 
-    def disconnect(self) -> None:
+    def disconnect(self):
         self.hub.broker.disconnect(self.client)
         self.hub.check()
 
@@ -84,14 +84,14 @@ class Peer:
 class Harness:
     """A broker, and the time."""
 
-    def __init__(self, *, ros_version: Literal[1, 2] = 1, **limits: Any) -> None:
+    def __init__(self, *, ros_version=1, **limits):
         self.broker = Broker(HubLimits(**limits), ros_version=ros_version, wall_clock=lambda: WALL_CLOCK)
         self.now = 1000.0
 
-    def connect(self, address: str = "127.0.0.1") -> Peer:
+    def connect(self, address="127.0.0.1"):
         return Peer(self, self.broker.connect(address))
 
-    def advance(self, seconds: float) -> None:
+    def advance(self, seconds):
         """Advance the clock, waking the broker at its deadlines."""
         end = self.now + seconds
         while self.broker.deadline <= end:
@@ -101,7 +101,7 @@ class Harness:
         self.now = end
         self.check()
 
-    def check(self) -> None:
+    def check(self):
         """Check the invariants."""
         broker, graph, limits = self.broker, self.broker.graph, self.broker.limits
         clients = set(graph.clients.values())
@@ -155,7 +155,7 @@ class Harness:
         deadlines += [client.outbox.deadline for client in clients]
         assert broker.deadline <= min(deadlines, default=inf), "the broker would be woken too late"
 
-    def _check_outbox(self, client: Client) -> None:
+    def _check_outbox(self, client):
         outbox = client.outbox
         entries = [entry for entry in outbox._entries if entry.payload is not None]
         lanes = {subscription.lane for subscription in client.subscriptions.values()}
@@ -179,9 +179,7 @@ class Harness:
             assert lane.queue_length <= self.broker.limits.longest_queue
 
 
-def publisher_and_subscriber(
-    type_name: str, ros_version: Any = 1, limits: dict[str, int] | None = None, **wish: Any
-) -> tuple[Peer, Peer]:
+def publisher_and_subscriber(type_name, ros_version=1, limits=None, **wish):
     """Connect a client that advertises /t to a new hub, and one that subscribes to it with a wish."""
     hub = Harness(ros_version=ros_version, **limits or {})
     publisher, subscriber = hub.connect(), hub.connect()

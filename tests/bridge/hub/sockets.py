@@ -7,15 +7,12 @@ import json
 import os
 import socket
 import struct
-from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from typing import Any, ClassVar, Literal
+from typing import ClassVar
 
-from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.client import connect
 from websockets.frames import Frame, Opcode
 
-from bridge.hub.access import AccessPolicy
-from bridge.hub.limits import HubLimits
 from bridge.hub.server import serve_hub
 from tests.patience import PATIENCE
 
@@ -23,34 +20,33 @@ from tests.patience import PATIENCE
 class Client:
     """A WebSocket client that sends and receives operations."""
 
-    def __init__(self, websocket: ClientConnection) -> None:
+    def __init__(self, websocket):
         self.websocket = websocket
 
-    async def send(self, **operation: Any) -> None:
+    async def send(self, **operation):
         await self.websocket.send(json.dumps(operation))
 
-    async def receive(self) -> dict[str, Any]:
+    async def receive(self):
         async with asyncio.timeout(PATIENCE):
-            operation: dict[str, Any] = json.loads(await self.websocket.recv())
-            return operation
+            return json.loads(await self.websocket.recv())
 
-    async def ask(self, service: str, **args: Any) -> Any:
+    async def ask(self, service, **args):
         await self.send(op="call_service", service=service, args=args, id="ask")
         answer = await self.receive()
         assert (answer["op"], answer["id"]) == ("service_response", "ask"), answer
         return answer["values"]
 
-    async def wait_for(self, service: str, accepts: Callable[[Any], bool], **args: Any) -> None:
+    async def wait_for(self, service, accepts, **args):
         """Repeat a call until its one value is accepted."""
         async with asyncio.timeout(PATIENCE):
             while not accepts(next(iter((await self.ask(service, **args)).values()))):
                 await asyncio.sleep(0.01)
 
-    async def sync(self) -> None:
+    async def sync(self):
         """Wait until the hub has performed everything that was sent before."""
         await self.ask("/rosapi/get_time")
 
-    async def closed(self) -> int:
+    async def closed(self):
         """Wait for the hub to end the connection, and return the close code."""
         async with asyncio.timeout(PATIENCE):
             await self.websocket.wait_closed()
@@ -60,16 +56,10 @@ class Client:
 
 
 @asynccontextmanager
-async def running_hub(
-    *,
-    port: int = 0,
-    limits: HubLimits | None = None,
-    access: AccessPolicy | None = None,
-    ros_version: Literal[1, 2] = 1,
-) -> AsyncIterator[int]:
+async def running_hub(*, port=0, limits=None, access=None, ros_version=1):
     """Run a hub on a port of this machine, 0 for any free one, and yield its port."""
     stop = asyncio.Event()
-    ready: asyncio.Future[int] = asyncio.get_running_loop().create_future()
+    ready = asyncio.get_running_loop().create_future()
     served = asyncio.create_task(
         serve_hub(
             "127.0.0.1",
@@ -92,7 +82,7 @@ async def running_hub(
 
 
 @asynccontextmanager
-async def client(port: int, **options: Any) -> AsyncIterator[Client]:
+async def client(port, **options):
     async with connect(f"ws://127.0.0.1:{port}", **options) as websocket:
         yield Client(websocket)
 
@@ -105,13 +95,13 @@ class RawClient:
 
     connected: ClassVar[set["RawClient"]] = set()
 
-    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    def __init__(self, reader, writer):
         self.reader = reader
         self.writer = writer
         self.connected.add(self)
 
     @classmethod
-    async def connect(cls, port: int, *, handshake: bool = True, receive_buffer: int = 0) -> "RawClient":
+    async def connect(cls, port, *, handshake=True, receive_buffer=0):
         sock = socket.socket()
         if receive_buffer:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
@@ -123,7 +113,7 @@ class RawClient:
             await raw.request()
         return raw
 
-    async def request(self, *headers: str, path: str = "/", host: str = "localhost") -> str:
+    async def request(self, *headers, path="/", host="localhost"):
         """Request a WebSocket, and return the status line of the answer."""
         key = base64.b64encode(os.urandom(16)).decode()
         lines = [
@@ -139,13 +129,13 @@ class RawClient:
         answer = await self.reader.readuntil(b"\r\n\r\n")
         return answer.split(b"\r\n")[0].decode()
 
-    def send(self, data: bytes, *, opcode: Opcode = Opcode.TEXT, fin: bool = True) -> None:
+    def send(self, data, *, opcode=Opcode.TEXT, fin=True):
         self.writer.write(Frame(opcode, data, fin).serialize(mask=True))
 
-    def send_operation(self, **operation: Any) -> None:
+    def send_operation(self, **operation):
         self.send(json.dumps(operation).encode())
 
-    async def frame(self) -> tuple[int, bytes]:
+    async def frame(self):
         """Return the next frame's opcode and payload."""
         first, length = await self.reader.readexactly(2)
         if length == 126:
@@ -154,7 +144,7 @@ class RawClient:
             (length,) = struct.unpack("!Q", await self.reader.readexactly(8))
         return first & 15, await self.reader.readexactly(length)
 
-    async def message(self) -> bytes:
+    async def message(self):
         """Return the next message's payload, skipping pings."""
         async with asyncio.timeout(PATIENCE):
             while True:
@@ -162,7 +152,7 @@ class RawClient:
                 if opcode in {Opcode.TEXT, Opcode.BINARY}:
                     return payload
 
-    async def ended(self) -> bytes:
+    async def ended(self):
         """Wait until the hub ends the connection, and return everything before that."""
         self.connected.discard(self)
         async with asyncio.timeout(PATIENCE):
@@ -175,19 +165,19 @@ class RawClient:
             await self.close()
             return data
 
-    async def close(self) -> None:
+    async def close(self):
         self.writer.transport.abort()
         with contextlib.suppress(OSError):
             await self.writer.wait_closed()
 
-    def cut(self) -> None:
+    def cut(self):
         """Leave without a word: TCP reset."""
-        sock: socket.socket = self.writer.get_extra_info("socket")
+        sock = self.writer.get_extra_info("socket")
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.writer.transport.abort()
 
 
-async def until(condition: Callable[[], bool]) -> None:
+async def until(condition):
     """Wait for what will become true."""
     async with asyncio.timeout(PATIENCE):
         while not condition():

@@ -1,8 +1,6 @@
 """Access to the hub: tokens, TLS, and answers to refused clients."""
 
 import ssl
-from pathlib import Path
-from typing import Any
 
 import pytest
 from websockets.asyncio.client import connect
@@ -18,11 +16,11 @@ OTHER = "another.token_of~the-same-hub"
 
 
 @pytest.fixture(scope="module")
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def certificate(tmp_path_factory):
     return issue(tmp_path_factory.mktemp("certificate"), "server")
 
 
-async def test_a_token_opens_the_door() -> None:
+async def test_a_token_opens_the_door():
     cases = [
         ([], 401),
         ([f"Authorization: Bearer {TOKEN}"], 101),
@@ -52,7 +50,7 @@ async def test_a_token_opens_the_door() -> None:
 @pytest.mark.parametrize(
     ("tokens", "offered"), [((TOKEN,), ["rosbridge", f"bearer.{TOKEN}"]), ((), ["rosbridge"])]
 )
-async def test_a_browsers_token_is_not_sent_back(tokens: tuple[str, ...], offered: Any) -> None:
+async def test_a_browsers_token_is_not_sent_back(tokens, offered):
     async with (
         running_hub(access=AccessPolicy(tokens=tokens)) as port,
         connect(f"ws://127.0.0.1:{port}", subprotocols=offered) as socket,
@@ -66,8 +64,8 @@ async def test_a_browsers_token_is_not_sent_back(tokens: tuple[str, ...], offere
 OWN_PAGES = ("https://robot.example:8000", "null")
 
 
-async def test_a_page_needs_a_known_origin_and_this_machines_name() -> None:
-    cases: list[tuple[str, str | None, int]] = [
+async def test_a_page_needs_a_known_origin_and_this_machines_name():
+    cases = [
         ("127.0.0.1", None, 101),
         ("[::1]:9090", None, 101),
         *(
@@ -95,7 +93,7 @@ async def test_a_page_needs_a_known_origin_and_this_machines_name() -> None:
 
 
 @pytest.mark.parametrize("hosts", [[], ["localhost", "localhost"], ["localhost", "attacker.example"]])
-async def test_a_request_names_one_host(hosts: list[str]) -> None:
+async def test_a_request_names_one_host(hosts):
     async with running_hub() as port:
         raw = await RawClient.connect(port, handshake=False)
         lines = [*(f"Host: {host}" for host in hosts), "Upgrade: websocket", "Connection: Upgrade"]
@@ -104,13 +102,13 @@ async def test_a_request_names_one_host(hosts: list[str]) -> None:
         assert (await raw.ended()).startswith(b"HTTP/1.1 403 ")
 
 
-async def test_without_a_list_no_page_but_of_this_machine_is_let_in() -> None:
+async def test_without_a_list_no_page_but_of_this_machine_is_let_in():
     async with running_hub() as port:
         raw = await RawClient.connect(port, handshake=False)
         assert " 403 " in await raw.request("Origin: null")
 
 
-async def test_tokens_are_in_no_log_and_no_answer(caplog: pytest.LogCaptureFixture) -> None:
+async def test_tokens_are_in_no_log_and_no_answer(caplog):
     access = AccessPolicy(tokens=(TOKEN,))
     assert TOKEN not in repr(access)
     async with running_hub(access=access) as port:
@@ -129,7 +127,7 @@ async def test_tokens_are_in_no_log_and_no_answer(caplog: pytest.LogCaptureFixtu
 @pytest.mark.parametrize(
     "token", ["", "short", "x" * 1025, "with spaces in the middle", "ümlaut" * 5, "a/b" * 9]
 )
-def test_a_token_that_is_guessed_or_cannot_be_sent_is_refused(token: str) -> None:
+def test_a_token_that_is_guessed_or_cannot_be_sent_is_refused(token):
     with pytest.raises(HubError) as caught:
         AccessPolicy(tokens=(TOKEN, token))
     assert caught.value.exit_code == 2
@@ -137,7 +135,7 @@ def test_a_token_that_is_guessed_or_cannot_be_sent_is_refused(token: str) -> Non
         assert token not in str(caught.value)
 
 
-def test_tokens_are_read_from_a_file_that_nobody_else_reads(tmp_path: Path) -> None:
+def test_tokens_are_read_from_a_file_that_nobody_else_reads(tmp_path):
     path = tmp_path / "tokens"
     path.write_text(f"# robots\n{TOKEN}\n\n  {OTHER}  \n")
     path.chmod(0o600)
@@ -154,7 +152,7 @@ def test_tokens_are_read_from_a_file_that_nobody_else_reads(tmp_path: Path) -> N
         read_tokens(tmp_path / "missing")
 
 
-async def test_tls_and_a_token(certificate: tuple[Path, Path]) -> None:
+async def test_tls_and_a_token(certificate):
     access = AccessPolicy(tokens=(TOKEN,), tls=tls_context(*certificate))
     trusting = ssl.create_default_context(cafile=str(certificate[0]))
     async with running_hub(access=access) as port:
@@ -174,7 +172,7 @@ async def test_tls_and_a_token(certificate: tuple[Path, Path]) -> None:
     assert await Client(leaves).closed() == 1001
 
 
-def test_unusable_certificates_are_an_error(certificate: tuple[Path, Path], tmp_path: Path) -> None:
+def test_unusable_certificates_are_an_error(certificate, tmp_path):
     nothing, missing = tmp_path / "nothing.pem", tmp_path / "missing.pem"
     nothing.write_text("nothing")
     cert, key = certificate
@@ -184,7 +182,7 @@ def test_unusable_certificates_are_an_error(certificate: tuple[Path, Path], tmp_
         assert "\n" not in str(caught.value)
 
 
-def test_loopback_addresses_are_recognised() -> None:
+def test_loopback_addresses_are_recognised():
     assert all(map(is_loopback, ["127.0.0.1", "127.8.9.10", "::1", "localhost"]))
     elsewhere = ["0.0.0.0", "::", "192.168.1.10", "robot.example", "localhost.example", ""]  # noqa: S104 - the test needs an address that is not loopback
     assert not any(map(is_loopback, elsewhere))

@@ -1,11 +1,9 @@
 """Calls of services and goals of actions: client -> hub -> serving client -> hub -> client, each ended exactly once."""
 
-from typing import Any
-
 import pytest
 
 from bridge.client.protocol.events import GoalStatus
-from tests.bridge.hub.broker_harness import Harness, Peer
+from tests.bridge.hub.broker_harness import Harness
 
 ASKS = {"service": "call_service", "action": "send_action_goal"}
 ENDS = {"service": "service_response", "action": "action_result"}
@@ -16,57 +14,57 @@ DOCK = "/dock"
 class Docking:
     """A hub with a client that offers /dock, a service or an action, and one that asks for it."""
 
-    def __init__(self, kind: str, *, ros_version: Any = 2, **limits: Any) -> None:
+    def __init__(self, kind, *, ros_version=2, **limits):
         self.kind = kind
         self.hub = Harness(ros_version=ros_version, **limits)
         self.server, self.client = self.hub.connect(), self.hub.connect()
         self.offer(self.server)
 
     @property
-    def offered(self) -> dict[str, Any]:
+    def offered(self):
         return self.hub.broker.graph.services if self.kind == "service" else self.hub.broker.graph.actions
 
     @property
-    def pending(self) -> dict[str, Any]:
+    def pending(self):
         return self.hub.broker._calls.pending if self.kind == "service" else self.hub.broker._actions.goals
 
-    def offer(self, peer: Peer, name: str = DOCK) -> None:
+    def offer(self, peer, name=DOCK):
         peer.send(op=f"advertise_{self.kind}", type=TYPES[self.kind], **{self.kind: name})
 
-    def withdraw(self, peer: Peer) -> None:
+    def withdraw(self, peer):
         peer.send(op=f"unadvertise_{self.kind}", **{self.kind: "dock"})
 
-    def ask(self, identity: Any = "x", peer: Peer | None = None, name: str = DOCK, **more: Any) -> None:
+    def ask(self, identity="x", peer=None, name=DOCK, **more):
         (peer or self.client).send(op=ASKS[self.kind], id=identity, **{self.kind: name}, **more)
 
-    def asked(self, identity: Any = "x", **more: Any) -> str:
+    def asked(self, identity="x", **more):
         """Ask, and return the key of the request at the server."""
         self.ask(identity, **more)
         (request,) = self.server.read()
         return str(request["id"])
 
-    def end(self, key: str, peer: Peer | None = None, **answer: Any) -> None:
+    def end(self, key, peer=None, **answer):
         (peer or self.server).send(op=ENDS[self.kind], id=key, **answer)
 
-    def answer(self, peer: Peer | None = None) -> dict[str, Any]:
+    def answer(self, peer=None):
         """Return the one answer that a client got."""
         (answer,) = (peer or self.client).read()
         assert answer["op"] == ENDS[self.kind]
         return answer
 
-    def ended(self, **answer: Any) -> dict[str, Any]:
+    def ended(self, **answer):
         """Ask, end it, and return the answer that the client gets."""
         self.end(self.asked(), **answer)
         return self.answer()
 
 
 @pytest.fixture(params=["service", "action"])
-def docking(request: pytest.FixtureRequest) -> Docking:
+def docking(request):
     return Docking(request.param)
 
 
 @pytest.fixture
-def action() -> Docking:
+def action():
     return Docking("action")
 
 
@@ -78,9 +76,7 @@ BOTH = pytest.mark.parametrize("kind", ["service", "action"])
 
 @pytest.mark.parametrize("args", [{"a": [1, {"b": None}]}, {}, [1, 2]])
 @pytest.mark.parametrize(("name", "identity"), [("dock", {}), (DOCK, {"id": 7}), (DOCK, {"id": "x"})])
-def test_an_answer_has_the_id_and_the_name_that_were_used(
-    docking: Docking, args: object, name: str, identity: dict[str, Any]
-) -> None:
+def test_an_answer_has_the_id_and_the_name_that_were_used(docking, args, name, identity):
     called = {docking.kind: name} | identity
     docking.client.send(op=ASKS[docking.kind], args=args, **called)
     (request,) = docking.server.read()
@@ -93,7 +89,7 @@ def test_an_answer_has_the_id_and_the_name_that_were_used(
     assert not docking.pending
 
 
-def test_answers_may_come_in_any_order_and_go_to_whoever_asked(docking: Docking) -> None:
+def test_answers_may_come_in_any_order_and_go_to_whoever_asked(docking):
     other = docking.hub.connect()
     keys = {peer: docking.asked("same", peer=peer) for peer in (docking.client, other)}
     for peer in (other, docking.client):
@@ -104,13 +100,13 @@ def test_answers_may_come_in_any_order_and_go_to_whoever_asked(docking: Docking)
 @pytest.mark.parametrize(
     ("values", "reason"), [("no such thing", "no such thing"), ({"error": 5}, '{"error":5}')]
 )
-def test_a_refusal_is_a_string(docking: Docking, values: object, reason: str) -> None:
+def test_a_refusal_is_a_string(docking, values, reason):
     answer = docking.ended(values=values, result=False)
     assert (answer["result"], answer["values"]) == (False, reason)
 
 
 @pytest.mark.parametrize("values", ["text", 3, [1]])
-def test_values_that_are_not_an_object_are_a_failure(docking: Docking, values: object) -> None:
+def test_values_that_are_not_an_object_are_a_failure(docking, values):
     assert docking.ended(values=values, result=True)["result"] is False
 
 
@@ -124,7 +120,7 @@ def test_values_that_are_not_an_object_are_a_failure(docking: Docking, values: o
         *((kind, {"name": "/nowhere"}) for kind in ASKS),
     ],
 )
-def test_an_impossible_wish_is_answered(kind: str, wish: dict[str, Any]) -> None:
+def test_an_impossible_wish_is_answered(kind, wish):
     docking = Docking(kind)
     docking.ask(**wish)
     assert docking.server.read() == []
@@ -134,7 +130,7 @@ def test_an_impossible_wish_is_answered(kind: str, wish: dict[str, Any]) -> None
     assert answer.get("status") == (GoalStatus.ABORTED if kind == "action" else None)
 
 
-def test_a_server_that_leaves_fails_what_it_works_on_and_leaves_nothing(docking: Docking) -> None:
+def test_a_server_that_leaves_fails_what_it_works_on_and_leaves_nothing(docking):
     docking.ask()
     docking.ask(peer=docking.server)  # a client can ask itself
     docking.server.disconnect()
@@ -145,7 +141,7 @@ def test_a_server_that_leaves_fails_what_it_works_on_and_leaves_nothing(docking:
     assert docking.answer()["result"] is False
 
 
-def test_a_client_that_leaves_is_not_answered_and_its_goals_are_cancelled(docking: Docking) -> None:
+def test_a_client_that_leaves_is_not_answered_and_its_goals_are_cancelled(docking):
     key = docking.asked()
     docking.client.disconnect()
     cancelled = [{"op": "cancel_action_goal", "id": key, "action": DOCK}]
@@ -155,14 +151,14 @@ def test_a_client_that_leaves_is_not_answered_and_its_goals_are_cancelled(dockin
     docking.hub.advance(1000)
 
 
-def test_only_the_server_can_answer_and_only_once(docking: Docking) -> None:
+def test_only_the_server_can_answer_and_only_once(docking):
     key = docking.asked()
     for peer, number in ((docking.hub.connect(), 666), (docking.server, 1), (docking.server, 2)):
         docking.end(key, peer, values={"n": number}, result=True)
     assert docking.answer()["values"] == {"n": 1}
 
 
-def test_the_newest_offer_counts_and_its_owner_alone_withdraws_it(docking: Docking) -> None:
+def test_the_newest_offer_counts_and_its_owner_alone_withdraws_it(docking):
     new = docking.hub.connect()
     key = docking.asked("old")
     docking.offer(new)
@@ -180,7 +176,7 @@ def test_the_newest_offer_counts_and_its_owner_alone_withdraws_it(docking: Docki
 
 
 @BOTH
-def test_what_a_client_waits_for_and_what_a_server_works_on_are_counted(kind: str) -> None:
+def test_what_a_client_waits_for_and_what_a_server_works_on_are_counted(kind):
     docking = Docking(kind, calls_per_client=3, goals_per_client=3)
     second, other = docking.hub.connect(), docking.hub.connect()
     docking.offer(second, "/second")
@@ -197,7 +193,7 @@ def test_what_a_client_waits_for_and_what_a_server_works_on_are_counted(kind: st
 
 
 @BOTH
-def test_offers_are_counted_and_can_be_repeated(kind: str) -> None:
+def test_offers_are_counted_and_can_be_repeated(kind):
     docking = Docking(kind, services_per_client=2)
     for name in ("/1", "/2", "/3", DOCK):
         docking.offer(docking.server, name)
@@ -205,7 +201,7 @@ def test_offers_are_counted_and_can_be_repeated(kind: str) -> None:
 
 
 @BOTH
-def test_what_is_too_large_fails_and_its_failure_fits(kind: str) -> None:
+def test_what_is_too_large_fails_and_its_failure_fits(kind):
     docking = Docking(kind, message_bytes=400)
     for answer in ({"values": {"a": "x" * 250}, "result": True}, {"values": "x" * 300, "result": False}):
         docking.end(docking.asked("g" * 250), **answer)
@@ -225,14 +221,14 @@ def test_what_is_too_large_fails_and_its_failure_fits(kind: str) -> None:
 # --- calls
 
 
-def test_as_in_ros_1_an_answer_is_passed_on_whatever_its_result() -> None:
+def test_as_in_ros_1_an_answer_is_passed_on_whatever_its_result():
     service = Docking("service", ros_version=1)
     answer = service.ended(values={"sum": 3}, result=False)
     assert (answer["values"], answer["result"]) == ({"sum": 3}, True)
     assert service.ended(result=False)["result"] is False
 
 
-def test_a_call_without_an_answer_fails_in_time() -> None:
+def test_a_call_without_an_answer_fails_in_time():
     service = Docking("service", call_timeout=10)
     for identifier, timeout in (("long", 0), ("short", 2.5), ("longer", 1000)):
         service.ask(identifier, timeout=timeout)
@@ -249,7 +245,7 @@ def test_a_call_without_an_answer_fails_in_time() -> None:
     assert service.server.client.refused == 1
 
 
-def test_deadlines_of_answered_calls_do_not_accumulate() -> None:
+def test_deadlines_of_answered_calls_do_not_accumulate():
     service = Docking("service")
     slow = service.asked("slow")
     for _ in range(1000):
@@ -260,7 +256,7 @@ def test_deadlines_of_answered_calls_do_not_accumulate() -> None:
     assert slow not in service.pending
 
 
-def test_a_client_that_reads_no_answers_must_be_closed() -> None:
+def test_a_client_that_reads_no_answers_must_be_closed():
     hub = Harness(message_bytes=1000, client_bytes=4000)
     reader, deaf = hub.connect(), hub.connect()
     for _ in range(100):
@@ -274,14 +270,14 @@ def test_a_client_that_reads_no_answers_must_be_closed() -> None:
 
 
 @pytest.mark.parametrize("wanted", [True, False])
-def test_feedback_is_sent_only_if_requested(action: Docking, wanted: bool) -> None:
+def test_feedback_is_sent_only_if_requested(action, wanted):
     key = action.asked(feedback=wanted, action_type=TYPES["action"])
     action.server.send(op="action_feedback", id=key, action=DOCK, values={"part": 1})
     feedback = {"op": "action_feedback", "action": DOCK, "values": {"part": 1}, "id": "x"}
     assert action.client.read() == [feedback] * wanted
 
 
-def test_goals_are_cancelled_by_their_server_one_or_all(action: Docking) -> None:
+def test_goals_are_cancelled_by_their_server_one_or_all(action):
     keys = [action.asked(number) for number in range(3)]
     action.client.send(op="cancel_action_goal", id=0, action="dock")
     assert action.server.read() == [{"op": "cancel_action_goal", "id": keys[0], "action": DOCK}]
@@ -304,20 +300,18 @@ def test_goals_are_cancelled_by_their_server_one_or_all(action: Docking) -> None
         ({"result": "yes", "values": "?", "status": True}, GoalStatus.ABORTED),
     ],
 )
-def test_a_failed_goal_has_a_status_and_a_reason(
-    action: Docking, answer: dict[str, Any], status: int
-) -> None:
+def test_a_failed_goal_has_a_status_and_a_reason(action, answer, status):
     result = action.ended(**answer)
     assert (result["result"], result["status"]) == (False, status)
     assert answer.get("values", DOCK) in result["values"]
 
 
-def test_fields_left_out_of_a_result_have_defaults(action: Docking) -> None:
+def test_fields_left_out_of_a_result_have_defaults(action):
     result = {"values": {}, "status": GoalStatus.SUCCEEDED, "result": True}
     assert action.ended() == {"op": "action_result", "action": DOCK, "id": "x", **result}
 
 
-def test_nobody_tells_or_cancels_the_goals_of_others(action: Docking) -> None:
+def test_nobody_tells_or_cancels_the_goals_of_others(action):
     stranger = action.hub.connect()
     key = action.asked()
     stranger.send(op="action_feedback", id=key, action=DOCK, values={})
@@ -327,14 +321,14 @@ def test_nobody_tells_or_cancels_the_goals_of_others(action: Docking) -> None:
     assert action.client.read() == action.server.read() == []
 
 
-def test_a_client_has_one_goal_of_an_id(action: Docking) -> None:
+def test_a_client_has_one_goal_of_an_id(action):
     action.ask()
     action.ask()
     assert action.answer()["result"] is False
     assert len(action.server.read()) == 1
 
 
-def test_a_slow_client_loses_feedback_but_not_the_result() -> None:
+def test_a_slow_client_loses_feedback_but_not_the_result():
     action = Docking("action", queue_length=3)
     key = action.asked(feedback=True)
     for index in range(100):
@@ -345,7 +339,7 @@ def test_a_slow_client_loses_feedback_but_not_the_result() -> None:
     assert result["op"] == "action_result"
 
 
-def test_actions_are_described_also_those_of_actionlibs_topics(action: Docking) -> None:
+def test_actions_are_described_also_those_of_actionlibs_topics(action):
     assert action.client.rosapi("action_type", action="dock") == {"type": TYPES["action"]}
     for part in ("cancel", "status", "feedback", "result"):
         action.client.advertise(f"/undock/{part}")
@@ -369,9 +363,7 @@ def test_actions_are_described_also_those_of_actionlibs_topics(action: Docking) 
         ("text", "text"),
     ],
 )
-def test_arguments_and_values_of_a_known_service_are_whole(
-    ros_version: Any, args: Any, received: Any
-) -> None:
+def test_arguments_and_values_of_a_known_service_are_whole(ros_version, args, received):
     hub = Harness(ros_version=ros_version)
     server, client = hub.connect(), hub.connect()
     server.send(op="advertise_service", service="/add", type="rospy_tutorials/AddTwoInts")
@@ -385,7 +377,7 @@ def test_arguments_and_values_of_a_known_service_are_whole(
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
-def test_parts_of_a_known_action_are_whole(ros_version: Any) -> None:
+def test_parts_of_a_known_action_are_whole(ros_version):
     hub = Harness(ros_version=ros_version)
     server, client = hub.connect(), hub.connect()
     server.send(op="advertise_action", action="/look", type="tf2_msgs/LookupTransform")
@@ -403,7 +395,7 @@ def test_parts_of_a_known_action_are_whole(ros_version: Any) -> None:
     assert values["transform"]["transform"]["rotation"]["w"] == float(ros_version == 2)
 
 
-def test_values_that_outgrow_the_limit_are_refused() -> None:
+def test_values_that_outgrow_the_limit_are_refused():
     hub = Harness(message_bytes=300)
     server, client = hub.connect(), hub.connect()
     server.send(op="advertise_service", service="/map", type="nav_msgs/GetPlan")
@@ -415,7 +407,7 @@ def test_values_that_outgrow_the_limit_are_refused() -> None:
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
-def test_the_reason_of_this_projects_client_is_passed_on(ros_version: Any) -> None:
+def test_the_reason_of_this_projects_client_is_passed_on(ros_version):
     docking = Docking("service", ros_version=ros_version)
     answer = docking.ended(values={}, result=False, reason="no room")
     assert (answer["values"], answer["result"]) == ("no room", False)

@@ -6,7 +6,6 @@ import logging
 import math
 import os
 import sys
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, publisher_and_s
 ARRAY = "std_msgs/Float64MultiArray"
 
 
-def _whole(payloads: list[bytes]) -> bytes:
+def _whole(payloads):
     reassembler = Reassembler()
     parts = [reassembler.take(json.loads(payload), 0) for payload in payloads]
     assert parts[:-1] == [None] * (len(parts) - 1)
@@ -34,7 +33,7 @@ def _whole(payloads: list[bytes]) -> bytes:
 # --- CBOR
 
 
-def test_cbor_has_bytes_and_typed_arrays_of_the_types_elements() -> None:
+def test_cbor_has_bytes_and_typed_arrays_of_the_types_elements():
     publisher, subscriber = publisher_and_subscriber("sensor_msgs/LaserScan", compression="cbor")
     scan = {"ranges": [1.5, 2, None], "intensities": [], "angle_min": -1.5, "header": {"frame_id": "é"}}
     publisher.publish("/t", scan)
@@ -57,9 +56,7 @@ def test_cbor_has_bytes_and_typed_arrays_of_the_types_elements() -> None:
         (None, {"data": [1.5, 2.5], "n": [1, 2]}),  # no rosbags
     ],
 )
-def test_of_an_unknown_field_floats_alone_are_packed(
-    type_name: str | None, message: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_an_unknown_field_floats_alone_are_packed(type_name, message, monkeypatch):
     if type_name is None:
         monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     publisher, subscriber = publisher_and_subscriber(type_name or ARRAY, compression="cbor")
@@ -76,7 +73,7 @@ def test_of_an_unknown_field_floats_alone_are_packed(
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
-def test_cbor_raw_is_what_ros_would_send(ros_version: Any) -> None:
+def test_cbor_raw_is_what_ros_would_send(ros_version):
     publisher, subscriber = publisher_and_subscriber(
         "geometry_msgs/PoseStamped", ros_version, compression="cbor-raw"
     )
@@ -91,17 +88,17 @@ def test_cbor_raw_is_what_ros_would_send(ros_version: Any) -> None:
         msg = cbor_codec.decode(payload)["msg"]
         assert set(msg) == {"secs", "nsecs", "bytes"}
         assert msg["secs"] > 1_600_000_000
-        pose: Any = read(msg["bytes"], "geometry_msgs/msg/PoseStamped")
+        pose = read(msg["bytes"], "geometry_msgs/msg/PoseStamped")
         assert (pose.header.stamp.sec, pose.header.stamp.nanosec) == (12, 34)
         assert pose.header.frame_id == "map"
         assert (pose.pose.position.x, pose.pose.position.y, pose.pose.position.z) == (1.5, 2.0, 0.0)
     assert len(payloads) == 2
 
 
-def test_arrays_are_serialised_with_their_type_and_length() -> None:
+def test_arrays_are_serialised_with_their_type_and_length():
     publisher, subscriber = publisher_and_subscriber("sensor_msgs/Imu", 2, compression="cbor-raw")
     publisher.publish("/t", {"orientation_covariance": [0.5, *[None] * 8]})
-    imu: Any = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(
+    imu = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(
         cbor_codec.decode(subscriber.payloads()[0])["msg"]["bytes"], "sensor_msgs/msg/Imu"
     )
     assert imu.orientation_covariance[0] == 0.5
@@ -119,7 +116,7 @@ def test_arrays_are_serialised_with_their_type_and_length() -> None:
         (ARRAY, {"layout": {"dim": 7}}),
     ],
 )
-def test_a_message_that_cannot_be_serialised_is_reported_once(type_name: str, message: Any) -> None:
+def test_a_message_that_cannot_be_serialised_is_reported_once(type_name, message):
     publisher, subscriber = publisher_and_subscriber(type_name, compression="cbor-raw", id="the one")
     for _ in range(3):
         publisher.publish("/t", message)
@@ -129,7 +126,7 @@ def test_a_message_that_cannot_be_serialised_is_reported_once(type_name: str, me
     assert publisher.read() == []
 
 
-def test_a_png_that_is_larger_than_may_be_is_refused() -> None:
+def test_a_png_that_is_larger_than_may_be_is_refused():
     publisher, subscriber = publisher_and_subscriber("a/B", limits={"message_bytes": 400}, compression="png")
     publisher.publish("/t", {"data": base64.b85encode(bytes(range(256))).decode()[:300]})
     assert subscriber.read()[0]["op"] == "status"
@@ -137,11 +134,11 @@ def test_a_png_that_is_larger_than_may_be_is_refused() -> None:
 
 
 @pytest.mark.parametrize("compression", list(Encoding))
-def test_the_limit_of_a_message_is_exact(compression: Encoding) -> None:
+def test_the_limit_of_a_message_is_exact(compression):
     definitions = MessageDefinitions()
     message = {"data": "x" * 100}
 
-    def payload(max_size: int) -> bytes:
+    def payload(max_size):
         data = json.dumps(message).encode()
         return OutgoingMessage(data, message, "std_msgs/String", 0, definitions, max_size).payload(
             compression, "/t"
@@ -158,12 +155,12 @@ def test_the_limit_of_a_message_is_exact(compression: Encoding) -> None:
 
 @pytest.mark.parametrize(("asked", "size"), [(1, 256), (256, 256), (300, 300)])
 @pytest.mark.parametrize("compression", ["none", "png"])
-def test_a_message_in_fragments(asked: int, size: int, compression: str) -> None:
+def test_a_message_in_fragments(asked, size, compression):
     publisher, subscriber = publisher_and_subscriber("a/B", fragment_size=asked, compression=compression)
     messages = [{"data": os.urandom(600).hex() + letter} for letter in "é☃"]
     for message in messages:
         publisher.publish("/t", message)
-    by_id: dict[str, list[bytes]] = {}
+    by_id = {}
     for payload in subscriber.payloads():
         operation = json.loads(payload)
         assert operation["op"] == "fragment"
@@ -185,13 +182,13 @@ def test_a_message_in_fragments(asked: int, size: int, compression: str) -> None
         *(({"a": 1}, {"compression": unknown}) for unknown in ("bson", "", None, 7, ["png"], {})),
     ],
 )
-def test_small_messages_cbor_and_unknown_forms_are_neither_cut_nor_packed(message: Any, wish: Any) -> None:
+def test_small_messages_cbor_and_unknown_forms_are_neither_cut_nor_packed(message, wish):
     publisher, subscriber = publisher_and_subscriber("a/B", **wish)
     publisher.publish("/t", message)
     assert subscriber.messages() == [message]
 
 
-def test_fragments_are_dropped_as_messages_are() -> None:
+def test_fragments_are_dropped_as_messages_are():
     publisher, slow = publisher_and_subscriber("a/B", limits={"queue_length": 2}, fragment_size=256)
     for index in range(10):
         publisher.publish("/t", {"i": index, "data": "x" * 1000})
@@ -200,7 +197,7 @@ def test_fragments_are_dropped_as_messages_are() -> None:
     assert [json.loads(_whole(part))["msg"]["i"] for part in (payloads[:half], payloads[half:])] == [8, 9]
 
 
-def test_the_answer_to_a_call_in_fragments_and_as_png() -> None:
+def test_the_answer_to_a_call_in_fragments_and_as_png():
     peer = Harness().connect()
     peer.send(op="call_service", service="/rosapi/services", id="x", fragment_size=300)
     assert "/rosapi/topics" in json.loads(_whole(peer.payloads()))["values"]["services"]
@@ -209,7 +206,7 @@ def test_the_answer_to_a_call_in_fragments_and_as_png() -> None:
     assert json.loads(png.decode(operation["data"]))["id"] == "x"
 
 
-def test_of_several_wishes_the_last_form_and_the_least_size_count() -> None:
+def test_of_several_wishes_the_last_form_and_the_least_size_count():
     publisher, subscriber = publisher_and_subscriber("a/B", id=1, fragment_size=640)
     subscriber.subscribe("/t", id=2, compression="cbor")
     subscriber.subscribe("/t", id=3, compression="png", fragment_size=320)
@@ -223,7 +220,7 @@ def test_of_several_wishes_the_last_form_and_the_least_size_count() -> None:
     assert json.loads(_whole(payloads))["op"] == "png"
 
 
-def test_a_dropped_message_is_not_encoded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_dropped_message_is_not_encoded(monkeypatch):
     publisher, subscriber = publisher_and_subscriber("a/B", compression="cbor", throttle_rate=1000)
     publisher.publish("/t", {"data": [1.5]})
     monkeypatch.setattr(topics.OutgoingMessage, "payload", None)
@@ -234,7 +231,7 @@ def test_a_dropped_message_is_not_encoded(monkeypatch: pytest.MonkeyPatch) -> No
 # --- what goes wrong is told to who wants it
 
 
-def test_status_messages_are_sent_on_request_and_do_not_pile_up() -> None:
+def test_status_messages_are_sent_on_request_and_do_not_pile_up():
     peer = Harness().connect()
     peer.send_raw(b"42")
     peer.send(op="set_level", level="warning")
@@ -255,7 +252,7 @@ def test_status_messages_are_sent_on_request_and_do_not_pile_up() -> None:
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
-def test_refusals_are_logged_on_rosout(ros_version: Any) -> None:
+def test_refusals_are_logged_on_rosout(ros_version):
     hub = Harness(ros_version=ros_version)
     peer, listener = hub.connect(), hub.connect()
     listener.subscribe("/rosout", type="rosgraph_msgs/Log" if ros_version == 1 else "rcl_interfaces/msg/Log")
@@ -270,9 +267,7 @@ def test_refusals_are_logged_on_rosout(ros_version: Any) -> None:
     assert len(listener.messages("/rosout")) == 1
 
 
-def test_a_failure_on_rosout_is_not_reported_there(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_failure_on_rosout_is_not_reported_there(monkeypatch, caplog):
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     hub = Harness()
     peer = hub.connect()
@@ -293,7 +288,7 @@ def test_a_failure_on_rosout_is_not_reported_there(
         ({"qos": {"lifespan": {"secs": 1, "nsecs": 0}, "deadline": "infinite"}}, 20),
     ],
 )
-def test_depth_is_the_length_of_the_queue(wish: dict[str, Any], length: int) -> None:
+def test_depth_is_the_length_of_the_queue(wish, length):
     publisher, slow = publisher_and_subscriber(
         "a/B", limits={"queue_length": 20, "longest_queue": 40}, **wish
     )
@@ -303,7 +298,7 @@ def test_depth_is_the_length_of_the_queue(wish: dict[str, Any], length: int) -> 
 
 
 @pytest.mark.parametrize(("ros_version", "time"), [(1, "time"), (2, "builtin_interfaces/msg/Time")])
-def test_message_details(ros_version: Any, time: str) -> None:
+def test_message_details(ros_version, time):
     peer = Harness(ros_version=ros_version).connect()
     definitions = peer.rosapi("message_details", type="sensor_msgs/LaserScan")["typedefs"]
     by_type = {definition["type"]: definition for definition in definitions}
@@ -321,7 +316,7 @@ def test_message_details(ros_version: Any, time: str) -> None:
     assert 9 in array["fieldarraylen"]
 
 
-def test_topics_and_raw_types() -> None:
+def test_topics_and_raw_types():
     hub = Harness()
     peer = hub.connect()
     peer.advertise("/known", "geometry_msgs/msg/PoseStamped")

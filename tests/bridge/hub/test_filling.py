@@ -2,7 +2,6 @@
 
 import json
 from functools import cache
-from typing import Any
 
 import pytest
 from hypothesis import given
@@ -13,7 +12,7 @@ from bridge.hub.conversions import DEFAULTS, TIMES
 from bridge.hub.definitions import _HEADER, MessageDefinitions
 from bridge.hub.filling import _KNOWN
 from bridge.names import ros2_type
-from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer, publisher_and_subscriber
+from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, publisher_and_subscriber
 
 _SECONDS, _NANOSECONDS = divmod(WALL_CLOCK, 10**9)
 _NOW = {1: {"secs": _SECONDS, "nsecs": _NANOSECONDS}, 2: {"sec": _SECONDS, "nanosec": _NANOSECONDS}}
@@ -21,14 +20,14 @@ _ZERO = {1: {"secs": 0, "nsecs": 0}, 2: {"sec": 0, "nanosec": 0}}
 _IDENTITY = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
 
 
-def _send(publisher: Peer, *payloads: bytes) -> None:
+def _send(publisher, *payloads):
     """Send operations as a connection does, which recognises repeated envelopes."""
     assert publisher.hub.broker.receive_turn(publisher.client, list(payloads), 0.0) == len(payloads)
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
 @pytest.mark.parametrize("prefix", ["", '"id":"x",'])  # with an envelope that is learned, and without
-def test_the_cancelling_of_a_goal_has_a_stamp(ros_version: Any, prefix: str) -> None:
+def test_the_cancelling_of_a_goal_has_a_stamp(ros_version, prefix):
     publisher, subscriber = publisher_and_subscriber("actionlib_msgs/GoalID", ros_version)
     texts = ('{"id": "g"}', "{}", "{ }", '{"id": "g"} ')
     _send(publisher, *(f'{{{prefix}"op":"publish","topic":"/t","msg":{text}}}'.encode() for text in texts))
@@ -36,7 +35,7 @@ def test_the_cancelling_of_a_goal_has_a_stamp(ros_version: Any, prefix: str) -> 
     assert subscriber.messages() == [{"id": id_, "stamp": zero} for id_ in ("g", "", "", "g")]
 
 
-def test_a_complete_message_is_forwarded_as_it_was_received() -> None:
+def test_a_complete_message_is_forwarded_as_it_was_received():
     publisher, subscriber = publisher_and_subscriber("std_msgs/Header")
     payload = b'{"op":"publish","topic":"/t","msg":{"frame_id":"" , "seq":1e0,"stamp":{"nsecs":0,"secs":0},"more":1}}'
     _send(publisher, payload, payload)
@@ -45,7 +44,7 @@ def test_a_complete_message_is_forwarded_as_it_was_received() -> None:
 
 @pytest.mark.parametrize("ros_version", [1, 2])
 @pytest.mark.parametrize("header", [None, {}, {"frame_id": "map"}])
-def test_an_absent_stamp_of_a_header_is_the_time_of_receipt(ros_version: Any, header: Any) -> None:
+def test_an_absent_stamp_of_a_header_is_the_time_of_receipt(ros_version, header):
     publisher, subscriber = publisher_and_subscriber("geometry_msgs/PointStamped", ros_version)
     message = {"point": {"x": 1, "y": 2, "z": 3}} | ({} if header is None else {"header": header})
     publisher.publish("/t", message)
@@ -57,19 +56,19 @@ def test_an_absent_stamp_of_a_header_is_the_time_of_receipt(ros_version: Any, he
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
-def test_a_time_of_the_other_version_is_translated_alone(ros_version: Any) -> None:
+def test_a_time_of_the_other_version_is_translated_alone(ros_version):
     publisher, subscriber = publisher_and_subscriber("std_msgs/Header", ros_version)
     publisher.publish("/t", {"stamp": _NOW[3 - ros_version], "frame_id": "a"})
     assert subscriber.messages()[0]["stamp"] == _NOW[1] | _NOW[2]
 
 
-def test_a_message_with_as_many_fields_as_its_type_is_forwarded_as_it_is() -> None:
+def test_a_message_with_as_many_fields_as_its_type_is_forwarded_as_it_is():
     publisher, subscriber = publisher_and_subscriber("geometry_msgs/Point")
     publisher.publish("/t", {"x": 1.0, "y": 2.0, "zz": 3.0})
     assert subscriber.messages() == [{"x": 1.0, "y": 2.0, "zz": 3.0}]
 
 
-def test_parts_and_elements_of_arrays_are_filled() -> None:
+def test_parts_and_elements_of_arrays_are_filled():
     publisher, subscriber = publisher_and_subscriber("tf2_msgs/TFMessage", 2)
     publisher.publish(
         "/t", {"transforms": [{"transform": {"rotation": {"x": 0.5}}}, {"child_frame_id": "b"}, None]}
@@ -94,13 +93,13 @@ def test_parts_and_elements_of_arrays_are_filled() -> None:
         ("tf2_msgs/LookupTransformActionFeedback", "feedback", {}),
     ],
 )
-def test_defaults_of_fields(type_name: str, field: str, default: object) -> None:
+def test_defaults_of_fields(type_name, field, default):
     publisher, subscriber = publisher_and_subscriber(type_name)
     publisher.publish("/t", {})
     assert subscriber.messages()[0][field] == default
 
 
-def test_all_encodings_have_the_whole_message() -> None:
+def test_all_encodings_have_the_whole_message():
     hub = Harness()
     publisher = hub.connect()
     publisher.advertise("/t", "std_msgs/Float64MultiArray")
@@ -117,13 +116,13 @@ def test_all_encodings_have_the_whole_message() -> None:
     assert cbor_codec.decode(payload)["msg"]["bytes"] == b"\0" * 8 + b"\x01\0\0\0" + b"\0" * 6 + b"\xf8\x3f"
 
 
-def test_messages_of_unknown_types_stay() -> None:
+def test_messages_of_unknown_types_stay():
     publisher, subscriber = publisher_and_subscriber("boat_msgs/Sensors")
     publisher.publish("/t", {})
     assert subscriber.messages() == [{}]
 
 
-def test_a_latched_message_is_filled() -> None:
+def test_a_latched_message_is_filled():
     hub = Harness()
     publisher, late = hub.connect(), hub.connect()
     publisher.advertise("/t", "std_msgs/String", latch=True)
@@ -135,7 +134,7 @@ def test_a_latched_message_is_filled() -> None:
 @pytest.mark.parametrize(
     "text", [b'{"markers":[%b{}]}' % (b"{}," * 50_000), b'{"x":"%b","y":0}' % (b"x" * ((1 << 20) - 60))]
 )
-def test_a_message_may_not_outgrow_the_limit(text: bytes) -> None:
+def test_a_message_may_not_outgrow_the_limit(text):
     publisher, subscriber = publisher_and_subscriber("visualization_msgs/MarkerArray")
     envelope = b'{"op":"publish","topic":"/t","msg":'
     _send(publisher, b"%b{}}" % envelope, b"%b%b}" % (envelope, text))
@@ -164,10 +163,10 @@ _LEAVES = st.sampled_from(
 class Slow:
     """Filling as the reference server does it: field by field, for each message."""
 
-    def __init__(self, definitions: MessageDefinitions) -> None:
+    def __init__(self, definitions):
         self.types = definitions
 
-    def filled(self, name: str, value: Any) -> Any:
+    def filled(self, name, value):
         """Return a message with all its fields, in the order of the text with the absent ones appended."""
         if type(value) is not dict:
             return value
@@ -183,10 +182,10 @@ class Slow:
                 )
         return whole
 
-    def each(self, element: str, values: Any) -> Any:
+    def each(self, element, values):
         return [self.filled(element, value) for value in values] if type(values) is list else values
 
-    def default(self, name: str, field: str, value: dict[str, Any]) -> Any:
+    def default(self, name, field, value):
         now = _NOW[self.types.ros_version]
         default = self.types.defaults(name)[field]
         if name in TIMES:
@@ -197,10 +196,10 @@ class Slow:
         return default | {"stamp": now} if self.types.fields(name)[field] == (_HEADER, -1) else default
 
 
-def _messages(definitions: MessageDefinitions, name: str) -> st.SearchStrategy[Any]:
+def _messages(definitions, name):
     """Return messages of a type, mostly of its form, with some of the fields."""
     types = definitions
-    fields: dict[str, st.SearchStrategy[Any]] = {"more": _LEAVES}
+    fields = {"more": _LEAVES}
     for field, (element, length) in types.fields(name).items():
         if element in DEFAULTS:
             fields[field] = _LEAVES
@@ -214,14 +213,14 @@ def _messages(definitions: MessageDefinitions, name: str) -> st.SearchStrategy[A
 
 
 @cache
-def _known(ros_version: Any) -> MessageDefinitions:
+def _known(ros_version):
     definitions = MessageDefinitions(ros_version, lambda: WALL_CLOCK)
     definitions.load()
     return definitions
 
 
 @cache
-def _messages_of(ros_version: Any, name: str) -> st.SearchStrategy[Any]:
+def _messages_of(ros_version, name):
     definitions = _known(ros_version)
     assert definitions.filler(name)
     return _messages(definitions, ros2_type(name))
@@ -229,7 +228,7 @@ def _messages_of(ros_version: Any, name: str) -> st.SearchStrategy[Any]:
 
 @pytest.mark.parametrize("name", _TYPES)
 @given(ros_version=st.sampled_from([1, 2]), data=st.data())
-def test_messages_are_filled_as_field_by_field(name: str, ros_version: Any, data: st.DataObject) -> None:
+def test_messages_are_filled_as_field_by_field(name, ros_version, data):
     definitions = _known(ros_version)
     filler = definitions.filler(name)
     if filler is None:
@@ -251,7 +250,7 @@ def test_messages_are_filled_as_field_by_field(name: str, ros_version: Any, data
     "name", ["std_msgs/Float64MultiArray", "geometry_msgs/PoseStamped", "std_msgs/Header"]
 )
 @given(data=st.data())
-def test_subscribers_of_a_burst_get_messages_filled_field_by_field(name: str, data: st.DataObject) -> None:
+def test_subscribers_of_a_burst_get_messages_filled_field_by_field(name, data):
     """The broker forwards a message as received, with appended fields or written again, to each name of the topic."""
     slow = Slow(_known(1))
     hub = Harness()
@@ -276,7 +275,7 @@ def test_subscribers_of_a_burst_get_messages_filled_field_by_field(name: str, da
     assert json.dumps(latecomer.messages()) == json.dumps(expected[-1:])
 
 
-def test_few_tails_are_kept() -> None:
+def test_few_tails_are_kept():
     filler = _known(1).filler("sensor_msgs/CameraInfo")
     assert filler is not None
     fields = ["header", "height", "width", "distortion_model", "D", "K", "R", "P"]

@@ -4,12 +4,12 @@ import json
 
 import pytest
 
-from tests.bridge.hub.broker_harness import Peer, publisher_and_subscriber
+from tests.bridge.hub.broker_harness import publisher_and_subscriber
 
 PUBLISH = b'{"op":"publish","topic":"/t","msg":'
 
 
-def publisher_and_listener(**limits: int) -> tuple[Peer, Peer]:
+def publisher_and_listener(**limits):
     """Connect a publisher of /t and /u whose envelope of /t the hub knows, and a listener to both."""
     publisher, listener = publisher_and_subscriber("p/T", limits=limits, queue_length=1000)
     publisher.advertise("/u", "p/T")
@@ -20,14 +20,14 @@ def publisher_and_listener(**limits: int) -> tuple[Peer, Peer]:
     return publisher, listener
 
 
-def say(publisher: Peer, data: bytes) -> None:
+def say(publisher, data):
     """Send as a socket's transport does, which lets the hub use a known envelope."""
     hub = publisher.hub
     assert hub.broker.receive_turn(publisher.client, [data], hub.now) == 1
     hub.check()
 
 
-def test_a_message_is_forwarded_unchanged() -> None:
+def test_a_message_is_forwarded_unchanged():
     publisher, listener = publisher_and_listener()
     for message in (b'{"a": [1.50, 2e3], "b":"\\u00e9"}', b'{"a":1,"a":2}', b"{ }"):
         say(publisher, PUBLISH + message + b"}")
@@ -62,7 +62,7 @@ def test_a_message_is_forwarded_unchanged() -> None:
     ],
     ids=lambda rest: repr(rest[:40]),
 )
-def test_the_rest_of_an_operation_keeps_its_meaning(rest: bytes) -> None:
+def test_the_rest_of_an_operation_keeps_its_meaning(rest):
     (knowing, one), (reading, other) = (publisher_and_listener(depth=5, message_bytes=500) for _ in range(2))
     say(knowing, PUBLISH + rest)
     reading.send_raw(PUBLISH + rest)
@@ -70,7 +70,7 @@ def test_the_rest_of_an_operation_keeps_its_meaning(rest: bytes) -> None:
     assert knowing.client.refused == reading.client.refused
 
 
-def test_a_topic_that_is_not_advertised_any_more_is_not_published() -> None:
+def test_a_topic_that_is_not_advertised_any_more_is_not_published():
     publisher, listener = publisher_and_listener()
     publisher.send(op="unadvertise", topic="/t")
     listener.send(op="unsubscribe", topic="/t")
@@ -80,7 +80,7 @@ def test_a_topic_that_is_not_advertised_any_more_is_not_published() -> None:
 
 
 @pytest.mark.parametrize("begun", [b'{"op":"publish","msg":', b'{"msg":', b'{"topic":"/t","msg":'])
-def test_an_operation_with_keys_after_its_message_has_no_envelope(begun: bytes) -> None:
+def test_an_operation_with_keys_after_its_message_has_no_envelope(begun):
     publisher, listener = publisher_and_listener()
     rest = {"op": "publish", "topic": "/t"}
     for key in [key for key in rest if f'"{key}"'.encode() in begun]:
@@ -92,7 +92,7 @@ def test_an_operation_with_keys_after_its_message_has_no_envelope(begun: bytes) 
     assert publisher.client.refused == 1
 
 
-def test_each_topic_has_its_envelope_and_one_alone() -> None:
+def test_each_topic_has_its_envelope_and_one_alone():
     publisher, listener = publisher_and_listener()
     said = [
         b'{"op":"publish","topic":"/%c","msg":{"n":%d}}' % (topic, n) for n in range(5) for topic in b"tu"

@@ -5,13 +5,13 @@ import pytest
 from bridge.hub.limits import HubError, HubLimits
 
 
-def test_every_limit_must_be_positive() -> None:
+def test_every_limit_must_be_positive():
     for field in dataclasses.fields(HubLimits):
         with pytest.raises(HubError, match=field.name):
             HubLimits(**{field.name: 0})
 
 
-def test_limits_that_contradict_each_other_are_refused() -> None:
+def test_limits_that_contradict_each_other_are_refused():
     with pytest.raises(HubError, match="client_bytes"):
         HubLimits(message_bytes=1000, client_bytes=999)
     with pytest.raises(HubError, match="depth"):
@@ -19,5 +19,5 @@ def test_limits_that_contradict_each_other_are_refused() -> None:
     assert HubError.exit_code == 2
 
 
-def test_the_default_message_is_a_mebibyte() -> None:
+def test_the_default_message_is_a_mebibyte():
     assert HubLimits().message_bytes == 1 << 20

@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from bridge.hub.outbox import Lane, Outbox
 
 
-def _drain(outbox: Outbox) -> list[bytes]:
+def _drain(outbox):
     payloads = []
     while (payload := outbox.pop()) is not None:
         payloads.append(payload)
     return payloads
 
 
-def _lane(throttle: float = 0.0, queue_length: int = 3) -> Lane:
+def _lane(throttle=0.0, queue_length=3):
     lane = Lane()
     lane.throttle, lane.queue_length = throttle, queue_length
     return lane
@@ -28,9 +28,7 @@ def _lane(throttle: float = 0.0, queue_length: int = 3) -> Lane:
     [(0.5, 1, 0.5, 2, [b"3"]), (0.0, 5, inf, 0, [b"1", b"2", b"3"])],
     ids=["shorter", "lifted"],
 )
-def test_an_adjusted_lane_drops_or_queues_what_it_held(
-    throttle: float, length: int, deadline: float, dropped: int, released: list[bytes]
-) -> None:
+def test_an_adjusted_lane_drops_or_queues_what_it_held(throttle, length, deadline, dropped, released):
     outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=5)
     for index in range(4):
         outbox.offer(lane, b"%d" % index, 0)
@@ -42,7 +40,7 @@ def test_an_adjusted_lane_drops_or_queues_what_it_held(
     assert _drain(outbox) == released
 
 
-def test_forgetting_a_lane_leaves_nothing_of_it() -> None:
+def test_forgetting_a_lane_leaves_nothing_of_it():
     outbox, gone, stays = Outbox(1000), _lane(throttle=1.0, queue_length=5), _lane()
     for index in range(3):
         outbox.offer(gone, b"%d" % index, 0)
@@ -54,7 +52,7 @@ def test_forgetting_a_lane_leaves_nothing_of_it() -> None:
     assert _drain(outbox) == [b"s", b"s", b"s"]
 
 
-def test_dropping_does_not_make_the_queue_longer() -> None:
+def test_dropping_does_not_make_the_queue_longer():
     outbox, lane = Outbox(10_000), _lane(queue_length=1)
     outbox.put(b"first")
     for _ in range(10_000):
@@ -63,7 +61,7 @@ def test_dropping_does_not_make_the_queue_longer() -> None:
     assert _drain(outbox) == [b"first", b"x"]
 
 
-def test_while_the_socket_takes_it_nothing_waits() -> None:
+def test_while_the_socket_takes_it_nothing_waits():
     outbox, lane = Outbox(10), _lane(queue_length=1)
     outbox.wire = []
     for index in range(5):
@@ -76,7 +74,7 @@ def test_while_the_socket_takes_it_nothing_waits() -> None:
     assert (outbox.size, lane.dropped, outbox.overflowed) == (0, 0, False)
 
 
-def test_queued_payloads_keep_their_place() -> None:
+def test_queued_payloads_keep_their_place():
     outbox, lane, cut = Outbox(1000), _lane(), _lane()
     cut.fragment_size = 16
     outbox.put(b"1")
@@ -97,7 +95,7 @@ def test_queued_payloads_keep_their_place() -> None:
     assert outbox.empty
 
 
-def test_a_throttle_holds_also_while_the_socket_takes_everything() -> None:
+def test_a_throttle_holds_also_while_the_socket_takes_everything():
     outbox, lane = Outbox(1000), _lane(throttle=1.0, queue_length=1)
     outbox.wire = wire = []
     for index in range(3):
@@ -123,28 +121,28 @@ class _ModelLane:
 class _Model:
     """The outbox's rules over plain lists. A waiting item is (payload, lane or None)."""
 
-    def __init__(self, max_bytes: int) -> None:
+    def __init__(self, max_bytes):
         self.max_bytes = max_bytes
-        self.waiting: list[tuple[bytes, _ModelLane | None]] = []
-        self.lanes: list[_ModelLane] = []
+        self.waiting = []
+        self.lanes = []
         self.overflowed = False
 
     @property
-    def size(self) -> int:
+    def size(self):
         held = sum(len(payload) for lane in self.lanes for payload in lane.held)
         return held + sum(len(payload) for payload, _lane in self.waiting)
 
     @property
-    def deadline(self) -> float:
+    def deadline(self):
         return min((lane.next_time for lane in self.lanes if lane.held), default=inf)
 
-    def put(self, payload: bytes) -> None:
+    def put(self, payload):
         if self._make_room(len(payload)):
             self.waiting.append((payload, None))
         else:
             self.overflowed = True
 
-    def offer(self, lane: _ModelLane, payload: bytes, now: float) -> None:
+    def offer(self, lane, payload, now):
         if not lane.throttle:
             self._queue(lane, payload)
         elif now >= lane.next_time and not lane.held:
@@ -159,13 +157,13 @@ class _Model:
             else:
                 lane.dropped += 1
 
-    def release(self, now: float) -> None:
+    def release(self, now):
         for lane in self.lanes:
             if lane.held and lane.next_time <= now:
                 lane.next_time = now + lane.throttle
                 self._queue(lane, lane.held.pop(0))
 
-    def _queue(self, lane: _ModelLane, payload: bytes) -> None:
+    def _queue(self, lane, payload):
         own = [index for index, (_payload, its_lane) in enumerate(self.waiting) if its_lane is lane]
         if len(own) >= max(lane.queue_length, 1):
             del self.waiting[own[0]]
@@ -175,7 +173,7 @@ class _Model:
         else:
             lane.dropped += 1
 
-    def _make_room(self, size: int) -> bool:
+    def _make_room(self, size):
         while self.size + size > self.max_bytes:
             index = next((i for i, (_payload, lane) in enumerate(self.waiting) if lane is not None), None)
             if index is not None:
@@ -206,9 +204,7 @@ _STEPS = st.lists(
 
 @given(_LANES, _STEPS, st.integers(12, 60))
 @settings(max_examples=300, deadline=None)
-def test_the_outbox_is_its_model(
-    shapes: list[tuple[float, int]], steps: list[tuple[str, int, int]], max_bytes: int
-) -> None:
+def test_the_outbox_is_its_model(shapes, steps, max_bytes):
     outbox, model, now = Outbox(max_bytes), _Model(max_bytes), 0.0
     # Harness for held messages is made in no stated order of lanes: one throttled lane keeps the model exact.
     throttles = [throttle for throttle, _length in shapes]

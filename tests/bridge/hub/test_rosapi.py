@@ -1,14 +1,13 @@
 import json
-from typing import Any
 
 import pytest
 
 from bridge.hub.rosapi import _ROS2_FIELDS, PREFIX
-from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, Peer
+from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness
 
 
 @pytest.fixture
-def peer(hub: Harness) -> Peer:
+def peer(hub):
     """The third client of a hub where the first two publish, hear and serve."""
     publisher, subscriber = hub.connect("10.0.0.1"), hub.connect("10.0.0.2")
     publisher.advertise("/boat/sensors", "boat_msgs/Sensors")
@@ -19,7 +18,7 @@ def peer(hub: Harness) -> Peer:
     return hub.connect()
 
 
-_NOTHING: dict[str, list[str]] = {"publishing": [], "subscribing": [], "services": []}
+_NOTHING = {"publishing": [], "subscribing": [], "services": []}
 _SECONDS, _NANOSECONDS = divmod(WALL_CLOCK, 10**9)
 
 
@@ -76,13 +75,13 @@ _SECONDS, _NANOSECONDS = divmod(WALL_CLOCK, 10**9)
         ),
     ],
 )
-def test_the_graph_is_described(peer: Peer, service: str, args: object, values: object) -> None:
+def test_the_graph_is_described(peer, service, args, values):
     for name in (f"/rosapi/{service}", f"rosapi/{service}"):
         answer = peer.ask(name, args)
         assert (answer["service"], answer["result"], answer["values"]) == (name, True, values)
 
 
-def test_every_service_that_is_listed_can_be_called(peer: Peer) -> None:
+def test_every_service_that_is_listed_can_be_called(peer):
     services = peer.rosapi("node_details", node="/rosapi")["services"]
     assert {"/add", "/rosapi/topics", "/rosapi/get_param", *services} == set(
         peer.rosapi("services")["services"]
@@ -98,7 +97,7 @@ def test_every_service_that_is_listed_can_be_called(peer: Peer) -> None:
     ("service", "type_name"),
     [("message_details", "boat_msgs/Sensors"), ("service_request_details", "boat_srvs/Row")],
 )
-def test_unknown_definitions_are_refused(peer: Peer, service: str, type_name: str) -> None:
+def test_unknown_definitions_are_refused(peer, service, type_name):
     assert peer.ask(f"/rosapi/{service}", {"type": type_name})["result"] is False
 
 
@@ -109,7 +108,7 @@ def test_unknown_definitions_are_refused(peer: Peer, service: str, type_name: st
         (2, "std_srvs/srv/SetBool", "std_srvs/srv/SetBool_Request"),
     ],
 )
-def test_details_of_services(ros_version: Any, type_name: str, request_type: str) -> None:
+def test_details_of_services(ros_version, type_name, request_type):
     peer = Harness(ros_version=ros_version).connect()
     (request,) = peer.rosapi("service_request_details", type=type_name)["typedefs"]
     assert (request["type"], request["fieldnames"], request["fieldtypes"]) == (
@@ -130,7 +129,7 @@ def test_details_of_services(ros_version: Any, type_name: str, request_type: str
         (2, "example_interfaces/action/Fibonacci", "example_interfaces/action/Fibonacci_Goal"),
     ],
 )
-def test_details_of_actions(ros_version: Any, type_name: str, goal_type: str) -> None:
+def test_details_of_actions(ros_version, type_name, goal_type):
     peer = Harness(ros_version=ros_version).connect()
     (goal,) = peer.rosapi("action_goal_details", type=type_name)["typedefs"]
     assert (goal["type"], goal["fieldnames"]) == (goal_type, ["order"])
@@ -140,7 +139,7 @@ def test_details_of_actions(ros_version: Any, type_name: str, goal_type: str) ->
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
-def test_services_of_rosapi_are_defined(ros_version: Any) -> None:
+def test_services_of_rosapi_are_defined(ros_version):
     peer = Harness(ros_version=ros_version).connect()
     for service in peer.rosapi("services")["services"]:
         type_name = peer.rosapi("service_type", service=service)["type"]
@@ -152,19 +151,19 @@ def test_services_of_rosapi_are_defined(ros_version: Any) -> None:
         peer.rosapi("service_response_details", type=type_name)
 
 
-def _arguments(peer: Peer, service: str) -> tuple[str, ...]:
+def _arguments(peer, service):
     _type, names, _answer = peer.hub.broker._calls._rosapi._services[service.removeprefix(PREFIX)]
     return names
 
 
-def test_a_default_of_a_parameter_under_both_of_its_names() -> None:
+def test_a_default_of_a_parameter_under_both_of_its_names():
     peer = Harness(ros_version=2).connect()
     for name in ("default", "default_value"):
         assert peer.rosapi("get_param", name="/p", **{name: "7"})["value"] == "7"
 
 
 @pytest.mark.parametrize("args", ["text", 7, {"topic": 7}, {"topic": None}, [["/chatter"]], True])
-def test_wrong_arguments_fail_the_call(peer: Peer, args: object) -> None:
+def test_wrong_arguments_fail_the_call(peer, args):
     assert peer.ask("/rosapi/topic_type", args)["result"] is False
 
 
@@ -172,7 +171,7 @@ def test_wrong_arguments_fail_the_call(peer: Peer, args: object) -> None:
 
 
 @pytest.mark.parametrize("value", [1, 2.5, "text", None, [1, 2], {"a": {"b": True}}])
-def test_a_parameter_keeps_its_value_and_outlives_its_client(hub: Harness, peer: Peer, value: object) -> None:
+def test_a_parameter_keeps_its_value_and_outlives_its_client(hub, peer, value):
     assert peer.rosapi("has_param", name="/p") == {"exists": False}
     peer.rosapi("set_param", name="p", value=json.dumps(value))
     peer.disconnect()
@@ -186,16 +185,16 @@ def test_a_parameter_keeps_its_value_and_outlives_its_client(hub: Harness, peer:
 
 
 @pytest.mark.parametrize("value", ["", "text", "{", "NaN", "1e999", "[" * 100 + "]" * 100])
-def test_a_parameter_must_be_json(peer: Peer, value: str) -> None:
+def test_a_parameter_must_be_json(peer, value):
     answer = peer.ask("/rosapi/set_param", {"name": "/p", "value": value})
     assert answer["result"] is False
     assert peer.rosapi("get_param_names") == {"names": []}
 
 
-def test_parameters_are_bounded_in_number_and_size() -> None:
+def test_parameters_are_bounded_in_number_and_size():
     peer = Harness(parameters=2, parameter_bytes=20).connect()
 
-    def can_set(name: str, value: object) -> bool:
+    def can_set(name, value):
         return bool(peer.ask("/rosapi/set_param", {"name": name, "value": json.dumps(value)})["result"])
 
     assert can_set("/a", "x" * 8)

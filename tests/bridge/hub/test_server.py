@@ -16,7 +16,7 @@ from tests.bridge.hub.sockets import RawClient, client, running_hub
 from tests.patience import PATIENCE
 
 
-async def test_messages_of_every_length_arrive_whole() -> None:
+async def test_messages_of_every_length_arrive_whole():
     async with running_hub() as port, client(port) as ears:
         await ears.send(op="advertise", topic="/t", type="a/B")
         await ears.send(op="subscribe", topic="/t")
@@ -27,7 +27,7 @@ async def test_messages_of_every_length_arrive_whole() -> None:
                 assert (await ears.receive())["msg"]["data"] == letter * size
 
 
-async def test_what_is_due_happens_by_itself() -> None:
+async def test_what_is_due_happens_by_itself():
     limits = HubLimits(call_timeout=0.1)
     async with running_hub(limits=limits) as port, client(port) as ears, client(port) as offers:
         await ears.send(op="subscribe", topic="/t", type="a/B", throttle_rate=30, queue_length=10)
@@ -44,7 +44,7 @@ async def test_what_is_due_happens_by_itself() -> None:
 
 
 @pytest.mark.parametrize("path", ["/", "/rosbridge", "/a/b?c=d"])
-async def test_any_path_will_do_and_nothing_is_compressed(path: str) -> None:
+async def test_any_path_will_do_and_nothing_is_compressed(path):
     async with (
         running_hub() as port,
         connect(f"ws://127.0.0.1:{port}{path}", compression="deflate") as socket,
@@ -53,7 +53,7 @@ async def test_any_path_will_do_and_nothing_is_compressed(path: str) -> None:
         assert "Sec-WebSocket-Extensions" not in socket.response.headers
 
 
-async def test_a_client_can_leave_politely() -> None:
+async def test_a_client_can_leave_politely():
     async with running_hub() as port, client(port) as stays:
         async with client(port) as leaves:
             await leaves.send(op="subscribe", topic="/t", type="a/B")
@@ -62,7 +62,7 @@ async def test_a_client_can_leave_politely() -> None:
         assert (await stays.ask("/rosapi/topics"))["topics"] == ["/rosout"]
 
 
-async def test_the_end_of_the_hub_closes_its_clients_with_1001() -> None:
+async def test_the_end_of_the_hub_closes_its_clients_with_1001():
     async with AsyncExitStack() as clients, AsyncExitStack() as hub:
         port = await hub.enter_async_context(running_hub())
         ears = await clients.enter_async_context(client(port))
@@ -73,7 +73,7 @@ async def test_the_end_of_the_hub_closes_its_clients_with_1001() -> None:
             await connect(f"ws://127.0.0.1:{port}")
 
 
-async def test_the_hub_ends_although_a_client_does_not(quick_sweeps: None) -> None:
+async def test_the_hub_ends_although_a_client_does_not(quick_sweeps):
     async with AsyncExitStack() as stack:
         port = await stack.enter_async_context(running_hub())
         deaf = await RawClient.connect(port)
@@ -88,13 +88,13 @@ async def test_the_hub_ends_although_a_client_does_not(quick_sweeps: None) -> No
     ("host", "port"),
     [("127.0.0.1", None), ("192.0.2.1", 0), ("no-such-host.invalid", 0), ("127.0.0.1", 70000)],
 )
-async def test_an_address_that_is_in_use_or_not_ours_is_an_error(host: str, port: int | None) -> None:
+async def test_an_address_that_is_in_use_or_not_ours_is_an_error(host, port):
     async with running_hub() as used:
         with pytest.raises(HubError, match=f"port {used}" if port is None else host):
             await serve_hub(host, used if port is None else port, stop=asyncio.Event())
 
 
-async def test_too_many_clients_are_answered_503() -> None:
+async def test_too_many_clients_are_answered_503():
     async with running_hub(limits=HubLimits(clients=2)) as port:
         async with client(port) as one, client(port):
             with pytest.raises(InvalidStatus) as caught:
@@ -105,7 +105,7 @@ async def test_too_many_clients_are_answered_503() -> None:
             await late.sync()
 
 
-async def test_a_web_browser_gets_an_explanation() -> None:
+async def test_a_web_browser_gets_an_explanation():
     async with running_hub() as port:
         raw = await RawClient.connect(port, handshake=False)
         raw.writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -117,7 +117,7 @@ async def test_a_web_browser_gets_an_explanation() -> None:
 @pytest.mark.parametrize(
     "garbage", [b"\r\n\r\n", b"SSH-2.0-x\r\n\r\n", b"\x16\x03\x01" + b"\0" * 300, b"x" * 100_000]
 )
-async def test_garbage_instead_of_http_ends_the_connection(garbage: bytes) -> None:
+async def test_garbage_instead_of_http_ends_the_connection(garbage):
     async with running_hub() as port, client(port) as ears:
         raw = await RawClient.connect(port, handshake=False)
         raw.writer.write(garbage)
@@ -126,10 +126,10 @@ async def test_garbage_instead_of_http_ends_the_connection(garbage: bytes) -> No
         await ears.sync()
 
 
-def test_the_loop_is_left_as_it_was() -> None:
+def test_the_loop_is_left_as_it_was():
     """A hub leaves no task, timer or socket behind in its event loop."""
 
-    async def life() -> int:
+    async def life():
         async with running_hub() as port, client(port) as ears:
             await ears.send(op="subscribe", topic="/t", type="a/B", throttle_rate=60_000, queue_length=9)
             for index in range(3):
@@ -145,11 +145,11 @@ def test_the_loop_is_left_as_it_was() -> None:
         sock.connect(("127.0.0.1", port))
 
 
-async def test_a_delayed_hub_closes_no_client() -> None:
+async def test_a_delayed_hub_closes_no_client():
     swept = []
 
     class Connection:
-        def sweep(self, now: float) -> None:
+        def sweep(self, now):
             swept.append(now)
 
     hub = server._Hub(HubLimits(), AccessPolicy(), 1, loopback=True)

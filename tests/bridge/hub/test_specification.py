@@ -4,19 +4,17 @@ Where the hub differs, docs/reference/rosbridge-differences.md says so.
 """
 
 import json
-from typing import Any
 
 import pytest
 
 from bridge.codecs import png
-from tests.bridge.hub.broker_harness import Harness, Peer
 
 DOCK = "/dock"
 DOCK_TYPE = "a/action/Dock"
 
 
 @pytest.fixture
-def strict(hub: Harness) -> Peer:
+def strict(hub):
     """A client that gets status messages."""
     peer = hub.connect()
     peer.send(op="set_level", level="error")
@@ -43,7 +41,7 @@ def strict(hub: Harness) -> Peer:
         b'{"op":"advertise","topic":"/t","type":"a/B"}{"op":"advertise","topic":"/u","type":"a/B"}',
     ],
 )
-def test_a_refused_operation_causes_one_status_message(strict: Peer, raw: bytes) -> None:
+def test_a_refused_operation_causes_one_status_message(strict, raw):
     strict.send_raw(raw)
     (status,) = strict.read()
     assert (status["op"], status["level"]) == ("status", "error")
@@ -51,7 +49,7 @@ def test_a_refused_operation_causes_one_status_message(strict: Peer, raw: bytes)
 
 
 @pytest.mark.parametrize("level", ["info", "warning", "error"])
-def test_every_level_includes_errors_and_nothing_else(hub: Harness, level: str) -> None:
+def test_every_level_includes_errors_and_nothing_else(hub, level):
     peer = hub.connect()
     peer.send(op="set_level", level=level, id="i")
     peer.send(op="advertise", topic="/t", type="std_msgs/String")
@@ -61,7 +59,7 @@ def test_every_level_includes_errors_and_nothing_else(hub: Harness, level: str) 
     assert peer.read()[0]["id"] == "f"
 
 
-def test_extra_fields_are_ignored(hub: Harness) -> None:
+def test_extra_fields_are_ignored(hub):
     publisher, subscriber = hub.connect(), hub.connect()
     publisher.send(op="advertise", topic="/t", type="a/B", queue_size=1, message_intervall=5, png="png")
     subscriber.send(op="subscribe", topic="/t", type="a/B", message_intervall=5, png="png")
@@ -69,14 +67,14 @@ def test_extra_fields_are_ignored(hub: Harness) -> None:
     assert subscriber.messages() == [{"a": 1}]
 
 
-def _goal(hub: Harness, **options: Any) -> tuple[Peer, Peer, list[Any]]:
+def _goal(hub, **options):
     server, client = hub.connect(), hub.connect()
     server.send(op="advertise_action", action=DOCK, type=DOCK_TYPE)
     client.send(op="send_action_goal", **{"action": DOCK, "action_type": DOCK_TYPE} | options)
     return server, client, server.read()
 
 
-def test_one_goal_at_a_time_may_have_no_id(hub: Harness) -> None:
+def test_one_goal_at_a_time_may_have_no_id(hub):
     server, client, (goal,) = _goal(hub)
     client.send(op="send_action_goal", action=DOCK, action_type=DOCK_TYPE)
     (refusal,) = client.read()
@@ -89,7 +87,7 @@ def test_one_goal_at_a_time_may_have_no_id(hub: Harness) -> None:
     ]
 
 
-def test_feedback_and_result_as_png(hub: Harness) -> None:
+def test_feedback_and_result_as_png(hub):
     server, client, (goal,) = _goal(hub, compression="png", feedback=True, id="g")
     server.send(op="action_feedback", id=goal["id"], action=DOCK, values={"a": 1})
     server.send(op="action_result", id=goal["id"], action=DOCK, values={"b": 1}, status=4, result=True)
@@ -97,7 +95,7 @@ def test_feedback_and_result_as_png(hub: Harness) -> None:
     assert [operation["values"] for operation in operations] == [{"a": 1}, {"b": 1}]
 
 
-def test_an_answer_needs_only_its_id(hub: Harness) -> None:
+def test_an_answer_needs_only_its_id(hub):
     server, client = hub.connect(), hub.connect()
     server.send(op="advertise_service", service="/s", type="a/S")
     client.send(op="call_service", service="/s", id=7)

@@ -1,20 +1,16 @@
-from typing import Any
-
 import pytest
 
-from tests.bridge.hub.broker_harness import Harness, Peer
+from tests.bridge.hub.broker_harness import Harness
 
 
-def publish_numbers(publisher: Peer, count: int) -> list[dict[str, int]]:
+def publish_numbers(publisher, count):
     messages = [{"i": index} for index in range(count)]
     for message in messages:
         publisher.publish("/t", message)
     return messages
 
 
-def test_a_message_reaches_all_subscribers_and_nobody_else(
-    hub: Harness, publisher: Peer, subscriber: Peer
-) -> None:
+def test_a_message_reaches_all_subscribers_and_nobody_else(hub, publisher, subscriber):
     typed, stranger = hub.connect(), hub.connect()
     typed.subscribe("/t", type="a/B")
     stranger.subscribe("/u")
@@ -27,7 +23,7 @@ def test_a_message_reaches_all_subscribers_and_nobody_else(
 
 
 @pytest.mark.parametrize("compression", ["none", "png", "cbor", "cbor-raw"])
-def test_each_form_is_encoded_once(hub: Harness, compression: str) -> None:
+def test_each_form_is_encoded_once(hub, compression):
     publisher, *subscribers = (hub.connect() for _ in range(4))
     publisher.advertise("/t", "std_msgs/Float64MultiArray")
     for peer in subscribers:
@@ -39,9 +35,7 @@ def test_each_form_is_encoded_once(hub: Harness, compression: str) -> None:
     assert all(other is first for other in others)
 
 
-def test_names_with_and_without_slash_and_both_forms_of_a_type_are_one(
-    hub: Harness, publisher: Peer, subscriber: Peer
-) -> None:
+def test_names_with_and_without_slash_and_both_forms_of_a_type_are_one(hub, publisher, subscriber):
     other = hub.connect()
     other.subscribe("t", type="a/msg/B")
     other.advertise("t", "a/msg/B")
@@ -52,7 +46,7 @@ def test_names_with_and_without_slash_and_both_forms_of_a_type_are_one(
     assert set(publisher.rosapi("publishers", topic="/t")["publishers"]) == {"/client_1", "/client_3"}
 
 
-def test_another_type_is_refused_silently(hub: Harness, publisher: Peer) -> None:
+def test_another_type_is_refused_silently(hub, publisher):
     other = hub.connect()
     other.subscribe("/t", type="a/C")
     other.advertise("/t", "a/C")
@@ -68,7 +62,7 @@ def test_another_type_is_refused_silently(hub: Harness, publisher: Peer) -> None
     [(name, "a/B") for name in ["", "/", "//t", "/t/", "/a b", "/ä", "/t" * 200, 7, None, ["/t"]]]
     + [("/t", type_name) for type_name in ["", "B", "a/b/c/D", "a/B ", 7]],
 )
-def test_malformed_names_and_types_are_refused(hub: Harness, name: Any, type_name: Any) -> None:
+def test_malformed_names_and_types_are_refused(hub, name, type_name):
     peer = hub.connect()
     peer.send(op="advertise", topic=name, type=type_name)
     peer.send(op="subscribe", topic=name, type=type_name)
@@ -77,7 +71,7 @@ def test_malformed_names_and_types_are_refused(hub: Harness, name: Any, type_nam
     assert not hub.broker.graph.topics
 
 
-def test_publishing_advertises_where_the_type_is_known_or_given(hub: Harness) -> None:
+def test_publishing_advertises_where_the_type_is_known_or_given(hub):
     publisher, subscriber = hub.connect(), hub.connect()
     subscriber.subscribe("/known/0", type="a/B")
     subscriber.subscribe("/given")
@@ -94,7 +88,7 @@ def test_publishing_advertises_where_the_type_is_known_or_given(hub: Harness) ->
     assert publisher.client.refused == 1
 
 
-def test_a_subscriber_without_a_type_is_served_by_whoever_names_it(hub: Harness) -> None:
+def test_a_subscriber_without_a_type_is_served_by_whoever_names_it(hub):
     untyped, first, second = hub.connect(), hub.connect(), hub.connect()
     untyped.subscribe("/t")
     for publisher, type_name in ((first, "a/B"), (second, "c/D")):
@@ -105,7 +99,7 @@ def test_a_subscriber_without_a_type_is_served_by_whoever_names_it(hub: Harness)
 
 
 @pytest.mark.parametrize("message", [1, "text", [1], None, True])
-def test_only_an_object_is_a_message(publisher: Peer, subscriber: Peer, message: object) -> None:
+def test_only_an_object_is_a_message(publisher, subscriber, message):
     publisher.send(op="publish", topic="/t", msg=message)
     assert subscriber.read() == []
     publisher.send(op="publish", topic="/t")  # as on the reference server, an empty one
@@ -115,7 +109,7 @@ def test_only_an_object_is_a_message(publisher: Peer, subscriber: Peer, message:
 # --- ids
 
 
-def test_a_topic_is_advertised_until_each_of_its_ids_is_withdrawn(hub: Harness) -> None:
+def test_a_topic_is_advertised_until_each_of_its_ids_is_withdrawn(hub):
     peer = hub.connect()
     for withdrawn in (["unknown", "one", 2], [None]):  # without an id: all of them
         peer.advertise("/t", id="one")
@@ -128,8 +122,8 @@ def test_a_topic_is_advertised_until_each_of_its_ids_is_withdrawn(hub: Harness) 
 
 @pytest.mark.parametrize("last", [{}, {"id": "three"}])  # without an id: all of them, and what waits
 def test_a_client_that_subscribes_twice_gets_each_message_once_until_it_unsubscribes_twice(
-    hub: Harness, publisher: Peer, last: dict[str, str]
-) -> None:
+    hub, publisher, last
+):
     subscriber = hub.connect()
     for each in ("two", "three"):
         subscriber.subscribe("/t", id=each)
@@ -147,7 +141,7 @@ def test_a_client_that_subscribes_twice_gets_each_message_once_until_it_unsubscr
 
 
 @pytest.mark.parametrize("identifier", [1.5, True, [], {}, "x" * 1025])
-def test_an_id_is_a_string_or_an_integer(hub: Harness, identifier: object) -> None:
+def test_an_id_is_a_string_or_an_integer(hub, identifier):
     peer = hub.connect()
     peer.subscribe("/t", id=identifier)
     peer.advertise("/t", id=identifier)
@@ -167,8 +161,8 @@ def test_an_id_is_a_string_or_an_integer(hub: Harness, identifier: object) -> No
     ],
 )
 def test_each_new_subscription_gets_the_latched_message_and_a_repeated_one_does_not(
-    hub: Harness, advertised: dict[str, Any] | None, published: dict[str, Any]
-) -> None:
+    hub, advertised, published
+):
     publisher, late, volatile = (hub.connect() for _ in range(3))
     if advertised is not None:
         publisher.advertise("/t", **advertised)
@@ -182,7 +176,7 @@ def test_each_new_subscription_gets_the_latched_message_and_a_repeated_one_does_
     assert volatile.messages() == []
 
 
-def test_a_latch_ends_with_its_publisher(hub: Harness) -> None:
+def test_a_latch_ends_with_its_publisher(hub):
     latching, other, late = (hub.connect() for _ in range(3))
     latching.advertise("/t", latch=True)
     latching.publish("/t", {"i": 0})
@@ -193,7 +187,7 @@ def test_a_latch_ends_with_its_publisher(hub: Harness) -> None:
     assert late.messages() == []
 
 
-def test_latched_messages_are_bounded_together() -> None:
+def test_latched_messages_are_bounded_together():
     hub = Harness(latched_bytes=30)
     publisher, late = hub.connect(), hub.connect()
     for topic in ("/a", "/b"):
@@ -212,7 +206,7 @@ def test_latched_messages_are_bounded_together() -> None:
 # --- throttle and queue
 
 
-def test_a_throttle_is_kept_in_time(hub: Harness, publisher: Peer, subscriber: Peer) -> None:
+def test_a_throttle_is_kept_in_time(hub, publisher, subscriber):
     throttled = hub.connect()
     throttled.subscribe("/t", throttle_rate=100)
     received = []
@@ -224,7 +218,7 @@ def test_a_throttle_is_kept_in_time(hub: Harness, publisher: Peer, subscriber: P
     assert len(subscriber.messages()) == 10
 
 
-def test_the_least_of_a_clients_options_applies(hub: Harness, publisher: Peer) -> None:
+def test_the_least_of_a_clients_options_applies(hub, publisher):
     subscriber = hub.connect()
     subscriber.subscribe("/t", id="slow", throttle_rate=1000, queue_length=5)
     publish_numbers(publisher, 2)
@@ -240,7 +234,7 @@ def test_the_least_of_a_clients_options_applies(hub: Harness, publisher: Peer) -
 
 
 @pytest.mark.parametrize("field", ["throttle_rate", "queue_length"])
-def test_a_rate_or_a_length_that_is_not_a_number_refuses_the_subscription(hub: Harness, field: str) -> None:
+def test_a_rate_or_a_length_that_is_not_a_number_refuses_the_subscription(hub, field):
     peer = hub.connect()
     for value in ("5", -1, True, [], 1e300):
         peer.subscribe("/t", **{field: value})
@@ -250,7 +244,7 @@ def test_a_rate_or_a_length_that_is_not_a_number_refuses_the_subscription(hub: H
     assert "/t" in hub.broker.graph.topics
 
 
-def test_a_slow_client_keeps_the_newest_and_costs_the_others_nothing() -> None:
+def test_a_slow_client_keeps_the_newest_and_costs_the_others_nothing():
     hub = Harness(queue_length=10, longest_queue=20)
     publisher, slow, latest, greedy, quick = (hub.connect() for _ in range(5))
     publisher.advertise("/t")
@@ -276,12 +270,12 @@ def test_a_slow_client_keeps_the_newest_and_costs_the_others_nothing() -> None:
         (b'1,"a":2', 2),
     ],
 )
-def test_unusual_json_is_made_strict(publisher: Peer, subscriber: Peer, sent: bytes, received: Any) -> None:
+def test_unusual_json_is_made_strict(publisher, subscriber, sent, received):
     publisher.send_raw(b'{"op":"advertise","op":"publish","topic":"/t","msg":{"a":%b}}' % sent)
     assert subscriber.messages() == [{"a": received}]
 
 
-def test_numbers_keep_their_values(publisher: Peer, subscriber: Peer) -> None:
+def test_numbers_keep_their_values(publisher, subscriber):
     numbers = [0, -0.0, 1, -(2**63), 2**64 - 1, 0.1, 1e-320, 1.7976931348623157e308, 1e15]
     publisher.publish("/t", {"a": numbers})
     (message,) = subscriber.messages()
@@ -296,9 +290,7 @@ def test_numbers_keep_their_values(publisher: Peer, subscriber: Peer) -> None:
         ("/t", b'{"n":[1e15],"a":"%b"}', -14),  # rewritten as 1000000000000000.0
     ],
 )
-def test_a_message_that_goes_out_larger_than_the_limit_is_refused(
-    topic: str, message: bytes, spare: int
-) -> None:
+def test_a_message_that_goes_out_larger_than_the_limit_is_refused(topic, message, spare):
     peer = Harness(message_bytes=500).connect()
     peer.advertise("t")
     peer.subscribe("/t")
@@ -310,7 +302,7 @@ def test_a_message_that_goes_out_larger_than_the_limit_is_refused(
     assert peer.client.refused == 1
 
 
-def test_topics_are_counted() -> None:
+def test_topics_are_counted():
     hub = Harness(topics=3)
     one, other = hub.connect(), hub.connect()
     for index in range(5):
@@ -324,7 +316,7 @@ def test_topics_are_counted() -> None:
     assert list(hub.broker.graph.topics) == ["/t0", "/u"]
 
 
-def test_open_operations_of_a_client_are_counted_by_id() -> None:
+def test_open_operations_of_a_client_are_counted_by_id():
     hub = Harness(advertisements_per_client=2, subscriptions_per_client=2)
     peer = hub.connect()
     for index in range(4):

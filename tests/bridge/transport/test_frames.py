@@ -19,7 +19,7 @@ URI = parse_uri("ws://localhost:9090")
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("masked", [True, False])
-def test_a_message_is_found_wherever_it_begins(size: int, masked: bool) -> None:
+def test_a_message_is_found_wherever_it_begins(size, masked):
     payload = b"x" * size
     one = Frame(Opcode.BINARY, payload).serialize(mask=masked)
     data = b"before" + 3 * one + b"\x81"
@@ -36,7 +36,7 @@ def test_a_message_is_found_wherever_it_begins(size: int, masked: bool) -> None:
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("masked", [True, False])
-def test_a_frame_that_is_not_all_there_is_waited_for(size: int, masked: bool) -> None:
+def test_a_frame_that_is_not_all_there_is_waited_for(size, masked):
     data = Frame(Opcode.TEXT, b"x" * size).serialize(mask=masked)
     header = len(data) - size
     for known in {*range(header + 1), len(data) - 1}:
@@ -52,7 +52,7 @@ def test_a_frame_that_is_not_all_there_is_waited_for(size: int, masked: bool) ->
     ("opcode", "size"), [*((Opcode.TEXT, size) for size in SIZES), (Opcode.CONT, 1), (Opcode.PING, 1)]
 )
 @pytest.mark.parametrize("masked", [True, False])
-def test_one_message_alone_is_found_as_among_others(opcode: Opcode, size: int, masked: bool) -> None:
+def test_one_message_alone_is_found_as_among_others(opcode, size, masked):
     one = Frame(opcode, b"x" * size).serialize(mask=masked)
     found = frames.whole_messages(one, 0, masked=masked, largest=size)[0]
     alone = frames.only_message(one, masked=masked, largest=size)
@@ -65,7 +65,7 @@ def test_one_message_alone_is_found_as_among_others(opcode: Opcode, size: int, m
 
 
 @given(st.binary(max_size=200), st.booleans(), st.integers(0, 200))
-def test_whatever_comes_means_the_same_alone(rest: bytes, masked: bool, length: int) -> None:
+def test_whatever_comes_means_the_same_alone(rest, masked, length):
     for data in (rest, b"\x81" + rest, b"\x81" + bytes((length,)) + rest[: length + 4]):
         alone = frames.only_message(data, masked=masked, largest=100)
         if alone is not None:
@@ -73,7 +73,7 @@ def test_whatever_comes_means_the_same_alone(rest: bytes, masked: bool, length: 
 
 
 @pytest.mark.parametrize("masked", [True, False])
-def test_the_library_handles_everything_but_whole_messages(masked: bool) -> None:
+def test_the_library_handles_everything_but_whole_messages(masked):
     for opcode in (Opcode.PING, Opcode.PONG, Opcode.CLOSE, Opcode.CONT):
         data = Frame(opcode, b"xx").serialize(mask=masked)
         assert frames.whole_messages(data, 0, masked=masked, largest=9) == ([], 0)
@@ -92,7 +92,7 @@ def test_the_library_handles_everything_but_whole_messages(masked: bool) -> None
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_a_text_as_a_client_writes_it_is_read_by_the_library(size: int) -> None:
+def test_a_text_as_a_client_writes_it_is_read_by_the_library(size):
     payload = bytes(range(256)) * (size // 256 + 1)
     server = ServerProtocol(state=State.OPEN)
     server.receive_data(b"".join(map(frames.Masker().encode, ([payload[:size]], [payload[:size]] * 2))))
@@ -100,7 +100,7 @@ def test_a_text_as_a_client_writes_it_is_read_by_the_library(size: int) -> None:
     assert events == [Frame(Opcode.TEXT, payload[:size])] * 3
 
 
-def test_keys_are_not_used_twice() -> None:
+def test_keys_are_not_used_twice():
     masker = frames.Masker()
     data = b"".join(masker.encode([b"x"] * count) for count in [1] * 1500 + [2000, 1, 3])
     keys = [data[at + 2 : at + 6] for at in range(0, len(data), len(masker.encode([b"x"])))]

@@ -1,7 +1,6 @@
 """The hub reads the same messages whatever frames they arrive in, and however their bytes are cut."""
 
 import asyncio
-from typing import Any
 
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -19,7 +18,7 @@ from tests.bridge.hub.sockets import RawClient, client, running_hub
     st.lists(st.integers(1, 400), min_size=1, max_size=20),
 )
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-async def test_messages_in_any_frames_cut_anywhere_arrive_in_order(kinds: list[str], cuts: list[int]) -> None:
+async def test_messages_in_any_frames_cut_anywhere_arrive_in_order(kinds, cuts):
     """One connection sends messages in all sorts of frames, in all sorts of chunks; another hears them."""
     data, expected = bytearray(), []
     for number, kind in enumerate(kinds):
@@ -51,12 +50,12 @@ async def test_messages_in_any_frames_cut_anywhere_arrive_in_order(kinds: list[s
             await raw.writer.drain()
             await asyncio.sleep(0)
             at += cut
-        heard: list[Any] = [(await ears.receive())["msg"]["i"] for _ in expected]
+        heard = [(await ears.receive())["msg"]["i"] for _ in expected]
         assert heard == expected
         raw.cut()
 
 
-async def test_frames_sent_before_the_handshakes_answer_are_read() -> None:
+async def test_frames_sent_before_the_handshakes_answer_are_read():
     async with running_hub() as port, client(port) as ears:
         await ears.send(op="subscribe", topic="/t", type="a/B")
         await ears.sync()

@@ -1,8 +1,6 @@
 """The transport reads what the library alone reads, whatever the peer sends and however its bytes are cut."""
 
 import asyncio
-from collections.abc import Iterator
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
@@ -25,51 +23,51 @@ URI = parse_uri("ws://localhost:9090")
 class Ends(asyncio.Transport):
     """A transport that keeps what is written."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.written = b""
         self.ended = False
         self.reads = True
 
-    def pause_reading(self) -> None:
+    def pause_reading(self):
         self.reads = False
 
-    def resume_reading(self) -> None:
+    def resume_reading(self):
         self.reads = True
 
-    def write(self, data: Any) -> None:
+    def write(self, data):
         self.written += data
 
-    def can_write_eof(self) -> bool:
+    def can_write_eof(self):
         return True
 
-    def write_eof(self) -> None:
+    def write_eof(self):
         self.ended = True
 
-    def set_write_buffer_limits(self, high: int | None = None, low: int | None = None) -> None:
+    def set_write_buffer_limits(self, high=None, low=None):
         """All is taken."""
 
-    def is_closing(self) -> bool:
+    def is_closing(self):
         return False
 
-    def abort(self) -> None:
+    def abort(self):
         self.ended = True
 
 
 class Library:
     """The library alone, as the reference."""
 
-    def __init__(self, key: str) -> None:
+    def __init__(self, key):
         self.protocol = ClientProtocol(URI, max_size=LARGEST)
         self.protocol.key = key
         self.protocol.send_request(self.protocol.connect())
         self.protocol.data_to_send()
-        self.messages: list[bytes] = []
+        self.messages = []
         self.written = b""
         self.ended = False
         self._begun = b""
 
-    def take(self, data: bytes) -> None:
+    def take(self, data):
         """Read, and do what the connection does of it."""
         if data:
             self.protocol.receive_data(data)
@@ -87,7 +85,7 @@ class Library:
 
 
 @pytest.fixture
-def plain(monkeypatch: pytest.MonkeyPatch) -> None:
+def plain(monkeypatch):
     """The library's masks are all zeros, so that what it writes can be compared."""
     monkeypatch.setattr("websockets.frames.secrets.token_bytes", bytes)
 
@@ -158,16 +156,14 @@ cuts = st.lists(st.integers(1, 300) | st.integers(1, 5), max_size=60)
 )
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @pytest.mark.asyncio(loop_factories=["asyncio"])
-async def test_client_reads_any_stream_as_the_library_does(
-    plain: None, stream: bytes, cuts: list[int], idle: int, apart: bool, closed: int
-) -> None:
+async def test_client_reads_any_stream_as_the_library_does(plain, stream, cuts, idle, apart, closed):
     """After every piece: the same messages, the same answers, the same state, the same reason.
 
     The handshake's answer is ``apart`` or not, reading starts ``idle`` pieces later, and this side closes the
     connection after piece ``closed``.
     """
-    heard: list[bytes] = []
-    lost: list[str] = []
+    heard = []
+    lost = []
     limits = Limits(connect_timeout=1000, max_size=LARGEST, ping_interval=1000, ping_timeout=1000)
     client = WebSocket(URI, limits, heard.extend, lambda _, reason: lost.append(reason))
     ends = Ends()
@@ -213,7 +209,7 @@ async def test_client_reads_any_stream_as_the_library_does(
     assert len(lost) == client.opened
 
 
-def parts(data: bytes, cuts: list[int]) -> Iterator[bytes]:
+def parts(data, cuts):
     """Some bytes in pieces, and an empty one for their end."""
     at = 0
     for cut in [*cuts, len(data)]:
@@ -226,14 +222,14 @@ def parts(data: bytes, cuts: list[int]) -> Iterator[bytes]:
 class Postponing(WebSocketTransport):
     """A connection after its handshake that handles each message in the second turn."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(ServerProtocol(state=State.OPEN), max_size=LARGEST, write_limit=LARGEST)
         self.is_open = self._quick = True
         self._in_handshake = False
-        self.seen: list[bytes] = []
-        self.handled: list[bytes] = []
+        self.seen = []
+        self.handled = []
 
-    def messages_received(self, messages: list[bytes]) -> None:
+    def messages_received(self, messages):
         new = [message for message in messages if message not in self.seen]
         self.seen += new
         self.handled += messages[: len(messages) - len(new)]
@@ -242,7 +238,7 @@ class Postponing(WebSocketTransport):
 
 
 @pytest.mark.parametrize("together", [True, False])
-async def test_a_postponed_message_is_handled_before_later_data_is_read(together: bool) -> None:
+async def test_a_postponed_message_is_handled_before_later_data_is_read(together):
     connection, transport = Postponing(), Ends()
     connection.connection_made(transport)
     one, two = (Frame(Opcode.TEXT, letter).serialize(mask=True) for letter in (b"{one}", b"{two}"))

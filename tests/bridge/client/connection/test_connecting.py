@@ -5,7 +5,6 @@ import contextlib
 import re
 import socket
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -25,7 +24,7 @@ from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import FACTOR, PATIENCE
 
 
-async def fails(uri: str, error: type[BridgeError], **options: Any) -> str:
+async def fails(uri, error, **options):
     """Connecting fails as expected; what it said, with the URI in it."""
     with pytest.raises(error) as caught:
         async with connect(uri, **options):
@@ -77,7 +76,7 @@ async def test_nothing_is_there(unused_tcp_port):
 async def test_a_first_connection_is_tried_until_its_time_is_over(unused_tcp_port, monkeypatch):
     uri, now, waits, states = f"ws://127.0.0.1:{unused_tcp_port}", [0.0], [], []
 
-    async def step(seconds: float) -> None:
+    async def step(seconds):
         waits.append(seconds)
         now[0] += seconds
 
@@ -141,7 +140,7 @@ async def test_a_host_that_is_switched_on_later_is_not_missed(monkeypatch):
 async def test_a_service_that_greets_before_it_is_asked(monkeypatch):
     handshake = WebSocket.handshake
 
-    async def late_handshake(self: WebSocket, *headers: Any) -> None:
+    async def late_handshake(self, *headers):
         while not self.first_bytes:
             await asyncio.sleep(0)
         await handshake(self, *headers)
@@ -188,9 +187,9 @@ STREAM = b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace\r\n\r\n"
     ],
 )
 async def test_a_service_that_is_something_else(answers, stays, error, seen):
-    asked: list[bytes] = []
+    asked = []
 
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def serve(reader, writer):
         """Give the answers, the last one again and again if it ``stays``, and hang up otherwise."""
         asked.append(await reader.readuntil(b"\r\n\r\n"))
         for answer in answers:
@@ -211,12 +210,7 @@ async def test_a_service_that_is_something_else(answers, stays, error, seen):
 
 @pytest.mark.parametrize(
     ("status", "error"),
-    [
-        (401, AccessRefusedError),
-        (403, AccessRefusedError),
-        (404, NotRosbridgeError),
-        (503, UnreachableError),
-    ],
+    [(401, AccessRefusedError), (403, AccessRefusedError), (404, NotRosbridgeError), (503, UnreachableError)],
 )
 async def test_a_server_that_refuses(status, error):
     async with FakeRosbridge(refuses=status) as fake:
@@ -232,7 +226,7 @@ async def test_tls_towards_a_server_without():
 async def test_cancelling_an_attempt_leaves_nothing_behind():
     asked, gone = asyncio.Event(), asyncio.Event()
 
-    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def answer(reader, writer):
         await reader.readuntil(b"\r\n\r\n")
         asked.set()
         with contextlib.suppress(ConnectionError):
@@ -268,7 +262,7 @@ async def test_a_client_that_is_cancelled_at_its_farewell_is_closed(fake, ros):
 async def test_a_service_may_close_its_client(fake, ros):
     finished = asyncio.Event()
 
-    async def handler(_args: dict[str, Any]) -> dict[str, Any]:
+    async def handler(_args):
         await ros.close()
         finished.set()
         return {}

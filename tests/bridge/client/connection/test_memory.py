@@ -3,13 +3,11 @@
 import gc
 import json
 import tracemalloc
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from bridge.client import connect
-from bridge.client.protocol import Compression
 from bridge.codecs import cbor_codec
 from bridge.codecs.fragments import split
 from tests.fake_rosbridge import FakeRosbridge
@@ -18,7 +16,7 @@ from tests.fake_rosbridge import FakeRosbridge
 SLACK = 40_000
 
 
-def growth(play: Callable[[int], None], rounds: int) -> int:
+def growth(play, rounds):
     """Bytes by which memory in use grew over the later rounds."""
     play(rounds // 4)
     gc.collect()
@@ -35,7 +33,7 @@ def growth(play: Callable[[int], None], rounds: int) -> int:
     return after - before
 
 
-def encoded_as(msg: object, kind: str) -> list[bytes]:
+def encoded_as(msg, kind):
     operation = {"op": "publish", "topic": "/a", "msg": msg}
     if kind == "cbor":
         return [cbor_codec.encode(operation)]
@@ -47,7 +45,7 @@ def encoded_as(msg: object, kind: str) -> list[bytes]:
 @pytest.mark.parametrize("kind", ["json", "cbor", "fragments", "broken"])
 async def test_a_reader_that_never_reads(kind):
     """The queue is full at once; each further message takes the place of the oldest."""
-    compression: Compression = "cbor" if kind == "cbor" else "none"
+    compression = "cbor" if kind == "cbor" else "none"
     async with FakeRosbridge() as fake, connect(fake.uri) as ros:
         subscription = ros.subscribe("/a", "p/T", compression=compression, queue_size=8)
         values = np.arange(100.0)
@@ -56,7 +54,7 @@ async def test_a_reader_that_never_reads(kind):
             pieces = [b"{", b"[1]", b"\xff\xfe", b'{"op":"fragment","id":1,"data":"x","num":0,"total":9}']
         take = ros._session._take
 
-        def play(rounds: int) -> None:
+        def play(rounds):
             for number in range(rounds):
                 for piece in pieces:
                     take([piece.replace(b'"id":1,', b'"id":%d,' % number) if kind == "broken" else piece])
@@ -71,7 +69,7 @@ async def test_calls_and_goals_that_come_and_go(fake, ros):
     fake.serve("/echo", lambda args: args)
     take = ros._session._take
 
-    def play(rounds: int) -> None:
+    def play(rounds):
         core = ros._session.core
         for number in range(rounds):
             call = core.calls.send("/echo", {"n": number})

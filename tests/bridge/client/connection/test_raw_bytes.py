@@ -9,8 +9,6 @@ import contextlib
 import hashlib
 import random
 import struct
-from collections.abc import AsyncIterator
-from typing import Any
 
 import pytest
 
@@ -20,9 +18,7 @@ from tests.bridge.client.tcp_service import tcp_service
 _GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 
 
-def frame(
-    opcode: int, payload: bytes, *, fin: bool = True, reserved: int = 0, size: int | None = None
-) -> bytes:
+def frame(opcode, payload, *, fin=True, reserved=0, size=None):
     """A frame as a server writes it, or one that lies about its size."""
     size = len(payload) if size is None else size
     first = bytes([(0x80 if fin else 0) | reserved << 4 | opcode])
@@ -34,17 +30,17 @@ def frame(
 
 
 @pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+def impatient(monkeypatch):
     """The server answers no farewell, so that it need not be waited for."""
     monkeypatch.setattr("bridge.client.websocket.CLOSE_TIMEOUT", 0.02)
 
 
 @contextlib.asynccontextmanager
-async def says(data: bytes, at_once: bytes = b"") -> AsyncIterator[tuple[int, asyncio.Event]]:
+async def says(data, at_once=b""):
     """A server that does the handshake, says this once it may, and reads on: its port, and when it may."""
     go = asyncio.Event()
 
-    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def serve(reader, writer):
         head = await reader.readuntil(b"\r\n\r\n")
         key = next(line[19:] for line in head.split(b"\r\n") if line.startswith(b"Sec-WebSocket-Key: "))
         accept = base64.b64encode(hashlib.sha1(key + _GUID, usedforsecurity=False).digest())
@@ -62,9 +58,9 @@ async def says(data: bytes, at_once: bytes = b"") -> AsyncIterator[tuple[int, as
         yield port, go
 
 
-async def hears(data: bytes, **options: Any) -> tuple[str, int]:
+async def hears(data, **options):
     """Return the client's last error and its number of unusable messages after a server has sent these bytes."""
-    problems: list[dict[str, Any]] = []
+    problems = []
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: problems.append(context))
     async with says(data) as (port, go), connect(f"ws://127.0.0.1:{port}", **options) as ros:
         ros.subscribe("/a", "p/T", compression="cbor")

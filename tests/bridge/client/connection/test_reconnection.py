@@ -5,11 +5,10 @@ import re
 import time
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
-from bridge.client import Ros, State, connect
+from bridge.client import State, connect
 from bridge.client.session import FIRST_DELAY, MAX_DELAY
 from bridge.errors import DisconnectedError, StateTimeoutError
 from tests.bridge.client.tcp_service import tcp_service
@@ -19,12 +18,12 @@ from tests.patience import PATIENCE
 
 
 @pytest.fixture
-def delays(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def delays(monkeypatch):
     """The waits before attempts to reconnect, which take no time."""
-    waits: list[float] = []
+    waits = []
     sleep = asyncio.sleep
 
-    async def no_sleep(delay: float, *_result: Any) -> None:
+    async def no_sleep(delay, *_result):
         if delay > 0:
             waits.append(delay)
         await sleep(0.001 if delay > 0 else 0)
@@ -33,11 +32,11 @@ def delays(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return waits
 
 
-def clock(now: list[float]) -> SimpleNamespace:
+def clock(now):
     return SimpleNamespace(monotonic=lambda: now[0], time_ns=time.time_ns, monotonic_ns=time.monotonic_ns)
 
 
-async def gone_and_back(fake: FakeRosbridge, ros: Ros) -> None:
+async def gone_and_back(fake, ros):
     await fake.vanish()
     await ros.wait_for_state(State.RECONNECTING, PATIENCE)
     fake.received.clear()
@@ -46,13 +45,13 @@ async def gone_and_back(fake: FakeRosbridge, ros: Ros) -> None:
 
 
 async def test_everything_is_restored(fake):
-    states: list[tuple[State, str]] = []
+    states = []
 
-    def on_state(state: State, reason: str) -> None:
+    def on_state(state, reason):
         states.append((state, reason))
         raise RuntimeError("a callback that fails breaks nothing")
 
-    async def handler(args: dict[str, Any]) -> dict[str, Any]:
+    async def handler(args):
         return args
 
     async with connect(fake.uri, on_state=on_state, check_types=False) as ros:
@@ -147,11 +146,7 @@ async def test_it_comes_back_whatever_was_there_meanwhile(fake, ros, trouble):
 
 @pytest.mark.parametrize(
     ("frame", "said"),
-    [
-        (b"\x88\x02\x03\xe9", 1001),
-        (b"\x88\x02\x03\xf1", 1009),
-        (b"\xff\xff not a frame", "protocol"),
-    ],
+    [(b"\x88\x02\x03\xe9", 1001), (b"\x88\x02\x03\xf1", 1009), (b"\xff\xff not a frame", "protocol")],
 )
 async def test_a_server_that_ends_the_connection_and_does_not_hang_up(fake, ros, monkeypatch, frame, said):
     monkeypatch.setattr("bridge.client.websocket.CLOSE_TIMEOUT", 0.2)
@@ -230,9 +225,9 @@ async def test_waiting_for_a_state_is_bounded_and_closing_ends_it_and_the_reconn
 
 
 async def test_closing_from_the_callback(fake):
-    closing: list[asyncio.Task[None]] = []
+    closing = []
 
-    def on_state(state: State, _reason: str) -> None:
+    def on_state(state, _reason):
         if state is State.RECONNECTING:
             closing.append(asyncio.get_running_loop().create_task(ros.close()))
 
@@ -252,7 +247,7 @@ async def test_the_first_message_after_losses_says_how_long_it_was_dark(fake, mo
         await _darkness(fake, ros, now)
 
 
-async def _darkness(fake: FakeRosbridge, ros: Ros, now: list[float]) -> None:
+async def _darkness(fake, ros, now):
     subscription = ros.subscribe("/a", "p/T")
     await fake.wait_for_op("subscribe")
     await fake.publish("/a", {})

@@ -9,15 +9,12 @@ import contextlib
 import logging
 import re
 import ssl
-from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from pathlib import Path
-from typing import Any, Self
 
 import pytest
-from websockets.asyncio.server import ServerConnection, serve
-from websockets.http11 import Request, Response
+from websockets.asyncio.server import serve
+from websockets.http11 import Request
 
 from bridge.client import State, connect
 from bridge.client.route import shown
@@ -30,7 +27,7 @@ TOKEN = "s3cret-token"
 
 
 @pytest.fixture(scope="module")
-def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def certificates(tmp_path_factory):
     """A CA, a server's certificate and a client's of it, and another CA that vouches for nobody."""
     folder = tmp_path_factory.mktemp("certificates")
     for name, ca in (("ca", None), ("other", None), ("server", "ca"), ("client", "ca")):
@@ -51,18 +48,16 @@ class AccessPolicy:
 
 
 @contextlib.asynccontextmanager
-async def access(
-    tls: ssl.SSLContext | None = None, wants: str | None = None, host: str = "127.0.0.1"
-) -> AsyncIterator[AccessPolicy]:
+async def access(tls=None, wants=None, host="127.0.0.1"):
     made = AccessPolicy(wants=wants)
 
-    def look(connection: ServerConnection, request: Request) -> Response | None:
+    def look(connection, request):
         made.shown.append(request)
         if made.wants is not None and request.headers.get("Authorization") != made.wants:
             return connection.respond(HTTPStatus.UNAUTHORIZED, "who are you?\n")
         return None
 
-    async def stay(connection: ServerConnection) -> None:
+    async def stay(connection):
         await connection.wait_closed()
 
     # The server's own log would show what it was shown.
@@ -73,7 +68,7 @@ async def access(
         yield made
 
 
-def server_context(certificates: Path, *, asks: bool = False) -> ssl.SSLContext:
+def server_context(certificates, *, asks=False):
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificates / "server.pem", certificates / "server.key")
     if asks:
@@ -82,7 +77,7 @@ def server_context(certificates: Path, *, asks: bool = False) -> ssl.SSLContext:
     return context
 
 
-async def refused(uri: str, error: type[BridgeError], **options: Any) -> str:
+async def refused(uri, error, **options):
     with pytest.raises(error) as caught:
         await connect(uri, **options).__aenter__()
     assert uri.rpartition("@")[2].partition("?")[0] in str(caught.value)
@@ -220,27 +215,27 @@ class ConnectProxy:
 
     scheme = "http"
 
-    def __init__(self, answer: bytes = b"HTTP/1.1 200 Connection established\r\n\r\n") -> None:
+    def __init__(self, answer=b"HTTP/1.1 200 Connection established\r\n\r\n"):
         self.answer = answer
-        self.asked: list[bytes] = []
+        self.asked = []
 
-    async def __aenter__(self) -> Self:
+    async def __aenter__(self):
         self._server = await asyncio.start_server(self.serve, "127.0.0.1", 0)
         self.where = f"127.0.0.1:{self._server.sockets[0].getsockname()[1]}"
         self.uri = f"{self.scheme}://user:s3cret@{self.where}"
         return self
 
-    async def __aexit__(self, *_exception: object) -> None:
+    async def __aexit__(self, *_exception):
         self._server.close()
 
-    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def serve(self, reader, writer):
         with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
             if (target := await self.greet(reader, writer)) is not None:
                 there, back = await asyncio.open_connection("localhost", int(target.rpartition(b":")[2]))
                 await asyncio.gather(self._pass(reader, back), self._pass(there, writer))
         writer.close()
 
-    async def greet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bytes | None:
+    async def greet(self, reader, writer):
         """Let a client in: where to, or None if it may not."""
         self.asked.append(await reader.readuntil(b"\r\n\r\n"))
         writer.write(self.answer)
@@ -248,7 +243,7 @@ class ConnectProxy:
         return self.asked[-1].split()[1] if b" 200 " in self.answer[:20] else None
 
     @staticmethod
-    async def _pass(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _pass(reader, writer):
         with contextlib.suppress(ConnectionError):
             while data := await reader.read(65536):
                 writer.write(data)
@@ -261,7 +256,7 @@ class SocksProxy(ConnectProxy):
 
     scheme = "socks5h"
 
-    async def greet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bytes | None:
+    async def greet(self, reader, writer):
         _, methods = await reader.readexactly(2)
         await reader.readexactly(methods)
         writer.write(b"\x05\x02")
@@ -346,7 +341,7 @@ async def test_a_proxy_that_is_not_there_or_says_nothing(unused_tcp_port, scheme
 
 
 async def test_socks_without_its_package(monkeypatch):
-    async def missing(*_: object) -> None:
+    async def missing(*_):
         raise ImportError  # what websockets puts there when it finds no python-socks
 
     monkeypatch.setattr("bridge.client.route.connect_socks_proxy", missing)

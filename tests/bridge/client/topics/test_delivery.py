@@ -6,7 +6,6 @@ ClientCore ──data_to_send──▶ the test (plays the server)
 """
 
 import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,15 +30,15 @@ ARRAYS = Delivery(compression="cbor", arrays="numpy")
 RAW = Delivery(compression="cbor-raw")
 
 
-def publish(msg: Any, topic: str = "/a") -> dict[str, Any]:
+def publish(msg, topic="/a"):
     return {"op": "publish", "topic": topic, "msg": msg}
 
 
-def in_cbor(msg: Any, topic: str = "/a") -> bytes:
+def in_cbor(msg, topic="/a"):
     return cbor_codec.encode(publish(msg, topic))
 
 
-def in_json(msg: Any, topic: str = "/a") -> bytes:
+def in_json(msg, topic="/a"):
     return json.dumps(publish(msg, topic)).encode()
 
 
@@ -90,7 +89,7 @@ def test_topics_of_one_client_that_want_it_differently():
     core.subscriptions.subscribe("/json", "p/T")
     msg = {"data": np.array([1.5]), "bytes": b"\x01"}
 
-    def came(data: bytes) -> Any:
+    def came(data):
         event = core.receive(data, 0.0)
         assert isinstance(event, MessageReceived)
         return event.msg
@@ -146,7 +145,7 @@ def test_large_messages_leave_in_fragments():
 # Goals of actions
 
 
-def goal_of(core: ClientCore, **options: Any) -> str:
+def goal_of(core, **options):
     return core.goals.send("/fly", "boat_msgs/Fly", {"to": [1, 2]}, feedback=True, **options)
 
 

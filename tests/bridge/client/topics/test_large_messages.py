@@ -2,17 +2,15 @@
 
 import asyncio
 import contextlib
-from collections.abc import Mapping
-from typing import Any
 
 import pytest
 
-from bridge.client import Ros, State, connect
+from bridge.client import State, connect
 from bridge.client.protocol.wire import SMALLEST_LIMIT
 from bridge.errors import EncodeError, MessageTooLargeError, TopicLeftOutError
 from bridge.hub.limits import HubLimits
 from tests.bridge.hub.sockets import running_hub
-from tests.fake_rosbridge import FakeRosbridge, _Client
+from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 
 LIMIT = 4000
@@ -22,17 +20,17 @@ LARGE = {"data": "x" * 2 * LIMIT}
 class Unnamed(FakeRosbridge):
     """A server that writes the message before its topic, so that the beginning does not tell."""
 
-    async def _say(self, client: _Client, data: Any) -> None:
+    async def _say(self, client, data):
         if isinstance(data, dict) and data["op"] == "publish":
             data = {"op": "publish", "msg": data["msg"], "topic": data["topic"]}
         await super()._say(client, data)
 
 
 @contextlib.asynccontextmanager
-async def publishing(fake: FakeRosbridge, messages: Mapping[str, dict[str, Any]]):
+async def publishing(fake, messages):
     """Publish these again and again."""
 
-    async def play() -> None:
+    async def play():
         while True:
             for topic, message in messages.items():
                 await fake.publish(topic, message)
@@ -127,7 +125,7 @@ async def test_messages_above_the_limit_of_their_topic_are_discarded_and_counted
         assert (large.discarded, small.discarded, ros.reconnections) == (3, 0, 0)
 
 
-async def publishes_in_vain(ros: Ros, topic: str, size: int) -> None:
+async def publishes_in_vain(ros, topic, size):
     publication = await ros.advertise(topic, "std_msgs/String")
     with pytest.raises(MessageTooLargeError):
         await publication.publish({"data": "x" * size})

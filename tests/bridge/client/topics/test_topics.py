@@ -8,9 +8,7 @@ import math
 import re
 import socket
 import time
-from collections.abc import Coroutine
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -117,7 +115,7 @@ async def test_a_message_that_need_not_wait_does_not(fake, ros):
 
 
 async def test_iteration_ends_with_the_subscription_or_the_client():
-    async def read(subscription: Any) -> list[int]:
+    async def read(subscription):
         return [message.msg["n"] async for message in subscription]
 
     async with FakeRosbridge() as fake:
@@ -193,12 +191,12 @@ async def test_each_wait_ends_at_its_own_time(fake, ros, monkeypatch):
     subscription = ros.subscribe("/a", "p/T")
     await fake.wait_for_op("subscribe")
 
-    async def begin(wait: Coroutine[Any, Any, Message]) -> asyncio.Task[Message]:
+    async def begin(wait):
         waiting = asyncio.create_task(wait)
         await asyncio.sleep(0)
         return waiting
 
-    async def hear(waiting: asyncio.Task[Message]) -> None:
+    async def hear(waiting):
         await fake.publish("/a", {})
         await waiting
 
@@ -317,7 +315,7 @@ async def test_a_tight_loop_of_publications_lets_others_live(fake, ros):
     publication = await ros.advertise("/a", "p/T")
     turns = 0
 
-    async def other() -> None:
+    async def other():
         nonlocal turns
         while True:
             turns += 1
@@ -360,7 +358,7 @@ async def test_a_server_that_causes_answers_and_reads_none_is_left(fake, ros, ki
         else b"\x89\x7d" + bytes(125)
     )
 
-    async def flood() -> None:
+    async def flood():
         while not client.connection.transport.is_closing():
             if client.connection.transport.get_write_buffer_size() < 1 << 16:
                 client.connection.transport.write(16 * frame)
@@ -385,7 +383,7 @@ async def test_a_server_that_takes_nothing_more(fake, ros):
     big = {"data": "x" * 500_000}
     sent = 0
 
-    async def flood() -> None:
+    async def flood():
         nonlocal sent
         for _ in range(200):
             await publication.publish(big, timeout=0.2)

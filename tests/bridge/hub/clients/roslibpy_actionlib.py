@@ -7,7 +7,6 @@ JSON.
 import json
 import sys
 import threading
-from typing import Any
 
 import roslibpy
 from roslibpy.ros1.actionlib import ActionClient, Goal, SimpleActionServer
@@ -17,11 +16,11 @@ PATIENCE = 3600
 TYPE = "actionlib_tutorials/FibonacciAction"
 
 
-def serve(ros: roslibpy.Ros) -> None:
+def serve(ros):
     """Serve `/count`; an order of 2 waits for cancellation."""
     server = SimpleActionServer(ros, "/count", TYPE)
 
-    def execute(goal: dict[str, Any]) -> None:
+    def execute(goal):
         order = goal["order"]
         server.send_feedback({"sequence": [0, 1]})
         if order != 2:
@@ -37,11 +36,11 @@ def serve(ros: roslibpy.Ros) -> None:
     sys.stdin.read()
 
 
-def send(ros: roslibpy.Ros) -> None:
+def send(ros):
     """Send goals to `/count`, and print their feedback and results."""
     client = ActionClient(ros, "/count", TYPE)
     finished = Goal(client, roslibpy.Message({"order": 5}))
-    feedback: list[Any] = []
+    feedback = []
     finished.on("feedback", feedback.append)
     finished.send()
     result = finished.wait(PATIENCE)
@@ -65,7 +64,7 @@ def send(ros: roslibpy.Ros) -> None:
     )
 
 
-def main() -> None:
+def main():
     """Connect and play the part."""
     ros = roslibpy.Ros("127.0.0.1", int(sys.argv[2]))
     ros.run(PATIENCE)

@@ -7,7 +7,6 @@ import json
 import queue
 import sys
 import threading
-from typing import Any
 
 import roslibpy
 
@@ -15,8 +14,8 @@ PATIENCE = 3600
 """The test that runs this has a limit of its own."""
 
 
-def _topics(ros: roslibpy.Ros, other: roslibpy.Ros) -> dict[str, Any]:
-    heard: queue.Queue[Any] = queue.Queue()
+def _topics(ros, other):
+    heard = queue.Queue()
     listener = roslibpy.Topic(other, "/chatter", "std_msgs/String")
     listener.subscribe(heard.put)
     _wait_for(lambda: other.get_topic_type("/chatter"))
@@ -36,14 +35,14 @@ def _topics(ros: roslibpy.Ros, other: roslibpy.Ros) -> dict[str, Any]:
     return found
 
 
-def _listen(ros: roslibpy.Ros, name: str, type_name: str) -> queue.Queue[Any]:
-    heard: queue.Queue[Any] = queue.Queue()
+def _listen(ros, name, type_name):
+    heard = queue.Queue()
     roslibpy.Topic(ros, name, type_name).subscribe(heard.put)
     _wait_for(lambda: ros.get_topic_type(name))
     return heard
 
 
-def _header(ros: roslibpy.Ros, other: roslibpy.Ros) -> Any:
+def _header(ros, other):
     heard = _listen(other, "/stamped", "std_msgs/Header")
     header = roslibpy.Header(seq=7, stamp=roslibpy.Time(12, 34), frame_id="map")
     message = roslibpy.Message({"header": header, "x": float("nan")})
@@ -51,8 +50,8 @@ def _header(ros: roslibpy.Ros, other: roslibpy.Ros) -> Any:
     return [heard.get(timeout=PATIENCE), _listen(other, "/stamped", "std_msgs/Header").get(timeout=PATIENCE)]
 
 
-def _services(ros: roslibpy.Ros, other: roslibpy.Ros) -> dict[str, Any]:
-    def add(request: Any, response: Any) -> bool:
+def _services(ros, other):
+    def add(request, response):
         response["sum"] = request["a"] + request["b"]
         return bool(response["sum"] != 13)
 
@@ -61,7 +60,7 @@ def _services(ros: roslibpy.Ros, other: roslibpy.Ros) -> dict[str, Any]:
     _wait_for(lambda: "/add" in other.get_services())
     caller = roslibpy.Service(other, "/add", "rospy_tutorials/AddTwoInts")
     answer = caller.call(roslibpy.ServiceRequest({"a": 1, "b": 2}), timeout=PATIENCE)
-    called_back: queue.Queue[Any] = queue.Queue()
+    called_back = queue.Queue()
     caller.call(roslibpy.ServiceRequest({"a": 3, "b": 4}), called_back.put, called_back.put)
     found = {
         "sum": answer["sum"],
@@ -76,7 +75,7 @@ def _services(ros: roslibpy.Ros, other: roslibpy.Ros) -> dict[str, Any]:
     return found
 
 
-def _failure(service: roslibpy.Service, request: dict[str, Any]) -> str | None:
+def _failure(service, request):
     try:
         service.call(roslibpy.ServiceRequest(request), timeout=PATIENCE)
     except roslibpy.core.ServiceException as error:
@@ -84,16 +83,16 @@ def _failure(service: roslibpy.Service, request: dict[str, Any]) -> str | None:
     return None
 
 
-def _parameters(ros: roslibpy.Ros, other: roslibpy.Ros) -> dict[str, Any]:
+def _parameters(ros, other):
     ros.set_param("/robot/speed", {"max": 1.5})
     found = {"value": other.get_param("/robot/speed"), "names": other.get_params()}
     other.delete_param("/robot/speed")
     return found | {"deleted": ros.get_param("/robot/speed"), "names_after": ros.get_params()}
 
 
-def _graph(ros: roslibpy.Ros, _other: roslibpy.Ros) -> dict[str, Any]:
-    def answer(ask: Any, *args: Any) -> Any:
-        answers: queue.Queue[Any] = queue.Queue()
+def _graph(ros, _other):
+    def answer(ask, *args):
+        answers = queue.Queue()
         ask(*args, answers.put, answers.put)
         return answers.get(timeout=PATIENCE)
 
@@ -105,7 +104,7 @@ def _graph(ros: roslibpy.Ros, _other: roslibpy.Ros) -> dict[str, Any]:
     }
 
 
-def _wait_for(condition: Any) -> None:
+def _wait_for(condition):
     pause = threading.Event()
     for _ in range(PATIENCE * 50):
         if condition():
@@ -114,7 +113,7 @@ def _wait_for(condition: Any) -> None:
     raise TimeoutError(condition)
 
 
-def main() -> None:
+def main():
     """Do it all, print one JSON object."""
     ros, other = (roslibpy.Ros("127.0.0.1", int(sys.argv[1])) for _ in range(2))
     ros.run(PATIENCE)

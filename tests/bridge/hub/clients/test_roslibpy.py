@@ -19,13 +19,10 @@ _ACTIONLIB = Path(__file__).with_name("roslibpy_actionlib.py")
 
 @pytest.mark.parametrize(
     "transport",
-    [
-        pytest.param("twisted", marks=pytest.mark.thorough),
-        pytest.param("asyncio", marks=pytest.mark.process),
-    ],
+    [pytest.param("twisted", marks=pytest.mark.thorough), pytest.param("asyncio", marks=pytest.mark.process)],
 )
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-async def test_a_session_of_roslibpy(transport: str) -> None:
+async def test_a_session_of_roslibpy(transport):
     before = int(time.time())
     async with running_hub() as port:
         session = await asyncio.create_subprocess_exec(
@@ -74,8 +71,8 @@ async def test_a_session_of_roslibpy(transport: str) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.asyncio(loop_factories=["uvloop"])
-async def test_actionlib_of_roslibpy_on_both_sides() -> None:
-    async def start(part: str) -> asyncio.subprocess.Process:
+async def test_actionlib_of_roslibpy_on_both_sides():
+    async def start(part):
         return await asyncio.create_subprocess_exec(
             *(sys.executable, str(_ACTIONLIB), part, str(port)),
             env={**os.environ, "ROSLIBPY_TRANSPORT": "asyncio"},

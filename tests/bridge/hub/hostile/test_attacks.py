@@ -9,10 +9,8 @@ import gc
 import json
 import logging
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 from websockets.frames import Frame, Opcode
@@ -23,7 +21,7 @@ from bridge.errors import DecodeError
 from bridge.hub import server
 from bridge.hub.broker import TURN_WORK
 from bridge.hub.limits import HubLimits
-from tests.bridge.hub.broker_harness import Harness, Peer, publisher_and_subscriber
+from tests.bridge.hub.broker_harness import Harness, publisher_and_subscriber
 from tests.bridge.hub.sockets import RawClient, client, running_hub
 
 MEBIBYTE = 1 << 20
@@ -31,13 +29,13 @@ MARGIN = 64 * MEBIBYTE
 """Growth of the process beyond the hub's budgets."""
 
 
-def _status(field: str) -> int:
+def _status(field):
     lines = Path("/proc/self/status").read_text().splitlines()
     return 1024 * int(next(line for line in lines if line.startswith(field)).split()[1])
 
 
 @contextmanager
-def memory_bounded(budget: int = 0) -> Iterator[None]:
+def memory_bounded(budget=0):
     """Fail if the process grows by more than a budget and the margin, even for a moment."""
     gc.collect()
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak
@@ -46,7 +44,7 @@ def memory_bounded(budget: int = 0) -> Iterator[None]:
     assert _status("VmHWM") - before <= budget + MARGIN
 
 
-def subscribed(compression: str, type_name: str, ros_version: Any = 1) -> tuple[Peer, Peer]:
+def subscribed(compression, type_name, ros_version=1):
     publisher, subscriber = publisher_and_subscriber(type_name, ros_version, compression=compression)
     publisher.publish("/t", {})  # loads the definitions
     subscriber.read()
@@ -75,9 +73,7 @@ def subscribed(compression: str, type_name: str, ros_version: Any = 1) -> tuple[
         ("std_msgs/Bool", {"data": 2}),
     ],
 )
-def test_a_message_that_does_not_fit_its_type_is_neither_converted_nor_serialised(
-    type_name: str, message: dict[str, Any]
-) -> None:
+def test_a_message_that_does_not_fit_its_type_is_neither_converted_nor_serialised(type_name, message):
     publisher, subscriber = subscribed("cbor", type_name)
     raw_publisher, raw_subscriber = subscribed("cbor-raw", type_name)
     with memory_bounded():
@@ -90,7 +86,7 @@ def test_a_message_that_does_not_fit_its_type_is_neither_converted_nor_serialise
     assert [operation["op"] for operation in raw_subscriber.read()] == ["status"]
 
 
-def test_a_number_beyond_float32_is_not_converted_to_infinity() -> None:
+def test_a_number_beyond_float32_is_not_converted_to_infinity():
     publisher, subscriber = subscribed("cbor", "sensor_msgs/LaserScan")
     publisher.publish("/t", {"ranges": [1e300, None]})
     payload = subscriber.client.outbox.pop()
@@ -100,7 +96,7 @@ def test_a_number_beyond_float32_is_not_converted_to_infinity() -> None:
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
-def test_defaults_of_left_out_fields_are_bounded(ros_version: Any) -> None:
+def test_defaults_of_left_out_fields_are_bounded(ros_version):
     publisher, subscriber = subscribed("cbor-raw", "visualization_msgs/MarkerArray", ros_version)
     with memory_bounded():
         publisher.send_raw(b'{"op":"publish","topic":"/t","msg":{"markers":[%b{}]}}' % (b"{}," * 300_000))
@@ -112,7 +108,7 @@ def test_defaults_of_left_out_fields_are_bounded(ros_version: Any) -> None:
 # --- fragments
 
 
-def test_incomplete_messages_are_charged_in_bytes() -> None:
+def test_incomplete_messages_are_charged_in_bytes():
     box, limit = Reassembler(), 4 * (MEBIBYTE + OVERHEAD)
     with memory_bounded(limit):
         for number in range(800):
@@ -125,7 +121,7 @@ def test_incomplete_messages_are_charged_in_bytes() -> None:
     assert box.waiting_bytes == 400 + OVERHEAD
 
 
-def test_incomplete_messages_expire_without_another_fragment() -> None:
+def test_incomplete_messages_expire_without_another_fragment():
     hub = Harness()
     peers = [hub.connect() for _ in range(2)]
     for peer in peers:
@@ -137,7 +133,7 @@ def test_incomplete_messages_expire_without_another_fragment() -> None:
     assert [len(peer.client.fragments or ()) for peer in peers] == [0, 0]
 
 
-def test_a_message_in_fragments_counts_until_its_last_fragment_has_left() -> None:
+def test_a_message_in_fragments_counts_until_its_last_fragment_has_left():
     limits = {"client_bytes": 2 * MEBIBYTE}
     publisher, subscriber = publisher_and_subscriber("a/B", limits=limits, fragment_size=1)
     outbox = subscriber.client.outbox
@@ -153,16 +149,16 @@ def test_a_message_in_fragments_counts_until_its_last_fragment_has_left() -> Non
     assert outbox.size == 0
 
 
-async def test_fragments_are_written_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_fragments_are_written_in_turns(monkeypatch):
     written, sizes = 0, []
     send, flush = server._Connection.send, server._Connection.flush
 
-    def count(connection: Any, messages: Any) -> None:
+    def count(connection, messages):
         nonlocal written
         written += sum(map(len, messages))
         send(connection, messages)
 
-    def measure(connection: Any) -> None:
+    def measure(connection):
         before = written
         flush(connection)
         sizes.append(written - before)
@@ -183,18 +179,18 @@ async def test_fragments_are_written_in_turns(monkeypatch: pytest.MonkeyPatch) -
 # --- output that a client causes
 
 
-async def _pipeline_calls(raw: RawClient) -> None:
+async def _pipeline_calls(raw):
     for index in range(64):
         raw.send_operation(op="call_service", service="/rosapi/get_param", args={"name": "/large"}, id=index)
 
 
-async def _pipeline_subscriptions(raw: RawClient) -> None:
+async def _pipeline_subscriptions(raw):
     for index in range(64):
         raw.send_operation(op="subscribe", topic="/large", id=index, queue_length=100)
 
 
 @pytest.mark.parametrize("attack", [_pipeline_calls, _pipeline_subscriptions])
-async def test_output_of_one_turn_counts(attack: Any) -> None:
+async def test_output_of_one_turn_counts(attack):
     limits = HubLimits(message_bytes=MEBIBYTE // 2, client_bytes=MEBIBYTE)
     value = "x" * 400_000
     async with running_hub(limits=limits) as port, client(port) as witness:
@@ -213,7 +209,7 @@ async def test_output_of_one_turn_counts(attack: Any) -> None:
             raw.cut()
 
 
-async def test_a_client_that_reads_gets_all_answers_that_it_asked_for_at_once() -> None:
+async def test_a_client_that_reads_gets_all_answers_that_it_asked_for_at_once():
     limits = HubLimits(message_bytes=MEBIBYTE // 2, client_bytes=MEBIBYTE // 2)
     async with running_hub(limits=limits) as port, client(port) as reader:
         await reader.ask("/rosapi/set_param", name="/large", value=json.dumps("x" * 400_000))
@@ -223,7 +219,7 @@ async def test_a_client_that_reads_gets_all_answers_that_it_asked_for_at_once() 
         raw.cut()
 
 
-async def test_a_client_that_reads_no_pongs_is_not_read_either() -> None:
+async def test_a_client_that_reads_no_pongs_is_not_read_either():
     pings = Frame(Opcode.PING, b"x" * 125).serialize(mask=True) * 500
     async with running_hub() as port, client(port) as witness:
         raw = await RawClient.connect(port, receive_buffer=4096)
@@ -241,10 +237,10 @@ async def test_a_client_that_reads_no_pongs_is_not_read_either() -> None:
 # --- work of one turn
 
 
-def test_depth_is_checked_without_visiting_the_values() -> None:
+def test_depth_is_checked_without_visiting_the_values():
     opcodes = 0
 
-    def trace(frame: Any, event: str, _arg: object) -> Any:
+    def trace(frame, event, _arg):
         nonlocal opcodes
         if frame.f_code.co_filename != json_codec.__file__:
             return None  # callbacks of the garbage collector, for example
@@ -261,14 +257,14 @@ def test_depth_is_checked_without_visiting_the_values() -> None:
     assert opcodes < 10_000
 
 
-def _resubscribe(hub: Harness) -> dict[str, Any]:
+def _resubscribe(hub):
     peer = hub.connect()
     for index in range(4096):
         hub.broker.receive(peer.client, b'{"op":"subscribe","topic":"/t","id":%d}' % index, 0.0)
     return {"op": "subscribe", "topic": "/t", "id": 7}
 
 
-def _list_topics(hub: Harness) -> dict[str, Any]:
+def _list_topics(hub):
     for half in range(2):
         peer = hub.connect()
         for index in range(4096):
@@ -276,13 +272,13 @@ def _list_topics(hub: Harness) -> dict[str, Any]:
     return {"op": "call_service", "service": "/rosapi/topics"}
 
 
-def _replay(hub: Harness) -> dict[str, Any]:
+def _replay(hub):
     hub.connect().publish("/t", {"data": "x" * 1_000_000}, type="a/B", latch=True)
     return {"op": "subscribe", "topic": "/t", "id": 7}
 
 
 @pytest.mark.parametrize("prepare", [_resubscribe, _list_topics, _replay])
-def test_a_turn_ends_after_a_bounded_amount_of_work(prepare: Any) -> None:
+def test_a_turn_ends_after_a_bounded_amount_of_work(prepare):
     hub = Harness(client_bytes=100 * MEBIBYTE)
     operation = prepare(hub)
     peer = next(iter(hub.broker.graph.clients.values()))
@@ -302,7 +298,7 @@ def test_a_turn_ends_after_a_bounded_amount_of_work(prepare: Any) -> None:
 # --- connections
 
 
-async def test_silent_connections_do_not_lock_newcomers_out() -> None:
+async def test_silent_connections_do_not_lock_newcomers_out():
     async with running_hub(limits=HubLimits(clients=3, handshake_timeout=1000)) as port:
         silent = [await RawClient.connect(port, handshake=False) for _ in range(400)]
         async with client(port) as newcomer:
@@ -314,7 +310,7 @@ async def test_silent_connections_do_not_lock_newcomers_out() -> None:
             raw.cut()
 
 
-async def test_refused_handshakes_do_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:
+async def test_refused_handshakes_do_not_flood_the_log(caplog):
     async with running_hub() as port:
         for _ in range(100):
             raw = await RawClient.connect(port, handshake=False)

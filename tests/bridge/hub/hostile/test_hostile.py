@@ -7,9 +7,7 @@ import asyncio
 import base64
 import json
 import os
-from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -17,12 +15,12 @@ from hypothesis import strategies as st
 from websockets.frames import Opcode
 
 from bridge.hub.limits import HubLimits
-from tests.bridge.hub.sockets import Client, RawClient, client, running_hub
+from tests.bridge.hub.sockets import RawClient, client, running_hub
 from tests.patience import FACTOR, PATIENCE
 
 
 @asynccontextmanager
-async def _hub_and_witness(limits: HubLimits | None = None) -> AsyncIterator[tuple[int, Client]]:
+async def _hub_and_witness(limits=None):
     """A hub, and a client of it that hears its own messages before, and must do so after."""
     async with running_hub(limits=limits) as port, client(port) as witness:
         await witness.send(op="advertise", topic="/witness", type="a/B")
@@ -32,7 +30,7 @@ async def _hub_and_witness(limits: HubLimits | None = None) -> AsyncIterator[tup
         await _serves(witness)
 
 
-async def _serves(witness: Client) -> None:
+async def _serves(witness):
     await witness.send(op="publish", topic="/witness", msg={"well": True})
     assert (await witness.receive())["msg"] == {"well": True}
 
@@ -41,9 +39,7 @@ async def _serves(witness: Client) -> None:
 
 
 @pytest.mark.parametrize("fragments", [1, 3])
-async def test_a_message_that_is_too_large_costs_the_connection(
-    fragments: int, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_message_that_is_too_large_costs_the_connection(fragments, caplog):
     limits = HubLimits(message_bytes=10_000)
     async with _hub_and_witness(limits) as (port, _witness), client(port) as greedy:
         await greedy.sync()
@@ -53,7 +49,7 @@ async def test_a_message_that_is_too_large_costs_the_connection(
     assert len([record for record in caplog.records if record.name == "bridge.hub.server"]) == 1
 
 
-async def test_a_huge_message_is_refused_before_it_has_come() -> None:
+async def test_a_huge_message_is_refused_before_it_has_come():
     async with _hub_and_witness() as (port, _witness):
         raw = await RawClient.connect(port)
         raw.writer.write(b"\x81\xff" + (1 << 62).to_bytes(8, "big") + b"mask" + b"x" * 100)
@@ -62,7 +58,7 @@ async def test_a_huge_message_is_refused_before_it_has_come() -> None:
         assert data[2:4] == (1009).to_bytes(2, "big")
 
 
-def _nested_fragments() -> bytes:
+def _nested_fragments():
     operation = {"op": "call_service", "service": "/rosapi/get_time"}
     for _ in range(8):  # each one makes the next three times as large
         operation = {"op": "fragment", "id": "f", "data": json.dumps(operation), "num": 0, "total": 1}
@@ -86,7 +82,7 @@ def _nested_fragments() -> bytes:
     ],
     ids=lambda data: repr(data[:50]),
 )
-async def test_nonsense_leaves_no_zombie(data: bytes) -> None:
+async def test_nonsense_leaves_no_zombie(data):
     async with _hub_and_witness() as (port, _witness):
         raw = await RawClient.connect(port)
         for opcode in (Opcode.TEXT, Opcode.BINARY):
@@ -108,7 +104,7 @@ async def test_nonsense_leaves_no_zombie(data: bytes) -> None:
         b"\x88\x81maskx",  # a close frame of one byte
     ],
 )
-async def test_broken_frames_cost_the_connection(frame: bytes) -> None:
+async def test_broken_frames_cost_the_connection(frame):
     async with _hub_and_witness() as (port, _witness):
         raw = await RawClient.connect(port)
         raw.writer.write(frame)
@@ -117,7 +113,7 @@ async def test_broken_frames_cost_the_connection(frame: bytes) -> None:
         assert data[2:4] == (1002).to_bytes(2, "big")
 
 
-async def test_fragments_without_end_and_without_content_take_nothing() -> None:
+async def test_fragments_without_end_and_without_content_take_nothing():
     limits = HubLimits(message_bytes=1000)
     async with _hub_and_witness(limits) as (port, witness):
         raw = await RawClient.connect(port)
@@ -133,7 +129,7 @@ async def test_fragments_without_end_and_without_content_take_nothing() -> None:
 
 @given(st.lists(st.binary(max_size=200), max_size=5), st.booleans())
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-async def test_any_bytes_after_the_handshake(chunks: list[bytes], handshake: bool) -> None:
+async def test_any_bytes_after_the_handshake(chunks, handshake):
     async with _hub_and_witness() as (port, witness):
         raw = await RawClient.connect(port, handshake=handshake)
         for chunk in chunks:
@@ -145,7 +141,7 @@ async def test_any_bytes_after_the_handshake(chunks: list[bytes], handshake: boo
 # --- floods
 
 
-async def test_a_flood_of_nonsense_is_reported_and_leaves_others_served() -> None:
+async def test_a_flood_of_nonsense_is_reported_and_leaves_others_served():
     async with _hub_and_witness() as (port, witness), client(port, max_queue=None) as listener:
         await listener.send(op="subscribe", topic="/rosout", queue_length=10)
         await listener.sync()
@@ -160,13 +156,13 @@ async def test_a_flood_of_nonsense_is_reported_and_leaves_others_served() -> Non
         raw.cut()
 
 
-async def _flood(raw: RawClient, data: bytes) -> None:
+async def _flood(raw, data):
     while True:
         raw.writer.write(data)
         await raw.writer.drain()
 
 
-async def test_a_flood_of_calls_without_reading_costs_the_connection(quick_sweeps: None) -> None:
+async def test_a_flood_of_calls_without_reading_costs_the_connection(quick_sweeps):
     limits = HubLimits(message_bytes=200_000, client_bytes=200_000, topics=2000, stuck_timeout=0.3)
     async with _hub_and_witness(limits) as (port, witness):
         for index in range(1500):  # so that one answer has 50 kB
@@ -181,7 +177,7 @@ async def test_a_flood_of_calls_without_reading_costs_the_connection(quick_sweep
 # --- those who take nothing
 
 
-async def test_a_slow_client_misses_the_oldest_and_then_has_the_newest() -> None:
+async def test_a_slow_client_misses_the_oldest_and_then_has_the_newest():
     async with _hub_and_witness() as (port, witness):
         slow = await RawClient.connect(port, receive_buffer=4096)
         slow.send_operation(op="subscribe", topic="/big", type="a/B", queue_length=2)
@@ -199,11 +195,11 @@ async def test_a_slow_client_misses_the_oldest_and_then_has_the_newest() -> None
         slow.cut()
 
 
-async def until_subscribed(witness: Client, topic: str, count: int = 1) -> None:
+async def until_subscribed(witness, topic, count=1):
     await witness.wait_for("/rosapi/subscribers", lambda nodes: len(nodes) == count, topic=topic)
 
 
-async def _gone(witness: Client, raw: RawClient) -> None:
+async def _gone(witness, raw):
     """Wait until the hub has forgotten all clients but the witness."""
     await witness.wait_for("/rosapi/nodes", lambda nodes: len(nodes) == 2)
     await raw.ended()
@@ -211,17 +207,9 @@ async def _gone(witness: Client, raw: RawClient) -> None:
 
 @pytest.mark.parametrize(
     "wish",
-    [
-        {},
-        {"compression": "cbor"},
-        {"compression": "png"},
-        {"fragment_size": 16},
-        {"compression": "cbor-raw"},
-    ],
+    [{}, {"compression": "cbor"}, {"compression": "png"}, {"fragment_size": 16}, {"compression": "cbor-raw"}],
 )
-async def test_a_client_that_never_reads_is_closed_and_costs_others_nothing(
-    wish: dict[str, Any], quick_sweeps: None
-) -> None:
+async def test_a_client_that_never_reads_is_closed_and_costs_others_nothing(wish, quick_sweeps):
     limits = HubLimits(stuck_timeout=0.3)
     async with _hub_and_witness(limits) as (port, witness), client(port) as reader:
         await reader.send(op="subscribe", topic="/big", type="std_msgs/String")
@@ -240,7 +228,7 @@ async def test_a_client_that_never_reads_is_closed_and_costs_others_nothing(
 # --- those who vanish
 
 
-async def test_a_silent_client_is_pinged_and_then_closed(quick_sweeps: None) -> None:
+async def test_a_silent_client_is_pinged_and_then_closed(quick_sweeps):
     limits = HubLimits(ping_interval=0.1, ping_timeout=FACTOR)
     async with _hub_and_witness(limits) as (port, witness):
         raw = await RawClient.connect(port)
@@ -248,7 +236,7 @@ async def test_a_silent_client_is_pinged_and_then_closed(quick_sweeps: None) -> 
         await _gone(witness, raw)
 
 
-async def test_a_client_that_answers_pings_may_be_silent(quick_sweeps: None) -> None:
+async def test_a_client_that_answers_pings_may_be_silent(quick_sweeps):
     limits = HubLimits(ping_interval=0.02, ping_timeout=PATIENCE)
     async with _hub_and_witness(limits) as (port, _witness):
         raw = await RawClient.connect(port)
@@ -261,7 +249,7 @@ async def test_a_client_that_answers_pings_may_be_silent(quick_sweeps: None) -> 
         raw.cut()
 
 
-async def test_a_connection_without_a_handshake_is_closed(quick_sweeps: None) -> None:
+async def test_a_connection_without_a_handshake_is_closed(quick_sweeps):
     async with _hub_and_witness(HubLimits(handshake_timeout=0.5 * FACTOR)) as (port, _witness):
         silent = await RawClient.connect(port, handshake=False)
         assert await silent.ended() == b""
@@ -272,12 +260,9 @@ async def test_a_connection_without_a_handshake_is_closed(quick_sweeps: None) ->
 
 @pytest.mark.parametrize(
     ("kind", "request_op", "answer_op"),
-    [
-        ("service", "call_service", "service_response"),
-        ("action", "send_action_goal", "action_result"),
-    ],
+    [("service", "call_service", "service_response"), ("action", "send_action_goal", "action_result")],
 )
-async def test_a_server_that_hangs_up_fails_its_requests(kind: str, request_op: str, answer_op: str) -> None:
+async def test_a_server_that_hangs_up_fails_its_requests(kind, request_op, answer_op):
     async with _hub_and_witness() as (port, witness):
         server = await RawClient.connect(port)
         server.send_operation(op=f"advertise_{kind}", type="a/Add", **{kind: "/add"})
@@ -291,7 +276,7 @@ async def test_a_server_that_hangs_up_fails_its_requests(kind: str, request_op: 
 
 
 @pytest.mark.parametrize("how", ["reset", "eof", "mid-message"])
-async def test_a_vanished_client_leaves_nothing(how: str) -> None:
+async def test_a_vanished_client_leaves_nothing(how):
     async with _hub_and_witness() as (port, witness):
         raw = await RawClient.connect(port)
         raw.send_operation(op="subscribe", topic="/t", type="a/B")

@@ -5,29 +5,28 @@ Everything that must always hold is checked after each step; every call is answe
 
 import json
 import random
-from typing import Any
 
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from tests.bridge.hub.broker_harness import Harness, Peer
+from tests.bridge.hub.broker_harness import Harness
 
 _NAMES = ["/t", "t", "/u", "/u", "/v", "v", "/w", "", "a b"]
 _TYPES = ["a/B", "a/msg/B", "a/B", "a/B", "a/C", "nonsense"]
-_IDS: list[Any] = [None, None, "one", "two", 3, 1.5]
+_IDS = [None, None, "one", "two", 3, 1.5]
 _SERVICES = ["/s", "s", "/r", "/q", "/nowhere", "/rosapi/set_param", "/rosapi/topics", "/rosapi/nodes"]
 _ACTIONS = ["/a", "a", "/b", "/nowhere"]
-_FORMS: list[Any] = ["none", "none", "png", "cbor", "cbor-raw", "bson", 7]
-_WILD: list[Any] = [None, True, -1, 1e300, 10**400, float("nan"), "", "x" * 2000, [], {}, [{"a": [1]}]]
+_FORMS = ["none", "none", "png", "cbor", "cbor-raw", "bson", 7]
+_WILD = [None, True, -1, 1e300, 10**400, float("nan"), "", "x" * 2000, [], {}, [{"a": [1]}]]
 
 
-def _message(rng: random.Random) -> Any:
+def _message(rng):
     if rng.random() < 0.05:
         return rng.choice(_WILD)
     return {"data": "x" * rng.choice([0, 1, 10, 100, 1000, 3300])}
 
 
-def _operation(rng: random.Random) -> dict[str, Any]:
+def _operation(rng):
     """Return an operation that a client could send; one in twenty has an invalid field."""
     name, service = rng.choice(_NAMES), rng.choice(_SERVICES)
     kind = rng.choice(
@@ -39,7 +38,7 @@ def _operation(rng: random.Random) -> dict[str, Any]:
         + ["send_action_goal"] * 4
         + ["advertise_action", "advertise_action", "cancel_action_goal", "action_feedback", "action_result"]
     )
-    fields: dict[str, Any] = {"op": kind}
+    fields = {"op": kind}
     if "action" in kind:
         fields |= {"action": rng.choice(_ACTIONS)}
     elif "service" in kind:
@@ -79,14 +78,14 @@ def _operation(rng: random.Random) -> dict[str, Any]:
 class _Visitor:
     """A client that remembers what it was asked, and counts its own calls and their answers."""
 
-    def __init__(self, hub: Harness) -> None:
-        self.peer: Peer = hub.connect()
-        self.requests: list[str] = []
-        self.goals: list[str] = []
-        self.calls: set[int] = set()
-        self.answered: set[int] = set()
+    def __init__(self, hub):
+        self.peer = hub.connect()
+        self.requests = []
+        self.goals = []
+        self.calls = set()
+        self.answered = set()
 
-    def send(self, operation: dict[str, Any], call_number: int) -> None:
+    def send(self, operation, call_number):
         service = operation.get("service")
         action = operation.get("action")
         call = operation["op"] == "call_service" and isinstance(service, str) and service
@@ -97,7 +96,7 @@ class _Visitor:
                 self.calls.add(call_number)
         self.peer.send(**operation)
 
-    def read(self) -> None:
+    def read(self):
         for operation in self.peer.read():
             if operation["op"] == "call_service":
                 self.requests.append(operation["id"])
@@ -114,7 +113,7 @@ class _Visitor:
             else:
                 assert set(operation) == {"op", "topic", "msg"}
 
-    def work(self, rng: random.Random) -> None:
+    def work(self, rng):
         """Say how far a goal is, or end it."""
         at = rng.randrange(len(self.goals))
         ends = rng.random() < 0.5
@@ -127,7 +126,7 @@ class _Visitor:
             status=rng.choice([4, 5, 6, 99]),
         )
 
-    def answer(self, rng: random.Random) -> None:
+    def answer(self, rng):
         self.peer.send(
             op="service_response",
             id=self.requests.pop(rng.randrange(len(self.requests))),
@@ -136,7 +135,7 @@ class _Visitor:
         )
 
 
-def _live(seed: int, steps: int) -> None:
+def _live(seed, steps):
     """One life of a hub."""
     rng = random.Random(seed)
     hub = Harness(
@@ -181,7 +180,7 @@ def _live(seed: int, steps: int) -> None:
     _end(hub, visitors)
 
 
-def _end(hub: Harness, visitors: list[_Visitor]) -> None:
+def _end(hub, visitors):
     for visitor in visitors:
         if (
             visitor.peer.client.close_reason
@@ -209,5 +208,5 @@ def _end(hub: Harness, visitors: list[_Visitor]) -> None:
 @given(st.integers(0, 2**32))
 @settings(max_examples=100, deadline=None)
 @example(0)
-def test_a_hub_stays_well_all_its_life(seed: int) -> None:
+def test_a_hub_stays_well_all_its_life(seed):
     _live(seed, 400)

@@ -2,7 +2,6 @@
 
 import json
 import logging
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -51,7 +50,7 @@ NONSENSE = [
 
 
 @pytest.mark.parametrize("data", NONSENSE, ids=lambda data: repr(data[:40]))
-def test_nonsense_is_refused_and_its_sender_served_on(data: bytes) -> None:
+def test_nonsense_is_refused_and_its_sender_served_on(data):
     hub = Harness()
     sender, other = hub.connect(), hub.connect()
     for peer in (sender, other):
@@ -65,7 +64,7 @@ def test_nonsense_is_refused_and_its_sender_served_on(data: bytes) -> None:
     assert sender.messages() == other.messages() == [{"a": 1}]
 
 
-def test_depth_up_to_the_limit_passes() -> None:
+def test_depth_up_to_the_limit_passes():
     peer = Harness(depth=10).connect()
     peer.advertise("/t")
     peer.subscribe("/t")
@@ -74,13 +73,13 @@ def test_depth_up_to_the_limit_passes() -> None:
         assert bool(peer.read()) is passes
 
 
-def test_a_message_beyond_the_limit_is_refused() -> None:
+def test_a_message_beyond_the_limit_is_refused():
     peer = Harness(message_bytes=100).connect()
     peer.send_raw(b'{"op":"subscribe","topic":"/t"%b}' % (b" " * 100))
     assert peer.client.refused == 1
 
 
-def test_a_flood_of_nonsense_does_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_flood_of_nonsense_does_not_flood_the_log(caplog):
     peer = Harness().connect("192.0.2.1")
     with caplog.at_level(logging.WARNING, "bridge.hub.broker"):
         for _ in range(1234):
@@ -102,7 +101,7 @@ _KNOWN_FIELDS = st.fixed_dictionaries(
 
 @given(st.lists(st.one_of(st.binary(), _JSON, _KNOWN_FIELDS), min_size=1, max_size=5))
 @settings(max_examples=100, deadline=None)
-def test_any_bytes_and_any_json_keep_the_hub_well(contents: list[Any]) -> None:
+def test_any_bytes_and_any_json_keep_the_hub_well(contents):
     hub = Harness()
     sender, other = hub.connect(), hub.connect()
     for content in contents:
