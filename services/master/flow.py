@@ -256,7 +256,7 @@ class FrameFlow:
             subscriber.send(
                 Notice(
                     "debug",
-                    f"frame={number} complete stamp_ns={reading.stamp_ns} received_ns={reading.received_ns} "
+                    f"complete frame={number} stamp_ns={reading.stamp_ns} received_ns={reading.received_ns} "
                     f"taken_us={taken}",
                 )
             )

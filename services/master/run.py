@@ -164,7 +164,8 @@ class Master:
         # waiting for the robot does not count
         began = self._flow.first_reading_at
         elapsed = 0.0 if began is None else time.monotonic() - began
-        text = f"{self._flow.published} results published in {elapsed:.1f} s"
+        published = self._flow.published
+        text = f"{published} result{'s' if published != 1 else ''} published in {elapsed:.1f} s"
         # results that were published, on fewer topics than they should
         if missed := losses.pop(LossReason.SOME_TOPICS, 0):
             text += f", {missed} of them {LossReason.SOME_TOPICS}"

@@ -262,7 +262,7 @@ async def test_a_frame_is_followed_by_its_number(boat):
     run.read(stamp_ns=17, received_tick=1000, sent_tick=3500)
     (notice,) = run.subscriber.records
     assert isinstance(notice, Notice)
-    assert notice.sentence.startswith("frame=1 complete stamp_ns=17 ")
+    assert notice.sentence.startswith("complete frame=1 stamp_ns=17 ")
     assert notice.sentence.endswith(" taken_us=2")
 
 
@@ -275,4 +275,4 @@ async def test_the_time_before_the_first_reading_does_not_count(run, monkeypatch
     now[0] = 402.0
     computed(run)
     published(run, 1)
-    assert "1 results published in 2.0 s" in run.master.summary()
+    assert "1 result published in 2.0 s" in run.master.summary()

@@ -89,8 +89,8 @@ def test_an_unusable_message_is_reported_by_its_cause(boat, link):
 def test_the_number_of_a_reading_is_logged_for_debugging(boat, link, level, logged):
     subscriber = Subscriber(Settings(log_level=level), boat, link.make)
     subscriber._log = Mock()
-    link.take(Notice("debug", "frame=1 complete"))
-    assert subscriber._log.debug.mock_calls == [call("frame=1 complete")] * logged
+    link.take(Notice("debug", "complete frame=1"))
+    assert subscriber._log.debug.mock_calls == [call("complete frame=1")] * logged
 
 
 @pytest.mark.parametrize(("existing", "hinted"), [("/boat/sensors2", True), ("/elsewhere", False)])
