@@ -10,15 +10,12 @@ import inspect
 import json
 import os
 import re
-import signal
 import socket
 import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
@@ -46,7 +43,7 @@ READING = {"D1": 71, "D2": 50, "D3": 50, "B1": 45, "B2": 0, "B3": 90}
 """Readings of a boat in the middle of the map."""
 
 
-async def until(true: Callable[[], Any], why: Callable[[], str] = str) -> Any:
+async def until(true, why=str):
     """Wait until a function, or what it returns awaited, returns something that is true; return that."""
     deadline = time.monotonic() + PROCESS_PATIENCE
     pause = 0.02
@@ -61,7 +58,7 @@ async def until(true: Callable[[], Any], why: Callable[[], str] = str) -> Any:
         pause = min(1.2 * pause, 0.25)  # looking costs what a slow machine needs for the processes
 
 
-def environment_of(where: Path, run: str) -> dict[str, str]:
+def environment_of(where, run):
     """The environment of a test's processes."""
     limits = {name: str(seconds) for name, seconds in PRODUCT_LIMITS.items()}
     return dict(os.environ) | limits | {MARK: run, "TMPDIR": str(where), "XDG_RUNTIME_DIR": ""}
@@ -70,9 +67,7 @@ def environment_of(where: Path, run: str) -> dict[str, str]:
 class Running:
     """A command of ours as a process, its output in files."""
 
-    def __init__(
-        self, where: Path, run: str, *command: str, environment: dict[str, str] | None = None
-    ) -> None:
+    def __init__(self, where, run, *command, environment=None):
         self.name = command[0]
         self._out = where / f"{self.name}-{uuid.uuid4().hex[:6]}.out"
         self._err = self._out.with_suffix(".err")
@@ -87,22 +82,22 @@ class Running:
             )
 
     @property
-    def out(self) -> str:
+    def out(self):
         return self._out.read_text()
 
     @property
-    def err(self) -> str:
+    def err(self):
         return self._err.read_text()
 
-    async def end(self) -> int:
+    async def end(self):
         """Its exit code."""
         await until(lambda: self.process.poll() is not None, lambda: f"{self.name} did not end: {self.err}")
         return self.process.returncode
 
-    async def says(self, pattern: str) -> re.Match[str]:
+    async def says(self, pattern):
         """Wait for a line on its standard error."""
 
-        def said() -> re.Match[str] | None:
+        def said():
             ended = self.process.poll() is not None
             found = re.search(pattern, self.err)
             assert found or not ended, f"{self.name} ended: {self.err}"
@@ -112,33 +107,33 @@ class Running:
         assert found is not None
         return found
 
-    def send(self, number: signal.Signals) -> None:
+    def send(self, number):
         self.process.send_signal(number)
 
 
 class Stage:
     """Starts processes for one test, and knows all that came from them."""
 
-    def __init__(self, where: Path) -> None:
+    def __init__(self, where):
         self.where = where
         self.run = uuid.uuid4().hex
-        self.running: list[Running] = []
-        self.robots: list[Robot] = []
+        self.running = []
+        self.robots = []
         self.runs = where / "runs"
         self.runs.mkdir(mode=0o700)
-        self._places: list[socket.socket] = []
+        self._places = []
 
-    def start(self, *command: str, environment: dict[str, str] | None = None) -> Running:
+    def start(self, *command, environment=None):
         running = Running(self.where, self.run, *command, environment=environment)
         self.running.append(running)
         return running
 
     @property
-    def environment(self) -> dict[str, str]:
+    def environment(self):
         """The environment of the processes."""
         return environment_of(self.where, self.run)
 
-    def place(self) -> int:
+    def place(self):
         """A port that is free, and the next one; nobody else is given them before the test's end."""
         while True:
             # bound and never listening
@@ -152,15 +147,15 @@ class Stage:
                 pair[1].bind(("127.0.0.1", port + 1))
                 return port
 
-    async def hub(self, port: int = 0) -> tuple[Running, str]:
+    async def hub(self, port=0):
         """A hub and its address; another one may follow it at its port."""
         port = port or self.place()
         hub = self.start("hub", "--port", str(port))
         return hub, (await hub.says(r"ws://\S+"))[0]
 
-    def processes(self) -> dict[str, list[psutil.Process]]:
+    def processes(self):
         """Live processes of this test, by command name; a board forked by `board` counts as a board."""
-        found: dict[str, list[psutil.Process]] = {}
+        found = {}
         for process in psutil.process_iter():
             with contextlib.suppress(psutil.Error):
                 if process.environ().get(MARK) == self.run and process.status() != psutil.STATUS_ZOMBIE:
@@ -175,7 +170,7 @@ class Stage:
                     found.setdefault(name, []).append(process)
         return found
 
-    def boards(self) -> list[psutil.Process]:
+    def boards(self):
         """The processes of the boards in their order, without that from which they were forked."""
         found = {each.pid: each for each in self.processes()["board"]}
         parent = next(pid for pid in {each.ppid() for each in found.values()} if pid in found)
@@ -183,15 +178,7 @@ class Stage:
         # process numbers begin again from below now and then
         return sorted(found.values(), key=lambda each: (each.pid - first.pid) % PID_MAX)
 
-    async def loop(
-        self,
-        boat: Path,
-        *options: str,
-        robot: Callable[[str], "Robot"] | None = None,
-        rate: float = 20,
-        reading: dict = READING,
-        environment: dict[str, str] | None = None,
-    ):
+    async def loop(self, boat, *options, robot=None, rate=20, reading=READING, environment=None):
         """Start a hub, a robot that publishes and a master in --loop, and wait for the first results."""
         hub, uri = await self.hub()
         publishing = (robot or Robot)(uri)
@@ -203,11 +190,11 @@ class Stage:
         await publishing.have(3)
         return hub, publishing, master
 
-    async def status(self, name: str, wanted: Callable[[dict], bool] = bool) -> dict:
+    async def status(self, name, wanted=bool):
         """Wait for a status of a process in the run directory that is as wanted."""
-        found: dict = {}
+        found = {}
 
-        async def is_wanted() -> bool:
+        async def is_wanted():
             with contextlib.suppress(OSError, ValueError):
                 found.update(await status_of(self.runs, name))
             return bool(found) and wanted(found)
@@ -215,14 +202,14 @@ class Stage:
         await until(is_wanted, lambda: f"{name}: {found}")
         return found
 
-    def start_boards(self) -> tuple[Path, str]:
+    def start_boards(self):
         """Start four boards; return the folder of their sockets, and their endpoints."""
         sockets = self.where / "s"
         sockets.mkdir(mode=0o700)
         self.start("board", "--boards", "4", "--directory", str(sockets))
         return sockets, endpoints_in(sockets)
 
-    async def restarted(self, role: str, times: int = 1) -> None:
+    async def restarted(self, role, times=1):
         """Wait until the master has restarted a service so many times."""
         await self.status(
             "master",
@@ -231,17 +218,17 @@ class Stage:
             ),
         )
 
-    async def board_is_back(self, times: int = 1) -> None:
+    async def board_is_back(self, times=1):
         """Wait until boards have failed so many times, and pcie-app has all of them again."""
         await self.status(
             "pcie-app",
             lambda status: status["ready"] and sum(board["restarts"] for board in status["boards"]) >= times,
         )
 
-    async def nothing_left(self, *except_for: str) -> None:
+    async def nothing_left(self, *except_for):
         """All processes but the named have ended; a killed master leaves its status socket."""
 
-        def left() -> list[str]:
+        def left():
             files = [
                 str(path)
                 for path in self.where.glob("rosbayes-*/*")
@@ -251,7 +238,7 @@ class Stage:
 
         await until(lambda: not left(), lambda: f"left: {left()}")
 
-    async def end_all(self) -> None:
+    async def end_all(self):
         for robot in self.robots:
             await robot.close()
         for all_ in self.processes().values():
@@ -267,25 +254,25 @@ class Stage:
 class Robot:
     """A rosbridge client of plain websockets and json; publishes readings and collects results."""
 
-    def __init__(self, uri: str) -> None:
+    def __init__(self, uri):
         self.uri = uri
-        self.results: list[dict] = []
-        self.frames: list[dict] = []
-        self.order: list[str] = []
-        self.paired: list[tuple[dict, dict]] = []
+        self.results = []
+        self.frames = []
+        self.order = []
+        self.paired = []
         """Each result with its report, which comes just before it; the first result may have come without."""
-        self._report: dict | None = None
-        self._tasks: list[asyncio.Task] = []
-        self._collecting: asyncio.Task | None = None
-        self._publishing: asyncio.Task | None = None
-        self._values: dict = {}
+        self._report = None
+        self._tasks = []
+        self._collecting = None
+        self._publishing = None
+        self._values = {}
         self._socket = None
 
     async def __aenter__(self):
         await self.connect()
         return self
 
-    async def connect(self) -> None:
+    async def connect(self):
         if self._socket is not None:
             await self._socket.close()
         self._socket = await websockets.connect(
@@ -302,7 +289,7 @@ class Robot:
         self._collecting = asyncio.ensure_future(self._collect(self._socket))
         self._tasks.append(self._collecting)
 
-    async def lost(self) -> None:
+    async def lost(self):
         """Wait until the server is gone, and all that it sent is here."""
         async with asyncio.timeout(PROCESS_PATIENCE):
             await asyncio.wait([self._collecting])
@@ -310,14 +297,14 @@ class Robot:
     async def __aexit__(self, *_):
         await self.close()
 
-    async def close(self) -> None:
+    async def close(self):
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         if self._socket is not None:
             await self._socket.close()
 
-    async def _collect(self, socket) -> None:
+    async def _collect(self, socket):
         with contextlib.suppress(websockets.ConnectionClosed):
             async for text in socket:
                 message = json.loads(text)
@@ -332,7 +319,7 @@ class Robot:
                         self.paired.append((self._report, message["msg"]))
                     self._report = None
 
-    async def publish(self, **values) -> int:
+    async def publish(self, **values):
         """Publish a reading; its stamp."""
         stamp_ns = time.time_ns()
         stamp = dict(zip(("sec", "nanosec"), divmod(stamp_ns, 10**9), strict=True))
@@ -340,12 +327,12 @@ class Robot:
         await self._socket.send(json.dumps({"op": "publish", "topic": "/boat/sensors", "msg": msg}))
         return stamp_ns
 
-    async def keep_publishing(self, rate: float = 20, **values) -> None:
+    async def keep_publishing(self, rate=20, **values):
         """Publish in the background until the test is over; a lost server is waited for."""
 
         self._values = values or READING
 
-        async def publish() -> None:
+        async def publish():
             while True:
                 try:
                     await self.publish(**self._values)
@@ -357,17 +344,17 @@ class Robot:
         self._publishing = asyncio.ensure_future(publish())
         self._tasks.append(self._publishing)
 
-    async def stop_publishing(self) -> None:
+    async def stop_publishing(self):
         """Publish no more in the background, and hear the results of what was published: nothing is under way then."""
         self._publishing.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await self._publishing
         await self.answer(await self.publish(**self._values))
 
-    async def answer(self, stamp_ns: int) -> tuple[dict, dict | None]:
+    async def answer(self, stamp_ns):
         """Wait for what comes of the reading with a stamp: its frame's report, and the result unless there is none."""
 
-        def answered() -> tuple[dict, dict | None] | None:
+        def answered():
             before = 0
             for frame in self.frames:
                 published = frame["status"][0]["level"] == 0
@@ -378,19 +365,19 @@ class Robot:
 
         return await until(answered, lambda: "nothing came of the reading")
 
-    async def have(self, count: int) -> None:
+    async def have(self, count):
         """Wait until so many results have come."""
         await until(lambda: len(self.results) >= count, lambda: f"{len(self.results)} results of {count}")
 
 
-def stamp_of(message: dict) -> int:
+def stamp_of(message):
     """A message's stamp in ns, as either ROS writes it."""
     stamp = message["header"]["stamp"]
     seconds, rest = stamp.get("sec", stamp.get("secs")), stamp.get("nanosec", stamp.get("nsecs"))
     return seconds * 10**9 + rest
 
 
-def endpoints_in(folder: Path) -> str:
+def endpoints_in(folder):
     """Four boards' endpoints, as --boards takes them."""
     return ",".join(f"unix:{folder}/board{at}.sock" for at in range(4))
 
@@ -413,14 +400,14 @@ def right_posteriors(folder):
     return posteriors
 
 
-def only_error(running: Running) -> str:
+def only_error(running):
     """The last line of standard error, which has the only error."""
     assert "Traceback" not in running.err
     assert running.err.count("error: ") == 1, running.err
     return running.err.splitlines()[-1]
 
 
-async def until_subscribed(uri: str, topic: str) -> None:
+async def until_subscribed(uri, topic):
     """Wait until somebody hears a topic at a hub."""
     async with asyncio.timeout(PROCESS_PATIENCE), websockets.connect(uri, open_timeout=None) as asking:
         while True:
@@ -431,7 +418,7 @@ async def until_subscribed(uri: str, topic: str) -> None:
             await asyncio.sleep(0.02)
 
 
-async def status_of(runs: Path, name: str) -> dict:
+async def status_of(runs, name):
     """Return the status of a process of a run."""
     reader, writer = await asyncio.open_unix_connection(runs / f"{name}.status.sock")
     try:
@@ -448,25 +435,25 @@ async def stage(tmp_path_factory):
     await made.end_all()
 
 
-def toolchain(*arguments: str | Path) -> None:
+def toolchain(*arguments):
     ended = invoke(main.app, arguments)
     assert ended.exit_code == 0, ended.output
 
 
-def build(model: Path, directory: Path, *options: str) -> Path:
+def build(model, directory, *options):
     """A deployment, built by the command line in this process."""
     topic = ("--uri", "ws://127.0.0.1:9090", "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors")
     toolchain("build", model, "-o", directory, *topic, *options)
     return directory
 
 
-def build_boat(directory: Path, *options: str, cells: int = 8, partitions: int = 4) -> Path:
+def build_boat(directory, *options, cells=8, partitions=4):
     """The boat on a square map of few cells, for four boards or another number of them."""
     size = ("--set", f"width={cells}", "--set", f"height={cells}")
     return build(ROOT / "casestudies/boat", directory, "--partitions", str(partitions), *size, *options)
 
 
-def the_boat(tmp_path_factory) -> Path:
+def the_boat(tmp_path_factory):
     """A folder that the first of all workers makes; nobody changes it."""
     shared = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:

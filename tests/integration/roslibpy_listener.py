@@ -26,7 +26,7 @@ PATIENCE = 86_400.0
 """Seconds; a test that no longer waits for it kills it."""
 
 
-def main(uri: str, file: str, count: int, reading: str = "") -> int:
+def main(uri, file, count, reading=""):
     host, port = uri.removeprefix("ws://").rsplit(":", 1)
     ros = roslibpy.Ros(host=host, port=int(port))
     ros.run(timeout=PATIENCE)
@@ -34,8 +34,8 @@ def main(uri: str, file: str, count: int, reading: str = "") -> int:
     results = 0
     enough = threading.Event()
 
-    def keep(topic: str):
-        def take(msg) -> None:
+    def keep(topic):
+        def take(msg):
             nonlocal results
             heard.append((topic, msg))
             results += topic == "/BMresults"

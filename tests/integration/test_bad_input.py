@@ -10,18 +10,11 @@ import pytest
 from machines import warm_up
 from services.commands import master
 from tests.command_runner import invoke
-from tests.integration.conftest import (
-    PROGRAMMED,
-    READING,
-    Robot,
-    build_boat,
-    only_error,
-    until_subscribed,
-)
+from tests.integration.conftest import PROGRAMMED, READING, Robot, build_boat, only_error, until_subscribed
 from tests.pcie_shim.boards import ServedBoard
 
 
-async def once(stage, deployment, uri, *options) -> tuple[int, str]:
+async def once(stage, deployment, uri, *options):
     running = stage.start("master", "--once", "--fused", "-d", str(deployment), "--uri", uri, *options)
     code = await running.end()
     sentence = only_error(running)

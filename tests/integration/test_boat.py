@@ -28,8 +28,8 @@ def whole_boat(tmp_path_factory):
     return build_boat(tmp_path_factory.mktemp("boat") / "deployment", cells=32)
 
 
-def heard(file: Path) -> dict[str, list[dict]]:
-    messages: dict[str, list[dict]] = {}
+def heard(file):
+    messages = {}
     for line in file.read_text().splitlines():
         entry = json.loads(line)
         messages.setdefault(entry["topic"], []).append(entry["msg"])

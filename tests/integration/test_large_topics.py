@@ -49,7 +49,7 @@ PICTURE = np.zeros((480, 640, 3), np.uint8).tobytes()
 
 @contextlib.asynccontextmanager
 async def robot(uri):
-    async def play() -> None:
+    async def play():
         async with connect(uri, ros_version="2", max_size=4_000_000) as ros:
             near = await ros.advertise("/range", "sensor_msgs/Range")
             camera = await ros.advertise("/camera", "sensor_msgs/Image")

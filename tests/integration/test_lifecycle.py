@@ -144,8 +144,7 @@ async def test_a_closed_terminal_leaves_nothing(stage, boat):
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("victim", "code"),
-    [("subscriber", 6), ("publisher", 6), ("pcie-app", 6), ("board", 5), ("hub", 3)],
+    ("victim", "code"), [("subscriber", 6), ("publisher", 6), ("pcie-app", 6), ("board", 5), ("hub", 3)]
 )
 async def test_once_ends_with_a_death(stage, boat, victim, code):
     _, uri = await stage.hub()
@@ -266,7 +265,7 @@ async def test_the_first_and_the_last_part_alone(stage, boat):
         assert alone.out == f'{{"D1":{READING["D1"]},"header.frame_id":"map"}}\n' * 2
 
 
-async def shell(stage, command: str) -> tuple[int, str]:
+async def shell(stage, command):
     """A command as a shell runs it, with the test's marks: exit code, and standard error."""
     process = await asyncio.create_subprocess_shell(
         f"set -o pipefail; cd {stage.where}; {command}",

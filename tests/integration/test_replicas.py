@@ -73,10 +73,7 @@ def message_of(deployment, seed):
     if seed % 3 == 2:  # the last replica's second filter says nothing
         each = count // machine.replicas
         right[-each:] = [None] * each
-    return {
-        "costs": {"left": left, "right": right},
-        "light": lights if machine.replicas > 1 else lights[0],
-    }
+    return {"costs": {"left": left, "right": right}, "light": lights if machine.replicas > 1 else lights[0]}
 
 
 def inputs_of(deployment, message):

@@ -72,10 +72,10 @@ class Robots:
         late_s: How far the clock of the second robot is behind, seconds.
     """
 
-    def __init__(self, one: str, two: str) -> None:
+    def __init__(self, one, two):
         self.uris = (one, two)
         self.late_s = 0.0
-        self._tasks: list[asyncio.Task[None]] = []
+        self._tasks = []
 
     async def __aenter__(self):
         self._tasks = [
@@ -90,7 +90,7 @@ class Robots:
         for ended in await asyncio.gather(*self._tasks, return_exceptions=True):
             assert isinstance(ended, asyncio.CancelledError), ended
 
-    async def _publish(self, uri, read) -> None:
+    async def _publish(self, uri, read):
         async with connect(uri, ros_version="2", connect_timeout=PROCESS_PATIENCE) as ros:
             topics = [await ros.advertise(topic, type_) for topic, type_, _ in read()]
             while True:

@@ -1,7 +1,5 @@
 """The deployment that the services' tests share, which no test changes."""
 
-from pathlib import Path
-
 import pytest
 
 from tests.integration.conftest import the_boat
@@ -9,7 +7,7 @@ from toolchain.deployment import load_deployment
 
 
 @pytest.fixture(scope="session")
-def built(tmp_path_factory) -> Path:
+def built(tmp_path_factory):
     return the_boat(tmp_path_factory)
 
 

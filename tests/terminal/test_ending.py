@@ -113,8 +113,7 @@ def test_a_signal_that_arrives_while_a_class_is_made(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    "replaced",
-    [ImportError("numba._devicearray failed to import"), SettingsError("this needs numba")],
+    "replaced", [ImportError("numba._devicearray failed to import"), SettingsError("this needs numba")]
 )
 def test_a_signal_is_the_reason_of_what_fails_after_it(replaced):
     """The C code of numba prints the exception of a signal that interrupts its import, and raises another one."""
@@ -139,14 +138,7 @@ def test_a_dropped_signal_counts_at_the_end_of_a_command():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["print(1)"],
-        ["print_json_line(1)"],
-        ["pass", "--help"],
-    ],
-)
+@pytest.mark.parametrize("command", [["print(1)"], ["print_json_line(1)"], ["pass", "--help"]])
 def test_a_full_disk_behind_standard_output_is_one_sentence(command):
     with Path("/dev/full").open("w") as full:
         code, lines = end_of(*command, stdout=full)

@@ -24,11 +24,11 @@ from bridge.stamps import stamp
 from services.commands.listen import app
 from tests.casestudies.pretend_stack import frame_message
 from tests.command_runner import invoke
-from tests.integration.conftest import BIN, ROOT, Running, until, until_subscribed
+from tests.integration.conftest import BIN, ROOT, until, until_subscribed
 from tests.patience import FACTOR, PROCESS_PATIENCE
 
 
-def programs(page: str) -> list[str]:
+def programs(page):
     """The page's Python that hears posteriors."""
     blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
     return [block for block in blocks if "from posteriors import" in block and "ws://" in block]
@@ -37,7 +37,7 @@ def programs(page: str) -> list[str]:
 GUIDE = programs("docs/how-to/listening.md")
 
 
-def result(number: int) -> dict:
+def result(number):
     """On the boat's 8 x 8 cells, three quarters in one of them."""
     data = [0.25 / 63] * 64
     data[number % 64] = 0.75
@@ -45,7 +45,7 @@ def result(number: int) -> dict:
     return {"layout": {"dim": dims, "data_offset": 0}, "data": data}
 
 
-async def publish_for_ever(uri: str, rate: float = 40) -> None:
+async def publish_for_ever(uri, rate=40):
     """Every fifth frame has no posterior; a lost hub is waited for."""
     async with connect(uri) as ros:
         frames = await ros.advertise("/bm/frame", "diagnostic_msgs/DiagnosticArray")
@@ -70,10 +70,10 @@ async def stack(stage):
         await playing
 
 
-async def printed(running: Running, lines: int) -> list[str]:
+async def printed(running, lines):
     """Wait for so many lines on its standard output."""
 
-    def enough() -> bool:
+    def enough():
         assert running.process.poll() is None, f"it ended: {running.err}"
         return running.out.count("\n") >= lines
 
@@ -129,7 +129,7 @@ async def test_on_a_terminal_one_picture_changes(stack, asked):
     )
     os.close(its)
 
-    def read() -> str:
+    def read():
         shown = b""
         with contextlib.suppress(OSError):  # the other end was closed
             while part := os.read(ours, 1 << 16):
@@ -225,7 +225,7 @@ async def test_silence_nonsense_and_another_model(stage, boat):
 
 
 @contextlib.asynccontextmanager
-async def running(text: str, uri: str):
+async def running(text, uri):
     """A page's program as a process, with this server's address."""
     changed = text.replace("ws://robot:9090", uri).replace("ws://127.0.0.1:9090", uri)
     assert changed.count(uri) == 1

@@ -118,7 +118,7 @@ def test_the_service_manager_hears_one_process_when_all_boards_listen(start, tmp
         manager.settimeout(PROCESS_PATIENCE)
         watched = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "60000000"}
         boards = start("--boards", "3", "--directory", str(tmp_path / "b"), **watched)
-        heard: list[str] = []
+        heard = []
         while not ("READY=1" in heard and heard.count("WATCHDOG=1") > 1):
             text, ancillary, _, _ = manager.recvmsg(1 << 12, 1 << 10)
             assert struct.unpack("3i", ancillary[0][2])[0] == boards.pid

@@ -4,7 +4,6 @@ import asyncio
 import io
 import json
 import signal
-from pathlib import Path
 
 import pytest
 from websockets.asyncio.client import connect
@@ -36,7 +35,7 @@ TOKEN = "correct-horse-battery-staple"
         (("--announce", "a.b", "--port", "0"), "a.b"),
     ],
 )
-def test_what_the_hub_refuses_is_one_sentence(arguments: tuple[str, ...], said: str) -> None:
+def test_what_the_hub_refuses_is_one_sentence(arguments, said):
     ended = invoke(hub.app, arguments)
     assert ended.exit_code == 2
     assert said in ended.stderr.splitlines()[-1]
@@ -44,7 +43,7 @@ def test_what_the_hub_refuses_is_one_sentence(arguments: tuple[str, ...], said: 
 
 
 @pytest.mark.process
-async def test_a_hub_with_tokens_on_another_address(tmp_path: Path) -> None:
+async def test_a_hub_with_tokens_on_another_address(tmp_path):
     """All of it as a user would: a file of tokens, ROS 2, and an address that is not loopback's."""
     tokens = tmp_path / "tokens"
     tokens.write_text(TOKEN + "\n")
@@ -72,18 +71,18 @@ async def test_a_hub_with_tokens_on_another_address(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def discovered(monkeypatch: pytest.MonkeyPatch) -> list[Robot]:
+def discovered(monkeypatch):
     """The robots on the network."""
-    robots: list[Robot] = []
+    robots = []
 
-    async def found(_timeout: float) -> list[Robot]:
+    async def found(_timeout):
         return robots
 
     monkeypatch.setattr("bridge.discovery.discover", found)
     return robots
 
 
-def test_discover_lists_robots(discovered: list[Robot]) -> None:
+def test_discover_lists_robots(discovered):
     discovered.append(Robot("Mr. [bold]", "ws://192.0.2.7:9090", 1))
     discovered.append(Robot("Zoë", "wss://zoe.local:9090", None, token=True))
     listed = invoke(discover.app, [])
@@ -94,9 +93,7 @@ def test_discover_lists_robots(discovered: list[Robot]) -> None:
     assert lines[1] == {"name": "Zoë", "uri": "wss://zoe.local:9090", "ros_version": None, "token": True}
 
 
-def test_one_of_the_robots_is_picked_by_its_number(
-    discovered: list[Robot], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_of_the_robots_is_picked_by_its_number(discovered, monkeypatch):
     discovered.extend([Robot("Adam", "ws://192.0.2.7:9090"), Robot("Zoë", "ws://192.0.2.8:9090")])
     monkeypatch.setattr("sys.stdin", io.StringIO("2\n"))
     picked = invoke(discover.app, ["--pick"])
@@ -112,11 +109,9 @@ def test_one_of_the_robots_is_picked_by_its_number(
     assert "--pick and --json" in both.stderr
 
 
-def test_ctrl_c_ends_the_question_for_a_number(
-    discovered: list[Robot], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_ends_the_question_for_a_number(discovered, monkeypatch):
     class Interrupted(io.StringIO):
-        def readline(self, _size: int | None = -1, /) -> str:
+        def readline(self, _size=-1, /):
             signal.raise_signal(signal.SIGINT)
             return "1\n"
 
@@ -127,16 +122,16 @@ def test_ctrl_c_ends_the_question_for_a_number(
 
 
 @pytest.mark.usefixtures("discovered")
-def test_a_network_without_robots_is_one_sentence() -> None:
+def test_a_network_without_robots_is_one_sentence():
     ended = invoke(discover.app, ["--timeout", "0.2", "--json"])
     assert (ended.exit_code, ended.stdout) == (3, "")
     assert "within 0.2 s" in ended.stderr
 
 
-async def test_a_robots_name_stands_for_its_uri(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_robots_name_stands_for_its_uri(monkeypatch):
     """Also where a loop runs already, as here."""
 
-    async def resolve(name: str) -> str:
+    async def resolve(name):
         await asyncio.sleep(0)
         if name != "Zoë":
             raise UnknownRobotError(f"no robot called {name}")

@@ -188,11 +188,7 @@ async def test_every_outcome_is_counted(run):
     published(run, 2)
     published(run, 3, Outcome.ROSBRIDGE_AWAY)
     published(run, 4, Outcome.NO_POSTERIOR)
-    assert run.lost == {
-        LossReason.SOME_TOPICS: 1,
-        LossReason.ROSBRIDGE_AWAY: 1,
-        LossReason.NO_POSTERIOR: 1,
-    }
+    assert run.lost == {LossReason.SOME_TOPICS: 1, LossReason.ROSBRIDGE_AWAY: 1, LossReason.NO_POSTERIOR: 1}
     assert run.master.summary().endswith(
         ", 1 of them on some topics only; not published: 1 rosbridge away, 1 no posterior"
     )

@@ -8,12 +8,7 @@ from unittest.mock import AsyncMock, Mock
 
 import pytest
 
-from services.errors import (
-    BoardFailedError,
-    ChildDiedError,
-    ReportedError,
-    SettingsError,
-)
+from services.errors import BoardFailedError, ChildDiedError, ReportedError, SettingsError
 from services.master.peers import Awaited, Peer, Peers
 from services.settings import Settings
 from services.sockets.local_socket import open_connection, own_hello

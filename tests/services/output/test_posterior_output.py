@@ -27,7 +27,7 @@ from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSec
 HASH = "0" * 64
 
 
-def deployment(*searched: Dimension) -> Deployment:
+def deployment(*searched):
     lines = 1
     for dimension in searched:
         lines *= dimension.size

@@ -19,7 +19,7 @@ from toolchain.deployment.sections import WrittenPrior
 HASH = "0" * 64
 
 
-def deployment(*variables: Variable, sources: int = 1, tolerance_s: float = 0.05) -> Deployment:
+def deployment(*variables, sources=1, tolerance_s=0.05):
     return Deployment(
         name="test",
         source=[Source(uri="ws://robot:9090", topic=f"/t{at}", type="a/B") for at in range(sources)],
@@ -31,7 +31,7 @@ def deployment(*variables: Variable, sources: int = 1, tolerance_s: float = 0.05
     )
 
 
-def variable(name: str, **settings) -> Variable:
+def variable(name, **settings):
     return Variable(name=name, bits=7, values=101, **settings)
 
 
@@ -40,7 +40,7 @@ def two_topics(*, tolerance_s=0.05, **second):
     return FrameAssembler(deployment(*variables, sources=2, tolerance_s=tolerance_s))
 
 
-def stamped(ms: float, **values):
+def stamped(ms, **values):
     return {"header": {"stamp": {"sec": 100, "nanosec": int(ms * 1e6)}}, **values}
 
 

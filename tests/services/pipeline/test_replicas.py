@@ -84,13 +84,7 @@ def test_addresses_become_the_drivers_inputs(changes, addresses, inputs, rows):
 
 @pytest.mark.parametrize(
     "addresses",
-    [
-        [[0] * 6],
-        [[0] * 5, [0] * 3],
-        [7, [0] * 3],
-        [[0] * 6, [0] * 4],
-        [[0] * 5 + [2**70], [0] * 3],
-    ],
+    [[[0] * 6], [[0] * 5, [0] * 3], [7, [0] * 3], [[0] * 6, [0] * 4], [[0] * 5 + [2**70], [0] * 3]],
 )
 def test_rows_that_do_not_fit_are_refused(addresses):
     with pytest.raises(FrameInputError):
@@ -100,11 +94,11 @@ def test_rows_that_do_not_fit_are_refused(addresses):
 OVERFLOW, SLICE, IMPOSSIBLE = StopReason.OVERFLOW, StopReason.SLICE, StopReason.IMPOSSIBLE
 
 
-def result(*boards) -> FrameResult:
+def result(*boards):
     return FrameResult(7, encode_boards(boards), 1, 2, 3, 4)
 
 
-def board(counts, cycles, reasons) -> BoardResult:
+def board(counts, cycles, reasons):
     words = np.array(counts, "<u4").tobytes()
     return BoardResult(words, max(cycles), reasons[0], tuple(cycles), tuple(reasons))
 

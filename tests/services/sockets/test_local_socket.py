@@ -12,17 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.errors import LocalSocketError, OtherPeerError
-from services.sockets.local_socket import (
-    MAX_RECORD,
-    RecordSplitter,
-    check_hello,
-    encode_record,
-    own_hello,
-)
+from services.sockets.local_socket import MAX_RECORD, RecordSplitter, check_hello, encode_record, own_hello
 from services.sockets.records import VERSION, FrameRequest, FrameResult, Hello, Notice
 
 
-def raw(value) -> msgspec.Raw:
+def raw(value):
     return msgspec.Raw(msgspec.msgpack.encode(value))
 
 

@@ -11,12 +11,7 @@ from services.errors import SettingsError
 from services.sockets import reporting
 from services.sockets.records import VERSION
 from services.sockets.reporting import Report, serve_status, serve_status_in_thread
-from services.sockets.status import (
-    FrameCounts,
-    ProcessStatus,
-    read_process_status,
-    seconds_since,
-)
+from services.sockets.status import FrameCounts, ProcessStatus, read_process_status, seconds_since
 from services.supervision.service_manager import ServiceManager
 from terminal.health import NoHealthError, Silence, in_thread, serve_health, status_socket
 from terminal.run_directory import remove_stale_sockets
@@ -80,10 +75,7 @@ def test_stale_sockets_are_removed_and_live_ones_stay(tmp_path):
     (tmp_path / "board0.sock").touch()
     with serve_status_in_thread(tmp_path, "board0", get_status):
         remove_stale_sockets(tmp_path)
-        assert sorted(path.name for path in tmp_path.iterdir()) == [
-            "board0.sock",
-            "board0.status.sock",
-        ]
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["board0.sock", "board0.status.sock"]
 
 
 def test_a_rate_is_of_the_last_seconds(monkeypatch):

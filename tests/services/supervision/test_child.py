@@ -8,7 +8,7 @@ import sys
 import pytest
 import uvloop
 
-from services.errors import ReportedError, StackError
+from services.errors import StackError
 from services.supervision.child import RESTARTS, Child, end_all
 from terminal.errors import ExitCode
 from tests.patience import PATIENCE
@@ -30,11 +30,11 @@ def run(request):
     return run
 
 
-def child(code: str) -> Child:
+def child(code):
     return Child("tester", [sys.executable, "-c", code])
 
 
-async def failure_of(code: str, number: int = 0) -> ReportedError:
+async def failure_of(code, number=0):
     one = child(code)
     await one.start()
     if number:
