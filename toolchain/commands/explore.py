@@ -111,7 +111,7 @@ def explore(
     kept.check_writable()
     there = sum(task.key in kept.points for task in found)
     typer.echo(
-        f"{len(found)} machines of {read.name} over {drawn.source}"
+        f"{len(found)} machine{'s' if len(found) != 1 else ''} of {read.name} over {drawn.source}"
         + (f"; {there} of them are in {results}" if there else ""),
         err=True,
     )
