@@ -1,8 +1,9 @@
-"""A fake server, and a client that is connected to it; a test gives their options as indirect parameters."""
+"""A fake server, a client that is connected to it, and a hub; a test gives their options as indirect parameters."""
 
 import pytest
 
 from bridge.client import connect, rosapi, session
+from tests.bridge.hub.sockets import running_hub
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 
@@ -18,6 +19,13 @@ def patient(monkeypatch):
 async def fake(request):
     async with FakeRosbridge(**getattr(request, "param", {})) as fake:
         yield fake
+
+
+@pytest.fixture
+async def hub(request):
+    """The URI of a hub; of ROS 2, unless a test gives other options."""
+    async with running_hub(**{"ros_version": 2} | getattr(request, "param", {})) as port:
+        yield f"ws://127.0.0.1:{port}"
 
 
 @pytest.fixture

@@ -15,8 +15,8 @@ from bridge.codecs.serialised import MessageTypes
 from bridge.errors import DecodeError, NoAnswerError, NoMessageError, ServiceError
 from bridge.qos import Qos
 from tests.bridge.client.doubles import Double
-from tests.bridge.client.waits import give_up, until
-from tests.bridge.hub.sockets import running_hub
+from tests.bridge.client.helpers import give_up
+from tests.bridge.hub.sockets import until
 from tests.patience import PATIENCE
 
 TYPE = "std_msgs/Float64MultiArray"
@@ -117,13 +117,9 @@ async def test_no_operation_of_the_client_makes_a_server_deaf(double):
     ("compression", "fragment_size", "arrays"),
     [("none", 50, "numpy"), ("png", None, "list"), ("cbor", None, "numpy"), ("cbor", 50, "list")],
 )
-async def test_a_scan_passes_the_hub_unchanged(compression, fragment_size, arrays):
+async def test_a_scan_passes_the_hub_unchanged(hub, compression, fragment_size, arrays):
     options = {"compression": compression, "fragment_size": fragment_size, "arrays": arrays}
-    async with (
-        running_hub(ros_version=2) as port,
-        connect(f"ws://127.0.0.1:{port}") as one,
-        connect(one.uri, fragment_size=64) as other,
-    ):
+    async with connect(hub) as one, connect(hub, fragment_size=64) as other:
         scans = one.subscribe("/scan", SCAN_TYPE, qos=Qos(reliability="best_effort"), **options)
         await one.call("/rosapi/get_time", timeout=PATIENCE)
         publication = await other.advertise("/scan", SCAN_TYPE, qos=Qos(depth=5))

@@ -17,7 +17,3 @@ def test_limits_that_contradict_each_other_are_refused():
     with pytest.raises(HubError, match="depth"):
         HubLimits(depth=251)
     assert HubError.exit_code == 2
-
-
-def test_the_default_message_is_a_mebibyte():
-    assert HubLimits().message_bytes == 1 << 20

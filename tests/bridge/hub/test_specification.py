@@ -93,14 +93,3 @@ def test_feedback_and_result_as_png(hub):
     server.send(op="action_result", id=goal["id"], action=DOCK, values={"b": 1}, status=4, result=True)
     operations = [json.loads(png.decode(operation["data"])) for operation in client.read()]
     assert [operation["values"] for operation in operations] == [{"a": 1}, {"b": 1}]
-
-
-def test_an_answer_needs_only_its_id(hub):
-    server, client = hub.connect(), hub.connect()
-    server.send(op="advertise_service", service="/s", type="a/S")
-    client.send(op="call_service", service="/s", id=7)
-    (request,) = server.read()
-    server.send(op="service_response", id=request["id"])
-    assert client.read() == [
-        {"op": "service_response", "service": "/s", "values": {}, "result": True, "id": 7}
-    ]

@@ -9,7 +9,6 @@ from bridge.client import State, connect
 from bridge.client.protocol.wire import SMALLEST_LIMIT
 from bridge.errors import EncodeError, MessageTooLargeError, TopicLeftOutError
 from bridge.hub.limits import HubLimits
-from tests.bridge.hub.sockets import running_hub
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 
@@ -131,11 +130,11 @@ async def publishes_in_vain(ros, topic, size):
         await publication.publish({"data": "x" * size})
 
 
-async def test_the_limit_of_the_hub_is_known_at_once():
-    async with (
-        running_hub(limits=HubLimits(message_bytes=LIMIT)) as port,
-        connect(f"ws://127.0.0.1:{port}") as ros,
-    ):
+@pytest.mark.parametrize(
+    "hub", [{"ros_version": 1, "limits": HubLimits(message_bytes=LIMIT)}], indirect=True, ids=["small"]
+)
+async def test_the_limit_of_the_hub_is_known_at_once(hub):
+    async with connect(hub) as ros:
         await publishes_in_vain(ros, "/large", LIMIT)
         with pytest.raises(EncodeError):
             await ros.call("/rosapi/topic_type", {"topic": "x" * LIMIT})

@@ -7,14 +7,13 @@ import pytest
 
 from bridge.client import connect
 from bridge.errors import FrameUnknownError
-from tests.bridge.hub.sockets import running_hub
 from tests.bridge.test_transforms import SECOND, message, turned
 from tests.patience import PATIENCE
 
 
-@pytest.mark.parametrize("version", [1, 2])
-async def test_a_lookup_waits_for_both_topics(version):
-    async with running_hub(ros_version=version) as port, connect(f"ws://127.0.0.1:{port}") as ros:
+@pytest.mark.parametrize("hub", [{"ros_version": 1}, {"ros_version": 2}], indirect=True)
+async def test_a_lookup_waits_for_both_topics(hub):
+    async with connect(hub) as ros:
         static = await ros.advertise("/tf_static", "tf2_msgs/TFMessage", latch=True)
         await static.publish(message("base", "laser", turned(0.5, 0, SECOND)))
         async with ros.transforms() as transforms:

@@ -24,7 +24,8 @@ from bridge.errors import (
     ServiceError,
     SlowPeerError,
 )
-from tests.bridge.client.waits import give_up, until
+from tests.bridge.client.helpers import give_up
+from tests.bridge.hub.sockets import until
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 

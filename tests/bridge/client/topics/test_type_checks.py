@@ -6,7 +6,6 @@ import pytest
 
 from bridge.client import State, connect, rosapi
 from bridge.errors import MessageTypeError, ServiceError
-from tests.bridge.hub.sockets import running_hub
 from tests.patience import PATIENCE
 
 TWIST = "geometry_msgs/Twist"
@@ -17,11 +16,12 @@ TYPEDEF = {
     "fieldtypes": ["geometry_msgs/Vector3"],
     "fieldarraylen": [-1],
 }
+BOTH = pytest.mark.parametrize("hub", [{"ros_version": 1}, {"ros_version": 2}], indirect=True)
 
 
-@pytest.mark.parametrize("version", [1, 2])
-async def test_the_first_message_of_each_publication_is_checked(version):
-    async with running_hub(ros_version=version) as port, connect(f"ws://127.0.0.1:{port}") as ros:
+@BOTH
+async def test_the_first_message_of_each_publication_is_checked(hub):
+    async with connect(hub) as ros:
         heard = ros.subscribe("/cmd_vel", TWIST)
         for _ in range(2):
             publication = await ros.advertise("/cmd_vel", TWIST)
@@ -70,14 +70,9 @@ async def test_a_silent_server_is_waited_for_once(fake, ros, monkeypatch):
     assert len(fake.ops("call_service", service="/rosapi/message_details")) == 1
 
 
-@pytest.mark.parametrize("version", [1, 2])
-async def test_a_request_and_an_answer_are_checked_like_messages(version):
-    async with (
-        running_hub(ros_version=version) as port,
-        connect(f"ws://127.0.0.1:{port}") as server,
-        connect(f"ws://127.0.0.1:{port}") as ros,
-        connect(f"ws://127.0.0.1:{port}", check_types=False) as unchecked,
-    ):
+@BOTH
+async def test_a_request_and_an_answer_are_checked_like_messages(hub):
+    async with connect(hub) as server, connect(hub) as ros, connect(hub, check_types=False) as unchecked:
         asked = []
 
         async def switch(args):
@@ -97,12 +92,8 @@ async def test_a_request_and_an_answer_are_checked_like_messages(version):
 
 
 @pytest.mark.parametrize("type_name", ["example_interfaces/action/Fibonacci", "example_interfaces/Fibonacci"])
-async def test_a_goal_is_checked(type_name):
-    async with (
-        running_hub(ros_version=2) as port,
-        connect(f"ws://127.0.0.1:{port}") as server,
-        connect(f"ws://127.0.0.1:{port}") as ros,
-    ):
+async def test_a_goal_is_checked(hub, type_name):
+    async with connect(hub) as server, connect(hub) as ros:
 
         async def count(goal):
             return {"sequence": list(range(goal.values["order"]))}

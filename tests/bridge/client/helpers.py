@@ -1,14 +1,36 @@
-"""A TCP service of a test, which leaves nothing."""
+"""What tests of the client share: its core alone, a TCP service that is no rosbridge, and waits that are ended."""
 
 import asyncio
 import contextlib
+import json
+
+from bridge.client.protocol import ClientCore
+
+
+def connected(**options):
+    core = ClientCore(**options)
+    core.restore()
+    return core
+
+
+def sent(core):
+    return [json.loads(data) for data in core.data_to_send()]
+
+
+def tell(core, now=0.0, **operation):
+    return core.receive(json.dumps(operation).encode(), now)
+
+
+def give_up(subscription):
+    """End the present wait as at its deadline."""
+    subscription._deadline = 0.0
+    subscription._ring()
 
 
 @contextlib.asynccontextmanager
 async def tcp_service(serve, port=0):
     """Serve each connection on a port of this machine; at the end, cut those that `serve` has not closed."""
-    tasks = []
-    writers = []
+    tasks, writers = [], []
 
     async def talk(reader, writer):
         tasks.append(asyncio.current_task())
@@ -23,7 +45,7 @@ async def tcp_service(serve, port=0):
         yield server.sockets[0].getsockname()[1]
     finally:
         server.close()
-        for task in filter(None, tasks):
+        for task in tasks:
             task.cancel()
         for writer in writers:
             writer.transport.abort()
