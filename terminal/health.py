@@ -19,7 +19,6 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager
-from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
@@ -32,22 +31,8 @@ ANSWER_LIMIT = 1 << 20
 _END_TIMEOUT = 2.0
 
 
-class Silence(StrEnum):
-    """The reason why a status socket did not answer."""
-
-    NO_SOCKET = "no socket"
-    NO_LISTENER = "no listener"
-    TIMEOUT = "timeout"
-    NOT_OURS = "not ours"
-
-
 class NoHealthError(Exception):
-    """A status socket did not answer; the text gives the reason."""
-
-    def __init__(self, reason: Silence, sentence: str) -> None:
-        """Take the reason, and a sentence whose subject is the process."""
-        super().__init__(sentence)
-        self.reason = reason
+    """A status socket did not answer; the text gives the reason, without its subject, the process."""
 
 
 def status_socket(directory: str | os.PathLike[str], name: str) -> str:
@@ -84,19 +69,17 @@ def silence_explained(path: str, timeout: float) -> Iterator[None]:
     try:
         yield
     except TimeoutError:
-        raise NoHealthError(Silence.TIMEOUT, f"does not answer at {path} within {timeout:g} s") from None
+        raise NoHealthError(f"does not answer at {path} within {timeout:g} s") from None
     except ConnectionRefusedError:
-        sentence = f"was killed and has not been restarted yet: nothing listens at {path}"
-        raise NoHealthError(Silence.NO_LISTENER, sentence) from None
+        raise NoHealthError(f"was killed and has not been restarted yet: nothing listens at {path}") from None
     except OSError as error:
         sentence = f"is not running, or does not report its status at {path} ({error.strerror or error})"
-        raise NoHealthError(Silence.NO_SOCKET, sentence) from None
+        raise NoHealthError(sentence) from None
 
 
 def foreign_socket_error(path: str) -> NoHealthError:
     """Return the error for an answer that is not a status."""
-    sentence = f"is not a rosbayes process of this version, according to its answer at {path}"
-    return NoHealthError(Silence.NOT_OURS, sentence)
+    return NoHealthError(f"is not a rosbayes process of this version, according to its answer at {path}")
 
 
 def is_ready(path: str, timeout: float) -> tuple[bool, str]:

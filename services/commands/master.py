@@ -8,7 +8,7 @@ import typer
 
 from services.commands import flags as options
 from services.errors import SettingsError
-from services.master.run import run_master
+from services.master.run import Master
 from services.settings import Settings, endpoint_in
 from services.sockets.reporting import check_metrics
 from services.sockets.serving import board_endpoints, deployment_for
@@ -59,7 +59,6 @@ def master(
             raise SettingsError(
                 f"--connect {connect} is not a folder; name the one with the sockets of the running services"
             )
-        # as if each had been given by its own variable
         # a flag, so it replaces the variables of the three endpoints
         services = {"subscriber": "subscriber", "publisher": "publisher", "pcie_app": "pcie-app"}
         settings = settings.model_copy(
@@ -81,7 +80,7 @@ def master(
     check_metrics(settings.metrics, insecure=insecure)
     # loaded before processes start, so that a damaged folder is reported at once
     loaded = deployment_for(settings)
-    return run_async(run_master(settings, loaded, once=once, count=count, json=json, plot=plot))
+    return run_async(Master(settings, loaded, once=once, count=count, json=json, plot=plot).run())
 
 
 def _check(settings: Settings) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from rich.console import Console
 from rich.text import Text
@@ -114,7 +114,3 @@ def _range(axis: Axis, first: int, last: int) -> str:
 def _style(share: float) -> str:
     red, green, blue = _COLOURS[round(share * (len(_COLOURS) - 1))]
     return f"on rgb({red},{green},{blue})"
-
-
-def _grid(dimensions: list[tuple[str, Any]]) -> str:
-    return " x ".join(f"{printable(label)} {size}" for label, size in dimensions)

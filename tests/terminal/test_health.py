@@ -21,7 +21,6 @@ from services import ready
 from terminal.health import (
     ANSWER_LIMIT,
     NoHealthError,
-    Silence,
     in_thread,
     is_ready,
     read_status,
@@ -135,9 +134,8 @@ def answering(path, data):
 )
 def test_an_answer_that_is_not_a_status_is_not_ready(tmp_path, data):
     path = status_socket(tmp_path, "hub")
-    with answering(path, data), pytest.raises(NoHealthError) as silent:
+    with answering(path, data), pytest.raises(NoHealthError, match="version"):
         is_ready(path, PATIENCE)
-    assert silent.value.reason is Silence.NOT_OURS
 
 
 def test_only_true_is_ready(tmp_path):
@@ -152,14 +150,16 @@ def test_silence_has_a_reason(tmp_path):
     def reason(timeout):
         with pytest.raises(NoHealthError) as silent:
             read_status(path, timeout)
-        return silent.value.reason
+        return str(silent.value)
 
-    assert reason(PATIENCE) is Silence.NO_SOCKET
+    absent = reason(PATIENCE)
     with socket.socket(socket.AF_UNIX) as stuck:
         stuck.bind(path)
         stuck.listen()
-        assert reason(0.1) is Silence.TIMEOUT
-    assert reason(PATIENCE) is Silence.NO_LISTENER
+        silent = reason(0.1)
+    killed = reason(PATIENCE)
+    # which of the three it is tells the user what to do
+    assert ("not running" in absent, "within" in silent, "killed" in killed) == (True, True, True)
 
 
 # --- python -m services.ready ----------------------------------------------------------------------

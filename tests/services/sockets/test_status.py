@@ -13,7 +13,7 @@ from services.sockets.records import VERSION
 from services.sockets.reporting import Report, serve_status, serve_status_in_thread
 from services.sockets.status import FrameCounts, ProcessStatus, read_process_status, seconds_since
 from services.supervision.service_manager import ServiceManager
-from terminal.health import NoHealthError, Silence, in_thread, serve_health, status_socket
+from terminal.health import NoHealthError, in_thread, serve_health, status_socket
 from terminal.run_directory import remove_stale_sockets
 from tests.patience import PATIENCE
 
@@ -45,10 +45,9 @@ async def test_a_process_that_makes_no_progress_is_not_ready(tmp_path):
 async def test_a_status_of_another_version_is_refused(tmp_path):
     with (
         in_thread(lambda: serve_health(tmp_path, "hub", lambda: b'{"ready":true,"why":3}')),
-        pytest.raises(NoHealthError) as silent,
+        pytest.raises(NoHealthError, match="version"),
     ):
         await read_process_status(status_socket(tmp_path, "hub"), PATIENCE)
-    assert silent.value.reason is Silence.NOT_OURS
 
 
 async def test_a_process_that_accepts_nobody_is_silent(tmp_path):
@@ -57,9 +56,8 @@ async def test_a_process_that_accepts_nobody_is_silent(tmp_path):
         stuck.bind(path)
         stuck.listen(0)
         queued.connect(path)  # the backlog is full
-        with pytest.raises(NoHealthError) as silent:
+        with pytest.raises(NoHealthError, match="within"):
             await read_process_status(path, 0.1)
-    assert silent.value.reason is Silence.TIMEOUT
 
 
 async def test_a_directory_that_is_not_there_is_the_users_mistake(tmp_path):
