@@ -149,6 +149,18 @@ def codes(random, parameters, rows, zeros, typical, *, top=True):
     return table
 
 
+def machine_of(lines=20, sensors=3, zeros=0.0, **changes):
+    """The same machine for the same arguments, of sensors with four values each."""
+    threshold = changes.get("sensor_mode") is SensorMode.THRESHOLD
+    parameters = BM1Parameters(
+        **{"lines": lines, "sensor_bits": (8 if threshold else 2,) * sensors, "counter_bits": 32, **changes}
+    )
+    random = np.random.default_rng(11)
+    prior = codes(random, parameters, parameters.prior_addresses, zeros, 0.8, top=False)
+    tables = () if threshold else tuple(codes(random, parameters, 4, zeros, 0.8) for _ in range(sensors))
+    return BM1Machine(parameters, prior, tables)
+
+
 def play(kernel: BM1Kernel, frames: tuple[Frame, ...]):
     """Run the frames, and yield all that can be seen of the kernel after every start and resume."""
     for frame in frames:

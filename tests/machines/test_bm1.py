@@ -92,11 +92,6 @@ def test_a_start_that_does_not_fit_changes_nothing(make, changes):
     assert (kernel.reason, kernel.cycles, kernel.counts.tolist(), kernel.rng_state.tolist()) == before
 
 
-def test_a_refusal_names_the_column_its_value_and_its_range(make):
-    with pytest.raises(StartError, match=r"^The address of column 2 is 4; it must be from 0 to 3\.$"):
-        make(build()).start(Start(**FINE | {"addresses": (0, 4)}))
-
-
 @pytest.mark.parametrize("codes", [np.full(2, 9), np.full(3, 256)])
 def test_a_written_prior_has_one_code_a_line(make, codes):
     with pytest.raises(StartError):

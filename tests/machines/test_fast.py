@@ -12,12 +12,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from machines import fast, fast_code
-from machines.bm1 import BM1Machine, Start, StopReason
+from machines.bm1 import Start, StopReason
 from machines.errors import MachineError
 from machines.fast import FastBM1
-from machines.parameters import BM1Parameters, RngKind, RngReset, SensorMode
+from machines.parameters import RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
-from tests.machines.random_machines import codes, play, seen, sessions
+from tests.machines.random_machines import machine_of, play, seen, sessions
 from tests.patience import PATIENCE
 
 
@@ -33,17 +33,6 @@ def equals_the_reference(session):
     for kept_bytes in (0, *(1 << kept for kept in (14, 16, 18, 20, 22, 26))):
         quick = FastBM1(session.machine, kept_bytes=kept_bytes)
         assert list(play(quick, session.frames)) == expected
-
-
-def machine_of(lines=20, sensors=3, typical=0.8, zeros=0.0, **changes):
-    threshold = changes.get("sensor_mode") is SensorMode.THRESHOLD
-    parameters = BM1Parameters(
-        **{"lines": lines, "sensor_bits": (8 if threshold else 2,) * sensors, "counter_bits": 32, **changes}
-    )
-    random = np.random.default_rng(11)
-    prior = codes(random, parameters, parameters.prior_addresses, zeros, typical, top=False)
-    tables = () if threshold else tuple(codes(random, parameters, 4, zeros, typical) for _ in range(sensors))
-    return BM1Machine(parameters, prior, tables)
 
 
 def start_of(machine, address=1, **changes):

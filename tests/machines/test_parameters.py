@@ -67,11 +67,6 @@ def test_parameters_of_no_machine_are_refused(changes):
     assert refusal.value.exit_code == 2
 
 
-def test_a_refusal_names_the_parameter_its_value_and_its_range():
-    with pytest.raises(ParameterError, match=r"^sensor_bits of column 2 is 0; it must be from 1 to 16\.$"):
-        BM1Parameters(lines=4, sensor_bits=(3, 0))
-
-
 def test_names_from_a_file_become_members():
     parameters = BM1Parameters(lines=1, sensor_bits=[2], rng="lfsr16", rng_reset="free")
     assert parameters.rng is RngKind.LFSR16

@@ -12,11 +12,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from machines import make_kernel
-from machines.bm1 import BM1Machine, Start, StopReason, joint_reason
+from machines.bm1 import Start, StopReason, joint_reason
 from machines.errors import StartError
-from machines.parameters import BM1Parameters, RngKind, RngReset, SensorMode
+from machines.parameters import RngKind, RngReset
 from machines.reference import ReferenceBM1
-from tests.machines.random_machines import codes, sessions
+from tests.machines.random_machines import machine_of, sessions
 
 
 @pytest.mark.parametrize("examples", [20, pytest.param(50, marks=pytest.mark.thorough)])
@@ -62,25 +62,12 @@ def equals_machines_that_run_alone(session, reference):
         assert together.rng_state.tolist() == longest.rng_state.tolist()
 
 
-def machine_of(replicas=3, mode=SensorMode.COLUMN, *, lines=12, sensors=2, zeros=0.0, **parameters):
-    bits = 8 if mode is SensorMode.THRESHOLD else 2
-    parameters = BM1Parameters(
-        **{
-            "lines": lines,
-            "sensor_bits": (bits,) * sensors,
-            "sensor_mode": mode,
-            "replicas": replicas,
-            **parameters,
-        }
-    )
-    random = np.random.default_rng(5)
-    prior = codes(random, parameters, parameters.prior_addresses, zeros, 0.8, top=False)
-    tables = tuple(codes(random, parameters, 4, zeros, 0.8) for _ in range(sensors))
-    return BM1Machine(parameters, prior, tables if parameters.has_tables else ())
+def replicas_of(count, **parameters):
+    return machine_of(lines=12, sensors=2, **{"replicas": count, "counter_bits": 8, **parameters})
 
 
 def test_a_halted_replica_stays_where_it_is_and_the_generators_go_on(make):
-    running = make(machine_of(rng_reset=RngReset.FREE))
+    running = make(replicas_of(3, rng_reset=RngReset.FREE))
     start = Start(addresses=np.zeros((3, 2), int), target_count=255, max_cycles=2**17, run_until=64)
     assert running.start(start) is StopReason.SLICE
     before = running.counts[1].tolist()
@@ -96,7 +83,7 @@ def test_a_halted_replica_stays_where_it_is_and_the_generators_go_on(make):
     with pytest.raises(StartError):
         running.resume(0)
     states = running.rng_state
-    alone = ReferenceBM1(machine_of(1, rng_reset=RngReset.FREE, counter_bits=32))
+    alone = ReferenceBM1(replicas_of(1, rng_reset=RngReset.FREE, counter_bits=32))
     alone.start(Start(addresses=(0, 0), target_count=2**32 - 1, max_cycles=running.cycles))
     assert alone.rng_state.tolist() == states.tolist()
     # the next frame halts nobody
@@ -133,14 +120,14 @@ def test_the_joint_reason(reasons, halted, joint):
     ],
 )
 def test_a_start_must_fit_the_replicas(make, change):
-    running = make(machine_of(3))
+    running = make(replicas_of(3))
     start = {"addresses": np.zeros((3, 2), int), "target_count": 9, "max_cycles": 9}
     with pytest.raises(StartError):
         running.start(Start(**start | change))
 
 
 def test_the_only_replica_cannot_be_halted(make):
-    alone = make(machine_of(1))
+    alone = make(replicas_of(1))
     alone.start(Start(addresses=(0, 0), target_count=255, max_cycles=2**17, run_until=9))
     with pytest.raises(StartError):
         alone.resume(0, {0})
