@@ -7,24 +7,18 @@ import asyncio
 import contextlib
 import itertools
 import time
-from collections.abc import Callable
-from typing import Any, Self
 
-from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PROCESS_PATIENCE
 
-Answer = list[float] | None
-"""A posterior over 32 x 32 cells; None for a frame without one."""
 
-
-def certain(line: int) -> list[float]:
-    """All of the probability in one cell."""
+def certain(line):
+    """All of the probability in one of 32 x 32 cells."""
     posterior = [0.0] * 1024
     posterior[line] = 1.0
     return posterior
 
 
-def frame_message(stamp: dict[str, int], number: int, *, published: bool) -> dict[str, Any]:
+def frame_message(stamp, number, *, published):
     now = time.time_ns()
     values = {
         "number": number,
@@ -44,51 +38,35 @@ def frame_message(stamp: dict[str, int], number: int, *, published: bool) -> dic
     return {
         "header": {"stamp": stamp, "frame_id": "bm"},
         "status": [
-            {
-                "level": 0,
-                "name": "rosbayes: frame",
-                "message": outcome,
-                "hardware_id": "boat",
-                "values": pairs,
-            },
-            {
-                "level": 0,
-                "name": "rosbayes: board 0",
-                "message": outcome,
-                "hardware_id": "board0",
-                "values": [],
-            },
+            {"level": 0, "name": f"rosbayes: {name}", "message": outcome, "hardware_id": on, "values": told}
+            for name, on, told in (("frame", "boat", pairs), ("board 0", "board0", []))
         ],
     }
 
 
-def posterior_message(values: list[float]) -> dict[str, Any]:
+def posterior_message(values):
     dims = [{"label": "y", "size": 32, "stride": 1024}, {"label": "x", "size": 32, "stride": 32}]
     return {"layout": {"dim": dims, "data_offset": 0}, "data": values}
 
 
 class PretendStack:
-    """Answers the n-th reading (from 1) with `answer(n, message)`; a "silent" one not at all."""
+    """Answers the n-th reading (from 1) with `answer(n, message)`: a posterior, None, or "silent" for no answer."""
 
-    def __init__(
-        self, fake: FakeRosbridge, topic: str, answer: Callable[[int, dict[str, Any]], Answer | str]
-    ) -> None:
+    def __init__(self, fake, topic, answer):
         self.fake = fake
         self.topic = topic
         self.answer = answer
-        self._task: asyncio.Task[None] | None = None
 
-    async def __aenter__(self) -> Self:
+    async def __aenter__(self):
         self._task = asyncio.create_task(self._serve())
         return self
 
-    async def __aexit__(self, *_exception: object) -> None:
-        assert self._task is not None
+    async def __aexit__(self, *_exception):
         self._task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await self._task
 
-    async def _serve(self) -> None:
+    async def _serve(self):
         for number in itertools.count(1):
             await self.fake.wait_for_op("publish", topic=self.topic, count=number, timeout=PROCESS_PATIENCE)
             message = self.fake.ops("publish", topic=self.topic)[number - 1]["msg"]

@@ -30,7 +30,9 @@ def asked(monkeypatch):
 def test_a_robots_name_stands_for_its_uri(command, asked, monkeypatch):
     found = invoke(command, ["--uri", "robot:Zoë"])
     assert (found.exit_code, asked) == (3, ["Zoë"])
+    assert found.stderr.splitlines()[-1].startswith("error: ")
     assert "ws://127.0.0.1:1" in found.stderr
+    assert "Traceback" not in found.stderr
     monkeypatch.setenv("BM_URI", "robot:Adam")
     unknown = invoke(command, [])
     assert (unknown.exit_code, asked) == (3, ["Zoë", "Adam"])

@@ -15,7 +15,7 @@ import sys
 import pytest
 from matplotlib.image import imread
 
-from casestudies.boat import normaliser, simulator, viewer
+from casestudies.boat import viewer
 from casestudies.boat.sensors import map_grid
 from tests.casestudies.pretend_stack import PretendStack, certain, frame_message, posterior_message
 from tests.command_runner import invoke
@@ -169,15 +169,6 @@ def test_a_folder_that_cannot_be_written_is_reported_at_the_start(flag, name, tm
     ended = invoke(viewer.app, ["--uri", "ws://127.0.0.1:1", flag, tmp_path / "file" / name])
     assert ended.exit_code == 2  # an unreachable server is 3
     assert ended.stderr.startswith(f"error: {tmp_path}/file")
-
-
-@pytest.mark.parametrize("module", [simulator, normaliser, viewer])
-def test_an_unreachable_server_is_one_sentence(module, monkeypatch):
-    monkeypatch.setattr("bridge.client.session.FIRST_DELAY", 3600)  # the first attempt is the last
-    ended = invoke(module.app, ["--uri", "ws://127.0.0.1:1"])
-    assert ended.exit_code == 3
-    assert ended.stderr.splitlines()[-1].startswith("error: ")
-    assert "Traceback" not in ended.stderr
 
 
 @pytest.mark.thorough
