@@ -14,6 +14,17 @@ TARGET = ("--uri", "ws://robot:9090", "--topic", "/readings", "--type", "std_msg
 OPTIONS = BuildOptions(uri="ws://robot:9090", topic="/readings", type="std_msgs/Float64MultiArray")
 
 
+TINY = """
+import numpy as np
+from toolchain.models.model import Known, Model, dimension
+
+def model(size: int = 4, bits: int = 0):
+    return Model(name="tiny", searched=(dimension("s", size=size),),
+                 known=(Known(name="K", table=np.full((2, size), 0.5), bits=bits),))
+"""
+"""A `MODEL` of the fixture `case`: one known variable that tells nothing."""
+
+
 def toolchain(*arguments):
     """Run the command; the result has `exit_code`, `stdout` and `stderr`."""
     return invoke(app, arguments)

@@ -10,18 +10,11 @@ import pytest
 
 from pcie_shim.programming_file import read_image
 from tests.patience import PROCESS_PATIENCE
-from tests.toolchain.running import TARGET, assert_refused, done, toolchain
+from tests.toolchain.running import TARGET, TINY, assert_refused, done, toolchain
 from toolchain.deployment import load_deployment
 from toolchain.outputs.mif import read_mif
 
-MODEL = """
-import numpy as np
-from toolchain.models.model import Known, Model, dimension
-
-def model(size: int = 4):
-    return Model(name="tiny", searched=(dimension("s", size=size),),
-                 known=(Known(name="K", table=np.full((2, size), 0.5)),))
-"""
+MODEL = TINY
 BOAT = Path(__file__).parents[2] / "casestudies" / "boat"
 
 

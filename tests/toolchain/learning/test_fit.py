@@ -357,24 +357,22 @@ def model():
 """
 
 
+def fitted_gas(folder, model, learnt, checked, *options):
+    """What `fit` says of rows (state, reading), and its last confusion matrix in words."""
+    (folder / "model.py").write_text(model)
+    for name, rows in (("learn.csv", learnt), ("check.csv", checked)):
+        (folder / name).write_text("gas,sensor\n" + "".join(f"{state},{value}\n" for state, value in rows))
+    out = ("-o", folder / "fit.npz", "--method", "counts", "--check", folder / "check.csv", *options)
+    said = done(toolchain("fit", folder, folder / "learn.csv", "--truth", "gas=gas", *out)).stdout
+    return said, [line.split() for line in said.split("fitted, gas: ", 1)[1].splitlines()[1:5]]
+
+
 def test_labels_have_a_confusion_matrix_and_no_distances(tmp_path):
-    (tmp_path / "gas").mkdir()
-    (tmp_path / "gas" / "model.py").write_text(LABELS)
     rows = [("air", 0)] * 4 + [("smoke", 1)] * 3 + [("smoke", 0)] + [("methane", 2)] * 2
-    text = "gas,sensor\n" + "".join(f"{state},{reading}\n" for state, reading in rows)
-    (tmp_path / "learn.csv").write_text(text)
-    (tmp_path / "check.csv").write_text(text)
-    out = ("-o", tmp_path / "fit.npz", "--method", "counts", "--learn-prior")
-    result = done(
-        toolchain(
-            *("fit", tmp_path / "gas", tmp_path / "learn.csv", "--truth", "gas=gas", *out),
-            *("--check", tmp_path / "check.csv"),
-        )
-    )
-    assert "distance" not in result.stdout
-    assert "accuracy 90.0% (most probable cell, 9 of 10)" in result.stdout
-    matrix = result.stdout.split("fitted, gas: ", 1)[1].splitlines()[1:5]
-    assert [line.split() for line in matrix] == [
+    said, matrix = fitted_gas(tmp_path, LABELS, rows, rows, "--learn-prior")
+    assert "distance" not in said
+    assert "accuracy 90.0% (most probable cell, 9 of 10)" in said
+    assert matrix == [
         ["air", "smoke", "methane"],
         ["air", "4", "0", "0"],
         ["smoke", "1", "3", "0"],
@@ -384,20 +382,11 @@ def test_labels_have_a_confusion_matrix_and_no_distances(tmp_path):
 
 
 def test_rows_that_a_model_regards_as_impossible_count_as_wrong(tmp_path):
-    (tmp_path / "gas").mkdir()
     model = LABELS.replace("[0.1, 0.1, 0.6]", "[0.1, 0.1, 0.6], [0, 0, 0]")
-    (tmp_path / "gas" / "model.py").write_text(model)
-    (tmp_path / "learn.csv").write_text("gas,sensor\nair,0\nsmoke,1\n")
-    (tmp_path / "check.csv").write_text("gas,sensor\nair,0\nair,3\n")
-    out = ("-o", tmp_path / "fit.npz", "--method", "counts", "--check", tmp_path / "check.csv")
-    result = done(toolchain("fit", tmp_path / "gas", tmp_path / "learn.csv", "--truth", "gas=gas", *out))
-    assert "accuracy 50.0% (most probable cell, 1 of 2)" in result.stdout
-    assert result.stdout.count("rows impossible in this model, which count as wrong: 1") == 2
-    matrix = result.stdout.split("fitted, gas: ", 1)[1].splitlines()[1:3]
-    assert [line.split() for line in matrix] == [
-        ["air", "smoke", "methane", "none"],
-        ["air", "1", "0", "0", "1"],
-    ]
+    said, matrix = fitted_gas(tmp_path, model, [("air", 0), ("smoke", 1)], [("air", 0), ("air", 3)])
+    assert "accuracy 50.0% (most probable cell, 1 of 2)" in said
+    assert said.count("rows impossible in this model, which count as wrong: 1") == 2
+    assert matrix[:2] == [["air", "smoke", "methane", "none"], ["air", "1", "0", "0", "1"]]
 
 
 def test_the_command_counts(corridor):
