@@ -4,7 +4,6 @@ A model is checked with its build options, a deployment with the codes of its im
 exact: a frame with an impossible reading ends as `impossible` on the machine, and a dead line never counts.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
@@ -117,15 +116,12 @@ def variable_findings(deployment: Deployment) -> Iterator[Finding]:
 
 
 def _same_readings(deployment: Deployment) -> Iterator[Finding]:
-    # A bare name as a path is searched for like the name itself.
-    paths = Counter((variable.source, variable.path or variable.name) for variable in deployment.variables)
-    for (source, path), count in paths.items():
-        if count > 1:
-            names = [
-                variable.name
-                for variable in deployment.variables
-                if (variable.source, variable.path or variable.name) == (source, path)
-            ]
+    readers: dict[tuple[int, str], list[str]] = {}
+    for variable in deployment.variables:
+        # A bare name as a path is searched for like the name itself.
+        readers.setdefault((variable.source, variable.path or variable.name), []).append(variable.name)
+    for (_, path), names in readers.items():
+        if len(names) > 1:
             yield warning(
                 Check.SAME_READING,
                 " and ".join(names),
@@ -148,24 +144,17 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
                 ),
                 f"use --bits {variable.name}={needed}",
             )
-        if variable.period is not None and variable.period > variable.values:
-            yield warning(
-                Check.RANGE,
-                variable.name,
-                (
-                    f"its readings wrap around after {variable.period} steps, but only {variable.values} are served: those from "
-                    f"{variable.offset + variable.values * variable.step:g} on are out of range"
-                ),
-                f"give it {variable.period} values, or a period of {variable.values}",
+        if variable.period is not None and variable.period != variable.values:
+            wrong = (
+                f"but only {variable.values} are served: those from "
+                f"{variable.offset + variable.values * variable.step:g} on are out of range"
+                if variable.period > variable.values
+                else f"so that the last {variable.values - variable.period} of its {variable.values} values never occur"
             )
-        if variable.period is not None and variable.period < variable.values:
             yield warning(
                 Check.RANGE,
                 variable.name,
-                (
-                    f"its readings wrap around after {variable.period} steps, so that the last "
-                    f"{variable.values - variable.period} of its {variable.values} values never occur"
-                ),
+                f"its readings wrap around after {variable.period} steps, {wrong}",
                 f"give it {variable.period} values, or a period of {variable.values}",
             )
         if variable.on_range == "missing" and variable.on_missing == "error":

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Final
 
 from pcie_shim.programming_file import Image
+from toolchain.building.machine import MACHINE_KEYS
 from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source, Variable
 from toolchain.hardware.sources import PARAMETERS
 from toolchain.outputs.memories import Memory, memories
@@ -53,18 +54,8 @@ def _deployment(image: Image) -> Deployment:
         machine=MachineSection(
             lines=total,
             interface=f"{image.interface_sensors}x{image.interface_results}",
-            prob_bits=parameters.prob_bits,
-            prior_bits=parameters.prior_bits,
-            prior_mode=parameters.prior_mode,
-            counter_bits=parameters.counter_bits,
-            rng=parameters.rng,
-            rng_banks=parameters.rng_banks,
-            rng_reset=parameters.rng_reset,
-            shared=parameters.shared,
-            steps_per_clock=parameters.steps_per_clock,
             target_count=min(255, parameters.target_count_max),
-            sensor_mode=parameters.sensor_mode,
-            replicas=parameters.replicas,
+            **{key: getattr(parameters, key) for key in MACHINE_KEYS},
         ),
         boards=(
             BoardSection(image="boards/board0.bm", image_hash=image.image_hash, line_offset=0, lines=total),

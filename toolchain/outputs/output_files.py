@@ -8,7 +8,7 @@ from enum import StrEnum
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 from machines.parameters import RngKind
 from pcie_shim.programming_file import Image, image_bytes
@@ -119,11 +119,14 @@ class Change(StrEnum):
     REMOVED = "removed"
 
 
+Pieces: TypeAlias = Callable[[], Iterable[bytes]]
+
+
 @dataclass(frozen=True, slots=True)
 class OutputFiles:
     """A part of a deployment: its files, and a pattern for files of earlier builds."""
 
-    contents: dict[str, Callable[[], Iterable[bytes]]]
+    contents: dict[str, Pieces]
     """Functions that return the content in pieces, by the path in the deployment's folder."""
     own: re.Pattern[str]
     """Paths of this part; files that are not in `contents` are removed."""
@@ -140,9 +143,7 @@ _PROJECT: Final = re.compile(rf"{PROJECT}\.(qpf|tcl)|{PROJECT}_board\d+\.qsf")
 
 def memory_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
     """Return `bm1_parameters.vhd` and the MIFs (thesis 3.2)."""
-    contents: dict[str, Callable[[], Iterable[bytes]]] = {
-        PARAMETERS_FILE: lambda: [parameters_vhd(deployment, images).encode()]
-    }
+    contents: dict[str, Pieces] = {PARAMETERS_FILE: lambda: [parameters_vhd(deployment, images).encode()]}
     for memory in memories(deployment, images):
         contents[f"{MEMORIES_FOLDER}/{memory.name}"] = partial(_encoded, memory)
     return OutputFiles(contents, _MEMORIES)
@@ -153,18 +154,14 @@ def quartus_files(deployment: Deployment, images: Sequence[Image]) -> OutputFile
     if deployment.machine.rng is RngKind.IDEAL:
         return OutputFiles({}, _PROJECT)
     mifs = [f"{MEMORIES_FOLDER}/{memory.name}" for memory in memories(deployment, images)]
-    contents: dict[str, Callable[[], Iterable[bytes]]] = {}
-    for name, text in project_files(deployment, mifs).items():
-        contents[name] = partial(iter, [text.encode()])
-    return OutputFiles(contents, _PROJECT)
+    texts = project_files(deployment, mifs)
+    return OutputFiles({name: partial(iter, [text.encode()]) for name, text in texts.items()}, _PROJECT)
 
 
 def image_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
     """Return the programming files."""
-    contents: dict[str, Callable[[], Iterable[bytes]]] = {
-        board.image: partial(_image, image) for board, image in zip(deployment.boards, images, strict=True)
-    }
-    return OutputFiles(contents, _IMAGES)
+    pairs = zip(deployment.boards, images, strict=True)
+    return OutputFiles({board.image: partial(_image, image) for board, image in pairs}, _IMAGES)
 
 
 def text_file(name: str, text: str) -> OutputFiles:
@@ -174,48 +171,37 @@ def text_file(name: str, text: str) -> OutputFiles:
 
 def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
     """Write the files of a part atomically; return every path, sorted, and its change."""
-    changes: dict[str, Change] = {}
-    for name, pieces in files.contents.items():
-        changes[name] = _write(directory / name, pieces)
-    for name in _existing(directory, files.own):
-        if name not in files.contents:
-            _remove(directory / name)
-            changes[name] = Change.REMOVED
-    return sorted(changes.items())
+    return _changes(directory, files, _write, _remove)
 
 
 def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
     """Return the changes that `write_files` would make; files that differ only in comments are unchanged."""
-    changes: dict[str, Change] = {}
-    for name, pieces in files.contents.items():
-        path = directory / name
-        if not path.is_file():
-            changes[name] = Change.NEW
-        else:
-            changes[name] = Change.UNCHANGED if _has_same_lines(path, pieces()) else Change.CHANGED
-    for name in _existing(directory, files.own):
-        if name not in files.contents:
-            changes[name] = Change.REMOVED
+    return _changes(directory, files, _compare, lambda _: None)
+
+
+def _changes(
+    directory: Path,
+    files: OutputFiles,
+    of_file: Callable[[Path, Pieces], Change],
+    remove: Callable[[Path], None],
+) -> list[tuple[str, Change]]:
+    changes = {name: of_file(directory / name, pieces) for name, pieces in files.contents.items()}
+    for folder in ("", "boards", PARAMETERS_FILE.partition("/")[0], MEMORIES_FOLDER):
+        for path in sorted((directory / folder).glob("*")):
+            name = path.relative_to(directory).as_posix()
+            if files.own.fullmatch(name) and name not in files.contents:
+                remove(path)
+                changes[name] = Change.REMOVED
     return sorted(changes.items())
 
 
-def _existing(directory: Path, own: re.Pattern[str]) -> list[str]:
-    folders = [
-        directory,
-        directory / "boards",
-        directory / PARAMETERS_FILE.partition("/")[0],
-        directory / MEMORIES_FOLDER,
-    ]
-    names = [
-        path.relative_to(directory).as_posix()
-        for folder in folders
-        if folder.is_dir()
-        for path in folder.iterdir()
-    ]
-    return sorted(name for name in names if own.fullmatch(name))
+def _compare(path: Path, pieces: Pieces) -> Change:
+    if not path.is_file():
+        return Change.NEW
+    return Change.UNCHANGED if _has_same_lines(path, pieces()) else Change.CHANGED
 
 
-def _write(path: Path, pieces: Callable[[], Iterable[bytes]]) -> Change:
+def _write(path: Path, pieces: Pieces) -> Change:
     with whole_file(path, BuildError) as partial:
         path.parent.mkdir(parents=True, exist_ok=True)
         with partial.open("wb") as file:
