@@ -73,6 +73,7 @@ def _slashed(name):
     return name if isinstance(name, str) and name.startswith("/") else f"/{name}"
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class FakeRosbridge:
     """A fake server on a port of this machine.
 
@@ -85,32 +86,19 @@ class FakeRosbridge:
         connections: how many connections were ever made.
     """
 
-    def __init__(
-        self,
-        *,
-        port=0,
-        ros=2,
-        rosapi=False,
-        statuses=False,
-        refuses_null=False,
-        zombies=False,
-        escapes=False,
-        silent=False,
-        delay=0.0,
-        refuses=None,
-        max_size=None,
-    ):
-        self.port = port
-        self.ros = ros
-        self.rosapi = rosapi
-        self.statuses = statuses
-        self.refuses_null = refuses_null
-        self.zombies = zombies
-        self.escapes = escapes
-        self.silent = silent
-        self.delay = delay
-        self.refuses = refuses
-        self.max_size = max_size
+    port: int = 0
+    ros: int = 2
+    rosapi: bool = False
+    statuses: bool = False
+    refuses_null: bool = False
+    zombies: bool = False
+    escapes: bool = False
+    silent: bool = False
+    delay: float = 0.0
+    refuses: int | None = None
+    max_size: int | None = None
+
+    def __post_init__(self):
         self.received = []
         self.connections = 0
         self.types = {}
