@@ -453,6 +453,30 @@ def build_boat(directory, *options, cells=8, partitions=4):
     return build(ROOT / "casestudies/boat", directory, "--partitions", str(partitions), *size, *options)
 
 
+CORRIDOR = """
+import numpy as np
+from toolchain.models.model import Known, Model, dimension
+
+def known(name, step=1.0, values=256, **more):
+    likely = np.full((values, 4), 0.2 / (values - 1))
+    likely[2 * np.arange(4), np.arange(4)] = 0.8  # reading number 2 s in place s
+    return Known(name=name, table=likely, step=step, **more)
+
+def model():
+    return Model(name="corridor", searched=(dimension("s", size=4),), known=({known}))
+"""
+
+
+def build_corridor(where, known, sources, *options):
+    """A robot in one of four places, its variables and sources as Python and TOML."""
+    case = where / "corridor"
+    case.mkdir(exist_ok=True)
+    (case / "model.py").write_text(CORRIDOR.replace("{known}", known))
+    (where / "sources.toml").write_text(sources)
+    toolchain("build", case, "-o", where / "out", "--sources", where / "sources.toml", *options)
+    return where / "out"
+
+
 def the_boat(tmp_path_factory):
     """A folder that the first of all workers makes; nobody changes it."""
     shared = tmp_path_factory.getbasetemp()

@@ -14,35 +14,15 @@ import pytest
 from bridge.client import connect
 from bridge.stamps import header
 from posteriors.listening import posteriors
-from tests.integration.conftest import toolchain
+from tests.integration.conftest import build_corridor
 from tests.patience import PROCESS_PATIENCE
 
-MODEL = """
-import numpy as np
-from toolchain.models.model import Known, Model, dimension
-
-def known(name, **more):
-    likely = np.full((256, 4), 0.2 / 255)
-    likely[2 * np.arange(4), np.arange(4)] = 0.8  # reading number 2 s in place s
-    return Known(name=name, table=likely, **more)
-
-def model():
-    return Model(name="corridor", searched=(dimension("s", size=4),), known=(
-        known("near"), known("red", on_missing="missing")))
-"""
+KNOWN = 'known("near"), known("red", on_missing="missing")'
 SOURCES = """
-[[source]]
-uri = "{uri}"
-topic = "/range"
-type = "sensor_msgs/Range"
-variables = {{ near = "range" }}
-
-[[source]]
-uri = "{uri}"
-topic = "/camera"
-type = "sensor_msgs/Image"
-variables = {{ red = "data[0]" }}
-{more}
+source = [
+    {{ uri = "{uri}", topic = "/range", type = "sensor_msgs/Range", variables = {{ near = "range" }} }},
+    {{ uri = "{uri}", topic = "/camera", type = "sensor_msgs/Image", variables = {{ red = "data[0]" }}{more} }},
+]
 """
 PICTURE = np.zeros((480, 640, 3), np.uint8).tobytes()
 
@@ -88,14 +68,9 @@ async def robot(uri):
 async def test_results_go_on_beside_a_camera_with_large_pictures(stage, key, flags, environment, said):
     hub = stage.start("hub", "--port", "0", "--message-bytes", "4000000")
     uri = (await hub.says(r"ws://\S+"))[0]
-    case = stage.where / "corridor"
-    case.mkdir()
-    (case / "model.py").write_text(MODEL)
-    sources = stage.where / "sources.toml"
-    sources.write_text(SOURCES.format(uri=uri, more=key))
-    toolchain("build", case, "-o", stage.where / "out", "--sources", sources)
+    deployment = build_corridor(stage.where, KNOWN, SOURCES.format(uri=uri, more=key and f", {key}"))
     async with robot(uri), connect(uri) as ros, posteriors(ros) as heard:
-        command = ("master", "--loop", "-d", str(stage.where / "out"), *flags)
+        command = ("master", "--loop", "-d", str(deployment), *flags)
         master = stage.start(*command, environment=environment | {"BM_RUN_DIRECTORY": str(stage.runs)})
         if said:
             await master.says(said)

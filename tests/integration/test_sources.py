@@ -18,48 +18,19 @@ from bridge.errors import BridgeError
 from bridge.stamps import header
 from posteriors.listening import posteriors
 from tests.fake_rosbridge import FakeRosbridge
-from tests.integration.conftest import only_error, toolchain
+from tests.integration.conftest import build_corridor, only_error
 from tests.patience import PROCESS_PATIENCE
 
-MODEL = """
-import numpy as np
-from toolchain.models.model import Known, Model, dimension
-
-def known(name, step, values, offset=0.0):
-    likely = np.full((values, 4), 0.2 / (values - 1))
-    likely[2 * np.arange(4), np.arange(4)] = 0.8  # reading number 2 s in place s
-    return Known(name=name, table=likely, step=step, offset=offset)
-
-def model():
-    return Model(name="corridor", searched=(dimension("s", size=4),), known=(
-        known("near", 0.5, 8), known("left", 0.25, 8), known("ahead", 1.0, 8),
-        known("turn", 0.5, 8, offset=-2.0), known("cell", 1.0, 8)))
-"""
+KNOWN = """
+    known("near", 0.5, 8), known("left", 0.25, 8), known("ahead", 1.0, 8),
+    known("turn", 0.5, 8, offset=-2.0), known("cell", 1.0, 8)"""
 SOURCES = """
-[[source]]
-uri = "{one}"
-topic = "/range"
-type = "sensor_msgs/Range"
-variables = {{ near = "range" }}
-
-[[source]]
-uri = "{two}"
-topic = "/scan"
-type = "sensor_msgs/LaserScan"
-compression = "cbor"
-variables = {{ left = "ranges[90]", ahead = "ranges[0]" }}
-
-[[source]]
-uri = "{two}"
-topic = "/imu"
-type = "sensor_msgs/Imu"
-variables = {{ turn = "angular_velocity.z" }}
-
-[[source]]
-uri = "{one}"
-topic = "/cells"
-type = "std_msgs/UInt8MultiArray"
-variables = {{ cell = "data[2]" }}
+source = [
+    {{ uri = "{one}", topic = "/range", type = "sensor_msgs/Range", variables = {{ near = "range" }} }},
+    {{ uri = "{two}", topic = "/scan", type = "sensor_msgs/LaserScan", compression = "cbor", variables = {{ left = "ranges[90]", ahead = "ranges[0]" }} }},
+    {{ uri = "{two}", topic = "/imu", type = "sensor_msgs/Imu", variables = {{ turn = "angular_velocity.z" }} }},
+    {{ uri = "{one}", topic = "/cells", type = "std_msgs/UInt8MultiArray", variables = {{ cell = "data[2]" }} }},
+]
 """
 ADDRESSES = [4, 4, 4, 4, 4]
 """Readings of a robot in place 2, in the order of the columns."""
@@ -129,14 +100,8 @@ async def robots(stage):
 
 @pytest.fixture
 def deployment(stage, robots):
-    case = stage.where / "corridor"
-    case.mkdir()
-    (case / "model.py").write_text(MODEL)
-    sources = stage.where / "sources.toml"
     one, two = robots.uris
-    sources.write_text(SOURCES.format(one=one, two=two))
-    toolchain("build", case, "-o", stage.where / "out", "--sources", sources, "--tolerance", "0.5")
-    return stage.where / "out"
+    return build_corridor(stage.where, KNOWN, SOURCES.format(one=one, two=two), "--tolerance", "0.5")
 
 
 @pytest.mark.process
@@ -156,9 +121,8 @@ async def test_the_subscriber_alone(stage, deployment):
             (operation,) = server.ops("subscribe", topic=topic)
             assert operation.get("compression") == asked
     # and a beam that does not exist
-    sources = stage.where / "sources.toml"
-    sources.write_text(sources.read_text().replace("ranges[90]", "ranges[360]"))
-    toolchain("build", stage.where / "corridor", "-o", deployment, "--sources", sources)
+    sources = (stage.where / "sources.toml").read_text().replace("ranges[90]", "ranges[360]")
+    build_corridor(stage.where, KNOWN, sources)
     subscriber = stage.start("subscriber", "-d", str(deployment))
     assert await subscriber.end() == 4
     assert "/scan: the message has no field 'ranges[360]'" in only_error(subscriber)
