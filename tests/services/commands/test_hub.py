@@ -24,7 +24,6 @@ TOKEN = "correct-horse-battery-staple"
     ("arguments", "said"),
     [
         (("--host", EVERYWHERE), "--tls-cert and --tls-key and --token-file, or --insecure"),
-        (("--host", "::"), "--insecure"),
         (("--host", "robot.example"), "--insecure"),
         (("--tls-cert", "cert.pem"), "--tls-key"),
         (("--tls-cert", "missing.pem", "--tls-key", "missing.pem"), "missing.pem"),

@@ -163,10 +163,7 @@ async def test_a_run_is_open_to_questions_until_its_end(boat, tmp_path, monkeypa
     assert given["stages"]() == []
     run.flow.end.set_result(None)
     assert await running == 0
-    assert (peers.start.await_args.args, peers.leave.await_count, peers.end.await_count) == (
-        (run.flow,),
-        1,
-        1,
-    )
+    assert peers.start.await_args.args == (run.flow,)
+    assert (peers.leave.await_count, peers.end.await_count) == (1, 1)
     assert len(capsys.readouterr().err.splitlines()) == (not once)
     assert log.call_args.args == ("master", "debug")

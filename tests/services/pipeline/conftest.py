@@ -4,7 +4,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from services.sockets.records import Notice, Ready
-from tests.patience import PATIENCE
+from tests.services.conftest import until
 
 
 @asynccontextmanager
@@ -40,16 +40,11 @@ class RecordingLink:
         self.sent.append(record)
         return True
 
-    keep = send
+    keep, until = send, staticmethod(until)
 
     def of(self, kind):
         """The records of a kind that were sent."""
         return [each for each in self.sent if isinstance(each, kind)]
-
-    async def until(self, true):
-        async with asyncio.timeout(PATIENCE):
-            while not true():
-                await asyncio.sleep(0.001)
 
     def notice(self, level, sentence):
         self.send(Notice(level, sentence))

@@ -13,6 +13,7 @@ from services.sockets.status import why_not_connected
 from tests.bridge.hub.sockets import running_hub
 from tests.certificates import issue
 from tests.patience import PATIENCE
+from tests.services.conftest import until
 
 
 async def test_a_certificate_that_only_the_settings_know(tmp_path):
@@ -46,9 +47,7 @@ async def test_a_server_that_is_waited_for_is_named(unused_tcp_port):
         connecting = asyncio.create_task(
             connect_all(stack, Settings(connect_timeout=PATIENCE), [uri], by_uri)
         )
-        async with asyncio.timeout(PATIENCE):
-            while not (by_uri and by_uri[uri].last_error):
-                await asyncio.sleep(0.01)
+        await until(lambda: by_uri and by_uri[uri].last_error)
         assert uri in why_not_connected(by_uri)
         async with running_hub(port=unused_tcp_port):
             await connecting

@@ -88,11 +88,9 @@ class Stage:
 
     async def sent(self, kind, count=1):
         """The records of a kind, once there are `count`."""
-        async with asyncio.timeout(PATIENCE):
-            while len(found := [each for each in self.link.sent if isinstance(each, kind)]) < count:
-                await asyncio.sleep(0.001)
-        assert len(found) == count
-        return found
+        await self.link.until(lambda: len(self.link.of(kind)) >= count)
+        assert len(self.link.of(kind)) == count
+        return self.link.of(kind)
 
 
 @pytest.fixture
@@ -130,10 +128,8 @@ async def test_a_master_gets_no_result_of_a_former_one(stage):
     stage.link.take(frame(1))
     assert stage.boards.frames == [1]  # the boards are busy
     stage.boards.finish()
-    async with asyncio.timeout(PATIENCE):
-        while stage.boards.frames != [1, 1]:
-            await asyncio.sleep(0.001)
-    assert not any(isinstance(each, FrameResult) for each in stage.link.sent)
+    await stage.link.until(lambda: stage.boards.frames == [1, 1])
+    assert not stage.link.of(FrameResult)
     stage.boards.finish()
     await stage.sent(FrameResult)
 

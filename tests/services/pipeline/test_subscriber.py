@@ -47,22 +47,17 @@ def test_unpaired_messages_are_reported_once_and_a_wait_ends_by_itself(boat, lin
     sources = source, source.model_copy(update={"topic": "/second"})
     deployment = boat.model_copy(update={"sources": sources, "variables": variables, "tolerance_s": 0.02})
 
-    def readings():
-        return [each for each in link.sent if isinstance(each, Reading)]
-
     async def read():
         subscriber = Subscriber(Settings(), deployment, link.make)
         for at, stamp in ((1, 1), (1, 2), (0, 3), (1, 4), (0, 5)):  # two, one
             stamped = READING | {"header": {"stamp": {"sec": stamp, "nanosec": 0}}}
             now = time.monotonic_ns()
             subscriber._read(at, Message("/t", stamped, now, now))
-        async with asyncio.timeout(PATIENCE):
-            while len(readings()) < 2:  # the last one waits for the second topic
-                await asyncio.sleep(0.001)
+        await link.until(lambda: len(link.of(Reading)) == 2)  # the last one waits for the second topic
         assert subscriber.status().frames.lost == {LossReason.UNPAIRED: 3}
 
     asyncio.run(read())
-    assert [reading.unpaired for reading in readings()] == [2, 1]
+    assert [reading.unpaired for reading in link.of(Reading)] == [2, 1]
 
 
 def test_readings_without_a_master_are_counted_as_passed_over(boat, link, monkeypatch):

@@ -30,13 +30,6 @@ def sets_of(needed, arrivals, tolerance=TOLERANCE):
     return sets, synchroniser
 
 
-def test_equal_stamps_make_one_set_of_optional_topics():
-    arrivals = [(at, 1000 + 100 * turn, 1000 + 100 * turn + at) for turn in range(3) for at in range(4)]
-    sets, synchroniser = sets_of([False] * 4, arrivals)
-    assert sets == [dict.fromkeys(range(4), 1000 + 100 * turn) for turn in range(3)]
-    assert synchroniser.unpaired == 0
-
-
 def test_a_set_is_complete_with_its_last_message():
     synchroniser = Synchroniser([False] * 2, TOLERANCE)
     synchroniser.add(0, 0, 5, "a")

@@ -12,6 +12,7 @@ from services.sockets.local_socket import RecordProtocol, open_connection, own_h
 from services.sockets.records import Hello, Notice, Trouble
 from services.sockets.serving import MasterLink, outdated
 from tests.patience import PATIENCE
+from tests.services.conftest import until
 from toolchain.building.regenerate import DeploymentEdits, regenerate_deployment
 from toolchain.deployment import load_deployment
 
@@ -35,12 +36,6 @@ def test_only_a_restart_would_help(changed):
     assert outdated(before, Trouble(2, "no greeting")) is None
     shutil.rmtree(now.directory)
     assert outdated(before, own_hello("master", now.hash)) is None
-
-
-async def until(true):
-    async with asyncio.timeout(PATIENCE):
-        while not true():
-            await asyncio.sleep(0.01)
 
 
 class Served:

@@ -28,11 +28,13 @@ def get_status():
     return ProcessStatus(ready=True, why="all is well", frames=counts(7))
 
 
-async def test_a_process_identifies_itself(tmp_path):
+async def test_a_process_identifies_itself_and_says_what_it_uses(tmp_path):
     with serve_status_in_thread(tmp_path, "pcie-app", get_status):
         found = await read_process_status(status_socket(tmp_path, "pcie-app"), PATIENCE)
     assert (found.name, found.pid, found.version) == ("pcie-app", os.getpid(), VERSION)
     assert (found.ready, found.why, found.frames) == (True, "all is well", counts(7))
+    assert found.cpu_s > 0
+    assert 10e6 < found.memory_bytes < 10e9
     assert not list(tmp_path.iterdir())
 
 
@@ -76,37 +78,24 @@ def test_stale_sockets_are_removed_and_live_ones_stay(tmp_path):
         assert sorted(path.name for path in tmp_path.iterdir()) == ["board0.sock", "board0.status.sock"]
 
 
-def test_a_rate_is_of_the_last_seconds(monkeypatch):
+@pytest.mark.parametrize(
+    ("completed", "rate"),
+    [
+        ([30] * 20 + [5] * 6, 5),  # it is slower now, and the past does not count any more
+        ([0, 0, 0, 10, 10], 10),  # nor does the time before the first result
+    ],
+)
+def test_a_rate_is_of_the_last_seconds(monkeypatch, completed, rate):
     now = [100.0]
     monkeypatch.setattr(reporting.time, "monotonic", lambda: now[0])
     done = [0]
     report = Report("pcie-app", lambda: ProcessStatus(ready=True, why="", frames=counts(done[0])))
-    for seconds, a_second in ((20, 30), (6, 5)):  # it is slower now, and the past does not count any more
-        for _ in range(seconds):
-            report.sample(ServiceManager())
-            now[0] += 1
-            done[0] += a_second
-    found = msgspec.json.decode(report.answer(), type=ProcessStatus)
-    assert (found.frames.rate, found.uptime_s) == (5, 26)
-
-
-def test_a_rate_does_not_count_the_time_before_the_first_result(monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr(reporting.time, "monotonic", lambda: now[0])
-    done = [0]
-    report = Report("pcie-app", lambda: ProcessStatus(ready=True, why="", frames=counts(done[0])))
-    for a_second in (0, 0, 0, 10, 10):
+    for a_second in completed:
         report.sample(ServiceManager())
         now[0] += 1
         done[0] += a_second
-    assert report.status().frames.rate == 10
-
-
-async def test_a_process_says_what_it_uses(tmp_path):
-    with serve_status_in_thread(tmp_path, "pcie-app", get_status):
-        found = await read_process_status(status_socket(tmp_path, "pcie-app"), PATIENCE)
-    assert found.cpu_s > 0
-    assert 10e6 < found.memory_bytes < 10e9
+    found = msgspec.json.decode(report.answer(), type=ProcessStatus)
+    assert (found.frames.rate, found.uptime_s) == (rate, len(completed))
 
 
 def test_the_age_of_nothing_is_none():
