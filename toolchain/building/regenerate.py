@@ -234,12 +234,9 @@ def _listed(values: Sequence[object]) -> str:
 def _with_places(new: Deployment, old: Deployment) -> Deployment:
     """Return the new deployment with the servers, topics, paths and endpoints of the old one."""
     before = {variable.name: variable for variable in old.variables}
+    kept = ("sources", "outputs", "queue", "tolerance_s", "prior", "directory")
     deployment = new.replace(
-        sources=old.sources,
-        outputs=old.outputs,
-        queue=old.queue,
-        tolerance_s=old.tolerance_s,
-        prior=old.prior,
+        **{key: getattr(old, key) for key in kept},
         variables=tuple(
             variable.replace(source=before[variable.name].source, path=before[variable.name].path)
             for variable in new.variables
@@ -248,6 +245,5 @@ def _with_places(new: Deployment, old: Deployment) -> Deployment:
             board.replace(endpoint=other.endpoint)
             for board, other in zip(new.boards, old.boards, strict=True)
         ),
-        directory=old.directory,
     )
     return with_hash(deployment)

@@ -8,10 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from pcie_shim.errors import PcieShimError
 from pcie_shim.programming_file import Image
+from toolchain.analysis.emulation import joined
 from toolchain.building.build import assemble, check_agreement, read_images
 from toolchain.building.machine import MachinePlan, partition_lines, plan_machine
 from toolchain.building.options import BuildOptions
@@ -61,16 +60,8 @@ def refusal(reason: Exception, about: str) -> Finding:
 
 
 def _machine(deployment: Deployment, images: Sequence[Image], model: Model | None) -> CheckedMachine:
-    machines = [image.machine for image in images]
-    return CheckedMachine(
-        deployment=deployment,
-        board=machines[0],
-        prior=np.hstack([machine.prior for machine in machines]),
-        tables=tuple(
-            np.hstack(tables) for tables in zip(*(machine.tables for machine in machines), strict=True)
-        ),
-        model=model,
-    )
+    whole = joined([image.machine for image in images])
+    return CheckedMachine(deployment, images[0].machine, whole.prior, whole.tables, model)
 
 
 def _check(machine: CheckedMachine) -> Iterator[Finding]:

@@ -142,11 +142,11 @@ class _Reader:
         return sizes["WIDTH"], sizes["DEPTH"], radices["ADDRESS_RADIX"], radices["DATA_RADIX"]
 
     def _entry(self, words: list[int | None], width: int, address_radix: str, data_radix: str) -> None:
-        line = self._line
-        first = last = None
-        if self._word == "[":
+        line, is_range = self._line, self._word == "["
+        if is_range:
             self._next()
-            first = self._address(address_radix, len(words))
+        first = last = self._address(address_radix, len(words))
+        if is_range:
             if self._kind != "dots":
                 self._refuse("'..' between the ends of a range")
             self._next()
@@ -154,8 +154,6 @@ class _Reader:
             if last < first:
                 self._fail(f"the range ends at address {last}, before it begins at {first}")
             self._expect("]")
-        else:
-            first = self._address(address_radix, len(words))
         self._expect(":")
         values: list[int] = []
         while self._word != ";":
@@ -164,7 +162,7 @@ class _Reader:
                 self._fail(f"the entry of line {line} has more words than the memory, which has {len(words)}")
         if not values:
             self._refuse("a word after ':'")
-        end = first + len(values) - 1 if last is None else last
+        end = last if is_range else first + len(values) - 1
         if end >= len(words):
             self._fail(
                 f"the entry of line {line} goes on to address {end}, but the last one is {len(words) - 1}"
@@ -205,9 +203,7 @@ class _Reader:
     def _tokenise(self, text: str) -> Iterator[tuple[str, str]]:
         for match in _TOKEN.finditer(text):
             kind = match.lastgroup
-            if kind == "newline":
-                self._line += 1
-            elif kind == "comment":
+            if kind in {"newline", "comment"}:
                 self._line += match[0].count("\n")
             elif kind == "other":
                 if match[0] == "%":

@@ -144,24 +144,18 @@ def _generators(image: Image) -> str:
     text = _section("The random number generators") + _constant(
         "RNG_KIND", "rng_kind_t", f"RNG_{parameters.rng.upper()}"
     )
+    width, taps = seed_width(image.machine), 0
+    state, polynomial = "of a generator's state: a place in the table", "no LFSR"
     if exponents is not None:
         taps = sum(1 << (exponent - 1) for exponent in exponents)
+        state = "of a generator's state"
         polynomial = " + ".join(f"x^{exponent}" for exponent in exponents) + " + 1"
-        text += _constant("RNG_BITS", "positive", exponents[0], "of a generator's state")
-        text += _constant("RNG_TAPS", _vector(exponents[0]), _hexadecimal(taps, exponents[0]), polynomial)
-    else:
-        width = seed_width(image.machine)
-        text += _constant("RNG_BITS", "positive", width, "of a generator's state: a place in the table")
-        text += _constant("RNG_TAPS", _vector(width), _hexadecimal(0, width), "no LFSR")
-    length = 1 if table is None else table.size
+    text += _constant("RNG_BITS", "positive", width, state)
+    text += _constant("RNG_TAPS", _vector(width), _hexadecimal(taps, width), polynomial)
+    length, what = (1, "no table") if table is None else (table.size, "numbers in the table")
     return (
         text
-        + _constant(
-            "RNG_TABLE_LENGTH",
-            "positive",
-            length,
-            "numbers in the table" if table is not None else "no table",
-        )
+        + _constant("RNG_TABLE_LENGTH", "positive", length, what)
         + _flag("RNG_SHARED", parameters.shared, "one a column, shared by its lines; else one a cell")
         + _constant("STEPS_PER_CLOCK", "positive", parameters.steps_per_clock)
         + _flag("RNG_RESET_BANK", parameters.rng_reset is RngReset.BANK, "a frame restarts the generators")
