@@ -14,7 +14,7 @@ from bridge.errors import DisconnectedError, SlowPeerError
 from bridge.names import same_type
 from terminal.health import resources, serve_health
 from terminal.one_line import shown
-from terminal.output import say
+from terminal.output import say, warn
 from terminal.run_directory import status_directory
 
 RECENT_S: Final = 10.0
@@ -73,8 +73,8 @@ async def report_refused(ros: Ros, topic: str, type_: str) -> None:
         return
     package = type_.partition("/")[0]
     reason = f"it is {shown(known)} there" if known else f"does the server have {package}?"
-    say(
-        f"warning: the server rejects everything on {topic}, of type {type_}: {reason}; "
+    warn(
+        f"the server rejects everything on {topic}, of type {type_}: {reason}; "
         "install the package on the robot, or publish arrays with --array"
     )
 
@@ -95,7 +95,7 @@ class LossyPublication:
             return False
         except SlowPeerError as error:
             if not self._slow:
-                say(f"warning: {error}; messages on {self._publication.topic} are dropped until it keeps up")
+                warn(f"{error}; messages on {self._publication.topic} are dropped until it keeps up")
             self._slow = True
             return False
         if self._slow:

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable
 
 from terminal.logs import log_libraries
-from terminal.output import say
+from terminal.output import say, warn
 
 
 def report_wait(uri: str) -> Callable[[str, str], None]:
@@ -41,6 +41,6 @@ def report_connection(uri: str) -> Callable[[str, str], None]:
             say(f"waiting for rosbridge at {uri} ({reason})")
         elif state == "reconnecting" and not missing:
             missing = state
-            say(f"warning: rosbridge at {uri} is gone ({reason}); waiting for it")
+            warn(f"rosbridge at {uri} is gone ({reason}); waiting for it")
 
     return on_state

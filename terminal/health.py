@@ -129,10 +129,10 @@ def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[
         try:
             listener = _listen(path)
         except OSError as error:
-            from terminal.output import say
+            from terminal.output import warn
 
             reason = "another process listens there" if error.errno == errno.EADDRINUSE else error.strerror
-            say(f"{name}: warning: its status cannot be shown at {path}: {reason or error}")
+            warn(f"its status cannot be shown at {path}: {reason or error}", name=name)
     try:
         yield listener
     finally:

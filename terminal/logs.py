@@ -12,7 +12,6 @@ neither begin a line nor control a terminal.
 import json
 import logging
 import os
-import re
 import sys
 from contextlib import suppress
 from enum import StrEnum
@@ -28,8 +27,6 @@ PARENT_VARIABLE: Final = "ROSBAYES_PARENT"
 """Environment variable that a process sets for its children, which exit with it and report nothing."""
 FORMAT_VARIABLE: Final = "BM_LOG_FORMAT"
 
-_ERROR: Final = "error: "
-_WARNING: Final = re.compile(r"(?:[\w-]+: )?warning: ")
 _CLEAR_LINE: Final = "\r\x1b[K"
 
 _stamp: Final = structlog.processors.TimeStamper(fmt="iso", utc=True, key="time")
@@ -86,15 +83,12 @@ def json_line(level: str, message: str, *, process: str = "", **fields: object) 
     return str(_json(None, level, _stamp(None, level, record)))
 
 
-def formatted(text: str) -> str:
-    """Return a text for the user in the format in force."""
-    if log_format() is LogFormat.TEXT:
-        return lines_of(text)
-    if text.startswith(_ERROR):
-        return json_line("error", text.removeprefix(_ERROR))
-    if found := _WARNING.match(text):
-        return json_line("warning", text[found.end() :])
-    return json_line("info", text)
+def formatted(level: str, text: str, *, name: str = "") -> str:
+    """Return a text for the user in the format in force: after `name: level: `, or with the level as a field."""
+    if log_format() is LogFormat.JSON:
+        return json_line(level, text)
+    prefix = f"{name}: " if name else ""
+    return lines_of(text if level == "info" else f"{prefix}{level}: {text}")
 
 
 def relayed(line: str, process: str) -> str:

@@ -23,7 +23,12 @@ ERROR_DESCRIPTOR: Final = "ROSBAYES_ERROR_DESCRIPTOR"
 
 def say(text: str) -> None:
     """Print one line for the user on standard error, even if that has been closed."""
-    write_line(formatted(one_line(text)))
+    write_line(formatted("info", one_line(text)))
+
+
+def warn(sentence: str, *, name: str = "") -> None:
+    """Print a warning in one line on standard error; `name` is that of the process, if a text shall have it."""
+    write_line(formatted("warning", one_line(sentence), name=name))
 
 
 def say_error(sentence: str) -> None:
@@ -33,7 +38,7 @@ def say_error(sentence: str) -> None:
         with contextlib.suppress(OSError):  # the parent may be gone
             os.write(int(descriptor), json.dumps({"error": sentence}).encode() + b"\n")
             return
-    say(f"error: {sentence}")
+    write_line(formatted("error", one_line(sentence)))
 
 
 def show_progress(text: str) -> None:
@@ -62,7 +67,7 @@ def say_if_slow(text: str, *, after_s: float = 2.0) -> Iterator[None]:
 
 def say_lines(text: str) -> None:
     """Print a text of several lines, such as a traceback, on standard error."""
-    write_line(formatted(text))
+    write_line(formatted("info", text))
 
 
 def relay(line: str, process: str) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from terminal.errors import ExitCode, OutputError
 from terminal.health import SUFFIX
-from terminal.output import say
+from terminal.output import warn
 
 _LONGEST_RUNTIME = 40
 """Bytes of XDG_RUNTIME_DIR at most: a socket's path has 107."""
@@ -65,7 +65,7 @@ def status_directory(given: Path | None, name: str) -> Path | None:
     try:
         return run_directory(given)
     except OutputError as error:
-        say(f"{name}: warning: its status cannot be shown: {error}")
+        warn(f"its status cannot be shown: {error}", name=name)
         return None
 
 

@@ -24,7 +24,7 @@ from casestudies.boat.sensors import (
 )
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
-from terminal.output import say
+from terminal.output import say, warn
 from terminal.signals import run_async
 
 
@@ -72,7 +72,7 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
                 values, head = read_raw(message.msg, array=array)
             except BadReadingError as error:
                 if str(error) not in reported:
-                    say(f"warning: a message on {raw_topic} is dropped: {error}")
+                    warn(f"a message on {raw_topic} is dropped: {error}")
                     reported.add(str(error))
                 continue
             if await sensors.publish(readings_message(normalise(values), head, array=array)):

@@ -15,7 +15,7 @@ from posteriors.errors import NoResultError
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.errors import ExitCode, StoppedError
-from terminal.output import check_writable, say, write_json
+from terminal.output import check_writable, say, warn, write_json
 from terminal.signals import run_async
 
 if TYPE_CHECKING:
@@ -158,7 +158,7 @@ class Viewer:
             finally:
                 self.route = tuple(listener.route)
                 if listener.announced_only:
-                    say(f"warning: frames on /bm/frame without their result: {listener.announced_only}")
+                    warn(f"frames on /bm/frame without their result: {listener.announced_only}")
 
     def draw(self, folder: Path) -> tuple[Path, ...]:
         """Write the two pictures and return their paths, or raise an OutputError."""

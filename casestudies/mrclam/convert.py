@@ -21,7 +21,7 @@ from casestudies import DataFileError
 from casestudies.mrclam.player import LANDMARKS
 from terminal.command_line import CommandLine
 from terminal.errors import OutputError
-from terminal.output import check_writable, say
+from terminal.output import check_writable, warn
 
 LARGEST_FILE: Final = 1 << 28
 """Size limit of a file, in bytes; the largest of the data set has some 20 million."""
@@ -320,7 +320,7 @@ def convert(
         if misread:
             said += f"; misread barcodes: {misread}"
         if not kept:
-            say(f"warning: robot {number}: nothing to write, {said}")
+            warn(f"robot {number}: nothing to write, {said}")
             continue
         path = output / f"{prefix_of(folder)}_robot{number}.csv"
         write_recording(path, kept, sorted(positions))

@@ -9,7 +9,7 @@ from pcie_shim.board.simulation import Simulation
 from pcie_shim.errors import SimulationError
 from pcie_shim.programming_file import Image
 from services.errors import SettingsError
-from terminal.output import say
+from terminal.output import say, warn
 from toolchain.hardware.simulation import Compiled, Simulator, check_tools, compiled
 from toolchain.hardware.tools import HardwareToolError, missing
 
@@ -67,6 +67,6 @@ class SimulatedHardware:
         except HardwareToolError as error:
             if not self._is_any or self._simulator is Simulator.GHDL:
                 raise SimulationError(str(error)) from error
-            say(f"warning: Verilator cannot compile this hardware, GHDL runs it: {error}")
+            warn(f"Verilator cannot compile this hardware, GHDL runs it: {error}")
             self._simulator = Simulator.GHDL
             return self._compiled(image)

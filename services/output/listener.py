@@ -13,7 +13,7 @@ from services.output.posterior_file import ResultFile
 from services.output.posterior_lines import Show
 from services.settings import Settings
 from terminal.connection import report_connection
-from terminal.output import say
+from terminal.output import say, warn
 from toolchain.deployment import Deployment
 
 _QUEUE_SIZE: Final = 1024
@@ -69,13 +69,13 @@ async def show_frames(
                     if not began or silence:
                         raise
                     if not silence_reported:
-                        say(f"warning: {error}")
+                        warn(str(error))
                     silence_reported = True
                     continue
                 except BadResultError as error:
                     if not began:
                         raise
-                    say(f"warning: {error}")
+                    warn(str(error))
                     continue
                 began, silence_reported = True, False
                 axes: list[Axis] = []
@@ -92,7 +92,5 @@ async def show_frames(
                 show(one, axes)
         finally:
             if frames.lost:
-                say(
-                    f"warning: {frames.lost} were lost: they arrived faster than they could be shown or saved"
-                )
+                warn(f"{frames.lost} were lost: they arrived faster than they could be shown or saved")
     return 0

@@ -13,12 +13,8 @@ from services.pipeline.subscriber import RECEIVED_QUEUE
 from services.settings import Settings
 from services.sockets.records import Reading
 from terminal.connection import report_wait
-from terminal.output import print_json_line, say
+from terminal.output import print_json_line, say, warn
 from toolchain.deployment import Deployment, Source
-
-
-def _warn(sentence: str) -> None:
-    say(f"warning: {sentence}")
 
 
 def _report_state() -> OnState:
@@ -55,7 +51,7 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
         )
         say(f"listening on {source.topic} at {source.uri}")
         # cancelled by the first message
-        hint = asyncio.ensure_future(report_unpublished(ros, source.topic, _warn))
+        hint = asyncio.ensure_future(report_unpublished(ros, source.topic, warn))
         printed = 0
         try:
             while count is None or printed < count:
@@ -119,7 +115,7 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
 
         async def follow(at: int, source: Source) -> None:
             ros = by_uri[settings.uri or source.uri]
-            hint = asyncio.ensure_future(report_unpublished(ros, source.topic, _warn))
+            hint = asyncio.ensure_future(report_unpublished(ros, source.topic, warn))
             stack.callback(hint.cancel)
             subscription = ros.subscribe(
                 source.topic,

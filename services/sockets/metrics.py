@@ -19,7 +19,7 @@ from prometheus_client.registry import Collector
 
 from pcie_shim.endpoint import Endpoint
 from services.sockets.status import BUCKETS_S, ProcessStatus
-from terminal.output import say
+from terminal.output import warn
 
 _ANSWER_TIME: Final = 2.0
 """Seconds in which the event loop must return the status."""
@@ -39,7 +39,7 @@ async def serve_metrics(
     try:
         server, thread = start_http_server(address.port, address.host, registry)
     except OSError as error:
-        say(f"{name}: warning: its metrics cannot be read at {address}: {error.strerror or error}")
+        warn(f"its metrics cannot be read at {address}: {error.strerror or error}", name=name)
         yield
         return
     # it would print a traceback for each client that resets its connection

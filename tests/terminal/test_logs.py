@@ -42,15 +42,15 @@ def test_a_message_is_one_line(capsys):
 CODE = f"""
 import logging
 from terminal.logs import get_logger, log_libraries, name_process
-from terminal.output import relay, say, say_lines
+from terminal.output import relay, say, say_error, say_lines, warn
 name_process("board3")
 log_libraries(logging.WARNING, "hub: %(message)s")
 log = get_logger("master", "info")
 log.debug("nobody sees this")
 log.warning({HOSTILE!r}, frame=7, why={HOSTILE!r}, _reason="failed")
 say("hub: listening")
-say("hub: warning: it is late")
-say("error: no robot")
+warn("it is late", name="hub")
+say_error("no robot")
 say_lines("Traceback\\n  line")
 relay("a library complains \\x1b", "pcie-app")
 relay('{{"time": "2026-01-01T00:00:00", "level": "info", "process": "x", "message": "of a child"}}', "pcie-app")
