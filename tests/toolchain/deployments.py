@@ -1,7 +1,5 @@
 """Deployments that are made without a model."""
 
-from typing import Any
-
 from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source, Variable
 
 BOAT = {
@@ -20,6 +18,6 @@ BOAT = {
 }
 
 
-def boat(**fields: Any) -> Deployment:
+def boat(**fields):
     """Make a deployment of two variables and twelve lines on two boards, but for some fields."""
     return Deployment(**(BOAT | fields))

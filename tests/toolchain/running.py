@@ -2,10 +2,13 @@
 
 import tracemalloc
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
 
 from tests.command_runner import invoke
+from toolchain.building.build import build_deployment
+from toolchain.building.machine import plan_machine
 from toolchain.building.options import BuildOptions
 from toolchain.commands.main import app
 
@@ -23,6 +26,11 @@ def model(size: int = 4, bits: int = 0):
                  known=(Known(name="K", table=np.full((2, size), 0.5), bits=bits),))
 """
 """A `MODEL` of the fixture `case`: one known variable that tells nothing."""
+
+
+def build_model(model, folder, **options):
+    """Build a model into a folder with the usual options but for some."""
+    return build_deployment(plan_machine(model, replace(OPTIONS, **options)), folder)
 
 
 def toolchain(*arguments):

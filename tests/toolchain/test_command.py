@@ -51,7 +51,6 @@ def test_a_build(case):
         (["--bits", "K=1"], ["'K'", "2 values", "1 bit holds 1"]),
         (["--rng-table", "a.mif"], ["--rng-table", "--rng lfsr32"]),
         (["--rng", "table", "--rng-table", "/no.mif"], ["/no.mif", "No such file"]),
-        (["--sensor-mode", "cell", "--scale", "address"], ["--scale address", "--sensor-mode cell"]),
         (["--replicas", "257"], ["--replicas", "256"]),
         (["--searched", "s"], ["--searched"]),
     ],

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from machines.parameters import RngKind, RngReset
 from pcie_shim.programming_file import read_image
-from tests.toolchain.running import OPTIONS
+from tests.toolchain.running import OPTIONS, build_model
 from toolchain.building.build import assemble, build_date, build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.building.quantise import quantise
@@ -34,9 +34,7 @@ def model(size=5, sensors=2):
 
 @pytest.mark.parametrize("partitions", [1, 3, 4, 25])
 def test_the_boards_together_are_the_machine(tmp_path, partitions):
-    built = build_deployment(
-        plan_machine(model(), replace(OPTIONS, partitions=partitions, prob_bits=7)), tmp_path
-    )
+    built = build_model(model(), tmp_path, partitions=partitions, prob_bits=7)
     deployment = load_deployment(tmp_path)
     assert deployment == built.deployment
     images = [read_image(deployment.image_path(i)) for i in range(partitions)]
@@ -87,10 +85,10 @@ def test_seeds_that_no_memory_holds(tmp_path):
 
 
 def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
-    built = build_deployment(plan_machine(model(sensors=21), OPTIONS), tmp_path)
+    built = build_model(model(sensors=21), tmp_path)
     assert built.deployment.machine.interface == "21x1200"
     assert "Interface: 21x1200, larger than the default 20x1200: " in built.report
-    default = build_deployment(plan_machine(model(), OPTIONS), tmp_path)
+    default = build_model(model(), tmp_path)
     assert "Interface: 20x1200.\n" in default.report
     assert default.deployment.machine.target_count == 255
     for interface in ((2, 25), (64, 4096)):  # exactly the machine's size, and the register map's
@@ -120,7 +118,7 @@ def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
 )
 def test_options_that_do_not_fit(tmp_path, changes):
     with pytest.raises(BuildError) as caught:
-        build_deployment(plan_machine(model(), replace(OPTIONS, **changes)), tmp_path / "new")
+        build_model(model(), tmp_path / "new", **changes)
     assert caught.value.exit_code == 2
     assert not (tmp_path / "new").exists()  # nothing is written before all is known to fit
 
@@ -132,30 +130,27 @@ def test_a_model_larger_than_the_register_map(tmp_path):
         known=(Known(name="K", table=np.ones((1, 5000))),),
     )
     with pytest.raises(BuildError, match="room for 64 and 4096: use --partitions 2 or more"):
-        build_deployment(plan_machine(flat, OPTIONS), tmp_path)
-    assert (
-        len(build_deployment(plan_machine(flat, replace(OPTIONS, partitions=2)), tmp_path).deployment.boards)
-        == 2
-    )
+        build_model(flat, tmp_path)
+    assert len(build_model(flat, tmp_path, partitions=2).deployment.boards) == 2
 
 
 def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(BuildError, match=rf"^{re.escape(str(folder))} .* -o$"):
-            build_deployment(plan_machine(model(), OPTIONS), folder)
+            build_model(model(), folder)
 
 
 def test_a_build_over_another_leaves_nothing_of_it_even_if_it_fails_half_way(tmp_path):
-    build_deployment(plan_machine(model(), replace(OPTIONS, partitions=4)), tmp_path)
+    build_model(model(), tmp_path, partitions=4)
     (tmp_path / "boards" / "notes.txt").write_text("mine")
-    build_deployment(plan_machine(model(), replace(OPTIONS, partitions=2)), tmp_path)
+    build_model(model(), tmp_path, partitions=2)
     assert sorted(p.name for p in (tmp_path / "boards").iterdir()) == ["board0.bm", "board1.bm", "notes.txt"]
     load_deployment(tmp_path)
     (tmp_path / "boards" / "board1.bm").unlink()
     (tmp_path / "boards" / "board1.bm" / "in the way").mkdir(parents=True)
     with pytest.raises(BuildError, match=r"boards/board1\.bm "):
-        build_deployment(plan_machine(model(), replace(OPTIONS, partitions=2)), tmp_path)
+        build_model(model(), tmp_path, partitions=2)
     with pytest.raises(DeploymentError, match="deployment.toml"):
         load_deployment(tmp_path)
 
@@ -163,7 +158,7 @@ def test_a_build_over_another_leaves_nothing_of_it_even_if_it_fails_half_way(tmp
 def test_the_report_has_loss_and_warnings(tmp_path):
     known = normal("D", mean=np.arange(40.0), sigma=1.0, values=40, floor=1e-3)
     line = Model(name="line", searched=(interval("x", -0.5, 39.5, cells=40),), known=(known,))
-    built = build_deployment(plan_machine(line, OPTIONS), tmp_path)
+    built = build_model(line, tmp_path)
     assert built.report == (tmp_path / "report.txt").read_text()
     assert "Model line: 40 lines (x 40), 1 known variable, D." in built.report
     assert "Warning: Variable D: its outlier floor of 0.001 vanishes" in built.report

@@ -25,7 +25,7 @@ from toolchain.analysis.resources import estimate
 from toolchain.building.build import BuildError, assemble, build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.checks.check import check_deployment, check_model
-from toolchain.deployment import REPLICA, Deployment, Scale, Stop, Variable, load_deployment
+from toolchain.deployment import REPLICA, Scale, Stop, load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.deployment.address_array import MISSING, to_addresses, written_prior
 from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError, ValueOutOfRangeError
@@ -46,14 +46,14 @@ def model(lines=6, *, select=False, **known):
     )
 
 
-def deployment_of(options, **changes) -> Deployment:
+def deployment_of(options, **changes):
     return assemble(plan_machine(model(**changes), options)).deployment
 
 
 # Arrays to addresses
 
 
-def variable_of(deployment, **changes) -> Variable:
+def variable_of(deployment, **changes):
     return deployment.variables[0].model_copy(update=changes)
 
 

@@ -3,8 +3,6 @@
 model ──▶ deployment.toml, images ──▶ addresses of a frame ──▶ row of the prior's table, codes to write ──▶ posterior
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -13,10 +11,8 @@ from machines.encode import decode_code
 from machines.parameters import PriorMode
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
-from tests.toolchain.running import OPTIONS
+from tests.toolchain.running import build_model
 from toolchain.analysis.emulation import joined
-from toolchain.building.build import build_deployment
-from toolchain.building.machine import plan_machine
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Variable, WrittenPrior, load_deployment
 from toolchain.deployment.address import to_address
@@ -42,7 +38,7 @@ def selected(**fields):
 
 
 def build(tmp_path, built_model, **options):
-    build_deployment(plan_machine(built_model, replace(OPTIONS, **options)), tmp_path)
+    build_model(built_model, tmp_path, **options)
     return load_deployment(tmp_path)
 
 

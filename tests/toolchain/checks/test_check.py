@@ -14,7 +14,7 @@ from machines.bm1 import Start, StopReason
 from machines.parameters import PriorMode, RngKind, RngReset
 from machines.reference import ReferenceBM1
 from tests.toolchain.deployments import boat
-from tests.toolchain.running import OPTIONS, TINY, toolchain
+from tests.toolchain.running import OPTIONS, TINY, build_model, toolchain
 from toolchain.building.build import assemble, build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.checks.check import check_deployment, check_model, source_findings
@@ -310,7 +310,7 @@ def test_several_mistakes_at_once():
 
 @pytest.fixture
 def deployment(tmp_path):
-    build_deployment(plan_machine(model(), replace(OPTIONS, partitions=2)), tmp_path / "out")
+    build_model(model(), tmp_path / "out", partitions=2)
     return tmp_path / "out"
 
 

@@ -6,7 +6,6 @@ build ──▶ deployment.toml ──▶ (a user edits it) ──▶ load_deplo
 
 import re
 import string
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,9 +14,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from tests.toolchain.deployments import boat
-from tests.toolchain.running import OPTIONS
-from toolchain.building.build import build_deployment
-from toolchain.building.machine import plan_machine
+from tests.toolchain.running import build_model
 from toolchain.deployment import (
     BoardSection,
     Dimension,
@@ -272,7 +269,7 @@ def test_objects_are_checked_like_files():
 def with_images(tmp_path):
     known = Known(name="K", table=np.array([[0.9, 0.5, 0.2, 0.1], [0.1, 0.5, 0.8, 0.9]]))
     model = Model(name="m", searched=(dimension("x", size=4),), known=(known,))
-    build_deployment(plan_machine(model, replace(OPTIONS, partitions=2)), tmp_path)
+    build_model(model, tmp_path, partitions=2)
     return tmp_path
 
 

@@ -5,7 +5,6 @@ import re
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,9 +13,7 @@ from machines.parameters import PriorMode, RngKind, RngReset
 from machines.rng import random_numbers
 from pcie_shim.programming_file import read_image
 from tests.patience import PROCESS_PATIENCE
-from tests.toolchain.running import OPTIONS, contents
-from toolchain.building.build import build_deployment
-from toolchain.building.machine import plan_machine
+from tests.toolchain.running import build_model, contents
 from toolchain.deployment import load_deployment
 from toolchain.models.conditional import normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
@@ -49,7 +46,7 @@ def model(*, select=False, lines=7):
 
 def build(folder, *, select=False, lines=7, **changes):
     select = select and changes.get("prior_mode") is not PriorMode.WRITTEN
-    build_deployment(plan_machine(model(select=select, lines=lines), replace(OPTIONS, **changes)), folder)
+    build_model(model(select=select, lines=lines), folder, **changes)
     deployment = load_deployment(folder)
     return [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
 
@@ -230,7 +227,7 @@ def bare(tmp_path):
     """A machine without sensors, whose seeds are in the memory alone."""
     place = interval("x", 0, 10, cells=2)
     one = Model(name="p", searched=(place,), known=())
-    build_deployment(plan_machine(one, replace(OPTIONS, rng_banks=5000)), tmp_path)
+    build_model(one, tmp_path, rng_banks=5000)
     return tmp_path / "bm_arch"
 
 

@@ -12,7 +12,7 @@ from toolchain.outputs.mif import Mif, mif_lines, parse_mif, read_mif
 HEAD = "WIDTH=8; DEPTH=8; ADDRESS_RADIX=HEX; DATA_RADIX=HEX;\nCONTENT BEGIN\n"
 
 
-def mif_text(mif, comments=()) -> str:
+def mif_text(mif, comments=()):
     return "".join(mif_lines(mif.width, len(mif.words), mif.words, comments))
 
 
