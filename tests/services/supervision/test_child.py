@@ -45,49 +45,39 @@ async def failure_of(code, number=0):
     return one.failure()
 
 
-@pytest.mark.parametrize(
-    ("code", "number", "exit_code", "sentence"),
-    [
-        pytest.param(
-            "print('starting', file=sys.stderr); say_error('no\\n luck'); sys.exit(3)",
-            *(0, 3, "no\n luck"),
-            marks=pytest.mark.process,
-            id="error",
-        ),
-        pytest.param(
-            "sys.stderr.write('starting\\nerror: half a line'); os.write(int(os.environ[ERROR_DESCRIPTOR]), b'{\"error\"')",
-            *(0, ExitCode.CHILD, "tester ended by itself with exit code 0"),
-            marks=pytest.mark.thorough,
-            id="no report",
-        ),
-        pytest.param(
-            "print('starting', file=sys.stderr)",
-            *(0, ExitCode.CHILD, "tester ended by itself with exit code 0"),
-            marks=pytest.mark.thorough,
-            id="silent",
-        ),
-        pytest.param(
-            "time.sleep(1000)",
-            *(signal.SIGKILL, ExitCode.CHILD, "tester was killed by SIGKILL"),
-            marks=pytest.mark.thorough,
-            id="killed",
-        ),
-        pytest.param(
-            "time.sleep(1000)",
-            *(signal.SIGRTMIN + 1, ExitCode.CHILD, "tester was killed by signal 35"),
-            marks=pytest.mark.thorough,
-            id="nameless signal",
-        ),
-    ],
-)
-def test_an_end_is_an_error_with_the_childs_own_sentence_and_code(
-    run, capsys, code, number, exit_code, sentence
-):
+def ended(run, capsys, code, number=0):
+    """The failure of a child, its exit code, and what was passed on."""
     failure = run(failure_of(f"import os, sys, time; from terminal.output import *; {code}", number))
-    assert (str(failure), failure.exit_code) == (sentence, exit_code)
-    assert capsys.readouterr().err.splitlines() == [
-        line for line in ("starting", "error: half a line") if line in code
-    ]
+    return str(failure), failure.exit_code, capsys.readouterr().err.splitlines()
+
+
+@pytest.mark.process
+def test_an_end_is_an_error_with_the_childs_own_sentence_and_code(run, capsys):
+    code = "print('starting', file=sys.stderr); say_error('no\\n luck'); sys.exit(3)"
+    assert ended(run, capsys, code) == ("no\n luck", 3, ["starting"])
+
+
+HALF_A_REPORT = "os.write(int(os.environ[ERROR_DESCRIPTOR]), b'{\"error\"')"
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("code", "number", "sentence", "lines"),
+    [
+        ("print('one', file=sys.stderr)", 0, "ended by itself with exit code 0", ["one"]),
+        (
+            f"print('error: half', file=sys.stderr, end=''); {HALF_A_REPORT}",
+            0,
+            "ended by itself with exit code 0",
+            ["error: half"],
+        ),
+        ("time.sleep(1000)", signal.SIGKILL, "was killed by SIGKILL", []),
+        ("time.sleep(1000)", signal.SIGRTMIN + 1, "was killed by signal 35", []),
+    ],
+    ids=["silent", "no report", "killed", "nameless signal"],
+)
+def test_an_end_without_a_report_is_described(run, capsys, code, number, sentence, lines):
+    assert ended(run, capsys, code, number) == (f"tester {sentence}", ExitCode.CHILD, lines)
 
 
 @pytest.mark.thorough
