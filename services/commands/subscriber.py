@@ -66,7 +66,6 @@ def subscriber(
         )
     # checked as a source of a deployment is, so that the same mistakes have the same errors
     names = [name.strip() for name in variables.split(",") if name.strip()]
-    # checked like the source of a deployment
     try:
         source = Source(uri=settings.uri, topic=topic, type=type_)
     except ValidationError as error:

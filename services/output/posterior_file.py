@@ -55,30 +55,23 @@ def record(frame: FrameOutcome, axes: list[Axis]) -> dict[str, Any]:
 
     Indices count from 0; `best_value` and `mean_value` exist if a deployment maps indices to values.
     """
+    known: dict[str, Any] = {"frame": frame.number, "stamp_ns": frame.stamp_ns, "cycles": frame.cycles}
     if not isinstance(frame, Posterior):
-        return {
-            "frame": frame.number,
-            "stamp_ns": frame.stamp_ns,
-            "cycles": frame.cycles,
-            "outcome": frame.outcome,
-        }
+        return known | {"outcome": frame.outcome}
     # names of states have no mean, and without a deployment there are only indices
     best, mean = frame.best(), frame.mean()
-    known: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     if any(axis.dimension for axis in axes):
-        known["best_value"] = {axis.label: axis.value(best[axis.label]) for axis in axes}
-        known["mean_value"] = {
+        values["best_value"] = {axis.label: axis.value(best[axis.label]) for axis in axes}
+        values["mean_value"] = {
             axis.label: axis.value(mean[axis.label]) for axis in axes if not axis.has_states
         }
-    return {
-        "frame": frame.number,
-        "stamp_ns": frame.stamp_ns,
-        "cycles": frame.cycles,
+    return known | {
         "latency_us": frame.latency_us,
         "probability": frame.probability,
         "best": best,
         "mean": mean,
-        **known,
+        **values,
         "labels": frame.labels,
         "sizes": frame.sizes,
         "probabilities": frame.probabilities,
