@@ -158,12 +158,12 @@ async def test_one_server_may_go_and_come(stage, deployment, robots):
         (second,) = (hub for hub in stage.running if hub.name == "hub" and f":{port}" in hub.err)
         second.send(signal.SIGKILL)
         await second.end()
-        await master.says(rf"warning: .*:{port} ")
+        await master.says(rf"\[warning\] .*:{port} ")
         with contextlib.suppress(BridgeError):  # what was under way
             while True:
                 await heard.next(1.0)
         await stage.hub(port)
-        await master.says(rf"(?s)warning: [^\n]*:{port} .*\n(?![^\n]*warning)[^\n]*:{port} ")
+        await master.says(rf"(?s)\[warning\] [^\n]*:{port} .*\n(?![^\n]*warning)[^\n]*:{port} ")
         for _ in range(3):
             assert (await heard.next(PROCESS_PATIENCE)).best() == {"s": 2}
         master.send(signal.SIGINT)
