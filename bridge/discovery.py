@@ -70,11 +70,7 @@ class Robot:
     token: bool = False
 
 
-async def discover(
-    timeout: float = 2.0,
-    *,
-    interfaces: Sequence[str] | None = None,
-) -> list[Robot]:
+async def discover(timeout: float = 2.0, *, interfaces: Sequence[str] | None = None) -> list[Robot]:
     """Return the rosbridge servers that answer within `timeout` seconds, sorted by name.
 
     It always waits for the whole time. `interfaces` are the addresses of this machine to query from; None for
@@ -118,12 +114,7 @@ async def discover(
     return sorted(from_name.values(), key=lambda robot: robot.name)
 
 
-async def resolve(
-    name: str,
-    timeout: float = 5.0,
-    *,
-    interfaces: Sequence[str] | None = None,
-) -> str:
+async def resolve(name: str, timeout: float = 5.0, *, interfaces: Sequence[str] | None = None) -> str:
     """Return the URI of the rosbridge server of a robot; `interfaces` as for `discover`.
 
     Raises:

@@ -86,8 +86,7 @@ class Settings(BaseSettings):
         description="Run subscriber, publisher and pcie-app inside the master's process: fewer hops, the same results.",
     )
     run_directory: Annotated[
-        Path | None,
-        Flag(metavar="DIR", otherwise="$XDG_RUNTIME_DIR/rosbayes or /tmp/rosbayes-UID"),
+        Path | None, Flag(metavar="DIR", otherwise="$XDG_RUNTIME_DIR/rosbayes or /tmp/rosbayes-UID")
     ] = Field(default=None, description="Folder of the sockets of a run, which one master at a time can use.")
 
     # --- timeouts, in seconds ---

@@ -320,14 +320,7 @@ class Publication(Handle):
     """
 
     def __init__(
-        self,
-        session: Session,
-        topic: str,
-        type_name: str,
-        *,
-        latch: bool,
-        queue_size: int,
-        qos: Qos | None,
+        self, session: Session, topic: str, type_name: str, *, latch: bool, queue_size: int, qos: Qos | None
     ) -> None:
         super().__init__(session)
         self.topic = topic

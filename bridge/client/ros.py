@@ -15,14 +15,7 @@ from ssl import SSLContext
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from bridge.client.actions import ActionServer, Goal, GoalHandler
-from bridge.client.handles import (
-    PUBLISH_QUEUE_SIZE,
-    QUEUE_SIZE,
-    Handler,
-    Publication,
-    Service,
-    Subscription,
-)
+from bridge.client.handles import PUBLISH_QUEUE_SIZE, QUEUE_SIZE, Handler, Publication, Service, Subscription
 from bridge.client.protocol import ClientCore, Compression, Delivery, RosVersion
 from bridge.client.protocol.events import StatusReceived
 from bridge.client.rosapi import (
@@ -243,12 +236,7 @@ class Ros:
 
     # Services
 
-    async def call(
-        self,
-        service: str,
-        args: Mapping[str, Any] | None = None,
-        timeout: float = 5.0,
-    ) -> Any:
+    async def call(self, service: str, args: Mapping[str, Any] | None = None, timeout: float = 5.0) -> Any:
         """Call a service.
 
         If the service's type is known to rosapi, the request is checked before it is sent. The first call of a
@@ -275,12 +263,7 @@ class Ros:
         return await self._session.call(service, args or {}, timeout)
 
     async def advertise_service(
-        self,
-        service: str,
-        type: str,
-        handler: Handler,
-        *,
-        handler_timeout: float = 30.0,
+        self, service: str, type: str, handler: Handler, *, handler_timeout: float = 30.0
     ) -> Service:
         """Serve a service.
 
@@ -350,12 +333,7 @@ class Ros:
                 "handle: use roslibpy's actionlib, or a ROS 2 server"
             )
 
-    async def advertise_action(
-        self,
-        action: str,
-        type: str,
-        handler: GoalHandler,
-    ) -> ActionServer:
+    async def advertise_action(self, action: str, type: str, handler: GoalHandler) -> ActionServer:
         """Serve an action of ROS 2.
 
         Args:

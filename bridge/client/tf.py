@@ -59,11 +59,7 @@ class Transforms:
                 self._news.set()
 
     async def lookup(
-        self,
-        target: str,
-        source: str,
-        stamp_ns: int | None = None,
-        timeout: float = 1.0,
+        self, target: str, source: str, stamp_ns: int | None = None, timeout: float = 1.0
     ) -> Transform:
         """Return the transform from frame `source` to frame `target`, as soon as it is known.
 

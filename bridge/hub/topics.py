@@ -10,14 +10,7 @@ from bridge.codecs.json_codec import BRACE, envelope_of, is_deeper, topic_of
 from bridge.errors import BridgeError
 from bridge.hub.definitions import MessageDefinitions
 from bridge.hub.dispatcher import Dispatcher, fragment_size_of
-from bridge.hub.encodings import (
-    AROUND,
-    ENCODINGS,
-    Encoding,
-    OutgoingMessage,
-    encoding_of,
-    json_prefix,
-)
+from bridge.hub.encodings import AROUND, ENCODINGS, Encoding, OutgoingMessage, encoding_of, json_prefix
 from bridge.hub.graph import Advertisement, Client, Graph, SubscribeOptions, Topic, TopicSubscription
 from bridge.hub.limits import (
     HubLimits,

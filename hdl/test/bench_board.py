@@ -34,9 +34,7 @@ from hdl.test.project import (
     next_doorbell,
     reference_kernel,
 )
-from hdl.test.project import (
-    register_map as rm,
-)
+from hdl.test.project import register_map as rm
 from hdl.test.random_machines import Case, codes, random_case
 
 if TYPE_CHECKING:

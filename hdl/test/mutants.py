@@ -123,10 +123,7 @@ MUTANTS: Final = (
         "halted(r) <= halt_i(r);",
     ),
     Mutant(
-        "an impossible frame runs",
-        "bm1_control.vhd",
-        "going(r) <= not impossible_i(r);",
-        "going(r) <= '1';",
+        "an impossible frame runs", "bm1_control.vhd", "going(r) <= not impossible_i(r);", "going(r) <= '1';"
     ),
     Mutant(
         "one line that cannot count makes a frame impossible",
@@ -146,12 +143,7 @@ MUTANTS: Final = (
         "clear_o        <= rst_i or reset_i or start;",
         "clear_o        <= rst_i or reset_i;",
     ),
-    Mutant(
-        "free generators restart",
-        "bm1_control.vhd",
-        "(start = '1' and RESET_BANK)",
-        "(start = '1')",
-    ),
+    Mutant("free generators restart", "bm1_control.vhd", "(start = '1' and RESET_BANK)", "(start = '1')"),
     Mutant(
         "a frame follows the target that is written after its start",
         "bm1_control.vhd",

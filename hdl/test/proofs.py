@@ -60,12 +60,7 @@ def failed_proof(name: str, folder: Path, hdl: Path = HDL) -> str | None:
         command, define = (_BOUNDED, "-DBOUNDED") if bounded else (_INDUCTION, "")
         sources = [f"{_FORMAL}/core_under_proof.vhd"]
         text = verilog(
-            folder,
-            "core_under_proof",
-            table=_ANY_TABLE,
-            hdl=hdl,
-            more_sources=sources,
-            generics=generics,
+            folder, "core_under_proof", table=_ANY_TABLE, hdl=hdl, more_sources=sources, generics=generics
         )
     (folder / "design.v").write_text(text)
     properties = (HDL / _FORMAL / f"{top}.sv").read_text()

@@ -303,9 +303,7 @@ class DrivenBoard:
                 replica_reasons=reasons,
             )
         return BoardResult(
-            words=bytes(self.done.results),
-            cycles=self.done.cycles,
-            reason=StopReason(self.done.reason),
+            words=bytes(self.done.results), cycles=self.done.cycles, reason=StopReason(self.done.reason)
         )
 
 

@@ -15,11 +15,7 @@ PART_BYTES: Final = 4 * framing.MAX_PAYLOAD_WORDS
 
 
 def program(
-    endpoint: Endpoint | str,
-    image: Image | Path,
-    *,
-    timeout: float = 30.0,
-    token: bytes = framing.NO_TOKEN,
+    endpoint: Endpoint | str, image: Image | Path, *, timeout: float = 30.0, token: bytes = framing.NO_TOKEN
 ) -> str:
     """Program a board, and read back its identity.
 

@@ -42,7 +42,7 @@ def board(
         Engine,
         typer.Option(
             help="The machine behind the registers: emulated, or simulated from the VHDL by ghdl or verilator; "
-            "rtl is verilator if it is installed, otherwise ghdl.",
+            "rtl is verilator if it is installed, otherwise ghdl."
         ),
     ] = Engine.EMULATED,
     hardware: Annotated[

@@ -28,8 +28,7 @@ app = CommandLine(
 @app.command(help=app.info.help)
 def discover(
     timeout: Annotated[
-        float,
-        typer.Option(min=0.1, max=60, help="Seconds to wait for answers; the whole time is used."),
+        float, typer.Option(min=0.1, max=60, help="Seconds to wait for answers; the whole time is used.")
     ] = 2.0,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object per line instead of a table.")

@@ -41,16 +41,13 @@ def hub(
         Literal["1", "2"], typer.Option(help="Emulated ROS version: spelling of types, answers of rosapi.")
     ] = "1",
     tls_cert: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Certificate of the hub (PEM), to serve wss://."),
+        Path | None, typer.Option(metavar="FILE", help="Certificate of the hub (PEM), to serve wss://.")
     ] = None,
     tls_key: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Private key of the certificate (PEM)."),
+        Path | None, typer.Option(metavar="FILE", help="Private key of the certificate (PEM).")
     ] = None,
     token_file: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Accepted client tokens, one per line."),
+        Path | None, typer.Option(metavar="FILE", help="Accepted client tokens, one per line.")
     ] = None,
     origin: Annotated[
         list[str] | None,
@@ -77,8 +74,7 @@ def hub(
         ),
     ] = None,
     insecure: Annotated[
-        bool,
-        typer.Option("--insecure", help="Permit a non-loopback address without TLS and tokens."),
+        bool, typer.Option("--insecure", help="Permit a non-loopback address without TLS and tokens.")
     ] = False,
 ) -> int:
     """Serve rosbridge without ROS."""

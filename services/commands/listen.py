@@ -78,13 +78,6 @@ def listen(
         show = stack.enter_context(drawing()) if plot else print_json if as_json else print_line
         return run_async(
             show_frames(
-                settings,
-                loaded,
-                uri=server,
-                topic=where,
-                count=count,
-                silence=timeout,
-                show=show,
-                file=file,
+                settings, loaded, uri=server, topic=where, count=count, silence=timeout, show=show, file=file
             )
         )

@@ -31,14 +31,7 @@ from services.errors import (
 from services.master.command_lines import boards_command, service_command
 from services.settings import Settings, endpoint_in
 from services.sockets.local_socket import RecordProtocol, check_hello, open_connection, own_hello
-from services.sockets.records import (
-    AnyRecord,
-    Begin,
-    Notice,
-    Ready,
-    Rosbridge,
-    Trouble,
-)
+from services.sockets.records import AnyRecord, Begin, Notice, Ready, Rosbridge, Trouble
 from services.sockets.serving import board_endpoints, endpoint_from
 from services.sockets.status import PeerStatus
 from services.supervision.child import RESTARTS, Child, end_all

@@ -22,15 +22,7 @@ from services.pipeline.connections import (
 )
 from services.pipeline.result_topics import RESULTS_DEPTH, ROLE, ResultTopics
 from services.settings import Settings
-from services.sockets.records import (
-    AnyRecord,
-    Begin,
-    Outcome,
-    Publish,
-    Published,
-    Ready,
-    Rosbridge,
-)
+from services.sockets.records import AnyRecord, Begin, Outcome, Publish, Published, Ready, Rosbridge
 from services.sockets.reporting import serve_status
 from services.sockets.serving import MakeLink, report_failure
 from services.sockets.status import (

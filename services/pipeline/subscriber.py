@@ -20,16 +20,7 @@ from services.pipeline.connections import connect_all, reconnect_now, report_unp
 from services.pipeline.frames import FrameAssembler
 from services.settings import Settings
 from services.sockets.local_socket import MAX_RECORD
-from services.sockets.records import (
-    AnyRecord,
-    Begin,
-    LossReason,
-    Notice,
-    Reading,
-    Ready,
-    Rosbridge,
-    Unusable,
-)
+from services.sockets.records import AnyRecord, Begin, LossReason, Notice, Reading, Ready, Rosbridge, Unusable
 from services.sockets.reporting import serve_status
 from services.sockets.serving import MakeLink, report_failure
 from services.sockets.status import (

@@ -47,15 +47,7 @@ from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.host.socket_link import Done
 from pcie_shim.register_map import BoardState
 from tests.patience import PATIENCE, PROCESS_PATIENCE
-from tests.pcie_shim.boards import (
-    endpoints_of,
-    expected,
-    image,
-    images,
-    machine,
-    never_stopping,
-    opened,
-)
+from tests.pcie_shim.boards import endpoints_of, expected, image, images, machine, never_stopping, opened
 
 LINES = (5, 4, 4, 4)
 PARTS = images(10, LINES, zeros=0.3)

@@ -20,14 +20,7 @@ from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, image_bytes
 from pcie_shim.register_map import ErrorCode
 from tests.patience import PATIENCE
-from tests.pcie_shim.boards import (
-    expected_of_replicas,
-    image,
-    images,
-    machine,
-    opened,
-    words,
-)
+from tests.pcie_shim.boards import expected_of_replicas, image, images, machine, opened, words
 
 JOINT_ORDER = (StopReason.OVERFLOW, StopReason.MAX_CYCLES, StopReason.IMPOSSIBLE, StopReason.SLICE)
 
@@ -212,10 +205,7 @@ def test_a_replica_that_is_not_there_is_not_halted():
     assert board.read(rm.OUTCOMES, 8) == bytes(32)
 
 
-@pytest.mark.parametrize(
-    ("replicas", "inputs"),
-    [(2, 4), (3, 5000)],
-)
+@pytest.mark.parametrize(("replicas", "inputs"), [(2, 4), (3, 5000)])
 def test_a_board_of_other_capabilities_is_refused(start_board, monkeypatch, replicas, inputs):
     """A board that shows the right image hash and has fewer machines or words all the same."""
     (part,) = CASES["three replicas on one board"]
