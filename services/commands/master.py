@@ -8,7 +8,7 @@ import typer
 
 from services.commands import flags as options
 from services.errors import SettingsError
-from services.master.run import Master
+from services.master.run import run_master
 from services.settings import Settings, endpoint_in
 from services.sockets.reporting import check_metrics
 from services.sockets.serving import board_endpoints, deployment_for
@@ -80,7 +80,7 @@ def master(
     check_metrics(settings.metrics, insecure=insecure)
     # loaded before processes start, so that a damaged folder is reported at once
     loaded = deployment_for(settings)
-    return run_async(Master(settings, loaded, once=once, count=count, json=json, plot=plot).run())
+    return run_async(run_master(settings, loaded, once=once, count=count, json=json, plot=plot))
 
 
 def _check(settings: Settings) -> None:

@@ -257,3 +257,10 @@ class ChildrenWatch:
             return (await read_process_status(status_socket(self._directory, role), _ANSWER_TIME)).alive
         except NoHealthError:
             return False
+
+
+async def run_master(
+    settings: Settings, deployment: Deployment, *, once: bool, count: int | None, json: bool, plot: bool
+) -> int:
+    """Run a master until its end (see `Master.run`), made inside the loop that its futures belong to."""
+    return await Master(settings, deployment, once=once, count=count, json=json, plot=plot).run()
