@@ -1,4 +1,4 @@
-"""What the case studies' publishers share: readiness on a status socket, and publications that drop messages."""
+"""Publishing in case studies: readiness on a status socket, and publications that drop messages."""
 
 import asyncio
 import contextlib

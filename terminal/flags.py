@@ -20,12 +20,12 @@ from pydantic import BaseModel
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """What a field does not say of its flag: `names` if not `--field-name`, the word for its value, its default."""
+    """Properties of a flag that its field lacks: `names` other than `--field-name`, the word for its value, its default."""
 
     names: tuple[str, ...] = ()
     metavar: str | None = None
     otherwise: str = ""
-    """What holds if neither flag nor variable is given, in words; empty for the default of the field."""
+    """Text for the default if neither flag nor variable is given; empty for the default of the field."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What is shipped: a bill of materials, and a wheel that is the same wherever it is built and runs elsewhere."""
+"""The bill of materials, and a wheel that has the same bytes wherever it is built and runs elsewhere."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""What the hub refuses: its limits, its errors, and the validation of the fields of an operation.
+"""Limits of the hub, its errors, and the validation of the fields of an operation.
 
 Functions that read a field raise a `RefusedOperationError` if it is invalid, which the broker logs or, for a call, answers.
 """

@@ -122,13 +122,13 @@ async def crowd(uri: str, hub: int, clients: int, seconds: float) -> list[Row]:
 
 
 class Attack(NamedTuple):
-    """What an attacker sends once and repeatedly, and the others that help it."""
+    """Messages that an attacker sends once and repeatedly, and those of its helpers."""
 
     once: bytes = b""
     again: bytes = b""
     pause: float = 0.02
     readers: bytes = b""
-    """What twenty other connections send once; they read what comes."""
+    """Message that twenty other connections send once, before they read all that arrives."""
     reads: bool = True
     silent: int = 0
     """Number of connections that send nothing."""

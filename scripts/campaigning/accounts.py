@@ -36,7 +36,7 @@ class Counters:
 
 @dataclass(frozen=True, slots=True)
 class Excuses:
-    """What the faults of a step explain.
+    """Losses that the faults of a step explain.
 
     Attributes:
         reasons: Reasons under which the stack may count losses.
@@ -62,17 +62,17 @@ def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses) -> lis
     missing = [each for each in given if not each.arrived]
     losses = sum(count for reason, count in added.lost.items() if reason != NOT_LOST)
     uncounted = len(given) - added.completed - losses
-    astray = added.completed - (len(given) - len(missing))
+    surplus = added.completed - (len(given) - len(missing))
     most = min(sum(each.published < excuses.until for each in missing), excuses.most)
     figures = f"{len(given)} readings, {len(missing)} without result; counted: {added}"
     if uncounted > (most if excuses.readings else 0):
         findings.append(Finding(Flaw.UNCOUNTED, f"{uncounted} readings: {figures}"))
     if uncounted < 0:
         findings.append(Finding(Flaw.MISCOUNTED, f"{-uncounted} too many: {figures}"))
-    if astray > (most if excuses.results else 0):
-        findings.append(Finding(Flaw.UNCOUNTED, f"{astray} results are counted as published: {figures}"))
-    if -astray > added.lost.get(WITH_PUBLISHER, 0):
-        findings.append(Finding(Flaw.MISCOUNTED, f"{-astray} results that were not counted: {figures}"))
+    if surplus > (most if excuses.results else 0):
+        findings.append(Finding(Flaw.UNCOUNTED, f"{surplus} results are counted as published: {figures}"))
+    if -surplus > added.lost.get(WITH_PUBLISHER, 0):
+        findings.append(Finding(Flaw.MISCOUNTED, f"{-surplus} results that were not counted: {figures}"))
     explained = {
         PASSED_OVER: sum(each.crowded for each in given),
         UNUSABLE: sum(each.addresses is None for each in given),

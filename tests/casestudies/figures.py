@@ -1,4 +1,4 @@
-"""How close posteriors over a grid are to the truth, and to each other."""
+"""Distances of posteriors over a grid from the truth, and from each other."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""How a command ends: signals, full disks, too few files."""
+"""The end of a command: signals, full disks, too few files."""
 
 import os
 import signal

@@ -27,7 +27,7 @@ from bridge.codecs import png
 from bridge.errors import EncodeError, NameFormError, OptionError, SlowPeerError, TypeConflictError
 from bridge.names import absolute
 from bridge.qos import Qos
-from tests.bridge.client.helpers import connected, sent, tell
+from tests.bridge.client.stand_ins import connected, sent, tell
 
 # Publishing
 

@@ -15,7 +15,7 @@ from bridge.codecs.serialised import MessageTypes
 from bridge.errors import DecodeError, NoAnswerError, NoMessageError, ServiceError
 from bridge.qos import Qos
 from tests.bridge.client.doubles import Double
-from tests.bridge.client.helpers import give_up
+from tests.bridge.client.stand_ins import give_up
 from tests.bridge.hub.sockets import until
 from tests.patience import PATIENCE
 

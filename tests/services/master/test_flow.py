@@ -38,7 +38,7 @@ def computed(run, number=None):
 
 
 def failed(run, reason=FailureReason.AWAY):
-    run.take(run.app, FrameFailed(run.app.frames[-1], 0, 5, "Board 0 is tired", reason))
+    run.take(run.app, FrameFailed(run.app.frames[-1], 0, 5, "Board 0 is silent", reason))
 
 
 def published(run, number, outcome=Outcome.PUBLISHED, **fields):
@@ -143,7 +143,7 @@ async def test_a_single_frame_does_not_wait_for_the_server(boat):
 
 async def test_a_failure_of_another_frame_leaves_the_present_one(run):
     run.read(2)
-    run.take(run.app, FrameFailed(9, 0, 5, "Board 0 is tired", FailureReason.AWAY))
+    run.take(run.app, FrameFailed(9, 0, 5, "Board 0 is silent", FailureReason.AWAY))
     computed(run, 1)
     assert [each.result.number for each in run.publisher.records] == [1]
 

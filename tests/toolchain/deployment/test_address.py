@@ -1,4 +1,4 @@
-"""How readings become addresses: the rule, the ends of the range, and everything that is not a number."""
+"""Addresses of readings: the rule, the ends of the range, and everything that is not a number."""
 
 import math
 

@@ -358,7 +358,7 @@ def model():
 
 
 def fitted_gas(folder, model, learnt, checked, *options):
-    """What `fit` says of rows (state, reading), and its last confusion matrix in words."""
+    """Return the output of `fit` for rows (state, reading), and the words of its last confusion matrix."""
     (folder / "model.py").write_text(model)
     for name, rows in (("learn.csv", learnt), ("check.csv", checked)):
         (folder / name).write_text("gas,sensor\n" + "".join(f"{state},{value}\n" for state, value in rows))

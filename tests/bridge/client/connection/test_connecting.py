@@ -19,7 +19,7 @@ from bridge.errors import (
     UnreachableError,
     UriError,
 )
-from tests.bridge.client.helpers import tcp_service
+from tests.bridge.client.stand_ins import tcp_service
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import FACTOR, PATIENCE
 

@@ -13,7 +13,7 @@ import struct
 import pytest
 
 from bridge.client import State, connect
-from tests.bridge.client.helpers import tcp_service
+from tests.bridge.client.stand_ins import tcp_service
 
 _GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 

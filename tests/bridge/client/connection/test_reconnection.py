@@ -11,7 +11,7 @@ import pytest
 from bridge.client import State, connect
 from bridge.client.session import FIRST_DELAY, MAX_DELAY
 from bridge.errors import DisconnectedError, StateTimeoutError
-from tests.bridge.client.helpers import tcp_service
+from tests.bridge.client.stand_ins import tcp_service
 from tests.bridge.hub.sockets import until
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE

@@ -19,7 +19,7 @@ from websockets.http11 import Request
 from bridge.client import State, connect
 from bridge.client.route import shown
 from bridge.errors import AccessRefusedError, BridgeError, OptionError, UnreachableError, UriError
-from tests.bridge.client.helpers import tcp_service
+from tests.bridge.client.stand_ins import tcp_service
 from tests.certificates import issue
 from tests.patience import PATIENCE
 

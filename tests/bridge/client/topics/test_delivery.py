@@ -23,7 +23,7 @@ from bridge.codecs import cbor_codec
 from bridge.codecs.fragments import split
 from bridge.errors import OptionError, SlowPeerError
 from bridge.qos import Qos
-from tests.bridge.client.helpers import connected, sent, tell
+from tests.bridge.client.stand_ins import connected, sent, tell
 
 CBOR = Delivery(compression="cbor")
 ARRAYS = Delivery(compression="cbor", arrays="numpy")

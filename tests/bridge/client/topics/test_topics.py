@@ -24,7 +24,7 @@ from bridge.errors import (
     ServiceError,
     SlowPeerError,
 )
-from tests.bridge.client.helpers import give_up
+from tests.bridge.client.stand_ins import give_up
 from tests.bridge.hub.sockets import until
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE

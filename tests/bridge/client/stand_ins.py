@@ -1,4 +1,4 @@
-"""What tests of the client share: its core alone, a TCP service that is no rosbridge, and waits that are ended."""
+"""Stand-ins for tests of the client: its core alone, a TCP service that is not rosbridge, and cancelled waits."""
 
 import asyncio
 import contextlib
