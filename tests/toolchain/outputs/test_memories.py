@@ -1,4 +1,4 @@
-"""Every memory of a machine as a MIF, read back by srec_cat, and the parameters, read by GHDL."""
+"""Every memory of a machine as a MIF, the parameters as a VHDL package, and the project of Quartus."""
 
 import os
 import re
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from machines.parameters import PriorMode, RngKind, RngReset
-from machines.rng import random_numbers
+from machines.rng import POLYNOMIALS, random_numbers
 from pcie_shim.programming_file import read_image
 from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.running import build_model, contents
@@ -57,63 +57,15 @@ def test_the_made_table_has_every_number_equally_often():
     assert not np.array_equal(random_table(16), np.arange(65536))
 
 
-SLICE_DIGITS = 15
-"""Hexadecimal digits of 60 bits: srec_cat holds no words of more than 62."""
-
-
-def read_by_srec_cat(path, folder):
-    """The width of a MIF and its words, as srec_cat reads them.
-
-    A wide one is cut, as text, into files of 15 digits a word each; nothing of this project's reader has a part in it.
-    """
-    text = path.read_text("ascii")
-    width = int(re.search(r"^WIDTH=(\d+);$", text, re.MULTILINE)[1])
-    digits = -(-width // 4)
-    words = None
-    for low in range(0, digits, SLICE_DIGITS):
-        bits = min(4 * SLICE_DIGITS, width - 4 * low)
-        high, count = digits - low, -(-bits // 4)
-        narrow = re.sub(
-            rf"^([0-9A-F]+) : [0-9A-F]{{{high - count}}}([0-9A-F]{{{count}}})[0-9A-F]{{{low}}};$",
-            r"\1 : \2;",
-            text.replace(f"WIDTH={width};", f"WIDTH={bits};"),
-            flags=re.MULTILINE,
-        )
-        (folder / "slice.mif").write_text(narrow, "ascii")
-        command = ["srec_cat", folder / "slice.mif", "-mif", "-o", folder / "words.bin", "-binary"]
-        subprocess.run(command, check=True, timeout=PROCESS_PATIENCE, capture_output=True)
-        data, size = (folder / "words.bin").read_bytes(), -(-bits // 8)
-        found = [int.from_bytes(data[place : place + size], "little") for place in range(0, len(data), size)]
-        words = [word | part << 4 * low for word, part in zip(words or [0] * len(found), found, strict=True)]
-    return width, words
-
-
-def read_by_toolchain(path, _):
-    mif = read_mif(path)
-    return mif.width, list(mif.words)
-
-
 def words_of(machine, codes):
     """The words that the table in an image must have become: line 0 in the lowest bits."""
     bits = machine.parameters.prob_bits
     return [sum(code << bits * line for line, code in enumerate(row)) for row in codes.tolist()]
 
 
-CHANGES = [*KINDS, {"lines": 400}, {"lines": 131, "prob_bits": 11, "partitions": 2}]
-
-
-@pytest.mark.parametrize(
-    ("changes", "reader"),
-    [
-        *((changes, read_by_toolchain) for changes in CHANGES),
-        pytest.param(CHANGES[0], read_by_srec_cat, marks=pytest.mark.process),
-        *(pytest.param(changes, read_by_srec_cat, marks=pytest.mark.thorough) for changes in CHANGES[1:]),
-    ],
-)
-def test_the_memories_hold_what_the_images_hold(tmp_path, changes, reader):
+@pytest.mark.parametrize("changes", [*KINDS, {"lines": 131, "prob_bits": 11, "partitions": 2}])
+def test_the_memories_hold_what_the_images_hold(tmp_path, changes):
     """Every word of every memory, also of those that are thousands of bits wide."""
-    if reader is read_by_srec_cat and shutil.which("srec_cat") is None:
-        pytest.skip("srec_cat is not there; Debian has it in the package srecord")
     images = build(tmp_path, select=True, **changes)
     folder = tmp_path / "bm_arch" / "Memory_MIFs"
     left = {path.name for path in folder.iterdir()}
@@ -133,116 +85,69 @@ def test_the_memories_hold_what_the_images_hold(tmp_path, changes, reader):
         expected[seeds] = (parameters.rng.lfsr_bits or 16, np.ravel(banks).tolist())
         if machine.rng_table is not None:
             expected["rng_table.mif"] = (parameters.prob_bits, machine.rng_table.tolist())
-        assert {name: reader(folder / name, tmp_path) for name in expected} == expected
+        found = {name: read_mif(folder / name) for name in expected}
+        assert {name: (mif.width, list(mif.words)) for name, mif in found.items()} == expected
         left -= expected.keys()
     assert not left
 
 
-PROBE = """
-use work.bm1_parameters.all;
-use std.textio.all;
-library ieee; use ieee.std_logic_1164.all;
-entity probe is end entity;
-architecture run of probe is
-  procedure say(what : string) is variable text : line; begin
-    write(text, what); writeline(output, text);
-  end procedure;
-begin
-  process begin
-    say("lines " & to_string(LINES) & " sensors " & to_string(SENSORS) & " columns " & to_string(COLUMNS));
-    say("bits " & to_string(PROB_BITS) & " " & to_string(PRIOR_BITS) & " " & to_string(COUNTER_BITS));
-    for c in SENSOR_BITS'range loop say("sensor " & to_string(c) & " " & to_string(SENSOR_BITS(c))); end loop;
-    say("rng " & rng_kind_t'image(RNG_KIND) & " " & to_string(RNG_SHARED) & " " & to_string(STEPS_PER_CLOCK)
-        & " " & to_string(RNG_RESET_BANK) & " " & to_string(RNG_BANKS) & " " & to_string(PRIOR_WRITTEN));
-    say("stop " & to_hstring(TARGET_COUNT) & " " & to_hstring(MAX_CYCLES));
-    say("interface " & to_string(INTERFACE_SENSORS) & " " & to_string(INTERFACE_RESULTS));
-    say("hashes " & to_hstring(MAP_HASH) & " " & to_hstring(MODEL_HASH));
-    for b in PARTITIONS'range loop
-      say("board " & to_string(b) & " " & to_string(PARTITIONS(b).lines) & " "
-          & to_string(PARTITIONS(b).line_offset) & " " & to_hstring(PARTITIONS(b).image_hash));
-    end loop;
-    {more}
-    wait;
-  end process;
-end architecture;
-"""
-SEEDS = """for b in RNG_SEEDS'range(1) loop for c in RNG_SEEDS'range(2) loop
-      say("seed " & to_string(b) & " " & to_string(c) & " " & to_string(RNG_SEEDS(b, c)));
-    end loop; end loop;"""
+def constants(folder):
+    """The constants of the package, as NAME=VALUE without comments and spaces, in lower case."""
+    text = re.sub(r"\s*--.*", "", (folder / "bm_arch/bm1_parameters.vhd").read_text()).lower()
+    found = re.findall(r"constant (\w+) +:[^:]*:=([^;]*);", text)
+    return [f"{name}={''.join(value.split())}" for name, value in found]
 
 
-def ghdl(folder, *arguments):
-    done = subprocess.run(
-        ["ghdl", *arguments],
-        check=False,
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=PROCESS_PATIENCE,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
-@pytest.mark.thorough
 @pytest.mark.parametrize(
     "changes",
-    [KINDS[1], KINDS[2], KINDS[4], {"rng": RngKind.IDEAL}],
-    ids=["lfsr8", "cells", "table", "ideal"],
+    [KINDS[1], KINDS[2], KINDS[3], KINDS[4], {"rng": RngKind.IDEAL}],
+    ids=["lfsr8", "cells", "free", "table", "ideal"],
 )
-def test_ghdl_finds_every_parameter(tmp_path, changes):
-    if shutil.which("ghdl") is None:
-        pytest.skip("ghdl is not there; Debian has it in a package of this name")
+def test_the_package_has_every_parameter(tmp_path, changes):
     images = build(tmp_path, **changes)
-    deployment, parameters = load_deployment(tmp_path), images[0].machine.parameters
-    seeds = parameters.shared and parameters.rng is not RngKind.IDEAL
-    (tmp_path / "probe.vhd").write_text(PROBE.format(more=SEEDS if seeds else ""))
-    ghdl(tmp_path, "-a", "--std=08", "bm_arch/bm1_parameters.vhd", "probe.vhd")
-    said = ghdl(tmp_path, "--elab-run", "--std=08", "probe").lower().splitlines()
-    image = images[0]
-    assert said == [
-        f"lines {deployment.machine.lines} sensors 2 columns 3",
-        f"bits {parameters.prob_bits} 0 {parameters.counter_bits}",
-        "sensor 1 4",
-        "sensor 2 2",
-        f"rng rng_{parameters.rng} {parameters.shared} {parameters.steps_per_clock} "
-        f"{parameters.rng_reset == 'bank'} {parameters.rng_banks} {parameters.prior_mode == 'written'}".lower(),
-        f"stop {deployment.machine.target_count:08x} {131072:016x}",
-        "interface 20 1200",
-        f"hashes {image.map_hash} {image.model_hash}",
-        *(
-            f"board {b} {each.machine.parameters.lines} {each.partition.line_offset} {each.image_hash}"
-            for b, each in enumerate(images)
-        ),
-        *(
-            f"seed {bank} {column} {int(seed):0{16 if parameters.rng is RngKind.TABLE else 8}b}"
-            for bank in range(parameters.rng_banks if seeds else 0)
-            for column, seed in enumerate(random_numbers(image.machine).restart(bank))
-        ),
-    ]
+    image, parameters, table = images[0], images[0].machine.parameters, images[0].machine.rng_table
+    width = parameters.rng.lfsr_bits or (64 if table is None else 16)
+    digits = width // 4
+    taps = sum(1 << (exponent - 1) for exponent in POLYNOMIALS.get(parameters.rng, ()))
+    seeds = ""
+    if parameters.rng is not RngKind.IDEAL:
+        seeds = f"seed_bits={width}"
+        if parameters.shared:
+            banks = [random_numbers(image.machine).restart(bank) for bank in range(parameters.rng_banks)]
+            rows = [",".join(f'{c}=>x"{int(s):0{digits}x}"' for c, s in enumerate(bank)) for bank in banks]
+            seeds += f" rng_seeds=({','.join(f'{at}=>({row})' for at, row in enumerate(rows))})"
+    partitions = ",".join(
+        f"{at}=>(lines=>{each.machine.parameters.lines},line_offset=>{each.partition.line_offset},"
+        f'image_hash=>x"{each.image_hash}")'
+        for at, each in enumerate(images)
+    )
+    expected = (
+        "lines=7 sensors=2 columns=3 replicas=1 sensor_mode=sensor_column sensor_bits=(1=>4,2=>2) "
+        f"prob_bits={parameters.prob_bits} prior_bits=0 counter_bits={parameters.counter_bits} "
+        f"prior_written={parameters.prior_mode is PriorMode.WRITTEN} "
+        f'rng_kind=rng_{parameters.rng} rng_bits={width} rng_taps=x"{taps:0{digits}x}" '
+        f"rng_table_length={1 if table is None else table.size} rng_shared={parameters.shared} "
+        f"steps_per_clock={parameters.steps_per_clock} "
+        f"rng_reset_bank={parameters.rng_reset is RngReset.BANK} rng_banks={parameters.rng_banks} {seeds} "
+        f'target_count=x"{parameters.target_count_max:08x}" max_cycles=x"{131072:016x}" '
+        f'interface_sensors=20 interface_results=1200 map_hash=x"{image.map_hash}" '
+        f'boards={len(images)} model_hash=x"{image.model_hash}" partitions=({partitions})'
+    )
+    assert constants(tmp_path) == expected.lower().split()
 
 
-@pytest.fixture
-def bare(tmp_path):
-    """A machine without sensors, whose seeds are in the memory alone."""
-    place = interval("x", 0, 10, cells=2)
-    one = Model(name="p", searched=(place,), known=())
-    build_model(one, tmp_path, rng_banks=5000)
-    return tmp_path / "bm_arch"
-
-
-def test_no_sensors_and_many_seeds(bare):
-    text = (bare / "bm1_parameters.vhd").read_text()
-    assert "SENSOR_BITS       : natural_array_t(1 to 0) := (others => 0);" in text
-    assert "RNG_SEEDS" not in text
-    assert len(read_mif(bare / "Memory_MIFs" / "rng_seeds.mif").words) == 5000
-
-
-@pytest.mark.thorough
-def test_ghdl_takes_an_empty_array_of_widths(bare):
+@pytest.mark.process
+def test_no_sensors_and_many_seeds(tmp_path):
+    """A machine whose package has an empty array, and whose seeds are in the memory alone."""
+    build_model(
+        Model(name="p", searched=(interval("x", 0, 10, cells=2),), known=()), tmp_path, rng_banks=5000
+    )
+    assert "rng_seeds=" not in " ".join(constants(tmp_path))
+    assert len(read_mif(tmp_path / "bm_arch" / "Memory_MIFs" / "rng_seeds.mif").words) == 5000
     if shutil.which("ghdl") is None:
         pytest.skip("ghdl is not there; Debian has it in a package of this name")
-    ghdl(bare, "-a", "--std=08", "bm1_parameters.vhd")
+    command = ["ghdl", "-a", "--std=08", "bm1_parameters.vhd"]
+    subprocess.run(command, check=True, cwd=tmp_path / "bm_arch", timeout=PROCESS_PATIENCE)
 
 
 def test_the_project_has_a_revision_for_every_board_and_names_harm_no_file(tmp_path):
@@ -299,15 +204,8 @@ def test_the_script_names_the_sources_and_compiles_every_board(tmp_path):
         expected += ["export", "flow -compile", "close"]
     for folder, lines in (("hdl", expected), ("boards", [])):
         script = f"set folder {folder}\n{TCL}"
-        done = subprocess.run(
-            ["tclsh"],
-            check=False,
-            input=script,
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=PROCESS_PATIENCE,
-        )
+        pipes = {"input": script, "capture_output": True, "text": True}
+        done = subprocess.run(["tclsh"], check=False, cwd=tmp_path, timeout=PROCESS_PATIENCE, **pipes)
         assert done.stdout.splitlines() == lines
     assert "error: no .vhd file in 'boards'" in done.stderr
 
@@ -342,21 +240,10 @@ def test_the_same_bytes_in_another_folder_locale_and_hash_seed(tmp_path):
     for number, language in enumerate(["C", "C.UTF-8"]):
         folder = tmp_path / f"number {number}"
         place = {"PYTHONHASHSEED": str(number), "LC_ALL": language, "TZ": ["UTC", "Asia/Tokyo"][number]}
-        subprocess.run(
-            [sys.executable, "-c", ELSEWHERE, folder],
-            check=True,
-            timeout=PROCESS_PATIENCE,
-            env=os.environ | place,
-        )
+        command = [sys.executable, "-c", ELSEWHERE, folder]
+        subprocess.run(command, check=True, timeout=PROCESS_PATIENCE, env=os.environ | place)
         found.append(contents(folder))
     assert found[0] == found[1]
     for name, content in found[0].items():
         assert str(tmp_path).encode() not in content, name
         assert b"2020" not in content or name.endswith(".bm"), name
-    memories = [f"board{i}_{what}" for i in range(2) for what in ("prior", "column1", "column2")]
-    assert set(found[0]) == {
-        *("deployment.toml", "report.txt", "bm1.qpf", "bm1.tcl", "bm_arch/bm1_parameters.vhd"),
-        *(f"boards/board{i}.bm" for i in range(2)),
-        *(f"bm1_board{i}.qsf" for i in range(2)),
-        *(f"bm_arch/Memory_MIFs/{each}.mif" for each in ("rng_seeds", *memories)),
-    }
