@@ -1,13 +1,19 @@
-"""The VHDL in short: sessions of two machines, the units' benches and a proof; scripts/verify hdl has all of them."""
+"""The VHDL in short: sessions of two machines, units, a proof, datasheets and logic; scripts/verify hdl has all of them."""
 
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
-from hdl.test.mutants import MUTANTS
-from hdl.test.project import HDL, SOURCES
+from hdl.test.datasheets import PAGES, THEORY, main
+from hdl.test.datasheets import units as documented_units
+from hdl.test.netlist import synthesised
+from hdl.test.project import HDL, SOURCES, BM1Parameters, RngKind, SensorMode, image_of_parameters, run_tool
 from hdl.test.verification import Check, formal, units
-from tests.patience import FACTOR
+from tests.patience import FACTOR, PROCESS_PATIENCE
+from toolchain.analysis.logic import WORST_ERROR, logic_of
 
 needs_ghdl = pytest.mark.skipif(
     shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
@@ -40,25 +46,57 @@ def test_units_keep_their_promises(check):
     assert check.failure() is None
 
 
+def test_every_unit_is_a_source_and_explains_its_theory_generics_and_ports():
+    assert {path.name for path in HDL.glob("*.vhd")} == set(SOURCES)
+    for unit in documented_units():
+        text = (PAGES / f"{unit.name}.md").read_text()
+        assert len(text.partition(THEORY)[2].split()) > 20
+        unexplained = [name for name, *_, comment in (*unit.generics, *unit.ports) if not comment]
+        assert not [name for name in unexplained if not name.startswith("axi_")], unit.name
+
+
+def test_the_datasheets_are_up_to_date(capsys):
+    assert main(["--check"]) == 0, capsys.readouterr().err
+
+
+@pytest.mark.thorough
+def test_the_vhdl_keeps_to_its_style():
+    files = [*HDL.glob("*.vhd"), *HDL.glob("s*/*.vhd"), *HDL.glob("test/formal/*.vhd")]
+    assert len(files) > 20
+    done = subprocess.run(
+        [Path(sys.executable).with_name("vsg"), "-c", HDL / "vsg.yaml", "-of", "syntastic", "-f", *files],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=PROCESS_PATIENCE,
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, ""), done.stdout + done.stderr
+
+
+REPLICAS = {"sensor_mode": SensorMode.THRESHOLD, "replicas": 2, "rng": RngKind.LFSR16, "rng_banks": 2}
+
+
 @pytest.mark.thorough
 @needs_ghdl
-def test_a_broken_machine_is_found(tmp_path):
-    shutil.copytree(HDL, tmp_path / "hdl")
-    counter = tmp_path / "hdl" / "bm1_counter.vhd"
-    text = counter.read_text()
-    assert text.count("count <= count + 1;") == 1
-    counter.write_text(text.replace("count <= count + 1;", "count <= count + 2;"))
-    why = Check("proof", "core of one machine").failure(tmp_path / "hdl")
-    assert why == "a property does not hold"
+@pytest.mark.parametrize(
+    ("parameters", "aluts", "registers"),
+    [
+        (BM1Parameters(lines=4, sensor_bits=(3, 2)), 2142, 1234),
+        (BM1Parameters(lines=2, sensor_bits=(4,), prob_bits=4, counter_bits=6, **REPLICAS), 2180, 1388),
+    ],
+    ids=["plain", "replicas"],
+)
+def test_the_logic_of_a_small_board_is_unchanged(tmp_path, parameters, aluts, registers):
+    found = synthesised(image_of_parameters(parameters), tmp_path)
+    assert (found.aluts, found.registers) == (aluts, registers)
+    estimate = logic_of(parameters)
+    assert estimate.registers == registers
+    assert estimate.aluts == pytest.approx(found.aluts, rel=WORST_ERROR)
+    assert estimate.alms == pytest.approx(found.alms, rel=WORST_ERROR)
 
 
-def test_every_unit_is_in_the_list_of_sources():
-    found = {path.name for path in HDL.glob("*.vhd")}
-    assert found == set(SOURCES)
-
-
-def test_every_mutant_changes_its_file_in_one_place():
-    assert len({mutant.name for mutant in MUTANTS}) == len(MUTANTS) >= 12
-    for mutant in MUTANTS:
-        assert (HDL / mutant.file).read_text().count(mutant.right) == 1, mutant.name
-        assert mutant.right != mutant.wrong
+@pytest.mark.thorough
+@needs_ghdl
+def test_the_table_for_quartus_is_vhdl(tmp_path):
+    sources = [HDL / "bm1_table.vhd", HDL / "synthesis/bm1_table_block.vhd"]
+    run_tool(["ghdl", "-a", "--std=08", *map(str, sources)], tmp_path)

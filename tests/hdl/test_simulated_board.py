@@ -40,6 +40,13 @@ from toolchain.hardware import simulation
 needs_ghdl = pytest.mark.skipif(
     shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
 )
+
+
+def simulating(test):
+    """Mark a test that compiles hardware."""
+    return pytest.mark.thorough(needs_ghdl(test))
+
+
 NOT_COMPARED = {
     *range(rm.CAP_SPEED, rm.CAP_SPEED + 4),
     *range(rm.COMPUTE_NS, rm.COMPUTE_NS + 8),
@@ -79,8 +86,7 @@ def serving(folder, compiled_into, count=1):
             board.communicate(timeout=PROCESS_PATIENCE)
 
 
-@pytest.mark.thorough
-@needs_ghdl
+@simulating
 def test_frames_over_the_link_are_the_same(tmp_path, compiled_into):
     parts = images(3, [5, 3], sensor_bits=(3, 4), prior_bits=1)
     random = np.random.default_rng(1)
@@ -111,8 +117,7 @@ def test_frames_over_the_link_are_the_same(tmp_path, compiled_into):
     assert not any(psutil.pid_exists(pid) for pid in hardware)
 
 
-@pytest.mark.thorough
-@needs_ghdl
+@simulating
 def test_a_killed_simulation_is_an_error_of_the_board(tmp_path, compiled_into):
     part = image(never_stopping())
     SimulatedHardware(Engine.GHDL, compiled_into, {0: part})
@@ -129,8 +134,7 @@ def test_a_killed_simulation_is_an_error_of_the_board(tmp_path, compiled_into):
         assert f"signal {int(signal.SIGKILL)}" in errors[0]
 
 
-@pytest.mark.thorough
-@needs_ghdl
+@simulating
 def test_the_simulation_ends_with_a_killed_board(tmp_path, compiled_into):
     part = image(never_stopping())
     SimulatedHardware(Engine.GHDL, compiled_into, {0: part})
@@ -175,8 +179,7 @@ def answered(board, access, *arguments):
         return error.code
 
 
-@pytest.mark.thorough
-@needs_ghdl
+@simulating
 @pytest.mark.parametrize(
     "parameters",
     [
@@ -233,8 +236,7 @@ def test_accesses_are_answered_and_refused_alike(parameters, compiled_into):
     assert {ErrorCode.OUTSIDE, ErrorCode.TOO_LONG, ErrorCode.READ_ONLY, ErrorCode.MISALIGNED} <= refused
 
 
-@pytest.mark.thorough
-@needs_ghdl
+@simulating
 def test_a_running_board_is_busy_until_it_is_released(compiled_into):
     emulated, simulated = both_boards(never_stopping(), compiled_into)
     with contextlib.closing(simulated):
@@ -251,8 +253,7 @@ def test_a_running_board_is_busy_until_it_is_released(compiled_into):
             assert board.done == 0
 
 
-@pytest.mark.thorough
-@needs_ghdl
+@simulating
 def test_an_image_that_is_loaded_again_replaces_the_hardware(compiled_into):
     first, second = image(machine(1)), image(machine(2))
     board = SimulatedHardware(Engine.GHDL, compiled_into, {0: first}).board(0)
@@ -266,8 +267,7 @@ def test_an_image_that_is_loaded_again_replaces_the_hardware(compiled_into):
             assert int.from_bytes(board.read(rm.PROGRAMMED, 1), "little") == board.programmed == number
 
 
-@pytest.mark.thorough
-@needs_ghdl
+@simulating
 def test_a_machine_that_exists_only_emulated_is_refused(tmp_path, compiled_into):
     ideal = image(machine(1, rng=RngKind.IDEAL))
     with pytest.raises(SimulationError):
@@ -296,8 +296,7 @@ def test_a_folder_of_others_is_not_used(tmp_path):
         SimulatedHardware(Engine.GHDL, tmp_path, {0: image(machine(1))})
 
 
-@pytest.mark.thorough
-@needs_ghdl
+@simulating
 def test_a_full_disk_is_an_error_of_the_board(tmp_path, monkeypatch):
     def write(*_):
         raise OSError(errno.ENOSPC, "full")
