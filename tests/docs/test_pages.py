@@ -9,7 +9,6 @@ import shlex
 import tomllib
 from pathlib import Path
 
-import numpy as np
 import pytest
 from pydantic import BaseModel
 from typer.main import get_command
@@ -21,19 +20,13 @@ from rosbayes.__main__ import app
 from services.settings import ENV_PREFIX, Settings
 from terminal.flags import default_of, field_flag
 from tests.bridge.hub.broker_harness import Harness
-from toolchain.building.build import assemble
-from toolchain.building.machine import plan_machine
-from toolchain.building.options import BuildOptions
 from toolchain.checks.finding import Check
 from toolchain.deployment import DeploymentFile
-from toolchain.models.model import Known, Model, dimension
-from toolchain.outputs.vhdl_parameters import parameters_vhd
 
 ROOT = Path(__file__).parents[2]
 PAGES = {path.relative_to(ROOT).as_posix(): path.read_text() for path in (ROOT / "docs").rglob("*.md")}
 PAGES["README.md"] = (ROOT / "README.md").read_text()
 ROOMS = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["root_packages"]
-IGNORED = {line.strip("/") for line in (ROOT / ".gitignore").read_text().splitlines()}
 
 
 # Paths, rooms and scripts
@@ -50,16 +43,6 @@ def test_paths_functions_and_rooms_of_the_house_exist():
     assert len(names) > 20
     sources = "\n".join(path.read_text() for room in ROOMS for path in (ROOT / room).rglob("*.py"))
     assert not [name for name in names if not re.search(rf"\b(def|class) {name}\b", sources)]
-    for room in ROOMS:
-        assert f"| `{room}/` |" in page
-        assert f"| [`{room}/`]({room}) |" in PAGES["README.md"]
-
-
-def test_every_page_of_the_navigation_is_listed():
-    pages = set(re.findall(r"^ +- [^:]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
-    listed = set(re.findall(r"\(([\w/-]+\.md)\)", PAGES["docs/index.md"]))
-    assert len(pages) > 20
-    assert pages - {"index.md"} <= listed
 
 
 def test_every_script_has_a_row():
@@ -80,11 +63,9 @@ def printed(text):
     return re.findall(r"^    (\S.*)$", joined, re.MULTILINE)
 
 
-def test_readme_prints_what_works_in_the_order_in_which_it_works():
-    page, group, checked = PAGES["README.md"], get_command(app), 0
-    order = ["scripts/demo\n", "--plot", "ws://robot:9090", "docker compose up"]
-    assert sorted(order, key=page.index) == order
-    for line in printed(page):
+def test_the_commands_of_readme_exist_with_their_flags():
+    group, checked = get_command(app), 0
+    for line in printed(PAGES["README.md"]):
         first, *words = shlex.split(line, comments=True)
         if first.startswith("scripts/"):
             assert (ROOT / first).is_file()
@@ -97,17 +78,6 @@ def test_readme_prints_what_works_in_the_order_in_which_it_works():
         assert {word for word in words if word.startswith("-")} <= flags, line
         checked += 1
     assert checked >= 5
-
-
-def test_no_page_puts_a_model_into_a_folder_that_git_ignores():
-    lines = [line.split() for page in PAGES.values() for line in printed(page)]
-    made = [
-        words[2]
-        for words in lines
-        if words[:1] == ["toolchain"] and words[1] in {"new", "build", "fit", "explore"}
-    ]
-    assert made
-    assert not {path.partition("/")[0] for path in made} & IGNORED
 
 
 def test_units_and_settings_of_the_pages_about_operation_are_known():
@@ -173,13 +143,10 @@ def test_every_option_of_the_toolchain_is_described():
     assert not {name for name in options - question if name not in section}
 
 
-def test_every_check_and_constant_of_the_toolchain_is_described():
+def test_every_check_and_parameter_is_described():
     assert set(documented("reference/toolchain", "Checks before anything runs")) == set(Check) - {Check.RNG}
-    known = Known(name="K", table=np.full((2, 2), 0.5))
-    model = Model(name="m", searched=(dimension("s", size=2),), known=(known,))
-    built = assemble(plan_machine(model, BuildOptions(uri="ws://robot:9090", topic="/readings", type="a/B")))
-    constants = re.findall(r"^  constant (\w+)", parameters_vhd(built.deployment, built.images), re.MULTILINE)
-    assert set(documented("reference/outputs", "bm1_parameters.vhd")) == set(constants)
+    for field in dataclasses.fields(BM1Parameters):
+        assert f"| `{field.name}` |" in PAGES["docs/reference/machines.md"]
 
 
 def test_every_limit_and_service_of_the_hub_is_described():
@@ -188,18 +155,6 @@ def test_every_limit_and_service_of_the_hub_is_described():
     limits = [field.name for field in dataclasses.fields(HubLimits)]
     for name in (*limits, *(service.removeprefix("/rosapi/") for service in services)):
         assert f"`{name}`" in PAGES["docs/how-to/hub.md"]
-
-
-@pytest.mark.parametrize("field", dataclasses.fields(BM1Parameters), ids=lambda field: field.name)
-def test_every_parameter_of_a_machine_is_described_with_its_default(field):
-    default = "" if field.default is dataclasses.MISSING else f" {field.default}"
-    if isinstance(field.default, str):
-        default = f" `{field.default}`"
-    elif isinstance(field.default, bool):
-        default = f" {str(field.default).lower()}"
-    elif field.name == "steps_per_clock":
-        default = " by kind"
-    assert f"| `{field.name}` |{default} |" in PAGES["docs/reference/machines.md"]
 
 
 def test_every_error_and_operation_of_a_board_is_described():
