@@ -141,6 +141,12 @@ class BoardMismatchError(BoardError):
     exit_code = 2
 
 
+class BoardKeyError(BoardError):
+    """The board and this host do not have the same key."""
+
+    exit_code = 2
+
+
 class BoardSilentError(BoardError):
     """The board did not answer or finish in time."""
 
