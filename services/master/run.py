@@ -119,7 +119,8 @@ class Master:
             # before the children end, because the private folder that contains the socket goes with them
             await sockets.aclose()
             await peers.end()
-            if not self._once:
+            # an error before the first reading could come needs no summary
+            if not self._once and self._peers.begun.is_set():
                 say(self.summary())
         return ExitCode.DONE
 

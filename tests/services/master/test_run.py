@@ -144,8 +144,10 @@ async def test_the_newest_posterior_is_drawn_once(boat):
     assert [axis.label for axis in axes] == ["y", "x"]
 
 
-@pytest.mark.parametrize("once", [True, False])
-async def test_a_run_is_open_to_questions_until_its_end(boat, tmp_path, monkeypatch, capsys, once):
+@pytest.mark.parametrize(("once", "begun", "lines"), [(True, True, 0), (False, True, 1), (False, False, 0)])
+async def test_a_run_is_open_to_questions_until_its_end(
+    boat, tmp_path, monkeypatch, capsys, once, begun, lines
+):
     status = Mock(return_value=nullcontext())
     monkeypatch.setattr("services.master.run.serve_status", status)
     monkeypatch.setattr("services.master.run.get_logger", log := Mock())
@@ -161,9 +163,11 @@ async def test_a_run_is_open_to_questions_until_its_end(boat, tmp_path, monkeypa
     given = status.call_args.kwargs
     assert given["metrics"] == run.master._settings.metrics
     assert given["stages"]() == []
+    if begun:
+        peers.begun.set()
     run.flow.end.set_result(None)
     assert await running == 0
     assert peers.start.await_args.args == (run.flow,)
     assert (peers.leave.await_count, peers.end.await_count) == (1, 1)
-    assert len(capsys.readouterr().err.splitlines()) == (not once)
+    assert len(capsys.readouterr().err.splitlines()) == lines  # only a run that has begun has a summary
     assert log.call_args.args == ("master", "debug")
