@@ -44,7 +44,7 @@ class Goal:
     """One active goal: `async for feedback in goal`, then `await goal.result(timeout)`.
 
     The iteration ends with the goal. If the connection is lost, iteration and result fail, because the server
-    forgets the sender of a goal and never reports its end.
+    forgets the sender of a goal and never reports its end; likewise after an `async with` that left it unfinished.
 
     Attributes:
         action: Name of the action.
@@ -57,6 +57,7 @@ class Goal:
         """Send a goal (see `bridge.client.Ros.send_goal`)."""
         identity = session.core.goals.send(action, type_name, goal, feedback=feedback)
         self.action = action
+        self._place = f"{action} at {session.uri}"  # for error messages
         self._session = session
         self._identity = identity
         self._sent_at = time.monotonic()  # for error messages: what the server has said since
@@ -82,9 +83,12 @@ class Goal:
         self._wake()
 
     def fail(self, reason: str) -> None:
-        """End the goal without a result."""
+        """End the goal without a result, because the connection was lost."""
+        self._fail(DisconnectedError(f"{reason} during a goal of {self.action}"))
+
+    def _fail(self, error: BridgeError) -> None:
         if not self._ended.done():
-            self._ended.set_exception(DisconnectedError(f"{reason} during a goal of {self.action}"))
+            self._ended.set_exception(error)
             self._ended.exception()  # mark the exception as retrieved, because it need not be awaited
         self._wake()
 
@@ -120,7 +124,7 @@ class Goal:
                 f"{self._session.context_since(self._sent_at)}"
             ) from None
         if not ended.ok:
-            raise GoalError(ended.values, f"{self.action} at {self._session.uri}")
+            raise GoalError(ended.values, self._place)
         return GoalResult(ended.status, ended.values)
 
     def __aiter__(self) -> Self:
@@ -153,12 +157,13 @@ class Goal:
             if not self.done:
                 await self.cancel()
         finally:
-            self.forget()
+            self._forget()
 
-    def forget(self) -> None:
-        """Ignore further events of this goal."""
+    def _forget(self) -> None:
+        """Ignore further events of this goal, and end what still waits for them."""
         self._session.goals.pop(self._identity, None)
         self._session.core.goals.forget(self._identity)
+        self._fail(GoalError("it was cancelled at the end of its block", self._place))
 
 
 FeedBack = Callable[[Mapping[str, Any]], None]

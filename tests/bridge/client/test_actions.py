@@ -68,6 +68,9 @@ async def test_leaving_the_block_cancels_the_goal_and_feedback_is_optional(servi
         await until(lambda: executed)
     await until(lambda: not executed)  # it ends only if it is cancelled
     assert not goal._feedback
+    for waiting in (anext(goal), goal.result(PATIENCE)):  # nothing more will come
+        with pytest.raises(GoalError):
+            await asyncio.wait_for(waiting, PATIENCE)
 
 
 async def test_feedback_that_nobody_reads_is_bounded(serving):
