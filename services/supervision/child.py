@@ -29,6 +29,9 @@ from terminal.signals import ENDING_SIGNALS, raise_on_signals
 RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 """Environment variable with the folder of status sockets (the setting `run_directory`)."""
 
+LONGEST_LINE: Final = 1 << 20
+"""Maximum number of bytes of a line from a child; a longer one is passed on in pieces."""
+
 RESTARTS = 3
 """A process may be restarted three times within the setting `restart_window`; then its master gives up."""
 
@@ -69,7 +72,7 @@ class _Pipe:
         # The writing end is the child's; its parent closes it after the start, otherwise the end would never come.
         self._reader, self.writer = os.pipe()
         self._is_open = True
-        # The begin of a line whose end has not arrived.
+        # The begin of a line whose end has not arrived; bounded.
         self._pending = b""
         os.set_blocking(self._reader, False)
         asyncio.get_running_loop().add_reader(self._reader, self.read)
@@ -81,13 +84,19 @@ class _Pipe:
                 data = os.read(self._reader, 1 << 16)
             except BlockingIOError:
                 break
-            self._pending += data
             if not data:
                 last = True
                 self.close()
-        *lines, self._pending = self._pending.split(b"\n")
+            *lines, self._pending = (self._pending + data).split(b"\n")
+            # a child may print without ever ending a line
+            if len(self._pending) >= LONGEST_LINE:
+                lines, self._pending = [*lines, self._pending], b""
+            self._pass_on(lines)
         if last:
-            lines, self._pending = [*lines, self._pending], b""
+            self._pass_on([self._pending])
+            self._pending = b""
+
+    def _pass_on(self, lines: list[bytes]) -> None:
         # a child may print anything, also bytes that are no text
         for line in lines:
             if text := line.decode("utf-8", "replace").rstrip():

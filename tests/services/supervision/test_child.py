@@ -9,7 +9,7 @@ import pytest
 import uvloop
 
 from services.errors import StackError
-from services.supervision.child import RESTARTS, Child, end_all
+from services.supervision.child import LONGEST_LINE, RESTARTS, Child, _Pipe, end_all
 from terminal.errors import ExitCode
 from tests.patience import PATIENCE
 
@@ -90,6 +90,19 @@ def test_a_line_is_passed_on_while_the_child_runs(run, capsys):
         assert await end_all([one], PATIENCE) == []
 
     run(until_said())
+
+
+async def test_output_without_an_end_of_line_is_passed_on_in_pieces():
+    pieces = []
+    pipe = _Pipe(pieces.append)
+    for _ in range(2 * LONGEST_LINE // 4096 + 1):
+        os.write(pipe.writer, bytes(4096).replace(b"\0", b"x"))
+        pipe.read()
+    assert [len(piece) for piece in pieces] == [LONGEST_LINE] * 2
+    pipe.read(last=True)
+    assert pieces[2:] == ["x" * 4096]
+    os.close(pipe.writer)
+    pipe.close()
 
 
 @pytest.mark.thorough
