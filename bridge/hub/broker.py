@@ -25,8 +25,7 @@ import orjson
 from bridge.codecs.fragments import Reassembler
 from bridge.codecs.json_codec import decode, is_deeper
 from bridge.errors import BridgeError
-from bridge.hub.actions import Actions
-from bridge.hub.calls import Calls
+from bridge.hub.calls_and_goals import Actions, Calls
 from bridge.hub.definitions import MessageDefinitions
 from bridge.hub.dispatcher import Dispatcher
 from bridge.hub.graph import Client, Graph
@@ -88,13 +87,13 @@ class Broker:
             "unsubscribe": self._topics.unsubscribe,
             "advertise": self._topics.advertise,
             "unadvertise": self._topics.unadvertise,
-            "call_service": self._calls.call,
+            "call_service": self._calls.ask,
             "service_response": self._calls.respond,
             "advertise_service": self._calls.advertise,
             "unadvertise_service": self._calls.unadvertise,
             "advertise_action": self._actions.advertise,
             "unadvertise_action": self._actions.unadvertise,
-            "send_action_goal": self._actions.send_goal,
+            "send_action_goal": self._actions.ask,
             "cancel_action_goal": self._actions.cancel,
             "action_feedback": self._actions.feed_back,
             "action_result": self._actions.end_goal,
