@@ -15,14 +15,13 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from bridge import fields
 from bridge.client.protocol import ClientCore, Delivery
-from bridge.client.protocol.actions import MAX_GOALS
+from bridge.client.protocol.calls_and_goals import MAX_CALLS, MAX_GOALS, MAX_REQUESTS
 from bridge.client.protocol.events import (
     MessageDiscarded,
     MessageReceived,
     ServiceRequested,
     UnusableReceived,
 )
-from bridge.client.protocol.services import MAX_CALLS, MAX_REQUESTS
 from bridge.codecs import cbor_codec, json_codec, png
 from bridge.codecs.cbor_codec import with_arrays, with_lists
 from bridge.codecs.fragments import Reassembler, split

@@ -6,10 +6,9 @@ Nothing is collected without a connection.
 
 from typing import Any
 
-from bridge.client.protocol.actions import PendingGoals, ServedActions
+from bridge.client.protocol.calls_and_goals import PendingCalls, PendingGoals, ServedActions, ServedServices
 from bridge.client.protocol.events import Event, MessageReceived, StatusReceived, UnusableReceived
 from bridge.client.protocol.publications import Publications
-from bridge.client.protocol.services import PendingCalls, ServedServices
 from bridge.client.protocol.subscriptions import Subscriptions
 from bridge.client.protocol.wire import Wire
 from bridge.codecs import cbor_codec, png

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from bridge.client.protocol import ClientCore, Delivery
+from bridge.client.protocol.calls_and_goals import MAX_CALLS, MAX_REQUESTS
 from bridge.client.protocol.events import (
     CallAnswered,
     MessageReceived,
@@ -22,7 +23,6 @@ from bridge.client.protocol.events import (
     StatusReceived,
     UnusableReceived,
 )
-from bridge.client.protocol.services import MAX_CALLS, MAX_REQUESTS
 from bridge.codecs import png
 from bridge.errors import EncodeError, NameFormError, OptionError, SlowPeerError, TypeConflictError
 from bridge.names import absolute

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bridge.client.protocol import ClientCore, Delivery
-from bridge.client.protocol.actions import MAX_GOALS
+from bridge.client.protocol.calls_and_goals import MAX_GOALS
 from bridge.client.protocol.events import (
     GoalEnded,
     GoalFeedback,
