@@ -1,1 +1,158 @@
-"""Predictions for machines before they are built: accuracy, cycles, resources, energy, and sweeps."""
+"""Analyses of a machine before it is on a board: accuracy, cycles, resources, energy. Here are their options.
+
+The options are dataclasses of flags, without NumPy, so that `--help` is fast.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Final, TypeAlias, TypeVar
+
+import typer
+
+from machines.parameters import RngKind
+from toolchain.building.options import BuildOptions
+from toolchain.deployment import Scale, Stop
+from toolchain.errors import BuildError
+from toolchain.flags import MaxCycles, Partitions, ReadingColumns, StopWhen
+
+MAX_POINTS: Final = 10_000
+CLOCK_MAX_HZ: Final = 1e12
+
+_Member = TypeVar("_Member", bound=StrEnum)
+_Numbers: TypeAlias = tuple[int, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadingOptions:
+    """The readings for a machine, and the hardware for the estimate of its costs."""
+
+    readings: Annotated[
+        Path | None,
+        typer.Option(
+            help="Recorded readings: CSV, MCAP or bag; without it, readings are drawn.", metavar="RECORDING"
+        ),
+    ] = None
+    reading: ReadingColumns = None
+    seed: Annotated[int, typer.Option(help="Seed of drawn readings.", min=0)] = 1
+    device: Annotated[str, typer.Option(help="FPGA of the boards.", metavar="proce-v-d8")] = "proce-v-d8"
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectOptions(ReadingOptions):
+    """The options of an inspection of a deployment."""
+
+    tolerance_s: Annotated[
+        float,
+        typer.Option(
+            "--tolerance", help="bags: maximum time between readings that belong together.", metavar="SECONDS"
+        ),
+    ] = 0.1
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            help="Maximum number of frames; fewer with replicas.",
+            show_default="200, or 20 for a slow machine",
+        ),
+    ] = None
+    banks: Annotated[
+        int | None,
+        typer.Option(help="Number of seed sets for each frame.", show_default="4, or 1 for a slow machine"),
+    ] = None
+    clock_hz: Annotated[
+        float, typer.Option("--clock", help="Clock frequency of the boards.", metavar="HERTZ")
+    ] = 100e6
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.clock_hz <= CLOCK_MAX_HZ:
+            raise BuildError(
+                f"--clock is {self.clock_hz:g}, expected hertz from 1 to {CLOCK_MAX_HZ:g}, such as 100e6"
+            )
+        if self.banks is not None and self.banks < 1:
+            raise BuildError(f"--banks is {self.banks}, expected 1 or more")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """The options of a sweep: comma-separated lists are combined, the rest is the same for all machines."""
+
+    prob_bits: Annotated[str, typer.Option(help="Bits of a code, comma-separated.", metavar="LIST")] = (
+        "4,6,8,10"
+    )
+    targets: Annotated[
+        str, typer.Option(help="Target counts, each with the narrowest counter.", metavar="LIST")
+    ] = "63,255,1023"
+    rngs: Annotated[str, typer.Option(help="Generators.", metavar="LIST")] = "lfsr16,lfsr32"
+    scales: Annotated[
+        str,
+        typer.Option(
+            help="Part of a table that is divided by its maximum before quantising.", metavar="LIST"
+        ),
+    ] = "address,column"
+    steps: Annotated[
+        str, typer.Option(help="Steps of a generator per cycle; 0: fresh bits.", metavar="LIST")
+    ] = "0"
+    partitions: Partitions = 1
+    stop: StopWhen = Stop.SLICES
+    max_cycles: MaxCycles = 2**17
+    banks: Annotated[int, typer.Option(help="Number of seed sets for each frame.")] = 2
+
+    def __post_init__(self) -> None:
+        """Refuse lists and numbers that are none, before a model is read."""
+        if self.partitions < 1 or self.max_cycles < 1 or self.banks < 1:
+            raise BuildError("--partitions, --max-cycles and --banks are numbers from 1")
+        self._lists()
+
+    def _lists(self) -> tuple[tuple[Scale, ...], tuple[RngKind, ...], _Numbers, _Numbers, _Numbers]:
+        return (
+            _members("--scales", self.scales, Scale),
+            _members("--rngs", self.rngs, RngKind),
+            _numbers("--steps", self.steps),
+            _numbers("--prob-bits", self.prob_bits),
+            _numbers("--targets", self.targets),
+        )
+
+    def options(self) -> Iterator[BuildOptions]:
+        """Return the options of every machine in order, or raise a BuildError if there are none or too many."""
+        lists = self._lists()
+        count = math.prod(map(len, lists))
+        if not 0 < count <= MAX_POINTS:
+            raise BuildError(f"these lists give {count} machines, expected 1 to {MAX_POINTS}")
+        for scale, rng, steps, prob_bits, target in itertools.product(*lists):
+            if target < 1:
+                raise BuildError(f"a target count of {target} is too small; expected 1 or more")
+            yield BuildOptions(
+                uri="ws://nowhere:9090",  # a sweep has no robot
+                topic="/readings",
+                type="std_msgs/Float64",
+                partitions=self.partitions,
+                scale=scale,
+                prob_bits=prob_bits,
+                counter_bits=target.bit_length(),
+                target_count=target,
+                max_cycles=self.max_cycles,
+                stop=self.stop,
+                rng=rng,
+                steps_per_clock=steps,
+            )
+
+
+def _numbers(flag: str, text: str) -> _Numbers:
+    try:
+        return tuple(dict.fromkeys(int(part) for part in text.split(",")))
+    except ValueError:
+        raise BuildError(
+            f"{flag} {text}: expected comma-separated whole numbers, such as {flag} 4,8"
+        ) from None
+
+
+def _members(flag: str, text: str, kind: type[_Member]) -> tuple[_Member, ...]:
+    try:
+        return tuple(dict.fromkeys(kind(part.strip()) for part in text.split(",")))
+    except ValueError:
+        raise BuildError(
+            f"{flag} {text}: expected some of {', '.join(kind)}, with commas between them"
+        ) from None

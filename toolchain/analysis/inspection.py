@@ -5,16 +5,16 @@ import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
 from machines.bm1 import BM1Machine
 from machines.parameters import SensorMode
+from toolchain.analysis import InspectOptions
 from toolchain.analysis.accuracy import Accuracy, Difference, Interval, measure
 from toolchain.analysis.emulation import EmulatedBoards, joined, one_replica
-from toolchain.analysis.logic import Device
+from toolchain.analysis.logic import device_named
 from toolchain.analysis.readings import (
     Readings,
     check_columns,
@@ -29,7 +29,7 @@ from toolchain.building.build import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
 from toolchain.building.report import loss_heading, many_sentence
 from toolchain.deployment import Deployment, Scale
-from toolchain.errors import BuildError, DeploymentError
+from toolchain.errors import BuildError
 from toolchain.models.model import Model
 from toolchain.outputs.mif import table_length
 
@@ -43,32 +43,6 @@ LEAST_FRAMES: Final = 20
 SLOW_LEAST_FRAMES: Final = 3
 """Minimum number of frames of slow machines with replicas."""
 SLOW_BANKS: Final = 1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InspectOptions:
-    """The readings for a deployment, and the hardware for the estimate of its costs.
-
-    Attributes:
-        recording: Recorded readings, or None to draw them.
-        columns: `NAME=COLUMN`s of the recording.
-        tolerance_s: Maximum time in seconds between a row and messages of other topics in a bag.
-        frames: Maximum number of frames; None for 200, or 20 if only the slow kernel supports the machine;
-            fewer with replicas.
-        banks: Number of seed sets for each frame; None for 4, or 1 for a slow machine.
-        seed: Seed of drawn readings.
-        clock_hz: Clock frequency of the boards.
-        device: FPGA of the boards.
-    """
-
-    recording: Path | None
-    columns: tuple[str, ...]
-    tolerance_s: float
-    frames: int | None
-    banks: int | None
-    seed: int
-    clock_hz: float
-    device: Device
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +63,8 @@ def inspect_deployment(
     deployment: Deployment, model: Model | None, options: InspectOptions, progress: Progress
 ) -> Inspection:
     """Run the machine of a deployment on readings, and estimate its costs, or raise a ToolchainError."""
-    machines = machines_of(deployment)
+    device = device_named(options.device)
+    machines = tuple(image.machine for image in read_images(deployment))
     whole = joined(machines)
     losses = None if model is None else _losses(deployment, whole, model)
     readings = _readings(deployment, whole, model, options)
@@ -101,8 +76,7 @@ def inspect_deployment(
         stop=section.stop,
     )
     resources = tuple(
-        estimate(machine.parameters, options.device, table_length=table_length(machine))
-        for machine in machines
+        estimate(machine.parameters, device, table_length=table_length(machine)) for machine in machines
     )
     banks = options.banks or (SLOW_BANKS if _is_slow(whole) else BANKS)
     with progress(len(readings)) as advance:
@@ -119,16 +93,6 @@ def inspect_deployment(
         energy=energy(machines, readings),
         clock_hz=options.clock_hz,
     )
-
-
-def machines_of(deployment: Deployment) -> tuple[BM1Machine, ...]:
-    """Return the machines in the programming files of a deployment."""
-    from pcie_shim.errors import PcieShimError
-
-    try:
-        return tuple(image.machine for image in read_images(deployment))
-    except PcieShimError as reason:
-        raise DeploymentError(str(reason)) from reason
 
 
 def _losses(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[ColumnLoss, ...]:
@@ -160,17 +124,17 @@ def _readings(
         frames = max(least, usual // replicas)
     check_frames(frames)
     mode = deployment.machine.sensor_mode
-    check_columns(options.recording, options.columns)
-    if options.recording is not None:
+    check_columns(options.readings, options.reading)
+    if options.readings is not None:
         if mode is not SensorMode.COLUMN:
             raise BuildError(
-                f"--readings {options.recording}: a recording's columns are numbers, and this machine reads arrays of one "
+                f"--readings {options.readings}: a recording's columns are numbers, and this machine reads arrays of one "
                 "number per line; omit it to draw readings"
             )
         return recorded_readings(
-            options.recording,
+            options.readings,
             deployment.variables,
-            options.columns,
+            options.reading or (),
             frames=frames * replicas,
             tolerance_s=options.tolerance_s,
         )

@@ -1,14 +1,12 @@
 """Sweeps over the possible machines of a model: accuracy, cycles and ALMs, stored point by point in a file."""
 
 import hashlib
-import itertools
 import json
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 from machines.parameters import RngKind
+from toolchain.analysis import Sweep
 from toolchain.analysis.accuracy import measure
 from toolchain.analysis.emulation import EmulatedBoards
 from toolchain.analysis.logic import Device
@@ -23,64 +21,9 @@ from toolchain.building.machine import (
     split,
     whole_machine,
 )
-from toolchain.building.options import BuildOptions
 from toolchain.building.quantise import quantise
-from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
 from toolchain.models.model import Model
-
-MAX_POINTS: Final = 10_000
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sweep:
-    """The lists that a sweep combines.
-
-    Attributes:
-        prob_bits: Widths of codes.
-        target_counts: Target counts, each with the narrowest sufficient counter.
-        rngs: Kinds of generators.
-        scales: Scalings before quantising.
-        steps_per_clock: Steps of a generator in a cycle; 0 for as many as give fresh bits.
-        partitions: Boards.
-        stop: When the boards stop.
-        max_cycles: Maximum number of cycles.
-        banks: Number of seed sets with which every frame is run.
-    """
-
-    prob_bits: tuple[int, ...]
-    target_counts: tuple[int, ...]
-    rngs: tuple[RngKind, ...]
-    scales: tuple[Scale, ...]
-    steps_per_clock: tuple[int, ...]
-    partitions: int
-    stop: Stop
-    max_cycles: int
-    banks: int
-
-    def options(self) -> Iterator[BuildOptions]:
-        """Return the options of every machine in order, or raise a BuildError if there are none or too many."""
-        lists = (self.scales, self.rngs, self.steps_per_clock, self.prob_bits, self.target_counts)
-        count = math.prod(map(len, lists))
-        if not 0 < count <= MAX_POINTS:
-            raise BuildError(f"these lists give {count} machines, expected 1 to {MAX_POINTS}")
-        for scale, rng, steps, prob_bits, target in itertools.product(*lists):
-            if target < 1:
-                raise BuildError(f"a target count of {target} is too small; expected 1 or more")
-            yield BuildOptions(
-                uri="ws://nowhere:9090",  # a sweep has no robot
-                topic="/readings",
-                type="std_msgs/Float64",
-                partitions=self.partitions,
-                scale=scale,
-                prob_bits=prob_bits,
-                counter_bits=target.bit_length(),
-                target_count=target,
-                max_cycles=self.max_cycles,
-                stop=self.stop,
-                rng=rng,
-                steps_per_clock=steps,
-            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
+import typer
 from pydantic import Field, ValidationError
 
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
@@ -14,6 +15,7 @@ from toolchain.bounded_files import TomlFile, nearest_name
 from toolchain.deployment import Output, Queue, Scale, Source, Stop, Variable, WrittenPrior
 from toolchain.deployment.sections import MessagePath, Name, Section, Sequence
 from toolchain.errors import BuildError, ToolchainError
+from toolchain.flags import MAX_CYCLES, STOP, MaxCycles, Partitions, StopWhen
 
 if TYPE_CHECKING:
     import numpy as np
@@ -147,63 +149,119 @@ class OnMissing(StrEnum):
     """A missing reading, which leaves the posterior as it is."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BuildOptions:
-    """The options of a build."""
+URI: Final = typer.Option(help="rosbridge server of the readings.", metavar="ws://HOST:PORT|robot:NAME")
+TOPIC: Final = typer.Option(help="Topic of the readings.", metavar="TOPIC")
+TYPE: Final = typer.Option(help="Type of the topic.", metavar="PACKAGE/NAME")
+OUTPUT: Final = typer.Option(help="Topic of the posteriors.", metavar="TOPIC")
+QUEUE: Final = typer.Option(help="If readings arrive too fast: keep only the latest, or all in order.")
+TOLERANCE: Final = typer.Option(
+    "--tolerance",
+    help="Seconds within which readings from several topics belong together.",
+    metavar="SECONDS",
+)
+TARGET_COUNT: Final = typer.Option(help="Count that stops a machine.", show_default="the counters' maximum")
 
-    uri: str
-    """The rosbridge server of the readings."""
-    topic: str
-    """The topic of the readings."""
-    type: str
-    """That topic's type."""
-    output: str = "/BMresults"
-    """The topic of the posteriors."""
-    partitions: int = 1
-    """The number of boards."""
+
+@dataclass(frozen=True, kw_only=True)
+class TargetOptions:
+    """The flags of a build for the topics."""
+
+    uri: Annotated[str, URI] = ""
+    topic: Annotated[str, TOPIC] = ""
+    type: Annotated[str, TYPE] = ""
+    output: Annotated[str, OUTPUT] = "/BMresults"
+    prior_path: Annotated[
+        str | None, typer.Option(help="Path of a written prior in the message.", metavar="PATH")
+    ] = None
+    queue: Annotated[Queue, QUEUE] = Queue.LATEST
+    tolerance_s: Annotated[float, TOLERANCE] = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeploymentEdits:
+    """Changes of `deployment.toml`, the flags of `toolchain regenerate deployment`; None leaves a key unchanged."""
+
+    uri: Annotated[str | None, URI] = None
+    topic: Annotated[str | None, TOPIC] = None
+    type: Annotated[str | None, TYPE] = None
+    output: Annotated[str | None, OUTPUT] = None
+    order: Annotated[
+        str | None, typer.Option(help="The sensors in the order of columns 1 to N.", metavar="A,B,C")
+    ] = None
+    path: Annotated[
+        list[str] | None,
+        typer.Option(help="Path of a variable in the message; repeatable.", metavar="NAME=PATH"),
+    ] = None
+    target_count: Annotated[int | None, TARGET_COUNT] = None
+    max_cycles: Annotated[int | None, MAX_CYCLES] = None
+    stop: Annotated[Stop | None, STOP] = None
+    queue: Annotated[Queue | None, QUEUE] = None
+    tolerance_s: Annotated[float | None, TOLERANCE] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineOptions:
+    """The flags of a build for the machine, except those that name a file or have a text form."""
+
+    partitions: Partitions = 1
+    scale: Annotated[
+        Scale | None,
+        typer.Option(
+            help="Part of a table that is divided by its maximum before quantising.",
+            show_default="address; column if cells have their own readings",
+        ),
+    ] = None
+    prob_bits: Annotated[int, typer.Option(help="Bits of a code.", min=1, max=16)] = 8
+    prior_mode: Annotated[
+        PriorMode, typer.Option(help="table: the prior is in the images; written: the host writes it.")
+    ] = PriorMode.TABLE
+    counter_bits: Annotated[int, typer.Option(help="Bits of a line's counter.", min=1, max=32)] = 8
+    target_count: Annotated[int | None, TARGET_COUNT] = None
+    max_cycles: MaxCycles = 2**17
+    stop: StopWhen = Stop.SLICES
+    rng: Annotated[
+        RngKind,
+        typer.Option(
+            help="Generators: lfsr8, lfsr16, lfsr24 or lfsr32; table: of random numbers; ideal: only in emulation.",
+            metavar="KIND",
+        ),
+    ] = RngKind.LFSR32
+    rng_banks: Annotated[int, typer.Option(help="Number of seed sets, used in turn.")] = 16
+    rng_reset: Annotated[
+        RngReset,
+        typer.Option(help="bank: each frame restarts the generators; free: never, as in the thesis."),
+    ] = RngReset.BANK
+    shared: Annotated[
+        bool, typer.Option("--shared/--per-cell", help="One generator per column, or one per cell.")
+    ] = True
+    steps_per_clock: Annotated[
+        int,
+        typer.Option(
+            help="Steps of a generator per cycle; 1 as in the thesis; 0: as many as are needed for fresh bits."
+        ),
+    ] = 0
+    sensor_mode: Annotated[
+        SensorMode,
+        typer.Option(
+            help="Input of a cell: its column's reading, its own reading (cell), or its probability (threshold)."
+        ),
+    ] = SensorMode.COLUMN
+    replicas: Annotated[
+        int,
+        typer.Option(help="Number of machines on each board, which share the generators.", min=1, max=256),
+    ] = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildOptions(MachineOptions, TargetOptions):
+    """The options of a build: those of its flags, and what the other flags name."""
+
     interface: tuple[int, int] | None = None
     """Inputs and results of the boards' registers; None for the thesis's 20 x 1200, or the size of the model
     if larger.
     """
-    scale: Scale | None = None
-    """The part of a table that is divided by its maximum before quantising; None for addresses if the lines
-    of a column share them, otherwise for whole columns.
-    """
-    prob_bits: int = 8
-    """Bits of a code (W)."""
-    prior_mode: PriorMode = PriorMode.TABLE
-    """Source of the prior: a table in the images, or the host."""
-    prior_path: str | None = None
-    """The path of a written prior in the message, with one number per line; None if it comes from elsewhere.
-    """
-    counter_bits: int = 8
-    """Bits of a line's counter."""
-    target_count: int | None = None
-    """The count that stops a machine; None for the maximum of the counters."""
-    max_cycles: int = 2**17
-    """Maximum number of cycles."""
-    stop: Stop = Stop.SLICES
-    """Stop rule: all boards together after a slice, or each at its own overflow."""
-    rng: RngKind = RngKind.LFSR32
-    """Kind of the random number generators."""
     rng_table: NDArray[np.uint32] | None = None
     """uint32[length], the random numbers for `rng = table`; None to generate them."""
-    shared: bool = True
-    """One generator per column, shared by its lines; otherwise one per cell."""
-    steps_per_clock: int = 0
-    """Steps of a generator per cycle; 0 for as many as are needed for fresh bits."""
-    sensor_mode: SensorMode = SensorMode.COLUMN
-    """The input of a cell: the reading of its column, its own reading, or its own code (`threshold`)."""
-    replicas: int = 1
-    """Number of machines on a board, which share the generators."""
-    rng_banks: int = 16
-    """Number of seed sets."""
-    rng_reset: RngReset = RngReset.BANK
-    """Reset rule of the generators: whether each frame restarts them."""
-    queue: Queue = Queue.LATEST
-    """The readings that wait if they arrive faster than frames are computed."""
-    tolerance_s: float = 0.05
-    """Maximum time in seconds between readings of several topics that belong together."""
     sources: SourcesFile | None = None
     """Several topics and their variables, in place of `uri`, `topic` and `type`; or None."""
     build_date: str = ""
@@ -212,7 +270,7 @@ class BuildOptions:
     def __post_init__(self) -> None:
         """Refuse a server, topic, type or path that is none, before a model is read."""
         try:
-            Output(topic=self.output), self.all_sources, self.written_prior
+            self.all_sources, Output(topic=self.output), self.written_prior
         except ValidationError as reason:
             raise refused_option(reason) from None
 

@@ -1,7 +1,7 @@
 """Regeneration of one part of a deployment: memories, project, or `deployment.toml` with edits (thesis 3.4)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -10,19 +10,12 @@ from machines.parameters import SensorMode
 from pcie_shim.programming_file import Image
 from toolchain.building.build import assemble, check_agreement, read_images
 from toolchain.building.machine import board_layout, machine_options, plan_machine
-from toolchain.building.options import BuildOptions, refused_option
+from toolchain.building.options import BuildOptions, DeploymentEdits, refused_option
 from toolchain.building.report import REPORT_NAME, build_report
-from toolchain.deployment import (
-    FILE_NAME,
-    Deployment,
-    Queue,
-    Stop,
-    Variable,
-    deployment_text,
-    load_deployment,
-)
+from toolchain.deployment import FILE_NAME, Deployment, Variable, deployment_text, load_deployment
 from toolchain.deployment.deployment import with_hash
 from toolchain.errors import BuildError, ModelError
+from toolchain.flags import key_values, names_in
 from toolchain.models.model import Model
 from toolchain.outputs.output_files import (
     Change,
@@ -32,34 +25,6 @@ from toolchain.outputs.output_files import (
     text_file,
     write_files,
 )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DeploymentEdits:
-    """Changes of `deployment.toml`; None leaves a key unchanged."""
-
-    uri: str | None = None
-    """The rosbridge server with the readings."""
-    topic: str | None = None
-    """The topic with the readings."""
-    type: str | None = None
-    """That topic's type."""
-    output: str | None = None
-    """The topic for the posteriors."""
-    order: tuple[str, ...] | None = None
-    """Names of all sensors in the order of the columns that read them."""
-    paths: tuple[tuple[str, str], ...] = ()
-    """The path of a variable in the message, by its name."""
-    target_count: int | None = None
-    """The count that stops a machine."""
-    max_cycles: int | None = None
-    """Maximum number of cycles."""
-    stop: Stop | None = None
-    """Stop rule of the boards."""
-    queue: Queue | None = None
-    """The readings that wait if they arrive too fast."""
-    tolerance_s: float | None = None
-    """Maximum time in seconds between readings of several topics that belong together."""
 
 
 def edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
@@ -77,7 +42,7 @@ def edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
         changed = deployment.replace(
             sources=(first_source.replace(**target), *sources),
             outputs=(first_output.replace(**_defined(topic=edits.output)), *outputs),
-            variables=_with_paths(_in_order(deployment.variables, edits.order), dict(edits.paths)),
+            variables=_with_paths(_in_order(deployment.variables, edits.order), edits.path or ()),
             machine=deployment.machine.replace(**machine),
             **_defined(queue=edits.queue, tolerance_s=edits.tolerance_s),
         )
@@ -90,13 +55,14 @@ def _defined(**values: object) -> dict[str, object]:
     return {key: value for key, value in values.items() if value is not None}
 
 
-def _in_order(variables: tuple[Variable, ...], order: tuple[str, ...] | None) -> tuple[Variable, ...]:
+def _in_order(variables: tuple[Variable, ...], given: str | None) -> tuple[Variable, ...]:
     """Return the variables in the order in which the columns read them.
 
     A column keeps its table and its conversion to addresses; its name, source and path change.
     """
-    if order is None:
+    if given is None:
         return variables
+    order = names_in("--order", given)
     columns = {variable.name: variable for variable in variables if variable.kind == "sensor"}
     if sorted(order) != sorted(columns):
         raise BuildError(
@@ -112,7 +78,8 @@ def _in_order(variables: tuple[Variable, ...], order: tuple[str, ...] | None) ->
     )
 
 
-def _with_paths(variables: tuple[Variable, ...], paths: dict[str, str]) -> tuple[Variable, ...]:
+def _with_paths(variables: tuple[Variable, ...], given: Sequence[str]) -> tuple[Variable, ...]:
+    paths = key_values(given, "--path", "range=data[0]")
     names = [variable.name for variable in variables]
     for name, path in paths.items():
         if name not in names:

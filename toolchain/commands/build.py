@@ -1,16 +1,32 @@
-"""The `toolchain build` command, which builds a deployment from a model or a network file."""
+"""The commands `toolchain build`, which builds a deployment from a model or a network file, and `toolchain check`."""
 
+import json as json_text
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from toolchain.commands.flags import BuildFlags, ModelPath
-from toolchain.deployment import Queue
+from toolchain.building.options import TargetOptions
+from toolchain.commands.request import (
+    BuildFlags,
+    ModelPath,
+    build_options,
+    fit_to_device,
+    model_file,
+    read_model,
+    read_named,
+)
+from toolchain.errors import BuildError, ToolchainError
+from toolchain.networks import is_network
 
 if TYPE_CHECKING:
-    from toolchain.building.options import SourcesFile
+    from toolchain.building.machine import MachinePlan
+    from toolchain.checks.finding import Finding
+
+_NO_ROBOT = TargetOptions(uri="ws://127.0.0.1:9090", topic="/readings", type="std_msgs/Float64MultiArray")
+"""A target for a check, which does not need one, unlike the options of a build."""
 
 
 def build(
@@ -19,13 +35,7 @@ def build(
         Path, typer.Option("--output-dir", "-o", help="Folder of the deployment.", metavar="DIR")
     ],
     flags: BuildFlags,
-    uri: Annotated[
-        str, typer.Option(help="rosbridge server of the readings.", metavar="ws://HOST:PORT|robot:NAME")
-    ] = "",
-    topic: Annotated[str, typer.Option(help="Topic of the readings.", metavar="TOPIC")] = "",
-    message_type: Annotated[
-        str, typer.Option("--type", help="Type of the topic.", metavar="PACKAGE/NAME")
-    ] = "",
+    target: TargetOptions,
     sources: Annotated[
         Path | None,
         typer.Option(
@@ -33,19 +43,6 @@ def build(
             metavar="FILE",
         ),
     ] = None,
-    output: Annotated[str, typer.Option(help="Topic of the posteriors.", metavar="TOPIC")] = "/BMresults",
-    prior_path: Annotated[
-        str | None, typer.Option(help="Path of a written prior in the message.", metavar="PATH")
-    ] = None,
-    queue: Annotated[
-        Queue, typer.Option(help="If readings arrive too fast: keep only the latest, or all in order.")
-    ] = Queue.LATEST,
-    tolerance: Annotated[
-        float,
-        typer.Option(
-            help="Seconds within which readings from several topics belong together.", metavar="SECONDS"
-        ),
-    ] = 0.05,
 ) -> None:
     """Build a deployment: programming files, deployment.toml, a report, and a hardware project.
 
@@ -60,25 +57,12 @@ def build(
     from toolchain.building.build import build_date, build_deployment
     from toolchain.building.machine import plan_machine
     from toolchain.building.report import REPORT_NAME
-    from toolchain.commands.request import build_options, fit_to_device, model_file, read_model, read_named
 
-    options = replace(
-        build_options(
-            flags,
-            uri=uri,
-            topic=topic,
-            message_type=message_type,
-            sources=_sources(sources, uri=uri, topic=topic, message_type=message_type, prior_path=prior_path),
-        ),
-        output=output,
-        prior_path=prior_path,
-        queue=queue,
-        tolerance_s=tolerance,
-    )
-    options = read_named(options, flags)
-    typer.echo(f"Reading {model_file(model)}", err=True)
+    file = model_file(model)
+    options = read_named(build_options(flags, target, sources), flags)
+    typer.echo(f"Reading {file}", err=True)
     read = read_model(model, flags, flags.bits)
-    dated = replace(options, build_date=build_date(model_file(model)))
+    dated = replace(options, build_date=build_date(file))
     plan, why = fit_to_device(plan_machine(read, dated), flags.device)
     typer.echo(f"Quantising {read.name} and writing its images", err=True)
     built = build_deployment(plan, directory, remark=why)
@@ -86,23 +70,72 @@ def build(
     typer.echo(f"Wrote {built.deployment.path} and {directory / REPORT_NAME}", err=True)
 
 
-def _sources(
-    path: Path | None, *, uri: str, topic: str, message_type: str, prior_path: str | None
-) -> "SourcesFile | None":
-    """Return the file that assigns variables to topics, if there is one; otherwise the flags must name a topic."""
-    from toolchain.building.options import read_sources
-    from toolchain.errors import BuildError
+def check(
+    context: typer.Context,
+    path: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder with model.py, a network file, or the folder of a deployment.", metavar="MODEL|DIR"
+        ),
+    ],
+    flags: BuildFlags,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
+) -> None:
+    """Report mistakes before anything runs: in a model as it would be built, or in a deployment.
 
-    target = {"--uri": uri, "--topic": topic, "--type": message_type}
-    if path is None:
-        missing = [flag for flag, value in target.items() if not value]
-        if missing:
-            raise BuildError(
-                f"{missing[0]} is missing: give the source of the readings with --uri, --topic and --type, or with "
-                "--sources FILE for several topics"
-            )
-        return None
-    for flag, value in (*target.items(), ("--prior-path", prior_path)):
-        if value and flag != "--uri":
-            raise BuildError(f"{flag} {value}: the file of --sources sets that for each topic; omit the flag")
-    return read_sources(path, uri or None)
+    For example `toolchain check casestudies/boat --partitions 4`, or `toolchain check build/boat`. The exit
+    code is 2 if there is an error among the findings, otherwise 0.
+    """
+    from toolchain.checks.check import check_deployment
+    from toolchain.checks.finding import Severity
+    from toolchain.deployment import FILE_NAME
+    from toolchain.models import case_study
+
+    if is_network(path) or case_study.model_path(path).is_file():
+        findings = _of_model(path, flags)
+    elif not (path / FILE_NAME).is_file():
+        raise BuildError(
+            f"{path} contains neither a model ({case_study.FILE_NAME}) nor a deployment ({FILE_NAME}), and is not a "
+            "network's file"
+        )
+    else:
+        for flag in _model_flags(context):
+            raise BuildError(f"{flag} is for a model; {path} is a deployment, which was built with its own")
+        findings = check_deployment(path)
+    for finding in findings:
+        typer.echo(json_text.dumps(finding.as_dict()) if json else finding.sentence)
+    counts = Counter(finding.severity for finding in findings)
+    if not json:
+        summary = ", ".join(
+            f"{counts[severity]} {severity}{'' if counts[severity] == 1 else 's'}" for severity in Severity
+        )
+        typer.echo(f"{path}: {summary}", err=True)
+    raise typer.Exit(ToolchainError.exit_code if counts[Severity.ERROR] else 0)
+
+
+def _model_flags(context: typer.Context) -> list[str]:
+    given = []
+    for each in context.command.params:
+        source = context.get_parameter_source(each.name or "")
+        if source is not None and source.name == "COMMANDLINE" and each.name not in {"path", "json"}:
+            given.append(max(each.opts, key=len))
+    return given
+
+
+def _of_model(path: Path, flags: BuildFlags) -> "list[Finding]":
+    from toolchain.checks.check import check_model, refusal
+
+    options = build_options(flags, _NO_ROBOT)
+    try:
+        options = read_named(options, flags)
+        model = read_model(path, flags, flags.bits)
+    except ToolchainError as reason:
+        return [refusal(reason, "the model")]
+
+    def fitted(plan: "MachinePlan") -> "MachinePlan":
+        plan, why = fit_to_device(plan, flags.device)
+        if why:
+            typer.echo(why, err=True)
+        return plan
+
+    return check_model(model, options, fitted)

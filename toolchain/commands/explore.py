@@ -1,55 +1,72 @@
-"""The `toolchain explore` command: a sweep over machines for a model, or the thesis's claims as experiments."""
+"""The commands of analyses: `toolchain inspect` explains a deployment, `toolchain explore` compares machines."""
 
-from dataclasses import dataclass
-from enum import StrEnum
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from machines.parameters import RngKind
-from toolchain.commands.flags import Bits, MaxCycles, ModelFlags, Partitions, ReadingFlags, StopWhen
-from toolchain.commands.progress import progress
-from toolchain.deployment import Scale, Stop
+from toolchain.analysis import InspectOptions, ReadingOptions, Sweep
+from toolchain.commands.request import ModelFlags, read_model
 from toolchain.errors import BuildError
+from toolchain.flags import Bits
 
 if TYPE_CHECKING:
     from toolchain.analysis.results import Point
-    from toolchain.analysis.sweep import Sweep
-
-Kind = TypeVar("Kind", bound=StrEnum)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SweepFlags(ModelFlags):
-    """Flags of a sweep: comma-separated lists are combined, the rest is the same for all machines."""
+@contextmanager
+def progress(total: int) -> Iterator[Callable[[str], None]]:
+    """Show a bar on a terminal, nothing elsewhere; yield a function to call with a text after each step."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    bits: Bits = None
-    prob_bits: Annotated[str, typer.Option(help="Bits of a code, comma-separated.", metavar="LIST")] = (
-        "4,6,8,10"
-    )
-    targets: Annotated[
-        str, typer.Option(help="Target counts, each with the narrowest counter.", metavar="LIST")
-    ] = "63,255,1023"
-    rngs: Annotated[str, typer.Option(help="Generators.", metavar="LIST")] = "lfsr16,lfsr32"
-    scales: Annotated[
-        str,
+    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True)) as shown:
+        bar = shown.add_task("", total=total)
+        yield lambda words: shown.update(bar, advance=1, description=words)
+
+
+def inspect(
+    directory: Annotated[Path, typer.Argument(help="Folder of a deployment.", metavar="DIR")],
+    flags: ModelFlags,
+    options: InspectOptions,
+    bits: Bits = None,
+    model: Annotated[
+        Path | None,
         typer.Option(
-            help="Part of a table that is divided by its maximum before quantising.", metavar="LIST"
+            help="The model from which it was built, folder or network file: accuracy is then compared with the "
+            "model, not only with its codes.",
+            metavar="MODEL",
         ),
-    ] = "address,column"
-    steps: Annotated[
-        str, typer.Option(help="Steps of a generator per cycle; 0: fresh bits.", metavar="LIST")
-    ] = "0"
-    partitions: Partitions = 1
-    stop: StopWhen = Stop.SLICES
-    max_cycles: MaxCycles = 2**17
-    banks: Annotated[int, typer.Option(help="Number of seed sets for each frame.")] = 2
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+) -> None:
+    """Explain a deployment: machine, quantisation loss, cycles, accuracy, resources and energy.
+
+    For example `toolchain inspect build/boat --model casestudies/boat --clock 100e6`, or over recorded readings
+    `toolchain inspect build/mrclam --readings DATA/ds1_robot3.csv --reading 'range_*=range_*_m' --reading
+    'bearing_*=bearing_*_rad'`
+    """
+    from toolchain.analysis.inspection import as_json, inspect_deployment, inspection_report
+    from toolchain.deployment import load_deployment
+
+    deployment = load_deployment(directory)
+    read = None if model is None else read_model(model, flags, bits)
+    found = inspect_deployment(deployment, read, options, progress)
+    typer.echo(as_json(found) if json else inspection_report(found), nl=False)
 
 
 def explore(
-    flags: SweepFlags,
-    readings: ReadingFlags,
+    flags: ModelFlags,
+    sweep: Sweep,
+    readings: ReadingOptions,
+    bits: Bits = None,
     model: Annotated[
         Path | None,
         typer.Argument(
@@ -94,13 +111,11 @@ def explore(
     from toolchain.analysis.readings import check_columns, recorded_readings, sample_readings
     from toolchain.analysis.results import Results, check_pictures_possible, draw_sweep, pareto, table
     from toolchain.analysis.sweep import run_sweep, run_task, tasks, with_resources
-    from toolchain.commands.request import read_model
 
     if plot is not None:
         check_pictures_possible(plot)
     device = device_named(readings.device)
-    sweep = _sweep(flags)
-    read = read_model(model, flags, flags.bits)
+    read = read_model(model, flags, bits)
     check_columns(readings.readings, readings.reading)
     if readings.readings is None:
         drawn = sample_readings(read, frames, seed=readings.seed)
@@ -137,42 +152,6 @@ def explore(
             if plot is not None:
                 draw_sweep(plot, read.name, points, front)
                 typer.echo(f"Wrote {plot}", err=True)
-
-
-def _sweep(flags: SweepFlags) -> "Sweep":
-    from toolchain.analysis.sweep import Sweep
-
-    if flags.partitions < 1 or flags.max_cycles < 1 or flags.banks < 1:
-        raise BuildError("--partitions, --max-cycles and --banks are numbers from 1")
-    return Sweep(
-        prob_bits=_numbers("--prob-bits", flags.prob_bits),
-        target_counts=_numbers("--targets", flags.targets),
-        rngs=_members("--rngs", flags.rngs, RngKind),
-        scales=_members("--scales", flags.scales, Scale),
-        steps_per_clock=_numbers("--steps", flags.steps),
-        partitions=flags.partitions,
-        stop=flags.stop,
-        max_cycles=flags.max_cycles,
-        banks=flags.banks,
-    )
-
-
-def _numbers(flag: str, text: str) -> tuple[int, ...]:
-    try:
-        return tuple(dict.fromkeys(int(part) for part in text.split(",")))
-    except ValueError:
-        raise BuildError(
-            f"{flag} {text}: expected comma-separated whole numbers, such as {flag} 4,8"
-        ) from None
-
-
-def _members(flag: str, text: str, kind: type[Kind]) -> tuple[Kind, ...]:
-    try:
-        return tuple(dict.fromkeys(kind(part.strip()) for part in text.split(",")))
-    except ValueError:
-        raise BuildError(
-            f"{flag} {text}: expected some of {', '.join(kind)}, with commas between them"
-        ) from None
 
 
 def _name_of(point: "Point") -> str:

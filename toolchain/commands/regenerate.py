@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 
 from terminal.command_line import CommandLine
-from toolchain.commands.flags import ModelFlags, TargetCount, add_commands
-from toolchain.deployment import FILE_NAME, Queue, Stop
+from toolchain.building.options import DeploymentEdits
+from toolchain.commands.request import ModelFlags, model_file, read_model
+from toolchain.deployment import FILE_NAME
+from toolchain.errors import BuildError
+from toolchain.flags import add_commands
 
 if TYPE_CHECKING:
     from toolchain.building.regenerate import Changes
@@ -45,8 +48,6 @@ def memories(
     """
     from toolchain.building.build import build_date
     from toolchain.building.regenerate import regenerate_memories
-    from toolchain.commands.request import model_file, read_model
-    from toolchain.errors import BuildError
 
     if model is not None:
         read = read_model(model, flags)
@@ -72,61 +73,14 @@ def project(directory: Directory, verbose: Verbose = False) -> None:
         typer.echo("rng = ideal exists only in emulation, so there is no project", err=True)
 
 
-def deployment(
-    directory: Directory,
-    uri: Annotated[
-        str | None,
-        typer.Option(help="rosbridge server of the readings.", metavar="ws://HOST:PORT|robot:NAME"),
-    ] = None,
-    topic: Annotated[str | None, typer.Option(help="Topic of the readings.", metavar="TOPIC")] = None,
-    message_type: Annotated[
-        str | None, typer.Option("--type", help="That topic's type.", metavar="PACKAGE/NAME")
-    ] = None,
-    output: Annotated[str | None, typer.Option(help="Topic of the posteriors.", metavar="TOPIC")] = None,
-    order: Annotated[
-        str | None, typer.Option(help="The sensors in the order of columns 1 to N.", metavar="A,B,C")
-    ] = None,
-    path: Annotated[
-        list[str] | None,
-        typer.Option(help="Path of a variable in the message; repeatable.", metavar="NAME=PATH"),
-    ] = None,
-    target_count: TargetCount = None,
-    max_cycles: Annotated[int | None, typer.Option(help="Maximum number of cycles.")] = None,
-    stop: Annotated[
-        Stop | None,
-        typer.Option(
-            help="slices: all boards shortly after the first overflow; own: each at its own overflow."
-        ),
-    ] = None,
-    queue: Annotated[
-        Queue | None, typer.Option(help="If readings arrive too fast: keep only the latest, or all in order.")
-    ] = None,
-    tolerance: Annotated[
-        float | None, typer.Option(help="Seconds within which readings from several topics belong together.")
-    ] = None,
-    verbose: Verbose = False,
-) -> None:
+def deployment(directory: Directory, edits: DeploymentEdits, verbose: Verbose = False) -> None:
     """Write deployment.toml with other topics, or variables in another order; manual edits are kept.
 
     For example `toolchain regenerate deployment build/boat --order D2,D1,D3,B1,B2,B3` if the first two
     readings were swapped. Images, memories and boards are not touched. Omitted flags do not change anything.
     """
-    from toolchain.building.regenerate import DeploymentEdits, regenerate_deployment
-    from toolchain.flag_values import key_values, names_in
+    from toolchain.building.regenerate import regenerate_deployment
 
-    edits = DeploymentEdits(
-        uri=uri,
-        topic=topic,
-        type=message_type,
-        output=output,
-        order=None if order is None else tuple(names_in("--order", order)),
-        paths=tuple(key_values(path or (), "--path", "range=data[0]").items()),
-        target_count=target_count,
-        max_cycles=max_cycles,
-        stop=stop,
-        queue=queue,
-        tolerance_s=tolerance,
-    )
     before = _lines(directory)
     changes = regenerate_deployment(directory, edits)
     _print_changes(changes, before, _lines(directory), verbose=verbose)

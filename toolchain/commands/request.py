@@ -1,101 +1,125 @@
-"""The model and the build options of a command line."""
-
-from __future__ import annotations
+"""The model and the build options of a command line: their flags, and how they are read."""
 
 import re
 from collections.abc import Iterable
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, TypeAlias
+
+import typer
 
 from machines.parameters import ADDRESS_BITS_MAX, RngKind
-from toolchain.analysis.logic import device_named
-from toolchain.analysis.resources import boards_needed
-from toolchain.building.machine import MachinePlan
-from toolchain.building.options import BuildOptions
+from toolchain.bounded_files import open_regular
+from toolchain.building.options import BuildOptions, MachineOptions, OnMissing, TargetOptions, read_sources
 from toolchain.deployment import parse_interface
-from toolchain.errors import BuildError
-from toolchain.flag_values import key_values, names_in
-from toolchain.models.case_study import load_model, model_path
-from toolchain.models.model import Model
+from toolchain.errors import BuildError, NetworkFileError
+from toolchain.flags import Bits, Settings, key_values, names_in
 from toolchain.networks import is_network, read_network
-from toolchain.outputs.mif import LENGTH, read_table
 
 if TYPE_CHECKING:
-    from toolchain.building.options import SourcesFile
-    from toolchain.commands.flags import BuildFlags, ModelFlags
+    from toolchain.building.machine import MachinePlan
+    from toolchain.models.model import Model
+
+ModelPath: TypeAlias = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net, .xdsl (.gz).",
+        metavar="MODEL",
+    ),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelFlags:
+    """Flags for reading a model: parameters of model.py, or variables of a network."""
+
+    settings: Settings = None
+    searched: Annotated[str, typer.Option(help="Searched variables.", metavar="A,B")] = ""
+    known: Annotated[
+        str, typer.Option(help="Variables with readings, in the order of the columns.", metavar="A,B")
+    ] = ""
+    given: Annotated[
+        list[str] | None,
+        typer.Option(help="A variable with a fixed state; repeatable.", metavar="NAME=STATE"),
+    ] = None
+    prior_select: Annotated[
+        str, typer.Option(help="Variable whose readings select the prior.", metavar="NAME")
+    ] = ""
+    on_missing: Annotated[OnMissing, typer.Option(help="Meaning of an absent reading.")] = OnMissing.ERROR
+
+    @property
+    def question(self) -> list[str]:
+        """The given flags that are only for networks."""
+        values = {
+            "--searched": self.searched,
+            "--known": self.known,
+            "--given": self.given,
+            "--prior-select": self.prior_select,
+            "--on-missing": self.on_missing is not OnMissing.ERROR,
+        }
+        return [flag for flag, value in values.items() if value]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BuildFlags(MachineOptions, ModelFlags):
+    """Flags for building a machine from a model."""
+
+    bits: Bits = None
+    device: Annotated[
+        str | None,
+        typer.Option(
+            help="FPGA of a board: the build uses as many boards as the lines need, and gives the reason.",
+            metavar="proce-v-d8",
+        ),
+    ] = None
+    interface: Annotated[
+        str | None,
+        typer.Option(
+            help="Inputs x results of a board's registers.",
+            show_default="20x1200, or the model's size if larger",
+            metavar="INPUTSxRESULTS",
+        ),
+    ] = None
+    rng_table: Annotated[
+        Path | None,
+        typer.Option(
+            help="With --rng table: the random numbers; without it, they are generated.", metavar="MIF"
+        ),
+    ] = None
 
 
 def model_file(path: Path) -> Path:
-    """Return the file of a model: the network file, or the `model.py` of a folder."""
-    return path if is_network(path) else model_path(path)
+    """Return the file of a model, the network file or the `model.py` of a folder, or raise a ToolchainError."""
+    if is_network(path):
+        open_regular(path, NetworkFileError).close()
+        return path
+    from toolchain.models.case_study import existing_model_path
+
+    return existing_model_path(path)
 
 
-def read_model(path: Path, flags: ModelFlags, bits: Iterable[str] | None = None) -> Model:
+def read_model(path: Path, flags: ModelFlags, bits: Iterable[str] | None = None) -> "Model":
     """Return the model of a folder or network file; `bits` are `NAME=BITS`, the address bits of columns."""
     settings = key_values(flags.settings or ())
     model = (_network_model if is_network(path) else _case_model)(path, flags, settings)
-    return _with_bits(model, key_values(bits or (), "--bits", "range=8"))
-
-
-def build_options(
-    flags: BuildFlags, *, uri: str, topic: str, message_type: str, sources: SourcesFile | None = None
-) -> BuildOptions:
-    """Return the options of a build, without the files named by flags."""
-    common = {field.name for field in fields(BuildOptions)} & {field.name for field in fields(flags)}
-    values = {name: getattr(flags, name) for name in common - {"interface", "rng_table"}}
-    return BuildOptions(uri=uri, topic=topic, type=message_type, sources=sources, **values)
-
-
-def read_named(options: BuildOptions, flags: BuildFlags) -> BuildOptions:
-    """Return the options with the interface and the table of random numbers given by flags."""
-    if flags.interface is not None:
-        try:
-            options = replace(options, interface=parse_interface(flags.interface))
-        except ValueError as reason:
-            raise BuildError(f"--interface: {reason}") from None
-    if flags.rng_table is not None:
-        if options.rng is not RngKind.TABLE:
-            raise BuildError(f"--rng-table requires --rng table, but this is --rng {options.rng}")
-        options = replace(options, rng_table=read_table(flags.rng_table))
-    return options
-
-
-def fit_to_device(plan: MachinePlan, name: str | None) -> tuple[MachinePlan, str]:
-    """Return the plan with as many boards as the lines need on a device, and the reason as a sentence."""
-    if name is None:
-        return plan, ""
-    options = plan.options
-    count, why = boards_needed(
-        plan.parameters,
-        device_named(name),
-        table_length=LENGTH if options.rng_table is None else options.rng_table.size,
-    )
-    if options.partitions > count:
-        why += f" --partitions {options.partitions} asks for more."
-    return replace(plan, options=replace(options, partitions=max(count, options.partitions))), why
-
-
-def _with_bits(model: Model, bits: dict[str, str]) -> Model:
+    widths = key_values(bits or (), "--bits", "range=8")
     names = [variable.name for variable in model.variables]
-    widths: dict[str, int] = {}
-    for name, text in bits.items():
+    for name, text in widths.items():
         if name not in names:
             raise BuildError(
                 f"--bits {name}={text}: the model has no such variable; it has {', '.join(names) or 'none'}"
             )
         if not re.fullmatch(r"\d{1,3}", text, re.ASCII) or not 1 <= int(text) <= ADDRESS_BITS_MAX:
             raise BuildError(f"--bits {name}={text}: expected 1 to {ADDRESS_BITS_MAX} bits")
-        widths[name] = int(text)
     select = model.prior_select
     return replace(
         model,
-        known=tuple(replace(known, bits=widths.get(known.name, known.bits)) for known in model.known),
-        prior_select=None if select is None else replace(select, bits=widths.get(select.name, select.bits)),
+        known=tuple(replace(known, bits=int(widths.get(known.name, known.bits))) for known in model.known),
+        prior_select=select and replace(select, bits=int(widths.get(select.name, select.bits))),
     )
 
 
-def _network_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> Model:
+def _network_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Model":
     """Return the model for the question to a network file."""
     if settings:
         raise BuildError(
@@ -117,9 +141,71 @@ def _network_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> M
     )
 
 
-def _case_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> Model:
+def _case_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Model":
+    from toolchain.models.case_study import load_model
+
     if flags.question:
         raise BuildError(
             f"{flags.question[0]} is for a network file, but {path} is not one; model.py contains its own question"
         )
     return load_model(path, settings)
+
+
+def build_options(flags: BuildFlags, target: TargetOptions, sources: Path | None = None) -> BuildOptions:
+    """Return the options of a build, without the interface and the table of random numbers.
+
+    `sources` is a file that assigns variables to topics; without it, the target must name a topic.
+    """
+    place = {"--uri": target.uri, "--topic": target.topic, "--type": target.type}
+    missing = [flag for flag, value in place.items() if not value]
+    if sources is None and missing:
+        raise BuildError(
+            f"{missing[0]} is missing: give the source of the readings with --uri, --topic and --type, or with "
+            "--sources FILE for several topics"
+        )
+    if sources is not None:
+        for flag, value in (*place.items(), ("--prior-path", target.prior_path)):
+            if value and flag != "--uri":
+                raise BuildError(
+                    f"{flag} {value}: the file of --sources sets that for each topic; omit the flag"
+                )
+    return BuildOptions(
+        sources=None if sources is None else read_sources(sources, target.uri or None),
+        **{each.name: getattr(target, each.name) for each in fields(TargetOptions)},
+        **{each.name: getattr(flags, each.name) for each in fields(MachineOptions)},
+    )
+
+
+def read_named(options: BuildOptions, flags: BuildFlags) -> BuildOptions:
+    """Return the options with the interface and the table of random numbers given by flags."""
+    from toolchain.outputs.mif import read_table
+
+    if flags.interface is not None:
+        try:
+            options = replace(options, interface=parse_interface(flags.interface))
+        except ValueError as reason:
+            raise BuildError(f"--interface: {reason}") from None
+    if flags.rng_table is not None:
+        if options.rng is not RngKind.TABLE:
+            raise BuildError(f"--rng-table requires --rng table, but this is --rng {options.rng}")
+        options = replace(options, rng_table=read_table(flags.rng_table))
+    return options
+
+
+def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
+    """Return the plan with as many boards as the lines need on a device, and the reason as a sentence."""
+    if name is None:
+        return plan, ""
+    from toolchain.analysis.logic import device_named
+    from toolchain.analysis.resources import boards_needed
+    from toolchain.outputs.mif import LENGTH
+
+    options = plan.options
+    count, why = boards_needed(
+        plan.parameters,
+        device_named(name),
+        table_length=LENGTH if options.rng_table is None else options.rng_table.size,
+    )
+    if options.partitions > count:
+        why += f" --partitions {options.partitions} asks for more."
+    return replace(plan, options=replace(options, partitions=max(count, options.partitions))), why

@@ -2,6 +2,11 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from toolchain.flags import ReadingColumns
 
 
 class FitMethod(StrEnum):
@@ -22,27 +27,46 @@ class FitPrior(StrEnum):
     """All values equally probable."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """The options of a fit, except the model and the recordings."""
+    """The flags of a fit, except the model and the recordings."""
 
-    truth: tuple[str, ...]
-    """`LABEL=COLUMN` of each searched dimension."""
-    readings: tuple[str, ...] = ()
-    """`NAME=COLUMN` of known variables; one `*` in both matches the same text."""
-    method: FitMethod = FitMethod.NORMALS
-    """The method of learning."""
-    pool: tuple[str, ...] = ()
-    """Patterns of variables that share sigma and bias; each has its own share of outliers."""
-    bias: bool = False
-    """True to fit a constant error."""
-    floor: float = 0.005
-    """The minimum probability of an outlier, relative to the peak."""
-    pseudo_count: float = 1.0
-    """Weight of the Dirichlet prior of a cell, in readings."""
-    prior: FitPrior = FitPrior.MODEL
-    """Shape of that prior."""
-    learn_prior: bool = False
-    """True to count P(S) too."""
-    tolerance_s: float = 0.1
-    """Maximum time in seconds between a reading in a bag and its truth."""
+    truth: Annotated[
+        list[str],
+        typer.Option(
+            help="Column of the true value of a searched dimension; one per dimension.",
+            metavar="LABEL=COLUMN",
+        ),
+    ]
+    readings: ReadingColumns = None
+    method: Annotated[
+        FitMethod, typer.Option(help="normals: sigma and the share of outliers; counts: whole tables.")
+    ] = FitMethod.NORMALS
+    pool: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="normals: variables that share sigma and bias, such as 'range_*'.", metavar="PATTERN"
+        ),
+    ] = None
+    bias: Annotated[bool, typer.Option("--bias", help="normals: also fit a constant error.")] = False
+    floor: Annotated[
+        float,
+        typer.Option(
+            help="normals: minimum probability of an outlier, relative to the peak; codes must represent it."
+        ),
+    ] = 0.005
+    pseudo_count: Annotated[
+        float, typer.Option(help="counts: weight of the Dirichlet prior of a cell, in readings.")
+    ] = 1.0
+    prior: Annotated[
+        FitPrior, typer.Option(help="counts: shape of the prior: the table of the model, or uniform.")
+    ] = FitPrior.MODEL
+    learn_prior: Annotated[
+        bool, typer.Option("--learn-prior", help="counts: also count how often each cell is the true one.")
+    ] = False
+    tolerance_s: Annotated[
+        float,
+        typer.Option(
+            "--tolerance", help="bags: maximum time between a reading and its truth.", metavar="SECONDS"
+        ),
+    ] = 0.1

@@ -146,7 +146,7 @@ def _normals(
         widths[name] = known.values * known.step
         supports.append(support)
     fitted: dict[str, FittedVariable] = {}
-    for pool in _pools(list(readings), options.pool):
+    for pool in _pools(list(readings), options.pool or ()):
         if sum(len(residuals[name]) for name in pool) < LEAST_READINGS:
             continue
         least = _LEAST_SIGMA * min(readings[name][0].step for name in pool)

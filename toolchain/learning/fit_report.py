@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from toolchain.deployment.address import to_address
 from toolchain.errors import BuildError, ModelError, ReadingError
-from toolchain.flag_values import key_values
+from toolchain.flags import key_values
 from toolchain.learning import FitMethod, FitOptions
 from toolchain.learning.fit import LEAST_READINGS, Support, TrueCells, fit_model, locate
 from toolchain.learning.fitted import Fit, FittedRecording, apply_fit, write_fit
@@ -46,7 +46,7 @@ def run_fit(
             )
     model = load_model(case, key_values(settings))
     truth_columns = _truth_columns(model, options.truth)
-    columns_of_readings = reading_columns([known.name for known in model.known], options.readings)
+    columns_of_readings = reading_columns([known.name for known in model.known], options.readings or ())
     columns = list(dict.fromkeys([*columns_of_readings.values(), *truth_columns.values()]))
     read = [read_recording(path, columns, tolerance_s=options.tolerance_s) for path in recordings]
     truth = locate(model, _joined(read, truth_columns), sum(each.rows for each in read))

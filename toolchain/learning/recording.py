@@ -18,7 +18,7 @@ from typing import Any, Final, TextIO
 
 from toolchain.bounded_files import open_regular
 from toolchain.errors import BuildError, ModelError
-from toolchain.flag_values import key_values
+from toolchain.flags import key_values
 
 MAX_ROWS: Final = 2_000_000
 _LONGEST_LINE: Final = 1 << 20

@@ -33,17 +33,7 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
         ModelError: The folder or file does not exist, a parameter or value is unknown or missing, `model.py`
             contains an error, or the result is not a Model.
     """
-    path = model_path(case)
-    if not path.is_file():
-        what = "does not exist"
-        if Path(case).is_dir():
-            what = f"has no {FILE_NAME}"
-        elif Path(case).exists():
-            what = "is not a model"
-        raise ModelError(
-            f"{case} {what}; expected a folder with a {FILE_NAME} that defines model(), or a network file (.bif, "
-            ".xmlbif, .uai, .net or .xdsl, with or without .gz)"
-        )
+    path = existing_model_path(case)
     # standard output belongs to the command, which may print JSON
     with _importing_from(path.parent.resolve()), redirect_stdout(sys.stderr):
         function = _model_function(path)
@@ -63,6 +53,22 @@ def model_path(case: Path) -> Path:
     """Return the path of a case study's model: in its folder, or the given file."""
     case = Path(case)
     return case if case.name == FILE_NAME and case.is_file() else case / FILE_NAME
+
+
+def existing_model_path(case: Path) -> Path:
+    """Return the path of a case study's model, or raise a ModelError if there is none."""
+    path = model_path(case)
+    if not path.is_file():
+        what = "does not exist"
+        if Path(case).is_dir():
+            what = f"has no {FILE_NAME}"
+        elif Path(case).exists():
+            what = "is not a model"
+        raise ModelError(
+            f"{case} {what}; expected a folder with a {FILE_NAME} that defines model(), or a network file (.bif, "
+            ".xmlbif, .uai, .net or .xdsl, with or without .gz)"
+        )
+    return path
 
 
 @contextmanager

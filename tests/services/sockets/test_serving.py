@@ -13,7 +13,8 @@ from services.sockets.records import Hello, Notice, Trouble
 from services.sockets.serving import MasterLink, outdated
 from tests.patience import PATIENCE
 from tests.services.conftest import until
-from toolchain.building.regenerate import DeploymentEdits, regenerate_deployment
+from toolchain.building.options import DeploymentEdits
+from toolchain.building.regenerate import regenerate_deployment
 from toolchain.deployment import load_deployment
 
 

@@ -12,15 +12,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from machines.parameters import RngKind
 from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.corridor import corridor
 from tests.toolchain.running import assert_refused, done, toolchain
+from toolchain.analysis import Sweep
 from toolchain.analysis.logic import DEVICES
 from toolchain.analysis.readings import sample_readings
 from toolchain.analysis.results import Point, Results, pareto
-from toolchain.analysis.sweep import Sweep, run_sweep, run_task, tasks
-from toolchain.deployment import Scale, Stop
+from toolchain.analysis.sweep import run_sweep, run_task, tasks
+from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 
 D8 = DEVICES["proce-v-d8"]
@@ -28,12 +28,10 @@ D8 = DEVICES["proce-v-d8"]
 
 def sweep(**others):
     settings = {
-        "prob_bits": (4, 8),
-        "target_counts": (15, 63),
-        "rngs": (RngKind.LFSR16,),
-        "scales": (Scale.ADDRESS,),
-        "steps_per_clock": (0,),
-        "partitions": 1,
+        "prob_bits": "4,8",
+        "targets": "15,63",
+        "rngs": "lfsr16",
+        "scales": "address",
         "stop": Stop.OWN,
         "max_cycles": 4096,
         "banks": 1,
@@ -61,7 +59,7 @@ def run(case, *arguments):
 
 
 def test_keys_name_what_the_figures_depend_on():
-    model, columns = corridor(), {"scales": (Scale.COLUMN,)}
+    model, columns = corridor(), {"scales": "column"}
 
     def keys(of=model, seed=1, **others):
         return [task.key for task in tasks(of, sweep(**others), sample_readings(of, 5, seed=seed), D8)]
@@ -71,15 +69,14 @@ def test_keys_name_what_the_figures_depend_on():
     changes = [{"seed": 2}, {"max_cycles": 4097}, {"partitions": 2}, {"banks": 2}, columns]
     others = [keys(corridor(sigma=1.1)), *(keys(**each) for each in changes)]
     assert len({key for each in (first, *others) for key in each}) == 4 * 7
-    assert set(first) < set(keys(prob_bits=(4, 8, 12)))
+    assert set(first) < set(keys(prob_bits="4,8,12"))
 
 
 def test_a_machine_that_two_combinations_make_is_one():
     frames = sample_readings(corridor(), 3, seed=1)
-    each = tasks(corridor(), sweep(steps_per_clock=(0, 8), prob_bits=(8,), target_counts=(15,)), frames, D8)
+    each = tasks(corridor(), sweep(steps="0,8", prob_bits="8", targets="15"), frames, D8)
     assert len(each) == 1
-    kinds = (RngKind.TABLE, RngKind.IDEAL, RngKind.LFSR16)
-    swept = sweep(steps_per_clock=(0, 1), prob_bits=(8,), target_counts=(15,), rngs=kinds)
+    swept = sweep(steps="0,1", prob_bits="8", targets="15", rngs="table,ideal,lfsr16")
     assert len(tasks(corridor(), swept, frames, D8)) == 4
 
 

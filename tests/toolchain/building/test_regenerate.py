@@ -3,7 +3,8 @@
 import pytest
 
 from tests.toolchain.running import TARGET, contents, done, toolchain
-from toolchain.building.regenerate import DeploymentEdits, edited
+from toolchain.building.options import DeploymentEdits
+from toolchain.building.regenerate import edited
 from toolchain.deployment import load_deployment
 from toolchain.errors import DamagedDeploymentError
 
@@ -172,7 +173,7 @@ def test_a_column_takes_the_source_of_the_variable_that_it_reads(built):
     one, two = deployment.variables
     sources = (deployment.sources[0], deployment.sources[0].replace(topic="/other"))
     deployment = deployment.replace(sources=sources, variables=(one, two.replace(source=1, path="data[1]")))
-    changed = edited(deployment, DeploymentEdits(order=(two.name, one.name))).variables
+    changed = edited(deployment, DeploymentEdits(order=f"{two.name},{one.name}")).variables
     assert [(each.name, each.source, each.path) for each in changed] == [
         (two.name, 1, "data[1]"),
         (one.name, 0, one.path),

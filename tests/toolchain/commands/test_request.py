@@ -1,13 +1,13 @@
 """Flags and the build options that they become."""
 
-from dataclasses import fields
+from dataclasses import asdict, fields
 
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
-from toolchain.commands.flags import BuildFlags, ModelFlags
-from toolchain.commands.request import build_options
-from toolchain.deployment import Scale, Stop
+from toolchain.building.options import BuildOptions, MachineOptions, TargetOptions
+from toolchain.commands.request import BuildFlags, build_options
+from toolchain.deployment import Queue, Scale, Stop
 
-OTHERS = {
+MACHINE = {
     "partitions": 2,
     "scale": Scale.NONE,
     "prob_bits": 9,
@@ -24,20 +24,15 @@ OTHERS = {
     "sensor_mode": SensorMode.CELL,
     "replicas": 15,
 }
+TARGET = TargetOptions(
+    uri="ws://a:1", topic="/b", type="c/D", output="/e", prior_path="f", queue=Queue.ALL, tolerance_s=0.7
+)
 
 
 def test_every_flag_reaches_the_options():
-    flags = BuildFlags(**OTHERS)
-    options = build_options(flags, uri="ws://a:1", topic="/b", message_type="c/D")
-    assert (options.uri, options.topic, options.type) == ("ws://a:1", "/b", "c/D")
-    assert {name: getattr(options, name) for name in OTHERS} == OTHERS
-    read_elsewhere = {
-        "device",
-        "interface",
-        "bits",
-        "rng_table",
-        *(field.name for field in fields(ModelFlags)),
-    }
-    assert {field.name for field in fields(BuildFlags)} == set(OTHERS) | read_elsewhere
-    default = build_options(BuildFlags(), uri="ws://a:1", topic="/b", message_type="c/D")
-    assert not [name for name, value in OTHERS.items() if getattr(default, name) == value]
+    assert {field.name for field in fields(MachineOptions)} == set(MACHINE)
+    given = MACHINE | asdict(TARGET)
+    options = build_options(BuildFlags(**MACHINE), TARGET)
+    assert {name: getattr(options, name) for name in given} == given
+    defaults = BuildOptions(uri="ws://a:2", topic="/c", type="d/D")
+    assert not [name for name, value in given.items() if getattr(defaults, name) == value]

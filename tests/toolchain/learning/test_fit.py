@@ -69,7 +69,7 @@ def simulated(rows, *, sigma=0.2, bias=0.0, outliers=0.2, seed=1):
 def learn(model, truth, readings, **options):
     rows = len(next(iter(truth.values())))
     located = locate(model, truth, rows)
-    return fit_model(model, located, readings, [], FitOptions(truth=(), **options))
+    return fit_model(model, located, readings, [], FitOptions(truth=[], **options))
 
 
 def test_normals_are_found_again():
