@@ -35,6 +35,9 @@ PUBLISH_QUEUE_SIZE: Final = 100
 """Default maximum number of messages of one topic that wait for a slow server."""
 EXPLAIN_TIMEOUT: Final = 0.5
 """Timeout in seconds for finding out why a topic is silent."""
+# Maximum seconds for which `next` busy-waits. The processes of client and server sleep in turn while one message is
+# under way, and waking each takes longer than an answer through the hub; a reader that polls needs no waking.
+_BUSY_WAIT: Final = 200e-6
 
 Handler = Callable[[dict[str, Any]], Awaitable[Mapping[str, Any] | None]]
 
@@ -133,6 +136,9 @@ class Subscription(Handle):
         self._deadline = inf
         self._alarm: asyncio.TimerHandle | None = None
         self._rings = inf
+        # True if the last wait of `next` ended within `_BUSY_WAIT`: then the next one begins with busy-waiting, so that
+        # only a reader of prompt answers takes CPU time for it.
+        self._is_prompt = False
 
         # Registered only after the core has accepted the subscription, because it may raise.
         self._number = session.core.subscriptions.subscribe(
@@ -196,13 +202,16 @@ class Subscription(Handle):
             await self._wait()
         return queue.popleft()
 
-    async def _wait(self) -> None:
+    async def _wait(self, busy_until: float = 0.0) -> None:
         self._check_alone()
         if self._left_out:
             raise TopicLeftOutError(f"{self.topic} {self._left_out}")
-        self._waiter = asyncio.get_running_loop().create_future()
+        self._waiter = waiter = asyncio.get_running_loop().create_future()
         try:
-            await self._waiter
+            # Other tasks have their turn at each pass, and the event loop looks at its sockets without sleeping.
+            while time.monotonic() < busy_until and not waiter.done():  # noqa: ASYNC110 - an event would sleep
+                await asyncio.sleep(0)
+            await waiter
         finally:
             self._waiter = None
 
@@ -254,7 +263,7 @@ class Subscription(Handle):
         if queue:
             return queue.popleft()
         self._check_alone()
-        begun = time.monotonic()
+        begun = now = time.monotonic()
         # Not `asyncio.timeout`, which schedules and cancels a call for each message.
         self._deadline = begun + timeout
         self._set_alarm(begun)
@@ -262,9 +271,12 @@ class Subscription(Handle):
             while not queue:
                 if self._closed:
                     raise DisconnectedError(f"the subscription of {self.topic} is closed")
-                if time.monotonic() >= self._deadline:
+                if now >= self._deadline:
                     break
-                await self._wait()
+                prompt = now + _BUSY_WAIT
+                await self._wait(prompt if self._is_prompt else 0.0)
+                now = time.monotonic()
+                self._is_prompt = now < prompt
             else:
                 return queue.popleft()
         finally:

@@ -225,6 +225,46 @@ async def test_each_wait_ends_at_its_own_time(fake, ros, monkeypatch):
     await hear(waiting)
 
 
+async def test_only_a_reader_of_prompt_answers_busy_waits_and_not_for_long(fake, ros, monkeypatch):
+    now, looks = 1000.0, 0
+
+    def monotonic():
+        nonlocal looks
+        looks += 1
+        return now
+
+    async def is_busy():
+        before = looks
+        for _ in range(5):  # turns of the event loop
+            await asyncio.sleep(0)
+        return looks > before
+
+    async def hear(delay):
+        """Return whether the reader busy-waits before and after the time until its message has passed."""
+        nonlocal now
+        waiting = asyncio.create_task(subscription.next(1000))
+        await asyncio.sleep(0)
+        with pytest.raises(ConcurrentReadError):
+            await subscription.next(1000)
+        busy = await is_busy()
+        now += delay
+        await asyncio.sleep(0)
+        later = await is_busy()
+        await fake.publish("/a", {})
+        await waiting
+        return busy, later
+
+    monkeypatch.setattr("bridge.client.handles.time", SimpleNamespace(monotonic=monotonic))
+    subscription = ros.subscribe("/a", "p/T")
+    await fake.wait_for_op("subscribe")
+    assert [await hear(delay) for delay in (1e-4, 1e-4, 1e-2, 1e-4)] == [
+        (False, False),
+        (True, True),
+        (True, False),
+        (False, False),
+    ]
+
+
 @pytest.mark.parametrize(
     ("fake", "prepare", "said"),
     [
