@@ -40,6 +40,7 @@ TYPED_ARRAYS: Final = {
 """Element types by tag: as NumPy and as the module `array` name them."""
 _BYTES_TAG: Final = 64
 _TAGS: Final = {name[1:]: tag for tag, (name, _code) in TYPED_ARRAYS.items()}
+_TEXT: Final = frozenset({str})
 _LEAVES: Final = frozenset({str, int, float, bool, type(None)})
 _NUMBERS: Final = frozenset({int, float, type(None)})
 
@@ -104,15 +105,17 @@ def _decoders(arrays: Arrays) -> _Tags:
 def _decoder(tag: int, arrays: Arrays) -> _Decoder:
     name, code = TYPED_ARRAYS[tag]
     size = array(code).itemsize
+    if arrays == "numpy":
+        import numpy as np
+
+        dtype = np.dtype(name)
 
     def make(value: object, _immutable: bool) -> Any:
         # A tag may stand before any value, and a length that is no multiple would be an error of NumPy.
         if type(value) is not bytes or len(value) % size:
             raise DecodeError(f"a typed array (tag {tag}) does not consist of {size}-byte elements")
         if arrays == "numpy":
-            import numpy as np
-
-            return np.frombuffer(value, name)
+            return np.frombuffer(value, dtype)
         # Not a list yet: `_check` creates it, so that another tag around this one cannot use it as its content.
         numbers = array(code, value)
         if byteorder == "big":
@@ -130,10 +133,10 @@ def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
     while inner:
         container = inner.pop()
         if type(container) is dict:
-            if set(map(type, container)) - {str}:
+            if not _TEXT.issuperset(map(type, container)):
                 raise DecodeError(f"a message with a key that is not text arrived: {excerpt(data)}")
             items: Any = container.items()
-        elif set(map(type, container)) <= _LEAVES:
+        elif _LEAVES.issuperset(map(type, container)):
             continue
         else:
             items = enumerate(container)

@@ -83,6 +83,9 @@ class ClientCore:
         It is None for requests that were refused here, and for messages of topics or calls that no longer
         exist.
         """
+        # A CBOR map begins like this, and JSON does not; it is expected only if a subscription requests CBOR.
+        if self.subscriptions.binary and data[:1] >= b"\x80":
+            return self._receive_cbor(data, now)
         # The usual case: a message of a topic that had one before.
         known = self.receive_known(data)
         if known is not None:
@@ -90,9 +93,6 @@ class ClientCore:
         discarded = self.subscriptions.discard_known(data)
         if discarded is not None:
             return discarded
-        # A CBOR map begins like this, and JSON does not; it is expected only if a subscription requests CBOR.
-        if self.subscriptions.binary and data[:1] >= b"\x80":
-            return self._receive_cbor(data, now)
         try:
             operation = self._decode(data)
             if operation.get("op") in ("fragment", "png"):
