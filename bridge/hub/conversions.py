@@ -161,8 +161,11 @@ def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | 
     return checked
 
 
-def typed_converter(store: "Typestore", name: str, known: dict[str, Convert]) -> Convert:
-    """Return the function that converts a message's arrays of numbers and leaves other fields unchanged."""
+def typed_converter(store: "Typestore", name: str, known: dict[str, Convert | None]) -> Convert | None:
+    """Return the function that converts a message's arrays of numbers, or None for a type that has none.
+
+    `known` has the functions of the types inside it that were met before.
+    """
     converts: dict[str, Convert] = {}
 
     def convert(message: dict[str, Any]) -> dict[str, Any]:
@@ -170,16 +173,17 @@ def typed_converter(store: "Typestore", name: str, known: dict[str, Convert]) ->
             field: converts[field](value) if field in converts else value for field, value in message.items()
         }
 
-    known[name] = convert
     for field, (kind, content) in store.fielddefs[name][1]:
         element, length = element_of(kind, content)
         if element in _NUMBERS:
             if length >= 0:
                 converts[field] = _array_converter(field, element, length)
         elif element in store.fielddefs:
-            inner = known.get(element) or typed_converter(store, element, known)
-            converts[field] = inner if length < 0 else _each(inner)
-    return convert
+            if element not in known:
+                known[element] = typed_converter(store, element, known)
+            if (inner := known[element]) is not None:
+                converts[field] = inner if length < 0 else _each(inner)
+    return convert if converts else None
 
 
 def _each(convert: Convert) -> Convert:

@@ -57,7 +57,7 @@ class MessageDefinitions:
         self._is_loaded = False
         self._wall_clock = wall_clock
         # What was derived from the definitions, by the names of types as they were asked for.
-        self._typed: dict[str, Convert] = {}
+        self._typed: dict[str, Convert | None] = {}
         self._texts: dict[str, str] = {}
         # And by the names that rosbags uses.
         self._fillers: dict[str, Filler] = {}
@@ -149,11 +149,11 @@ class MessageDefinitions:
     def typed(self, type_name: str, message: dict[str, Any]) -> dict[str, Any] | None:
         """Convert a message's arrays of numbers to typed arrays, or return None if its type is unknown or does not fit."""
         try:
-            convert = self._typed.get(type_name)
-            if convert is None:
+            if type_name not in self._typed:
                 store, known = self._known(type_name)
-                convert = self._typed[type_name] = typed_converter(store, known, {})
-            converted: dict[str, Any] = convert(message)
+                self._typed[type_name] = typed_converter(store, known, {})
+            convert = self._typed[type_name]
+            converted: dict[str, Any] = message if convert is None else convert(message)
         except (BridgeError, TypeError, ValueError, AttributeError):
             return None
         return converted
