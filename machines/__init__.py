@@ -2,14 +2,16 @@
 
 Start at `machines.posterior` (one call, for a notebook) or `make_kernel` (the machine of a board).
 `machines.bm1` defines a machine, `machines.reference` runs it cycle by cycle, and `machines.fast` gets the
-same results faster. Only `machines.fast` imports numba.
+same results faster. Only `machines.fast` imports numba. `machines.kind` is what everybody else asks of a machine.
 """
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from machines.bm1 import BM1Machine
     from machines.kernel import BM1Kernel
+    from machines.kind import MachineKind
 
 FAST_CODES_MAX: Final = 2**24
 """Maximum number of different codes, over all columns, for the fast kernel, which has a table of them."""
@@ -34,3 +36,20 @@ def warm_up() -> None:
     from machines import fast
 
     fast.warm_up()
+
+
+def _bm1() -> "MachineKind":
+    from machines.bm1_kind import BM1
+
+    return BM1
+
+
+KINDS: Final[dict[str, Callable[[], "MachineKind"]]] = {"BM1": _bm1}
+"""The kinds of machines by name, imported when they are called, because the subscriber does without NumPy."""
+
+
+def kind_of(parameters: object) -> "MachineKind":
+    """Return the kind of a machine with these parameters."""
+    return next(
+        kind for kind in (each() for each in KINDS.values()) if isinstance(parameters, kind.parameters)
+    )

@@ -187,18 +187,6 @@ def addressed_codes(machine: BM1Machine, start: Start) -> npt.NDArray[np.uint16]
     return codes if parameters.replicas > 1 else codes[0]
 
 
-def missing_inputs(parameters: BM1Parameters) -> tuple[int, ...] | npt.NDArray[np.int64]:
-    """Return the inputs of a frame in which all readings are missing, in the form of `Start.addresses`."""
-    tops = tuple((1 << bits) - 1 for bits in parameters.sensor_bits)
-    shape = parameters.input_shape
-    if shape == (parameters.sensors,):
-        return tops
-    by_column = np.array(tops, dtype=np.int64)
-    if parameters.sensor_mode is not SensorMode.COLUMN:
-        by_column = by_column[:, np.newaxis]
-    return np.broadcast_to(by_column, shape).copy()
-
-
 def checked_codes(
     name: str, given: npt.NDArray[np.uint16], shape: tuple[int, ...], parameters: BM1Parameters
 ) -> npt.NDArray[np.uint16]:

@@ -14,22 +14,22 @@ import math
 import os
 import struct
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeAlias
+from typing import Annotated, Any, Final, Generic, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from machines.bm1 import BM1Machine
+from machines import KINDS, kind_of
 from machines.errors import MachineError
-from machines.parameters import BM1Parameters, RngKind, SensorMode
+from machines.kind import MachineKind, UsedRegisters
 from pcie_shim import register_map
 from pcie_shim.errors import DamagedImageError, ImageError, ImageMismatchError
+from pcie_shim.register_layout import interface_room
 
 MAGIC: Final = b"BMIMAGE\x01"
 """First bytes of a programming file; the last one is the version of the format."""
@@ -62,7 +62,7 @@ class Image:
     """The content of the programming file of one board.
 
     Attributes:
-        machine: The machine with the lines of the board.
+        machine: The machine with the lines of the board, of any kind.
         partition: Position of the lines in the model.
         interface_sensors: Input words of the interface (thesis 3.2: 20).
         interface_results: Result words of the interface (thesis 3.2: 1200).
@@ -75,7 +75,7 @@ class Image:
             partition does not match the lines.
     """
 
-    machine: BM1Machine
+    machine: Any
     partition: Partition
     interface_sensors: int
     interface_results: int
@@ -85,9 +85,9 @@ class Image:
 
     def __post_init__(self) -> None:
         """Check that a board can hold the image."""
-        parameters, part = self.machine.parameters, self.partition
-        lines, words = parameters.lines, interface_room(parameters)
-        inputs, results = interface_words(parameters)
+        registers, part = self.registers, self.partition
+        lines, words = registers.lines, interface_room(registers)
+        inputs, results = registers.input_words, registers.result_words
         if not (0 < self.interface_sensors <= words[0] and 0 < self.interface_results <= words[1]):
             raise ImageError(
                 f"The interface {self.interface_sensors}x{self.interface_results} does not fit the register "
@@ -95,12 +95,12 @@ class Image:
             )
         if inputs > words[0] or results > words[1]:
             raise ImageError(
-                f"The machine has {_sizes(parameters)}; the register map has room for {words[0]}x{words[1]}: "
-                "use more partitions" + (", or fewer replicas" if parameters.replicas > 1 else "")
+                f"The machine has {registers.size}; the register map has room for {words[0]}x{words[1]}: "
+                "use more partitions" + (", or fewer replicas" if registers.replicas > 1 else "")
             )
         if inputs > self.interface_sensors or results > self.interface_results:
             raise ImageError(
-                f"The machine has {_sizes(parameters)}; the interface "
+                f"The machine has {registers.size}; the interface "
                 f"{self.interface_sensors}x{self.interface_results} is smaller: use --interface "
                 f"{max(inputs, self.interface_sensors)}x{max(results, self.interface_results)}, "
                 "or more partitions"
@@ -111,6 +111,16 @@ class Image:
                 f"on: the model has {part.total_lines}"
             )
 
+    @cached_property
+    def kind(self) -> MachineKind:
+        """The kind of the machine."""
+        return kind_of(self.machine.parameters)
+
+    @cached_property
+    def registers(self) -> UsedRegisters:
+        """The registers that a board with the image uses."""
+        return self.kind.registers(self.machine.parameters)
+
     @property
     def map_hash(self) -> str:
         """SHA-256 (hex) of the register map of this software, for which the image is built."""
@@ -119,32 +129,7 @@ class Image:
     @cached_property
     def image_hash(self) -> str:
         """SHA-256 (hex) of the computation of the board, independent of the build date."""
-        return _manifest(self, _sections(self.machine)).image_hash
-
-
-def interface_words(parameters: BM1Parameters) -> tuple[int, int]:
-    """Return the numbers of input words and result words of a board with this machine and all its replicas."""
-    return math.prod(parameters.input_shape), math.prod(parameters.count_shape)
-
-
-def interface_room(parameters: BM1Parameters) -> tuple[int, int]:
-    """Return the maximum numbers of input words and result words in the register map, for such inputs."""
-    inputs = register_map.SENSORS_WORDS if is_plain(parameters) else register_map.INPUTS_WORDS
-    return inputs, register_map.RESULTS_WORDS
-
-
-def is_plain(parameters: BM1Parameters) -> bool:
-    """Return whether a single machine has one input per column, in SENSORS; otherwise inputs are in INPUTS."""
-    return parameters.replicas == 1 and parameters.sensor_mode is SensorMode.COLUMN
-
-
-def _sizes(parameters: BM1Parameters) -> str:
-    """Return the size of a machine as text for an error."""
-    if is_plain(parameters):
-        return f"{parameters.sensors} sensors and {parameters.lines} lines"
-    inputs, results = interface_words(parameters)
-    several = f" in {parameters.replicas} replicas" if parameters.replicas > 1 else ""
-    return f"{inputs} inputs and {results} results ({parameters.sensors} sensors and {parameters.lines} lines{several})"
+        return _manifest(self, self.kind.sections(self.machine)).image_hash
 
 
 class _Checked(BaseModel):
@@ -173,11 +158,14 @@ class _Section(_Checked):
     sha256: str
 
 
-class _Identity(_Checked):
+_Parameters = TypeVar("_Parameters")
+
+
+class _Identity(_Checked, Generic[_Parameters]):
     """The input of the image hash."""
 
     machine: str
-    parameters: BM1Parameters
+    parameters: _Parameters
     partition: _PartitionEntry
     interface: _Interface
     model_hash: str
@@ -189,12 +177,24 @@ class _Identity(_Checked):
         return hashlib.sha256(_canonical(self.model_dump(mode="json"))).hexdigest()
 
 
-class _Manifest(_Checked):
+class _Manifest(_Checked, Generic[_Parameters]):
     emulated: bool
     tool_version: str
     build_date: str
     image_hash: str
-    identity: _Identity
+    identity: _Identity[_Parameters]
+
+
+class _Named(BaseModel):
+    """The part of an identity that says which parameters it has."""
+
+    machine: str
+
+
+class _Kind(BaseModel):
+    """The part of a manifest that says of which kind its machine is."""
+
+    identity: _Named
 
 
 def build_date() -> str:
@@ -215,7 +215,7 @@ def tool_version() -> str:
 
 def image_bytes(image: Image) -> bytes:
     """Return the bytes of the programming file, which are always the same for the same image."""
-    sections = _sections(image.machine)
+    sections = image.kind.sections(image.machine)
     manifest = _canonical(_manifest(image, sections).model_dump(mode="json"))
     header = _HEADER.pack(MAGIC, len(manifest), 0, hashlib.sha256(manifest).digest())
     return b"".join([header, manifest, *(array.tobytes() for _, array in sections)])
@@ -253,27 +253,23 @@ def image_from_bytes(content: bytes, name: str = "the image") -> Image:
         DamagedImageError: A hash is wrong.
         ImageMismatchError: The file is for another register map or format.
     """
-    manifest, data_start = _read_manifest(content, name)
+    kind, manifest, data_start = _read_manifest(content, name)
     if manifest.identity.map_hash != register_map.MAP_SHA256:
         raise ImageMismatchError(
             f"{name} was built for register map {manifest.identity.map_hash}, this software has "
             f"{register_map.MAP_SHA256}: build the deployment again"
         )
     # before the image hash, so that an error names the damaged table
-    sections = _read_sections(content, name, manifest, data_start)
+    sections = _read_sections(content, name, kind, manifest, data_start)
     if manifest.identity.hash != manifest.image_hash:
         raise DamagedImageError(
             f"{name} is damaged: the image hash is {manifest.identity.hash}, its manifest says "
             f"{manifest.image_hash}; build the deployment again"
         )
     part, interface = manifest.identity.partition, manifest.identity.interface
-    columns = [array for section, array in sections.items() if section.startswith("column ")]
     try:
-        machine = BM1Machine(
-            manifest.identity.parameters, sections["prior"], tuple(columns), sections.get("rng")
-        )
         return Image(
-            machine=machine,
+            machine=kind.machine(manifest.identity.parameters, sections),
             partition=Partition(part.index, part.count, part.line_offset, part.total_lines),
             interface_sensors=interface.sensors,
             interface_results=interface.results,
@@ -285,8 +281,8 @@ def image_from_bytes(content: bytes, name: str = "the image") -> Image:
         raise ImageMismatchError(f"{name} contains a machine that cannot be built: {error}") from error
 
 
-def _read_manifest(content: bytes, name: str) -> tuple[_Manifest, int]:
-    """Return the manifest, and the offset of the first section."""
+def _read_manifest(content: bytes, name: str) -> tuple[MachineKind, _Manifest[Any], int]:
+    """Return the kind of machine, the manifest, and the offset of the first section."""
     if len(content) > MAX_IMAGE_BYTES:
         raise ImageMismatchError(
             f"{name} is larger than {MAX_IMAGE_BYTES} bytes: it is not a programming file"
@@ -305,16 +301,26 @@ def _read_manifest(content: bytes, name: str) -> tuple[_Manifest, int]:
     text = content[_HEADER.size : start]
     _check_hash(name, "its manifest", text, digest.hex(), "its header")
     try:
-        return _Manifest.model_validate_json(text), start
+        named = _Kind.model_validate_json(text).identity.machine
+        if named not in KINDS:
+            raise ImageMismatchError(
+                f"{name} is for a machine of kind {named!r}, and this software has {', '.join(KINDS)}: build the "
+                "deployment again"
+            )
+        kind = KINDS[named]()
+        # a generic model of the kind's parameters: `parameters` is a type that is known at run time
+        return kind, _Manifest[kind.parameters].model_validate_json(text), start  # type: ignore[name-defined]
     except (ValidationError, MachineError) as error:
         first = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
         raise ImageMismatchError(f"{name} has a manifest that this software cannot read: {first}") from error
 
 
-def _read_sections(content: bytes, name: str, manifest: _Manifest, start: int) -> dict[str, npt.NDArray[Any]]:
+def _read_sections(
+    content: bytes, name: str, kind: MachineKind, manifest: _Manifest[Any], start: int
+) -> dict[str, npt.NDArray[Any]]:
     """Return the tables by name; the parameters define the expected sections before anything is allocated."""
     sections: dict[str, npt.NDArray[Any]] = {}
-    due = _due_sections(manifest.identity.parameters)
+    due = kind.due_sections(manifest.identity.parameters)
     for section in manifest.identity.sections:
         name_due, dtype, shape = next(due, ("no further section", "", ()))
         # -1: the only length that the parameters do not define
@@ -339,16 +345,6 @@ def _read_sections(content: bytes, name: str, manifest: _Manifest, start: int) -
     return sections
 
 
-def _due_sections(parameters: BM1Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-    """Yield the name, type and shape of each expected section."""
-    yield "prior", "<u2", (parameters.prior_addresses, parameters.lines)
-    if parameters.has_tables:
-        for column, bits in enumerate(parameters.sensor_bits, start=1):
-            yield f"column {column}", "<u2", (1 << bits, parameters.lines)
-    if parameters.rng is RngKind.TABLE:
-        yield "rng", "<u4", (-1,)
-
-
 def _check_hash(name: str, what: str, data: bytes, expected: str, source: str) -> None:
     found = hashlib.sha256(data).hexdigest()
     if found != expected:
@@ -358,11 +354,12 @@ def _check_hash(name: str, what: str, data: bytes, expected: str, source: str) -
         )
 
 
-def _manifest(image: Image, sections: list[tuple[str, npt.NDArray[Any]]]) -> _Manifest:
+def _manifest(image: Image, sections: list[tuple[str, npt.NDArray[Any]]]) -> _Manifest[Any]:
     part = image.partition
     # the date and the version are outside: they do not change what the board computes
-    identity = _Identity(
-        machine="BM1",
+    parameters = image.kind.parameters
+    identity = _Identity[parameters](  # type: ignore[valid-type]
+        machine=image.kind.name,
         parameters=image.machine.parameters,
         partition=_PartitionEntry(
             index=part.index, count=part.count, line_offset=part.line_offset, total_lines=part.total_lines
@@ -380,23 +377,13 @@ def _manifest(image: Image, sections: list[tuple[str, npt.NDArray[Any]]]) -> _Ma
             for name, array in sections
         ),
     )
-    return _Manifest(
+    return _Manifest[parameters](  # type: ignore[valid-type]
         emulated=True,
         tool_version=image.tool_version,
         build_date=image.build_date,
         image_hash=identity.hash,
         identity=identity,
     )
-
-
-def _sections(machine: BM1Machine) -> list[tuple[str, npt.NDArray[Any]]]:
-    """Return the tables in the order and types of the file (one per MIF of the thesis's hardware project)."""
-    sections: list[tuple[str, npt.NDArray[Any]]] = [("prior", machine.prior.astype("<u2", copy=False))]
-    for column, table in enumerate(machine.tables, start=1):
-        sections.append((f"column {column}", table.astype("<u2", copy=False)))
-    if machine.rng_table is not None:
-        sections.append(("rng", machine.rng_table.astype("<u4", copy=False)))
-    return sections
 
 
 def _canonical(value: object) -> bytes:

@@ -1,9 +1,11 @@
-"""Layouts shared by host and board: doorbell numbers, and registers read or written in one burst."""
+"""Layouts shared by host and board: doorbell numbers, named blocks, and registers read or written in one burst."""
 
 import struct
+from collections.abc import Mapping
 from typing import Final
 
-import numpy as np
+from machines.kind import UsedRegisters
+from pcie_shim import register_map as rm
 
 ALL_ONES: Final = 0xFFFFFFFF
 """The all-ones word, which all registers read as if no device answers."""
@@ -17,10 +19,26 @@ SETTINGS: Final = struct.Struct("<IQII")
 DONE_BLOCK: Final = struct.Struct("<IIQQ")
 """DONE, STATUS, CYCLES and COMPUTE_NS."""
 
-REPLICA_OUTCOME: Final = np.dtype([("reason", "<u4"), ("zero", "<u4"), ("cycles", "<u8")])
-"""The part of OUTCOMES for one replica."""
+BLOCKS: Final = {block.name: block for block in rm.BLOCKS}
+"""The blocks of the map by the names that machine kinds use."""
 
 
 def next_doorbell(number: int) -> int:
     """Return the doorbell number after `number`: one more, modulo 2^32, skipping 0, which has no effect."""
     return number % ALL_ONES + 1
+
+
+def register_values(fields: Mapping[str, int]) -> dict[int, int]:
+    """Return the values of registers by address, from those of registers (`CAP_LINES`) and fields (`CAP_MACHINE.RNG`)."""
+    values: dict[int, int] = {}
+    for name, value in fields.items():
+        register, _, field = name.partition(".")
+        shift = getattr(rm, f"{register}_{field}_SHIFT") if field else 0
+        address = BLOCKS[register].address
+        values[address] = values.get(address, 0) | value << shift
+    return values
+
+
+def interface_room(registers: UsedRegisters) -> tuple[int, int]:
+    """Return the maximum numbers of input words and result words in the register map, for such inputs."""
+    return BLOCKS[registers.inputs].words, rm.RESULTS_WORDS

@@ -11,33 +11,6 @@ MAP_SHA256: Final = "1f815974f7e70a1d3204f266a1cbcc87ff954020f422129857e6f13af50
 BAR_SIZE: Final = 0x20000
 
 
-class MachineKind(IntEnum):
-    """Values of CAP_MACHINE.KIND."""
-
-    NONE = 0  # blank: no image has been loaded
-    BM1 = 1  # exact inference with approximate computations (thesis 2.1.2)
-
-
-class RngKind(IntEnum):
-    """Values of CAP_MACHINE.RNG."""
-
-    NONE = 0  # blank: no image has been loaded
-    LFSR8 = 1  # 8-bit Fibonacci LFSR
-    LFSR16 = 2  # 16-bit Fibonacci LFSR
-    LFSR24 = 3  # 24-bit Fibonacci LFSR
-    LFSR32 = 4  # 32-bit Fibonacci LFSR
-    TABLE = 5  # a table of random numbers that all columns read cyclically
-    IDEAL = 6  # a hash of seed, column and cycle; only on emulated boards
-
-
-class SensorMode(IntEnum):
-    """Values of CAP_MACHINE.SENSOR_MODE."""
-
-    COLUMN = 0  # one address for all cells of a sensor column
-    CELL = 1  # an address for each cell
-    THRESHOLD = 2  # a probability code for each cell; there are no tables
-
-
 class BoardState(IntEnum):
     """Values of STATUS.STATE."""
 
@@ -45,16 +18,6 @@ class BoardState(IntEnum):
     IDLE = 1  # reset; nothing has run
     RUNNING = 2  # the machine is running; writes are refused, except CONTROL.RESET
     DONE = 3  # the machine has stopped for the reason in STOP_REASON
-
-
-class StopReason(IntEnum):
-    """Values of STATUS.STOP_REASON."""
-
-    NONE = 0  # nothing has run since the reset
-    OVERFLOW = 1  # a counter reached TARGET_COUNT
-    MAX_CYCLES = 2  # MAX_CYCLES cycles have run
-    SLICE = 3  # RUN_UNTIL was reached; RESUME continues
-    IMPOSSIBLE = 4  # no line can count for these readings; nothing has run
 
 
 class ErrorCode(IntEnum):

@@ -28,7 +28,7 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
         ToolchainError: The deployment is damaged, or a reading cannot be used.
         NoPosteriorError: All counts are 0 for these readings.
     """
-    from machines.posterior import posterior as run
+    from machines.kind import FrameInput
     from pcie_shim.programming_file import read_image
     from toolchain.deployment.address import to_address
 
@@ -46,14 +46,15 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
     addresses, row = deployment.machine_addresses(
         [to_address(variable, readings.get(variable.name)) for variable in deployment.variables]
     )
-    values = run(
-        [read_image(deployment.image_path(board)).machine for board in range(len(deployment.boards))],
-        addresses,
+    frame = FrameInput(
+        addresses=addresses,
         prior_address=row,
         target_count=deployment.machine.target_count,
         max_cycles=deployment.machine.max_cycles,
         bank=bank,
     )
+    machines = [read_image(deployment.image_path(board)).machine for board in range(len(deployment.boards))]
+    values = deployment.machine.kind.posterior(machines, frame)
     return Posterior(
         probabilities=tuple(values.tolist()),
         labels=tuple(dimension.label for dimension in deployment.searched),

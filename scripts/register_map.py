@@ -47,6 +47,8 @@ library ieee;
 """
 _WORD: Final = "std_logic_vector(31 downto 0)"
 _FULL: Final = 0xFFFFFFFF
+_ENUMERATIONS: Final = {"board_state", "error_code"}
+"""Encodings that are in the constants module: the others are those of machine kinds, in `machines`."""
 
 
 # The map, as the compiler of SystemRDL has read it
@@ -160,6 +162,8 @@ def module_text(register_map: RegisterMap) -> str:
         f"BAR_SIZE: Final = {register_map.bar_size:#x}",
     ]
     for encoding, user in register_map.encodings.items():
+        if encoding.type_name not in _ENUMERATIONS:
+            continue
         name = "".join(word.capitalize() for word in encoding.type_name.split("_"))
         lines += ["", "", f"class {name}(IntEnum):", f'    """Values of {user}."""', ""]
         lines += [f"    {each.name} = {int(each.value)}  # {_one_line(each.rdl_desc)}" for each in encoding]

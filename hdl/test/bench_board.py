@@ -20,6 +20,7 @@ from cocotb.triggers import ClockCycles, FallingEdge, RisingEdge
 from cocotbext.axi import AxiLiteBus, AxiLiteMaster, AxiResp
 
 from hdl.test.project import (
+    BM1,
     BM1Kernel,
     BM1Machine,
     BoardState,
@@ -30,7 +31,6 @@ from hdl.test.project import (
     Start,
     StopReason,
     image_bytes,
-    interface_words,
     next_doorbell,
     reference_kernel,
 )
@@ -181,7 +181,7 @@ class Both:
         """Compare the interrupt's message, every result, and the generators."""
         for address in (rm.STATUS, rm.DONE, rm.CYCLES, rm.CYCLES + 4, rm.START, rm.RESUME):
             await self.read(address)
-        _, results = interface_words(self.parameters)
+        results = BM1.registers(self.parameters).result_words
         for word in range(results):
             await self.read(rm.RESULTS + 4 * word)
         if self.parameters.replicas > 1:
@@ -380,12 +380,12 @@ class Session:
         board = EmulatedBoard(lambda _: twin)
         board.load(image_bytes(self.both.case.image))
         twin.__dict__.update(copy.deepcopy(self.both.slow.kernel).__dict__)
-        inputs, results = interface_words(self.parameters)
-        copied = [(self.inputs, inputs), (rm.TARGET_COUNT, 1), (rm.BANK, 1), (rm.PRIOR_SELECT, 1)]
+        used = BM1.registers(self.parameters)
+        copied = [(self.inputs, used.input_words), (rm.TARGET_COUNT, 1), (rm.BANK, 1), (rm.PRIOR_SELECT, 1)]
         if self.parameters.replicas > 1:
             copied.append((rm.PRIOR_SELECTS, self.parameters.replicas))
         if self.parameters.prior_mode is PriorMode.WRITTEN:
-            copied.append((rm.PRIOR_CODES, results))
+            copied.append((rm.PRIOR_CODES, used.result_words))
         for address, words in copied:
             if words:
                 board.write(address, self.both.board.read(address, words))
@@ -446,7 +446,7 @@ class Session:
             if number not in {0, due}:
                 assert not await both.write(rm.START, number)
                 assert not await both.write(rm.RESUME, number)
-        _, results = interface_words(p)
+        results = BM1.registers(p).result_words
         wrong = [
             (rm.TARGET_COUNT, 0),
             (rm.BANK, p.rng_banks),

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from machines.bm1 import BM1Machine, Start, StopReason
+from machines.bm1_kind import BM1
 from machines.kernel import BM1Kernel
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
 from machines.reference import ReferenceBM1
 from pcie_shim import register_map
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
-from pcie_shim.programming_file import Image, Partition, image_bytes, interface_words
+from pcie_shim.programming_file import Image, Partition, image_bytes
 from pcie_shim.register_layout import next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode
 from toolchain.hardware.sources import HDL, PARAMETERS, SOURCES, in_order, verilog
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 __all__ = [
+    "BM1",
     "HDL",
     "PARAMETERS",
     "SOURCES",
@@ -49,7 +51,6 @@ __all__ = [
     "image_of",
     "image_of_parameters",
     "in_order",
-    "interface_words",
     "next_doorbell",
     "reference_kernel",
     "register_map",
@@ -68,7 +69,8 @@ def reference_kernel(machine: BM1Machine) -> BM1Kernel:
 
 def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -> Image:
     """Return a board's image of a machine, whose interface has some words more than the machine needs."""
-    inputs, results = interface_words(machine.parameters)
+    used = BM1.registers(machine.parameters)
+    inputs, results = used.input_words, used.result_words
     return Image(
         machine=machine,
         partition=Partition(0, 1, 0, machine.parameters.lines),

@@ -9,25 +9,27 @@ machine runs in chunks of about 50 ms (`EmulatedBoard.step`), between which the 
 Chunks do not change results, because a machine that is stopped and resumed gives the same bits.
 """
 
-import math
 import struct
 import time
-from collections.abc import Callable, Collection
-from typing import Final, NoReturn
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final, NoReturn
 
-import numpy as np
-import numpy.typing as npt
-
-from machines import make_kernel
-from machines.bm1 import BM1Machine, Start, StopReason, missing_inputs
 from machines.errors import MachineError, StartError
-from machines.kernel import BM1Kernel
-from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, RngReset
+from machines.kind import OUTCOME, BoardMachine, FrameSettings
 from pcie_shim import register_map as rm
 from pcie_shim.errors import ImageError, PcieShimError
-from pcie_shim.programming_file import Image, image_from_bytes, is_plain
-from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, REPLICA_OUTCOME, SETTINGS, WORD, next_doorbell
-from pcie_shim.register_map import BoardState, ErrorCode, MachineKind, RngKind, SensorMode
+from pcie_shim.programming_file import Image, image_from_bytes
+from pcie_shim.register_layout import (
+    ALL_ONES,
+    BLOCKS,
+    DONE_BLOCK,
+    SETTINGS,
+    WORD,
+    next_doorbell,
+    register_values,
+)
+from pcie_shim.register_map import BoardState, ErrorCode
 
 CHUNK_S: Final = 0.05
 """Duration of a chunk in seconds, after which the board reads from its host again."""
@@ -36,6 +38,7 @@ _NO_ACCESS, _READ, _READ_WRITE = 0, 1, 3
 _SETTINGS: Final = struct.Struct(f"{SETTINGS.format}Q")  # and RUN_UNTIL
 _SHORTEST_CHUNK: Final = 64  # cycles, even if the machine is slow
 _ALIGNMENT: Final = 4096  # chunks end between the blocks of a fast kernel
+_CYCLES_MAX: Final = 2**63 - 1  # of registers whose values must fit into a signed number
 
 
 class RefusedError(PcieShimError):
@@ -51,9 +54,10 @@ class RefusedError(PcieShimError):
 
 
 class EmulatedBoard:
-    """A board: blank until an image is loaded, then a BM1 with registers (docs/reference/registers.md)."""
+    """A board: blank until an image is loaded, then a machine with registers (docs/reference/registers.md)."""
 
-    def __init__(self, make: Callable[[BM1Machine], BM1Kernel] = make_kernel) -> None:
+    def __init__(self, make: Callable[[Any], Any] | None = None) -> None:
+        """Create a blank board; `make` returns the kernel of a machine instead of its kind."""
         self._make = make
         self.turned = 0.0
         """Monotonic time at which its server last looked for requests; 0 before the first time."""
@@ -69,13 +73,13 @@ class EmulatedBoard:
         self._view = memoryview(self._memory)
         self._access = bytearray(rm.BAR_SIZE // 4)
 
-        # The machine of the loaded image, None while blank, and what follows from its parameters. The arrays are
-        # views of the map: what is assigned to them is what a host reads.
-        self._kernel: BM1Kernel | None = None
-        self._results: npt.NDArray[np.uint32] = np.empty(0, np.uint32)
-        self._outcomes: npt.NDArray[np.void] = np.empty(0, REPLICA_OUTCOME)
-        self._sensors = struct.Struct("")
-        self._is_plain = True
+        # The machine of the loaded image, None while blank, which reads and writes the blocks of the map; and the
+        # bytes of its results and of its replicas' outcomes.
+        self._machine: BoardMachine | None = None
+        self._blocks = {
+            block.name: self._view[block.address : block.address + 4 * block.words] for block in rm.BLOCKS
+        }
+        self._results = self._outcomes = self._view[:0]
 
         # High words of 64-bit registers by address, from the read of the low word until they are read.
         self._latched: dict[int, bytes] = {}
@@ -134,76 +138,65 @@ class EmulatedBoard:
             raise RefusedError(ErrorCode.BUSY, "the machine is running; reset it before programming")
         try:
             image = image_from_bytes(content, "the image")
-            kernel = self._make(image.machine)
+            kernel = (self._make or image.kind.kernel)(image.machine)
+            machine = image.kind.on_board(kernel, self._blocks)
             # now, so that the first frame does not wait for it
-            kernel.prepare()
+            machine.prepare()
         except (ImageError, MachineError) as error:
             raise RefusedError(ErrorCode.BAD_IMAGE, str(error).rstrip(".")) from error
-        self._kernel = kernel
+        speed = self._measured_speed(image, machine)
+        self._machine = machine
         self.programmed += 1
         # the registers of the former image must not be seen beside those of this one
         self._power_up()
         self._describe(image)
-        speed = _measure_speed(kernel)
         self._first_chunk = max(int(speed * CHUNK_S), _SHORTEST_CHUNK)
         self._put(rm.CAP_SPEED, min(int(speed), ALL_ONES))
         self.reset()
 
     def _describe(self, image: Image) -> None:
         """Set the capability registers, and permit access to the words that the image implements."""
-        parameters, part = image.machine.parameters, image.partition
-        written = parameters.prior_mode is PriorMode.WRITTEN
+        registers, part = image.registers, image.partition
         self._view[rm.IMAGE_HASH : rm.IMAGE_HASH + 32] = bytes.fromhex(image.image_hash)
-        self._put(
-            rm.CAP_MACHINE,
-            MachineKind.BM1 << rm.CAP_MACHINE_KIND_SHIFT
-            | RngKind[parameters.rng.name] << rm.CAP_MACHINE_RNG_SHIFT
-            | parameters.shared << rm.CAP_MACHINE_SHARED_SHIFT
-            | (parameters.rng_reset is RngReset.FREE) << rm.CAP_MACHINE_FREE_SHIFT
-            | written << rm.CAP_MACHINE_PRIOR_WRITTEN_SHIFT
-            | SensorMode[parameters.sensor_mode.name] << rm.CAP_MACHINE_SENSOR_MODE_SHIFT,
-        )
-        self._put(rm.CAP_LINES, parameters.lines)
-        self._put(rm.CAP_TOTAL_LINES, part.total_lines)
-        self._put(rm.CAP_LINE_OFFSET, part.line_offset)
-        self._put(
-            rm.CAP_PARTITION,
-            part.index << rm.CAP_PARTITION_INDEX_SHIFT | part.count << rm.CAP_PARTITION_COUNT_SHIFT,
-        )
-        self._put(rm.CAP_SENSORS, parameters.sensors)
-        self._put(
-            rm.CAP_WIDTHS,
-            parameters.prob_bits << rm.CAP_WIDTHS_PROB_BITS_SHIFT
-            | parameters.counter_bits << rm.CAP_WIDTHS_COUNTER_BITS_SHIFT
-            | parameters.prior_bits << rm.CAP_WIDTHS_PRIOR_BITS_SHIFT,
-        )
-        self._put(rm.CAP_BANKS, parameters.rng_banks)
-        self._put(rm.CAP_REPLICAS, parameters.replicas)
-        self._put(
-            rm.CAP_INTERFACE,
-            image.interface_sensors << rm.CAP_INTERFACE_SENSORS_SHIFT
-            | image.interface_results << rm.CAP_INTERFACE_RESULTS_SHIFT,
-        )
-        self._put(rm.CAP_STEPS, parameters.steps_per_clock)
-        # a machine with inputs per cell can have more sensors than fit into the register
-        widths = bytes(parameters.sensor_bits[: 4 * rm.CAP_SENSOR_BITS_WORDS])
-        self._view[rm.CAP_SENSOR_BITS : rm.CAP_SENSOR_BITS + len(widths)] = widths
-        self._sensors = struct.Struct(f"<{parameters.sensors}I")
-        lines = parameters.replicas * parameters.lines
-        results = np.frombuffer(self._memory, "<u4", lines, rm.RESULTS)
-        self._results = results.reshape(parameters.count_shape)
-        self._is_plain = is_plain(parameters)
-        inputs = rm.SENSORS if self._is_plain else rm.INPUTS
-        self._allow(inputs, image.interface_sensors, _READ_WRITE)
+        capabilities = {
+            **registers.capabilities,
+            "CAP_TOTAL_LINES": part.total_lines,
+            "CAP_LINE_OFFSET": part.line_offset,
+            "CAP_PARTITION.INDEX": part.index,
+            "CAP_PARTITION.COUNT": part.count,
+            "CAP_INTERFACE.SENSORS": image.interface_sensors,
+            "CAP_INTERFACE.RESULTS": image.interface_results,
+        }
+        for address, value in register_values(capabilities).items():
+            self._put(address, value)
+        for name, words in image.kind.contents(image.machine).items():
+            self._blocks[name][: len(words)] = words
+        several = registers.replicas if registers.replicas > 1 else 0
+        self._results = self._blocks["RESULTS"][: 4 * registers.result_words]
+        self._outcomes = self._blocks["OUTCOMES"][: several * OUTCOME.itemsize]
+        self._allow(BLOCKS[registers.inputs].address, image.interface_sensors, _READ_WRITE)
         self._allow(rm.RESULTS, image.interface_results, _READ)
-        several = parameters.replicas if parameters.replicas > 1 else 0
-        self._outcomes = np.frombuffer(self._memory, REPLICA_OUTCOME, several, rm.OUTCOMES)
-        self._allow(rm.OUTCOMES, 4 * several, _READ)
-        self._allow(rm.PRIOR_SELECTS, several, _READ_WRITE)
-        if written:
-            self._allow(rm.PRIOR_CODES, lines, _READ_WRITE)
-            prior = image.machine.prior[0].astype("<u4").tobytes() * parameters.replicas
-            self._view[rm.PRIOR_CODES : rm.PRIOR_CODES + len(prior)] = prior
+        self._allow(rm.OUTCOMES, len(self._outcomes) // 4, _READ)
+        for name, count in registers.written.items():
+            self._allow(BLOCKS[name].address, count, _READ_WRITE)
+
+    def _measured_speed(self, image: Image, machine: BoardMachine) -> float:
+        """Return the cycles per second of the slowest frame, whose inputs are left in the registers.
+
+        It measures CPU time of the thread, so that other load does not permanently make the board look slow.
+        """
+        host = image.kind.on_host([image.machine])
+        settings, blocks = host.begin(host.slowest()).starts[0]
+        for name, words in blocks.items():
+            self._blocks[name][: len(words)] = words
+        machine.start(settings, 1)  # the first start of a kernel takes longer
+        began = time.thread_time_ns()
+        machine.start(settings, 1)
+        while machine.paused and machine.cycles < _ALIGNMENT:
+            if time.thread_time_ns() - began > CHUNK_S * 1e8:
+                break
+            machine.step(2 * machine.cycles)
+        return machine.cycles * 1e9 / max(time.thread_time_ns() - began, 1)
 
     # ---- registers ------------------------------------------------------------------------------------
 
@@ -261,7 +254,7 @@ class EmulatedBoard:
         if address & 3:
             self._refuse(ErrorCode.MISALIGNED, f"address {address:#06x} is not a multiple of 4")
         if not words or words[0] == _NO_ACCESS:
-            if self._kernel is None and any(address in block for block in _DATA):
+            if self._machine is None and any(address in block for block in _DATA):
                 self._refuse(ErrorCode.BLANK, "the board is blank; program it first")
             self._refuse(ErrorCode.OUTSIDE, f"nothing can be {verb} at {address:#06x}")
         if len(words) < count or _NO_ACCESS in words:
@@ -284,13 +277,11 @@ class EmulatedBoard:
         self.running = False
         self._error = ErrorCode.NONE
         self._compute_ns = 0
-        if self._kernel is None:
-            self._publish(BoardState.BLANK, StopReason.NONE, 0)
+        if self._machine is None:
+            self._publish(BoardState.BLANK, 0, 0)
             return
-        self._kernel.reset()
-        self._results[:] = 0
-        self._outcomes[:] = np.zeros((), REPLICA_OUTCOME)
-        self._publish(BoardState.IDLE, StopReason.NONE, 0)
+        self._machine.reset()
+        self._publish(BoardState.IDLE, 0, 0)
 
     def release(self) -> None:
         """Stop a running machine and disable interrupts, because the host has disconnected."""
@@ -303,117 +294,67 @@ class EmulatedBoard:
 
     def _ring(self, doorbell: int, number: int) -> None:
         """Check a doorbell, and run the first chunk."""
-        kernel = self._kernel
-        if kernel is None:
+        machine = self._machine
+        if machine is None:
             self._refuse(ErrorCode.BLANK, "the board is blank; program it first")
         # a lost or repeated start must not compute a frame
         due = next_doorbell(self.done)
         if self.running or number != due:
             self._refuse(ErrorCode.DOORBELL, f"number {number} was written, {due} was expected")
-        target, max_cycles, bank, prior_address, run_until = _SETTINGS.unpack_from(
-            self._memory, rm.TARGET_COUNT
-        )
-        if run_until > CYCLES_MAX:
+        *settings, run_until = _SETTINGS.unpack_from(self._memory, rm.TARGET_COUNT)
+        if run_until > _CYCLES_MAX:
             self._refuse(
-                ErrorCode.BAD_VALUE, f"a slice cannot end at cycle {run_until}: the maximum is {CYCLES_MAX}"
+                ErrorCode.BAD_VALUE, f"a slice cannot end at cycle {run_until}: the maximum is {_CYCLES_MAX}"
             )
         if doorbell == rm.RESUME:
-            if kernel.reason is not StopReason.SLICE:
+            if not machine.paused:
                 self._refuse(ErrorCode.DOORBELL, "there is no slice to resume")
-            if 0 < run_until <= kernel.cycles:
+            if 0 < run_until <= machine.cycles:
                 self._refuse(
                     ErrorCode.BAD_VALUE,
-                    f"a slice cannot end at cycle {run_until}: {kernel.cycles} cycles have run",
+                    f"a slice cannot end at cycle {run_until}: {machine.cycles} cycles have run",
                 )
         self._compute_ns = 0
         self._run_until = run_until
         self._number = number
-        if doorbell == rm.RESUME:
-            try:
-                self._run(kernel, None, self._chunk_end(kernel.cycles), self._halted())
-            except StartError as error:
-                self._refuse(ErrorCode.BAD_VALUE, str(error).rstrip("."))
-        else:
-            self._max_cycles = max_cycles
-            self._chunk = self._first_chunk
-            end = self._chunk_end(0)
-            start = Start(
-                addresses=self._inputs(kernel.machine.parameters),
-                prior_address=self._prior_address(prior_address),
-                prior_codes=self._written_prior(kernel.machine.parameters),
-                target_count=target,
-                max_cycles=max_cycles,
-                bank=bank,
-                run_until=end,
-            )
-            try:
-                self._run(kernel, start, end)
-            except StartError as error:
-                self._refuse(ErrorCode.BAD_VALUE, str(error).rstrip("."))
+        try:
+            if doorbell == rm.RESUME:
+                self._run(machine, machine.resume, self._chunk_end(machine.cycles))
+            else:
+                frame = FrameSettings(*settings)
+                self._max_cycles = frame.max_cycles
+                self._chunk = self._first_chunk
+                self._run(machine, partial(machine.start, frame), self._chunk_end(0))
+        except StartError as error:
+            self._refuse(ErrorCode.BAD_VALUE, str(error).rstrip("."))
         # only now: a refused doorbell leaves the register as it was
         self._put(doorbell, number)
 
-    def _inputs(self, parameters: BM1Parameters) -> tuple[int, ...] | npt.NDArray[np.int64]:
-        if self._is_plain:
-            return self._sensors.unpack_from(self._memory, rm.SENSORS)
-        shape = parameters.input_shape
-        words = np.frombuffer(self._memory, "<u4", math.prod(shape), rm.INPUTS)
-        return words.reshape(shape).astype(np.int64)
-
-    def _prior_address(self, of_one: int) -> int | tuple[int, ...]:
-        if self._is_plain or not len(self._outcomes):
-            return of_one
-        return tuple(np.frombuffer(self._memory, "<u4", len(self._outcomes), rm.PRIOR_SELECTS).tolist())
-
-    def _halted(self) -> Collection[int]:
-        """Return the replicas that a resume does not continue."""
-        if not len(self._outcomes):
-            return ()
-        mask = int.from_bytes(self._view[rm.HALT : rm.HALT + 4 * rm.HALT_WORDS], "little")
-        return {at for at in range(mask.bit_length()) if mask >> at & 1}
-
-    def _written_prior(self, parameters: BM1Parameters) -> npt.NDArray[np.uint16] | None:
-        if parameters.prior_mode is PriorMode.TABLE:
-            return None
-        shape = parameters.count_shape
-        words = np.frombuffer(self._memory, "<u4", math.prod(shape), rm.PRIOR_CODES).reshape(shape)
-        if int(words.max()) > parameters.ones_code:
-            self._refuse(
-                ErrorCode.BAD_VALUE, f"a prior code is {words.max()}; the maximum is {parameters.ones_code}"
-            )
-        codes: npt.NDArray[np.uint16] = words.astype(np.uint16)
-        return codes
-
     def step(self) -> None:
         """Run the machine for one more chunk; then `running` tells whether it must continue."""
-        kernel = self._kernel
-        if kernel is not None and self.running:
-            self._run(kernel, None, self._chunk_end(kernel.cycles))
+        machine = self._machine
+        if machine is not None and self.running:
+            self._run(machine, machine.step, self._chunk_end(machine.cycles))
 
-    def _run(self, kernel: BM1Kernel, start: Start | None, end: int, halted: Collection[int] = ()) -> None:
-        """Run one chunk, to cycle `end`, of a new frame (`start`) or of the current one."""
+    def _run(self, machine: BoardMachine, chunk: Callable[[int], None], end: int) -> None:
+        """Run one chunk, to cycle `end`; the results are in the registers then, for a host that looks at them."""
         began = time.perf_counter_ns()
-        reason = kernel.resume(end, halted) if start is None else kernel.start(start)
+        chunk(end)
         elapsed = time.perf_counter_ns() - began
         self._compute_ns += elapsed
-        cycles = kernel.cycles
         # The speed varies with the frame (lines that cannot count take no time) and with the load of the
         # core.
         if elapsed < CHUNK_S * 0.5e9:
             self._chunk *= 2
         elif elapsed > CHUNK_S * 1.5e9:
             self._chunk = max(int(self._chunk * CHUNK_S * 1e9 / elapsed), _SHORTEST_CHUNK)
-        # after every chunk, so that a host can look at a running machine
-        self._results[:] = kernel.counts
-        if not self._is_plain and len(self._outcomes):
-            self._outcomes["reason"] = kernel.replica_reasons
-            self._outcomes["cycles"] = kernel.replica_cycles
-        self.running = reason is StopReason.SLICE and cycles != self._run_until
+        cycles = machine.cycles
+        self.running = machine.paused and cycles != self._run_until
         if self.running:
-            self._publish(BoardState.RUNNING, StopReason.NONE, cycles)
+            self._publish(BoardState.RUNNING, 0, cycles)
         else:
             self.done = self._number
-            self._publish(BoardState.DONE, reason, cycles)
+            self._publish(BoardState.DONE, machine.reason, cycles)
 
     def _chunk_end(self, cycles: int) -> int:
         """Return the end of the next chunk, or of the slice if that is nearer, in cycles; 0 for none."""
@@ -423,7 +364,7 @@ class EmulatedBoard:
         run_until = self._run_until
         return run_until if end >= self._max_cycles or end >= run_until > 0 else end
 
-    def _publish(self, state: BoardState, reason: StopReason, cycles: int) -> None:
+    def _publish(self, state: BoardState, reason: int, cycles: int) -> None:
         """Write the outcome to the registers."""
         status = (
             state << rm.STATUS_STATE_SHIFT
@@ -433,9 +374,8 @@ class EmulatedBoard:
         DONE_BLOCK.pack_into(self._memory, rm.DONE, self.done, status, cycles, self._compute_ns)
 
     def interrupt_words(self) -> bytes:
-        """Return the payload of an interrupt: DONE to COMPUTE_NS, one count per line, replicas' outcomes."""
-        words = self._view[rm.DONE : rm.DONE + DONE_BLOCK.size].tobytes() + self._results.tobytes()
-        return words if self._is_plain else words + self._outcomes.tobytes()
+        """Return the payload of an interrupt: DONE to COMPUTE_NS, the results, replicas' outcomes."""
+        return b"".join((self._view[rm.DONE : rm.DONE + DONE_BLOCK.size], self._results, self._outcomes))
 
     # ---- memory ---------------------------------------------------------------------------------------
 
@@ -448,33 +388,9 @@ class EmulatedBoard:
 
 
 _LONG_LOW: Final = frozenset({rm.CYCLES, rm.COMPUTE_NS})
-_DATA: Final = (
-    range(rm.SENSORS, rm.SENSORS + 4 * rm.SENSORS_WORDS),
-    range(rm.INPUTS, rm.INPUTS + 4 * rm.INPUTS_WORDS),
-    range(rm.PRIOR_SELECTS, rm.PRIOR_SELECTS + 4 * rm.PRIOR_SELECTS_WORDS),
-    range(rm.OUTCOMES, rm.OUTCOMES + 4 * rm.OUTCOMES_WORDS),
-    range(rm.RESULTS, rm.RESULTS + 4 * rm.RESULTS_WORDS),
-    range(rm.PRIOR_CODES, rm.PRIOR_CODES + 4 * rm.PRIOR_CODES_WORDS),
-)
-
-
-def _measure_speed(kernel: BM1Kernel) -> float:
-    """Return the cycles per second in the slowest case: with all readings missing, all lines count.
-
-    It measures CPU time of the thread, so that other load does not permanently make the board look slow.
-    """
-    parameters = kernel.machine.parameters
-    start = Start(
-        addresses=missing_inputs(parameters),
-        target_count=parameters.target_count_max,
-        max_cycles=CYCLES_MAX,
-        run_until=1,
+_DATA: Final = tuple(
+    range(block.address, block.address + 4 * block.words)
+    for block in map(
+        BLOCKS.__getitem__, ("SENSORS", "INPUTS", "PRIOR_SELECTS", "OUTCOMES", "RESULTS", "PRIOR_CODES")
     )
-    kernel.start(start)  # the first start of a kernel takes longer
-    began = time.thread_time_ns()
-    reason = kernel.start(start)
-    while reason is StopReason.SLICE and kernel.cycles < _ALIGNMENT:
-        if time.thread_time_ns() - began > CHUNK_S * 1e8:
-            break
-        reason = kernel.resume(2 * kernel.cycles)
-    return kernel.cycles * 1e9 / max(time.thread_time_ns() - began, 1)
+)

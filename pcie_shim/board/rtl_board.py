@@ -6,15 +6,13 @@ import time
 from collections.abc import Callable
 from typing import Final, NoReturn
 
-import numpy as np
-
-from machines.bm1 import missing_inputs
+from machines.kind import OUTCOME
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import CHUNK_S, EmulatedBoard, RefusedError
 from pcie_shim.board.simulation import MOST_WORDS, Simulation
 from pcie_shim.errors import ImageError, SimulationError
-from pcie_shim.programming_file import Image, image_from_bytes, interface_words, is_plain
-from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, REPLICA_OUTCOME, WORD
+from pcie_shim.programming_file import Image, image_from_bytes
+from pcie_shim.register_layout import ALL_ONES, BLOCKS, DONE_BLOCK, SETTINGS, WORD
 from pcie_shim.register_map import BoardState, ErrorCode
 
 LOAD_S: Final = 20.0
@@ -221,14 +219,14 @@ class RtlBoard:
         self.running = status & rm.STATUS_STATE_MASK == BoardState.RUNNING << rm.STATUS_STATE_SHIFT
 
     def interrupt_words(self) -> bytes:
-        """Return the payload of an interrupt: DONE to COMPUTE_NS, one count per line, replicas' outcomes."""
+        """Return the payload of an interrupt: DONE to COMPUTE_NS, the results, replicas' outcomes."""
         words = self.read(rm.DONE, DONE_BLOCK.size // 4)
         if self._image is None:
             return words
-        parameters = self._image.machine.parameters
-        words += self.read(rm.RESULTS, interface_words(parameters)[1])
-        if parameters.replicas > 1:
-            words += self.read(rm.OUTCOMES, parameters.replicas * REPLICA_OUTCOME.itemsize // 4)
+        registers = self._image.registers
+        words += self.read(rm.RESULTS, registers.result_words)
+        if registers.replicas > 1:
+            words += self.read(rm.OUTCOMES, registers.replicas * OUTCOME.itemsize // 4)
         return words
 
     def release(self) -> None:
@@ -280,13 +278,13 @@ class _Preparation(threading.Thread):
 
 
 def _measure_speed(simulation: Simulation, image: Image) -> float:
-    """Return the clocks per second in the slowest case: with all readings missing, all lines count."""
-    parameters = image.machine.parameters
-    inputs = rm.SENSORS if is_plain(parameters) else rm.INPUTS
-    for at, word in enumerate(np.asarray(missing_inputs(parameters)).ravel().tolist()):
-        simulation.write(inputs + 4 * at, word)
-    simulation.write(rm.TARGET_COUNT, parameters.target_count_max)
-    simulation.write(rm.MAX_CYCLES, ALL_ONES)
+    """Return the clocks per second of the slowest frame."""
+    host = image.kind.on_host([image.machine])
+    settings, blocks = host.begin(host.slowest()).starts[0]
+    places = [(BLOCKS[name].address, words) for name, words in blocks.items()]
+    for address, words in [*places, (rm.TARGET_COUNT, SETTINGS.pack(*settings))]:
+        for at, (word,) in enumerate(WORD.iter_unpack(words)):
+            simulation.write(address + 4 * at, word)
     simulation.write(rm.CONTROL, rm.CONTROL_INTERRUPT_ENABLE_MASK)
     number = clocks = 0
     chunk = _SHORTEST_CHUNK

@@ -6,9 +6,8 @@ import time
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-from machines.bm1 import StopReason, joint_reason
+from machines.kind import OUTCOME, Blocks, BoardResult, FrameSettings
 from pcie_shim import register_map as rm
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import (
@@ -38,20 +37,18 @@ from pcie_shim.errors import (
     ShortReadError,
     StaleHandleError,
 )
-from pcie_shim.host.frame import BoardResult, BoardWords
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import Done, RegisterWrite, SocketLink
-from pcie_shim.programming_file import Image, interface_words, is_plain
-from pcie_shim.register_layout import ALL_ONES, REPLICA_OUTCOME, next_doorbell
+from pcie_shim.programming_file import Image
+from pcie_shim.register_layout import ALL_ONES, BLOCKS, SETTINGS, next_doorbell, register_values
 from pcie_shim.register_map import BoardState
 
 _ASSUMED_SPEED: Final = 1e4  # cycles per second of a board that does not report its speed
 _START: Final = struct.Struct("<QI")  # RUN_UNTIL, START
 _RESUME: Final = struct.Struct("<QII")  # RUN_UNTIL, START (0: no effect), RESUME
 _BANK_AT: Final = rm.BANK - rm.TARGET_COUNT
-_REASONS: Final = frozenset(StopReason) - {StopReason.NONE}
 _PRIOR_AT: Final = rm.PRIOR_SELECT - rm.TARGET_COUNT
-_CAPABILITIES: Final = range(rm.CAP_MACHINE, rm.CAP_INTERFACE + 4, 4)
+_CAPABILITIES: Final = range(rm.CAP_MACHINE, rm.CAP_STEPS + 4, 4)
 
 
 class DrivenBoard:
@@ -64,14 +61,13 @@ class DrivenBoard:
         self.image = image
         self._reprogram = reprogram
 
-        # What follows from the image: where the inputs are, and the extent of a result, which every answer must have.
-        parameters = image.machine.parameters
-        self.lines = parameters.lines
-        self.replicas = parameters.replicas
-        self.inputs_at = rm.SENSORS if is_plain(parameters) else rm.INPUTS
-        self.counts_bytes = 4 * self.replicas * self.lines
+        # What follows from the image: the extent of a result, which every answer must have, and its reasons.
+        self._kind = image.kind
+        self._reasons = frozenset(image.kind.reasons) - {0}
+        self.replicas = image.registers.replicas
+        self._results_bytes = 4 * image.registers.result_words
         outcomes = self.replicas if self.replicas > 1 else 0
-        self.result_bytes = self.counts_bytes + outcomes * REPLICA_OUTCOME.itemsize
+        self._answer_bytes = self._results_bytes + outcomes * OUTCOME.itemsize
 
         # Either an open link, or None and the reason why.
         self.link: SocketLink | None = None
@@ -83,18 +79,18 @@ class DrivenBoard:
 
     def _forget(self) -> None:
         """Forget the contents of the registers, which another host may have written."""
-        # What the board has: a frame writes only what differs. Empty or None: unknown.
+        # What the board has: a frame writes only what differs. Empty: unknown.
         self.settings = b""
-        self.selects = b""
-        self.prior: npt.NDArray[np.uint16] | None = None
+        self._blocks: dict[str, bytes] = {}
 
         # Number of the last doorbell, and whether its answer is still missing: then `done` is None.
         self.number = 0
         self.waiting = False
         self.done: Done | None = None
 
-        # The replicas' part of the last answer, copied, because the others wait for the buffer of the link.
-        self.outcomes: npt.NDArray[np.void] = np.zeros(0, REPLICA_OUTCOME)
+        # Of the last answer: the stop reason of each replica, and with several their cycles.
+        self.reasons: tuple[int, ...] = (0,) * self.replicas
+        self._replica_cycles: tuple[int, ...] = ()
 
         # A poll of this board's link alone.
         self.readable = select.poll()
@@ -167,25 +163,19 @@ class DrivenBoard:
 
     def _check_capabilities(self, link: SocketLink) -> None:
         """Check that the registers used by the host exist, independently of the image hash."""
-        parameters = self.image.machine.parameters
         words = struct.iter_unpack("<I", link.read_block(_CAPABILITIES.start, len(_CAPABILITIES)))
-        capabilities = dict(zip(_CAPABILITIES, (word for (word,) in words), strict=True))
-        mode = capabilities[rm.CAP_MACHINE] & rm.CAP_MACHINE_SENSOR_MODE_MASK
-        mode >>= rm.CAP_MACHINE_SENSOR_MODE_SHIFT
-        room = capabilities[rm.CAP_INTERFACE] & 0xFFFF, capabilities[rm.CAP_INTERFACE] >> 16
-        inputs, results = interface_words(parameters)
-        wanted = rm.SensorMode[parameters.sensor_mode.name]
+        theirs = dict(zip(_CAPABILITIES, (word for (word,) in words), strict=True))
+        registers = self.image.registers
         # these decide how long a result is, and where its parts are
-        for what, theirs, ours in (
-            ("replicas", capabilities[rm.CAP_REPLICAS], parameters.replicas),
-            ("sensor mode", mode, int(wanted)),
-            ("lines", capabilities[rm.CAP_LINES], parameters.lines),
-        ):
-            if theirs != ours:
+        for address, value in register_values(registers.capabilities).items():
+            if theirs[address] != value:
+                name = next(name for name, block in BLOCKS.items() if block.address == address)
                 raise ImageMismatchError(
-                    f"The board at {self.endpoint} has {what} {theirs}, the deployment's image has {ours}: "
+                    f"The board at {self.endpoint} has {name} {theirs[address]:#x}, the deployment's image has {value:#x}: "
                     "program it with the loader, or restart it"
                 )
+        room = theirs[rm.CAP_INTERFACE] & 0xFFFF, theirs[rm.CAP_INTERFACE] >> 16
+        inputs, results = registers.input_words, registers.result_words
         if inputs > room[0] or results > room[1]:
             raise ImageMismatchError(
                 f"The board at {self.endpoint} has room for {room[0]} inputs and {room[1]} results, the deployment "
@@ -209,33 +199,34 @@ class DrivenBoard:
 
     # ---- a frame --------------------------------------------------------------------------------------
 
-    def start(self, words: BoardWords, end: int) -> None:
-        """Post a new frame: the sensors, the settings that changed, and the doorbell (figure 3.3)."""
+    def start(self, settings: FrameSettings, blocks: Blocks, end: int) -> None:
+        """Post a new frame: the inputs and settings that changed, and the doorbell (figure 3.3)."""
         self.waiting = True  # from here on, abandoning the frame must interrupt the board
-        settings, sensors, selects, prior = words
-        writes: list[RegisterWrite] = [(self.inputs_at, sensors)] if sensors else []
-        if selects != self.selects:
-            writes.append((rm.PRIOR_SELECTS, selects))
-            self.selects = selects
-        if prior is not None and (self.prior is None or not np.array_equal(prior, self.prior)):
-            writes.append((rm.PRIOR_CODES, prior.astype("<u4").tobytes()))
-            self.prior = prior.copy()
+        words, known = SETTINGS.pack(*settings), self.settings
         # Settings, slice and doorbell are adjacent: write one burst from the first changed setting on.
-        known = self.settings
-        if settings == known:
-            at = len(settings)
-        elif settings[:_BANK_AT] != known[:_BANK_AT]:
+        if words == known:
+            at = len(words)
+        elif words[:_BANK_AT] != known[:_BANK_AT]:
             at = 0
-        elif settings[_BANK_AT:_PRIOR_AT] != known[_BANK_AT:_PRIOR_AT]:
+        elif words[_BANK_AT:_PRIOR_AT] != known[_BANK_AT:_PRIOR_AT]:
             at = _BANK_AT
         else:
             at = _PRIOR_AT
-        self.settings = settings
-        self._ring(writes, rm.TARGET_COUNT + at, settings[at:], _START, end)
+        self.settings = words
+        self._ring(self._changed(blocks), rm.TARGET_COUNT + at, words[at:], _START, end)
 
-    def resume(self, end: int, halted: bytes = b"") -> None:
-        """Post the next slice of the frame; `halted` are the words of HALT, empty if nothing is halted."""
-        self._ring([(rm.HALT, halted)] if halted else [], rm.RUN_UNTIL, b"", _RESUME, end, 0)
+    def resume(self, blocks: Blocks, end: int) -> None:
+        """Post the next slice of the frame, after these blocks."""
+        self._ring(self._changed(blocks), rm.RUN_UNTIL, b"", _RESUME, end, 0)
+
+    def _changed(self, blocks: Blocks) -> list[RegisterWrite]:
+        """Return the blocks to write, which the board is known to have from then on."""
+        writes: list[RegisterWrite] = []
+        for name, words in blocks.items():
+            if self._blocks.get(name) != words:
+                writes.append((BLOCKS[name].address, words))
+                self._blocks[name] = words
+        return writes
 
     def _ring(
         self, writes: list[RegisterWrite], address: int, before: bytes, layout: struct.Struct, *words: int
@@ -268,45 +259,36 @@ class DrivenBoard:
             raise SequenceError(
                 f"The board at {self.endpoint} answered doorbell {done.number} where {self.number} was due once"
             )
-        if len(done.results) != self.result_bytes:
+        if len(done.results) != self._answer_bytes:
             raise ShortReadError(
                 f"The board at {self.endpoint} sent {len(done.results) // 4} results where "
-                f"{self.result_bytes // 4} were due"
+                f"{self._answer_bytes // 4} were due"
             )
-        if done.state != BoardState.DONE or done.reason not in _REASONS:
+        if done.state != BoardState.DONE or done.reason not in self._reasons:
             raise FramingError(
                 f"The board at {self.endpoint} stopped with an impossible status, {done.status:#010x}"
             )
         if self.replicas > 1:
-            outcomes = np.frombuffer(done.results, REPLICA_OUTCOME, self.replicas, self.counts_bytes)
-            if not _REASONS.issuperset(outcomes["reason"].tolist()):
+            outcomes = np.frombuffer(done.results, OUTCOME, self.replicas, self._results_bytes)
+            reasons = tuple(outcomes["reason"].tolist())
+            if not self._reasons.issuperset(reasons):
                 raise FramingError(f"The board at {self.endpoint} stopped a replica with an unknown reason")
-            self.outcomes = outcomes.copy()
+            self.reasons = reasons
+            self._replica_cycles = tuple(outcomes["cycles"].tolist())
+        else:
+            self.reasons = (done.reason,)
         self.waiting = False
         self.done = done
 
-    @property
-    def reason(self) -> int:
-        """The last stop reason of the machine."""
-        return 0 if self.done is None else self.done.reason
-
     def result(self) -> BoardResult:
-        """Return the result of the frame; the counts are copied from the buffer of the link."""
+        """Return the result of the frame; the words are copied from the buffer of the link."""
         if self.done is None:
             raise SequenceError(f"The board at {self.endpoint} has not answered doorbell {self.number}")
-        if self.replicas > 1:
-            reasons = tuple(StopReason(reason) for reason in self.outcomes["reason"].tolist())
-            joint = joint_reason(reasons, range(self.replicas))
-            return BoardResult(
-                words=bytes(self.done.results[: self.counts_bytes]),
-                cycles=self.done.cycles,
-                reason=joint if joint is not StopReason.NONE else StopReason.SLICE,
-                replica_cycles=tuple(self.outcomes["cycles"].tolist()),
-                replica_reasons=reasons,
-            )
-        return BoardResult(
-            words=bytes(self.done.results), cycles=self.done.cycles, reason=StopReason(self.done.reason)
-        )
+        words = bytes(self.done.results[: self._results_bytes])
+        if self.replicas == 1:
+            return BoardResult(words, self.done.cycles, self.done.reason)
+        joint = self._kind.joint_reason(self.reasons)
+        return BoardResult(words, self.done.cycles, joint, self._replica_cycles, self.reasons)
 
 
 _BOARD_ERRORS: Final[tuple[tuple[tuple[type[PcieShimError], ...], type[BoardError]], ...]] = (

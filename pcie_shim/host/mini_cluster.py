@@ -12,11 +12,11 @@ are received as the boards stop. Boards stop together (`slices`) or independentl
 import select
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final, NoReturn, Self
 
-import numpy as np
-
-from machines.bm1 import StopReason, first_slice
+from machines.errors import StartError
+from machines.kind import BoardResult, FrameCourse, FrameInput
 from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import (
     AccessError,
@@ -28,7 +28,6 @@ from pcie_shim.errors import (
     StaleHandleError,
 )
 from pcie_shim.host.driven_board import DrivenBoard, board_error
-from pcie_shim.host.frame import FrameEncoder, FrameInput, FrameOutput
 from pcie_shim.host.socket_link import LONGEST_POLL_S
 from pcie_shim.programming_file import Image
 
@@ -40,21 +39,38 @@ PROGRAMMING_S: Final = 30.0
 """Minimum timeout of each step of programming a blank board, in seconds."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameOutput:
+    """The results of a frame, and its durations in nanoseconds (thesis figure 4.5).
+
+    Attributes:
+        boards: One result per board, in the order of the partition.
+        register_writes_ns: Posting settings, sensors, starts and resumes.
+        compute_ns: Waiting for the boards, including their computing and the transport.
+        reads_ns: Copying the results.
+        boards_compute_ns: Computing time of the slowest board, summed over the slices. The rest of
+            `compute_ns` is transport, or other boards on the same core.
+        slices: Number of slices.
+    """
+
+    boards: tuple[BoardResult, ...]
+    register_writes_ns: int
+    compute_ns: int
+    reads_ns: int
+    boards_compute_ns: int
+    slices: int
+
+
 class _Progress:
     """Progress of the posted frame."""
 
-    def __init__(self, max_cycles: int, end: int, boards: Sequence[DrivenBoard]) -> None:
+    def __init__(self, max_cycles: int, course: FrameCourse, boards: Sequence[DrivenBoard]) -> None:
         self.max_cycles = max_cycles
+        self.course = course
 
-        # The slice: its first cycle, and its last one (0: that of the frame).
-        self.begun = 0
-        self.end = end
-
-        # The boards that were started for this slice, and how many of them have not answered yet. The replicas in
-        # `halted` have overflowed on a board and stay stopped for the rest of the frame.
+        # The boards that were started for this slice, and how many of them have not answered yet.
         self.running = boards
         self.left = 0
-        self.halted: frozenset[int] = frozenset()
 
         # The cycles of the slice, the seconds that they may take, and the monotonic time when these are over.
         self.cycles = 0
@@ -73,8 +89,8 @@ class MiniCluster:
     def __init__(self, boards: Sequence[DrivenBoard], *, timeout: float, slack: float) -> None:
         """Store the boards; use `open`, which also connects."""
         self._boards = tuple(boards)
-        self._encoder = FrameEncoder([board.image for board in self._boards])
-        self._replicas = self._boards[0].replicas
+        first = self._boards[0].image
+        self._machines = first.kind.on_host([board.image.machine for board in self._boards])
         self._timeout = timeout
         self._slack = slack
 
@@ -174,16 +190,16 @@ class MiniCluster:
         """Start a frame on all boards without waiting; `collect` returns its result. Errors as for `run`."""
         if self._progress is not None:
             raise FrameInputError("A frame is in progress; collect its result before posting the next")
-        words = self._encoder.encode(frame)
-        self._make_ready()
-        end = first_slice(frame.target_count) if frame.stop == "slices" else 0
-        if end >= frame.max_cycles or (self._replicas > 1 and len(self._boards) == 1):
-            end = 0  # one slice, which ends with the frame
-        progress = self._progress = _Progress(frame.max_cycles, end, self._boards)
         try:
-            for board, own in zip(self._boards, words, strict=True):
+            course = self._machines.begin(frame)
+        except StartError as error:
+            raise FrameInputError(str(error)) from error
+        self._make_ready()
+        progress = self._progress = _Progress(frame.max_cycles, course, self._boards)
+        try:
+            for board, (settings, blocks) in zip(self._boards, course.starts, strict=True):
                 try:
-                    board.start(own, end)
+                    board.start(settings, blocks, course.end)
                 except LinkError as error:
                     self._fail(board, error)
             self._expect_done(progress)
@@ -228,7 +244,7 @@ class MiniCluster:
     def _expect_done(self, progress: _Progress) -> None:
         """Set the deadline of a slice that has just been started."""
         # emulated boards may all run on one core
-        cycles = (progress.end or progress.max_cycles) - progress.begun
+        cycles = (progress.course.end or progress.max_cycles) - progress.course.begun
         progress.cycles = cycles
         progress.limit = self._slack + cycles * len(self._boards) / min(board.speed for board in self._boards)
         progress.deadline = time.monotonic() + progress.limit
@@ -271,23 +287,13 @@ class MiniCluster:
         progress.computing_ns += max(
             board.done.compute_ns for board in progress.running if board.done is not None
         )
-        halts = b""
-        # replicas stop one by one: those that are over on a board are halted on the others
-        if self._replicas > 1:
-            running, halts = self._boards_of_replicas(progress)
-        else:
-            running = [board for board in progress.running if board.reason == StopReason.SLICE]
-            # with `slices` the frame is over for all, and with `own` no board has a slice left
-            if any(board.reason == StopReason.OVERFLOW for board in self._boards):
-                running = []
-        if running:
-            progress.running = running
-            progress.begun, progress.end = progress.end, 2 * progress.end
-            if progress.end >= progress.max_cycles:
-                progress.end = 0  # the last slice ends with the frame
-            for board in running:
+        course = progress.course
+        numbers, blocks = course.proceed([board.reasons for board in self._boards])
+        if numbers:
+            progress.running = [self._boards[number] for number in numbers]
+            for board in progress.running:
                 try:
-                    board.resume(progress.end, halts)
+                    board.resume(blocks, course.end)
                 except LinkError as error:
                     self._fail(board, error)
             self._expect_done(progress)
@@ -301,22 +307,6 @@ class MiniCluster:
             boards_compute_ns=progress.computing_ns,
             slices=progress.slices,
         )
-
-    def _boards_of_replicas(self, progress: _Progress) -> tuple[list[DrivenBoard], bytes]:
-        """Return the boards on which a replica continues, and the words of HALT for the other replicas.
-
-        A replica continues if it has not overflowed on any board; a part that has stopped needs no halt.
-        """
-        reasons = np.stack([board.outcomes["reason"] for board in self._boards])
-        over = (reasons == StopReason.OVERFLOW).any(axis=0)
-        progress.halted |= frozenset(np.flatnonzero(over).tolist())
-        running = [
-            board
-            for board in progress.running
-            if bool(((board.outcomes["reason"] == StopReason.SLICE) & ~over).any())
-        ]
-        mask = sum(1 << replica for replica in progress.halted)
-        return running, mask.to_bytes(4 * -(-self._replicas // 32), "little")
 
     def _abandon(self) -> None:
         """Drop the frame, and stop the boards that are still computing it by closing their links."""
@@ -385,7 +375,7 @@ def _check_images(boards: int, images: Sequence[Image]) -> None:
             raise ImageMismatchError(
                 f"Image {index} belongs to model {image.model_hash}, image 0 to {first.model_hash}"
             )
-        offset += image.machine.parameters.lines
+        offset += image.registers.lines
     if offset != first.partition.total_lines:
         raise ImageMismatchError(
             f"The images hold {offset} lines, the model has {first.partition.total_lines}"

@@ -24,10 +24,10 @@ from typing import Final
 from hdl.test.mutants import MUTANTS, Mutant, caught_by
 from hdl.test.project import HardwareToolError
 from hdl.test.verification import formal, sessions, units
+from machines.kind import FrameInput
 from pcie_shim import register_map
 from pcie_shim.endpoint import parse_endpoint
 from pcie_shim.errors import PcieShimError
-from pcie_shim.host.frame import FrameInput
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import Image, read_image

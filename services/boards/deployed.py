@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
+from machines.kind import FrameInput
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import BoardError, BoardMismatchError
-from pcie_shim.host.frame import FrameInput, FrameOutput
-from pcie_shim.host.mini_cluster import MiniCluster
+from pcie_shim.host.mini_cluster import FrameOutput, MiniCluster
 from pcie_shim.programming_file import Image, read_image
 from services.boards.frames import BoardAwayError, driver_input
 from services.settings import Settings

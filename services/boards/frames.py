@@ -7,9 +7,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from machines.parameters import SensorMode
+from machines.kind import BoardResult, FrameInput
 from pcie_shim.errors import BoardError, FrameInputError
-from pcie_shim.host.frame import BoardResult, FrameInput, FrameOutput
+from pcie_shim.host.mini_cluster import FrameOutput
 from services.sockets.records import Addresses, FailureReason, FrameFailed, FrameRequest, FrameResult
 from terminal.errors import exit_code_of
 from toolchain.deployment import Deployment, Variable
@@ -74,7 +74,7 @@ def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.ND
             # the top row is the prior without a selection
             rows = np.where(array == -1, 2**variable.bits - 1, array)
             row = tuple(rows.tolist()) if rows.ndim else int(rows)
-    per_line = (machine.lines,) if machine.sensor_mode is not SensorMode.COLUMN else ()
+    per_line = (machine.lines,) if machine.reads_lines else ()
     stacked = np.stack(sensors, axis=1) if sensors else np.empty((replicas, 0, *per_line), dtype=np.int64)
     shape = (len(sensors), *per_line)
     return stacked.reshape((replicas, *shape) if replicas > 1 else shape), row

@@ -3,14 +3,14 @@
 import time
 
 from posteriors.posterior import Posterior
-from services.pipeline.inference import Inference, report_of
+from services.pipeline.inference import infer, report_of
 from services.sockets.records import Publish
 from toolchain.deployment import Deployment
 
 
 def posterior_of(publish: Publish, deployment: Deployment) -> Posterior | None:
     """Return the posterior of a computed frame with its report, or None if all counts were 0."""
-    inference = Inference(publish.result)
+    inference = infer(publish.result, deployment)
     if inference.posterior is None:
         return None
     dimensions = deployment.result_dimensions

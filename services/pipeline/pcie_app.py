@@ -15,7 +15,7 @@ from concurrent.futures import Future
 from typing import TypeVar
 
 from pcie_shim.errors import BoardError, PcieShimError
-from pcie_shim.host.frame import FrameOutput
+from pcie_shim.host.mini_cluster import FrameOutput
 from services.boards.deployed import TICK, DeployedBoards
 from services.boards.frames import frame_failed, result_record
 from services.settings import Settings

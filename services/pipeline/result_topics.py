@@ -11,10 +11,11 @@ import msgspec
 
 from bridge.client import Publication, Ros, State, Subscription
 from bridge.errors import BridgeError, DisconnectedError, NoMessageError, SlowPeerError
+from machines.kind import Inference
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, write_frame_report
 from posteriors.posterior import MAX_RESULT, posterior_layout
 from services.pipeline.connections import AdvertisedTopic, OnState, connect_all
-from services.pipeline.inference import Inference, report_of
+from services.pipeline.inference import infer, report_of
 from services.settings import Settings
 from services.sockets.records import Outcome, Publish, Published
 from terminal.logs import get_logger
@@ -134,7 +135,7 @@ class ResultTopics:
 
         With `look`, wait until the result is seen on the wire, or until the timeout of the settings.
         """
-        inference = Inference(publish.result)
+        inference = infer(publish.result, self._deployment)
         # a server that does not accept the result in time is left out of it, with a warning
         ready = [publication.ready() for publication in self._connected()]
         for error in await asyncio.gather(*ready, return_exceptions=True):
@@ -155,7 +156,7 @@ class ResultTopics:
         one output.
         """
         started = time.monotonic_ns()
-        inference = inference or Inference(publish.result)
+        inference = inference or infer(publish.result, self._deployment)
         report = report_of(
             publish,
             inference,
@@ -163,7 +164,7 @@ class ResultTopics:
             now=(time.time_ns(), started),
             previous_out_ns=self._previous_out_ns,
         )
-        posterior = inference.posterior
+        posterior, best = inference.posterior, inference.best
         missed = 0
         # one write of the socket for both, so that they arrive together
         with self._outputs[0][0].together():
@@ -183,8 +184,8 @@ class ResultTopics:
             number=publish.result.number,
             outcome=outcome,
             seen=None,
-            best_line=inference.best,
-            best_probability=0.0 if posterior is None else float(posterior[inference.best]),
+            best_line=best,
+            best_probability=0.0 if posterior is None else float(posterior[best]),
             cycles=report.cycles or 0,
             total_ns=now - publish.received_tick,
             missed=missed,

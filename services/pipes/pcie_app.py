@@ -1,15 +1,15 @@
 """`pcie-app` without a master, which computes the readings of standard input and prints counts."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 
 from pcie_shim.errors import FrameInputError
-from pcie_shim.host.frame import FrameOutput
+from pcie_shim.host.mini_cluster import FrameOutput
 from services.boards.deployed import DeployedBoards
 from services.errors import InputLineError
-from services.pipeline.inference import REASON_WORDS
 from services.pipes.lines import blocking_lines, decoded
 from services.sockets.records import Addresses, FrameRequest
 from terminal.output import print_json_line, say, say_if_slow
@@ -42,6 +42,7 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
     with say_if_slow("waiting for the boards"):
         opened = boards.open()
     say(opened)
+    reasons = boards.deployment.machine.kind.reasons
     try:
         for number, line in blocking_lines():
             reading = reading_from_line(line, number)
@@ -52,20 +53,22 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
                 output = boards.run(frame)
             except FrameInputError as error:
                 raise InputLineError(f"line {number} of standard input: {error}") from error
-            print_json_line(_line(number, output, reading.stamp_ns))
+            print_json_line(_line(number, output, reading.stamp_ns, reasons))
     finally:
         boards.close()
     return 0
 
 
-def _line(number: int, output: FrameOutput, stamp_ns: int | None) -> dict[str, Any]:
+def _line(
+    number: int, output: FrameOutput, stamp_ns: int | None, reasons: Mapping[int, str]
+) -> dict[str, Any]:
     boards = []
     for board in output.boards:
         values: dict[str, Any] = {
             "counts": np.frombuffer(board.words, "<u4").tolist(),
             "cycles": board.cycles,
             "reason": board.reason,
-            "why": REASON_WORDS[board.reason],
+            "why": reasons[board.reason],
         }
         if board.replica_cycles:
             values |= {"replica_cycles": board.replica_cycles, "replica_reasons": board.replica_reasons}

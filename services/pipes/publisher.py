@@ -7,8 +7,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from machines.bm1 import StopReason
-from pcie_shim.host.frame import BoardResult
+from machines.kind import BoardResult
 from services.boards.frames import encode_boards
 from services.errors import InputLineError
 from services.pipeline.result_topics import ResultTopics
@@ -16,7 +15,7 @@ from services.pipes.lines import decoded, lines
 from services.settings import Settings
 from services.sockets.records import FrameResult, Outcome, Publish
 from terminal.output import say
-from toolchain.deployment import Deployment
+from toolchain.deployment import Deployment, MachineSection
 
 Unsigned = Annotated[int, msgspec.Meta(ge=0)]
 
@@ -24,9 +23,9 @@ Unsigned = Annotated[int, msgspec.Meta(ge=0)]
 class _LineBoard(msgspec.Struct):
     counts: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]]
     cycles: Unsigned
-    reason: StopReason
+    reason: int
     replica_cycles: list[Unsigned] = []
-    replica_reasons: list[StopReason] = []
+    replica_reasons: list[int] = []
 
 
 class _LineResult(msgspec.Struct):
@@ -39,16 +38,15 @@ _Line = _LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # JSON has no 
 
 
 def result_from_line(
-    line: bytes, number: int, count: int, replicas: int = 1
+    line: bytes, number: int, machine: MachineSection
 ) -> tuple[FrameResult, int | None] | list[float]:
     """Return the value of a line: a result of `pcie-app` with the stamp of its reading, or probabilities.
-
-    A result of this deployment has `count` counts or probabilities.
 
     Raises:
         InputLineError: The line is neither.
     """
     where = f"line {number} of standard input"
+    count, replicas, reasons = machine.results, machine.replicas, machine.kind.reasons
     expected = f"a result of pcie-app or an array of {count} probabilities"
     value = decoded(line, number, _Line, expected)
     found = len(value) if isinstance(value, list) else sum(len(board.counts) for board in value.boards)
@@ -65,6 +63,9 @@ def result_from_line(
                 f"{where} has {len(board.replica_cycles)} replicas' cycles on a board; expected a result of "
                 f"{replicas} replica{'s' if replicas > 1 else ''}"
             )
+        for reason in (board.reason, *board.replica_reasons):
+            if reason not in reasons:
+                raise InputLineError(f"{where} has the stop reason {reason}; expected 0 to {max(reasons)}")
         if each and len(board.counts) % each:
             raise InputLineError(f"{where} has {len(board.counts)} counts on a board of {each} replicas")
     boards = [
@@ -88,13 +89,12 @@ async def publish_lines(settings: Settings, deployment: Deployment) -> int:
         BridgeError: A server is unreachable.
     """
     topics = ResultTopics(settings, deployment)
-    machine = deployment.machine
     async with topics.opened() as where:
         say(where)
         outcomes: Counter[Outcome] = Counter()
         async for number, line in lines():
             # a line that cannot be used ends the pipe, so that no later result takes its place
-            value = result_from_line(line, number, machine.results, machine.replicas)
+            value = result_from_line(line, number, deployment.machine)
             if isinstance(value, list):
                 await topics.publish_array(value)
                 outcomes[Outcome.PUBLISHED] += 1

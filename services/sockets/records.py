@@ -171,7 +171,7 @@ class FrameRequest(Record, tag="frame", frozen=True):
 class FrameResult(Record, tag="result", frozen=True):
     """pcie-app to master: the results of the boards, and durations.
 
-    `boards` is a list of `pcie_shim.host.frame.BoardResult`, which only its sender and the publisher read.
+    `boards` is a list of `machines.kind.BoardResult`, which only its sender and the publisher read.
     """
 
     number: int

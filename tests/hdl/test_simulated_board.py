@@ -21,11 +21,11 @@ import psutil
 import pytest
 
 from machines.bm1 import StopReason
+from machines.kind import FrameInput
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.errors import BoardError, BoardRefusedError, SimulationError
-from pcie_shim.host.frame import FrameInput
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import image_bytes
 from pcie_shim.register_layout import next_doorbell

@@ -22,8 +22,8 @@ import psutil
 import pytest
 import websockets
 
+from machines.kind import FrameInput
 from machines.posterior import joint_posterior
-from pcie_shim.host.frame import FrameInput
 from pcie_shim.programming_file import read_image
 from tests.command_runner import invoke
 from tests.patience import PROCESS_PATIENCE, PRODUCT_LIMITS

@@ -11,8 +11,8 @@ import textwrap
 import numpy as np
 import pytest
 
+from machines.kind import FrameInput
 from machines.posterior import joint_posterior
-from pcie_shim.host.frame import FrameInput
 from pcie_shim.programming_file import read_image
 from posteriors.frame_report import read_frame_report
 from posteriors.posterior import read_posterior

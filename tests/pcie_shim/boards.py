@@ -13,12 +13,13 @@ import numpy as np
 
 from machines import make_kernel
 from machines.bm1 import BM1Machine, Start, StopReason
+from machines.bm1_kind import BM1
+from machines.kind import FrameInput
 from machines.parameters import BM1Parameters, RngKind, SensorMode
 from pcie_shim.board.server import StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint
-from pcie_shim.host.frame import FrameInput
 from pcie_shim.host.mini_cluster import MiniCluster
-from pcie_shim.programming_file import Image, Partition, interface_words
+from pcie_shim.programming_file import Image, Partition
 from tests.misbehaving_board import serve_misbehaving
 from tests.patience import PATIENCE
 
@@ -61,7 +62,7 @@ def image(of: BM1Machine, *, index: int = 0, count: int = 1, offset: int = 0, to
     return Image(
         machine=of,
         partition=Partition(index, count, offset, total or lines),
-        interface_sensors=max(20, interface_words(of.parameters)[0]),
+        interface_sensors=max(20, BM1.registers(of.parameters).input_words),
         interface_results=1200,
         model_hash="ab" * 32,
         build_date="2026-01-02T03:04:05Z",
@@ -171,7 +172,9 @@ def expected_of_replicas(parts: Sequence[Image], frame: FrameInput):
     for part in parts:
         one = dataclasses.replace(part.machine.parameters, replicas=1)
         of_one = dataclasses.replace(part.machine, parameters=one)
-        alone.append(dataclasses.replace(part, machine=of_one, interface_sensors=interface_words(one)[0]))
+        alone.append(
+            dataclasses.replace(part, machine=of_one, interface_sensors=BM1.registers(one).input_words)
+        )
     inputs = np.asarray(frame.addresses).reshape(parameters.replicas, parameters.sensors, -1)
     priors, codes = frame.prior_address, frame.prior_codes
     return [

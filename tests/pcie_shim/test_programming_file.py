@@ -11,17 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from machines.bm1_kind import BM1
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from pcie_shim import programming_file, register_map
 from pcie_shim.errors import DamagedImageError, ImageError, ImageMismatchError
-from pcie_shim.programming_file import (
-    Image,
-    build_date,
-    image_bytes,
-    image_from_bytes,
-    interface_room,
-    read_image,
-)
+from pcie_shim.programming_file import Image, build_date, image_bytes, image_from_bytes, read_image
+from pcie_shim.register_layout import interface_room
 from tests.pcie_shim.boards import image, machine
 
 MACHINES = [
@@ -195,7 +190,7 @@ def test_an_impossible_partition_is_refused(index, count, offset, total):
 
 def test_what_just_fits_is_accepted():
     of = machine(1)
-    room = interface_room(of.parameters)
+    room = interface_room(BM1.registers(of.parameters))
     last = image(of, index=65534, count=65535, offset=92, total=100)
     assert last.partition.line_offset == 100 - of.parameters.lines
     largest = dataclasses.replace(last, interface_sensors=room[0], interface_results=room[1])

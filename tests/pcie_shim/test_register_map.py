@@ -1,7 +1,9 @@
 """The committed constants and documentation, compared with the SystemRDL file."""
 
+from machines import KINDS
 from machines.bm1 import StopReason
-from machines.parameters import RngKind
+from machines.bm1_kind import BM1
+from machines.parameters import BM1Parameters, RngKind, SensorMode
 from pcie_shim import register_map
 from pcie_shim.framing import MAX_PAYLOAD_WORDS
 from scripts.register_map import SOURCE, RegisterMap, main
@@ -24,11 +26,22 @@ def test_the_hash_covers_the_definition_and_not_the_words(tmp_path):
     assert hash_with("OVERFLOW = 1", "OVERFLOW = 9") != register_map.MAP_SHA256
 
 
-def test_stop_reasons_and_rngs_are_the_machines():
-    assert {(each.name, each.value) for each in register_map.StopReason} == {
-        (each.name, each.value) for each in StopReason
+def test_the_encodings_are_the_machines_numbers():
+    encodings = {
+        encoding.type_name: {each.name: int(each.value) for each in encoding}
+        for encoding in RegisterMap(SOURCE).encodings
     }
-    assert {each.name for each in register_map.RngKind} - {"NONE"} == {each.name for each in RngKind}
+    assert encodings["stop_reason"] == {each.name: each.value for each in StopReason}
+
+    def number(field, **parameters):
+        used = BM1.registers(BM1Parameters(lines=1, sensor_bits=(8,), **parameters))
+        return used.capabilities[f"CAP_MACHINE.{field}"]
+
+    assert encodings["machine_kind"] == {"NONE": 0} | {name: number("KIND") for name in KINDS}
+    rngs = {each.name: number("RNG", rng=each, prob_bits=7) for each in RngKind}
+    assert encodings["rng_kind"] == {"NONE": 0} | rngs
+    modes = {each.name: number("SENSOR_MODE", sensor_mode=each) for each in SensorMode}
+    assert encodings["sensor_mode"] == modes
 
 
 def test_blocks_neither_overlap_nor_outgrow_a_frame():

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
+from machines.bm1_kind import BM1
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
-from pcie_shim.programming_file import interface_words
 from toolchain.errors import BuildError
 from toolchain.outputs.memories import generators
 from toolchain.outputs.mif import LENGTH
@@ -216,7 +216,8 @@ def _generators(p: BM1Parameters, table_length: int) -> LogicPart:
 
 def _inputs(p: BM1Parameters) -> LogicPart:
     """Return the words that the host writes for a frame (bm1_words): readings, prior addresses of replicas, codes."""
-    inputs, results = interface_words(p)
+    used = BM1.registers(p)
+    inputs, results = used.input_words, used.result_words
     sensor_bits = sum(p.sensor_bits) * inputs // max(p.sensors, 1)
     # words, and their used bits
     blocks = [(inputs, sensor_bits)]
@@ -292,7 +293,8 @@ def _tables(p: BM1Parameters) -> list[_Memory]:
 
 def _other_memories(p: BM1Parameters, table_length: int) -> list[_Memory]:
     """Return the seeds, the table of random numbers (one for each generator), and the words that the host writes."""
-    inputs, results = interface_words(p)
+    used = BM1.registers(p)
+    inputs, results = used.input_words, used.result_words
     memories = [
         _Memory(p.rng_banks * generators(p), state_bits(p, table_length), 1),
         _Memory(max(inputs, 1), WORD_BITS, 1),

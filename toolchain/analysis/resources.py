@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from machines.bm1 import Start, addressed_codes
+from machines.bm1_kind import BM1
 from machines.encode import decode_code
 from machines.parameters import SensorMode
-from pcie_shim.programming_file import interface_room
+from pcie_shim.register_layout import interface_room
 from toolchain.analysis.emulation import one_replica
 from toolchain.analysis.logic import MLAB_ALMS, MLAB_SHARE, Logic, Memories, logic_of, place_memories
 from toolchain.building.machine import partition_lines
@@ -96,7 +97,7 @@ def boards_needed(
     def on(lines: int) -> Estimate:
         return estimate(replace(parameters, lines=lines), device, table_length=table_length)
 
-    room = interface_room(parameters)
+    room = interface_room(BM1.registers(parameters))
     largest_lines = min(largest_lines, room[1] // parameters.replicas)
     if parameters.sensor_mode is not SensorMode.COLUMN and parameters.sensors:
         largest_lines = min(largest_lines, room[0] // (parameters.replicas * parameters.sensors))

@@ -6,9 +6,10 @@ from typing import Any, Final
 import numpy as np
 
 from machines.bm1 import BM1Machine
+from machines.bm1_kind import BM1
 from machines.errors import ParameterError
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
-from pcie_shim.programming_file import interface_room, interface_words
+from pcie_shim.register_layout import interface_room
 from toolchain.building.options import BuildOptions
 from toolchain.building.quantise import Quantised
 from toolchain.deployment import MachineSection, Scale
@@ -168,7 +169,8 @@ def board_layout(
     blocks = partition_lines(parameters.lines, partitions)
     board = replace(parameters, lines=blocks[0].lines)
     _check_seeds(board)
-    needed, room = interface_words(board), interface_room(board)
+    used = BM1.registers(board)
+    needed, room = (used.input_words, used.result_words), interface_room(used)
     sentence = (
         f"a board needs {needed[0]} inputs and {needed[1]} results ({board.sensors} known variables and {board.lines} lines on it"
         + (f", {board.replicas} times)" if board.replicas > 1 else ")")

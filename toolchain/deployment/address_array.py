@@ -117,7 +117,7 @@ def to_addresses(deployment: Deployment, variable: Variable, value: object) -> l
         addresses = _codes(variable, numbers, machine.prob_bits, machine.scale)
     else:
         addresses = _addresses(variable, numbers)
-    if variable.kind == "sensor" and machine.sensor_mode is not SensorMode.COLUMN:
+    if variable.kind == "sensor" and machine.reads_lines:
         _check_missing(variable, addresses)
     if (addresses == MISSING).all():
         return None

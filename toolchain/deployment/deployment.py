@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, Self
 import tomli_w
 from pydantic import Field, model_validator
 
-from machines.parameters import PriorMode, SensorMode
+from machines.parameters import PriorMode
 from toolchain.bounded_files import TomlFile, whole_file
 from toolchain.deployment.sections import (
     BoardSection,
@@ -140,7 +140,7 @@ class Deployment(DeploymentFile):
     def reading_shape(self, variable: Variable) -> tuple[int, ...]:
         """Shape of a variable's reading: () a number, (lines,), (replicas,), or (replicas, lines)."""
         machine = self.machine
-        per_line = machine.sensor_mode is not SensorMode.COLUMN and variable.kind == "sensor"
+        per_line = machine.reads_lines and variable.kind == "sensor"
         replicas = () if machine.replicas == 1 else (machine.replicas,)
         return (*replicas, machine.lines) if per_line else replicas
 

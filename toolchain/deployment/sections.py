@@ -4,11 +4,12 @@ import re
 from collections import Counter
 from enum import StrEnum
 from pathlib import PurePosixPath
-from typing import Annotated, Any, Final, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeVar
 from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, field_validator, model_validator
 
+from machines import KINDS
 from machines.parameters import (
     COUNTER_BITS_MAX,
     CYCLES_MAX,
@@ -18,6 +19,9 @@ from machines.parameters import (
     RngReset,
     SensorMode,
 )
+
+if TYPE_CHECKING:
+    from machines.kind import MachineKind
 
 NAME_MAX: Final = 200
 """Maximum number of characters in a name."""
@@ -272,9 +276,19 @@ class MachineSection(Section):
         return self
 
     @property
+    def kind(self) -> "MachineKind":
+        """The kind of the machine, which knows its frames and results."""
+        return KINDS[self.type]()
+
+    @property
+    def reads_lines(self) -> bool:
+        """True if every line of a column has its own reading."""
+        return self.sensor_mode is not SensorMode.COLUMN
+
+    @property
     def is_plain(self) -> bool:
         """True for one machine with one reading per column, and so one posterior per result."""
-        return self.replicas == 1 and self.sensor_mode is SensorMode.COLUMN
+        return self.replicas == 1 and not self.reads_lines
 
     @property
     def results(self) -> int:

@@ -94,8 +94,8 @@ def test_capabilities_are_the_images():
     )  # fmt: skip
     board = programmed(of)
     found = read(board, rm.CAP_MACHINE)
-    assert found & rm.CAP_MACHINE_KIND_MASK == rm.MachineKind.BM1
-    assert found >> rm.CAP_MACHINE_RNG_SHIFT & 255 == rm.RngKind.LFSR24
+    assert found & rm.CAP_MACHINE_KIND_MASK == 1
+    assert found >> rm.CAP_MACHINE_RNG_SHIFT & 255 == 3
     assert found & rm.CAP_MACHINE_SHARED_MASK
     assert found & rm.CAP_MACHINE_FREE_MASK
     assert not found & rm.CAP_MACHINE_PRIOR_WRITTEN_MASK
@@ -239,7 +239,7 @@ def compare_a_frame(data, board, kernel):
     assert board.read(rm.RESULTS, parameters.lines) == kernel.counts.tobytes()
     assert read64(board, rm.CYCLES) == kernel.cycles
     assert status(board)[1] is kernel.reason
-    assert np.array_equal(board._kernel.rng_state, kernel.rng_state)
+    assert np.array_equal(board._machine._kernel.rng_state, kernel.rng_state)
     assert rounds >= kernel.cycles // 64 - len(ends) - 1
 
 
@@ -282,7 +282,7 @@ def test_a_chunk_takes_its_time_whatever_the_speed(monkeypatch):
     board = programmed(never_stopping())
     start(board, 1, target=2**32 - 1, max_cycles=CYCLES_MAX)
     for nanoseconds in (1_000, 20_000, 1_000):  # per cycle, of a clock that stands still between chunks
-        clock = SimpleNamespace(perf_counter_ns=lambda each=nanoseconds: board._kernel.cycles * each)
+        clock = SimpleNamespace(perf_counter_ns=lambda each=nanoseconds: board._machine._kernel.cycles * each)
         monkeypatch.setattr(emulated_board, "time", clock)
         for _ in range(20):
             before = read64(board, rm.CYCLES)
@@ -401,4 +401,4 @@ def test_measuring_the_speed_leaves_no_trace():
     board = programmed(of)
     fresh = make_kernel(of)
     fresh.reset()
-    assert np.array_equal(board._kernel.rng_state, fresh.rng_state)
+    assert np.array_equal(board._machine._kernel.rng_state, fresh.rng_state)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from machines.bm1 import StopReason
-from pcie_shim.host.frame import BoardResult
+from machines.kind import BoardResult
 from services.boards.frames import encode_boards
 from services.errors import NoDataError
 from services.sockets.records import FrameResult, LossReason, Outcome, Published

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bridge.client import State
-from pcie_shim.host.frame import BoardResult
+from machines.kind import BoardResult
 from services.boards.frames import encode_boards
 from services.pipeline.connections import NotReceivableError
 from services.pipeline.publisher import Publisher

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from machines.bm1 import StopReason
+from machines.kind import BoardResult
 from machines.parameters import SensorMode
 from pcie_shim.errors import FrameInputError
-from pcie_shim.host.frame import BoardResult
 from services.boards.frames import encode_boards, machine_inputs
 from services.errors import VariableError
 from services.pipeline.frames import FrameAssembler
-from services.pipeline.inference import Inference
+from services.pipeline.inference import infer
 from services.sockets.records import FrameResult
 from toolchain.building.build import assemble
 from toolchain.building.machine import plan_machine
@@ -109,10 +109,10 @@ def test_posteriors_are_normalised_over_boards_and_by_replica():
         board([[10, 30], [4, 4], [0, 0]], [100, 8, 0], [OVERFLOW, OVERFLOW, IMPOSSIBLE]),
         board([[100], [8], [0]], [1000, 16, 0], [SLICE, SLICE, IMPOSSIBLE]),
     )
-    inferred = Inference(counted)
+    inferred = infer(counted, CELLS)
     assert inferred.posterior == pytest.approx([0.2, 0.6, 0.2, 1 / 3, 1 / 3, 1 / 3, 0, 0, 0])
     assert (inferred.totals, inferred.best) == ([48, 108], 1)
-    nothing = Inference(result(board([[0], [0]], [0, 0], [IMPOSSIBLE] * 2)))
+    nothing = infer(result(board([[0], [0]], [0, 0], [IMPOSSIBLE] * 2)), CELLS)
     assert (nothing.posterior, nothing.best, nothing.totals) == (None, -1, [0])
 
 

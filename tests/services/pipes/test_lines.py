@@ -8,13 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from machines.bm1_kind import BM1
+from services.boards.frames import decode_boards
 from services.commands import master, subscriber
 from services.errors import InputLineError
-from services.pipeline.inference import Inference
 from services.pipes import lines
 from services.pipes.pcie_app import reading_from_line
 from services.pipes.publisher import result_from_line
 from tests.command_runner import invoke
+from toolchain.deployment import MachineSection
 
 BOAT = Path(__file__).parents[3] / "casestudies" / "boat"
 
@@ -39,25 +41,31 @@ def test_a_line_that_is_not_a_reading_is_refused(line):
 
 def test_a_result_and_an_array():
     counted, stamp = result_from_line(
-        b'{"number": 1, "boards": [{"counts": [1, 258], "cycles": 5, "reason": 1}]}', 1, 2
+        b'{"number": 1, "boards": [{"counts": [1, 258], "cycles": 5, "reason": 1}]}', 1, of(2)
     )
-    (one,) = Inference(counted).boards
+    (one,) = decode_boards(counted)
     assert (one.words, one.cycles, stamp) == (b"\1\0\0\0\2\1\0\0", 5, None)
-    assert result_from_line(b"[0.25, 0.75]", 1, 2) == [0.25, 0.75]
-    counted, _ = result_from_line(board([1, 2, 3, 4], **OF_REPLICAS).encode(), 1, 4, 2)
-    assert Inference(counted).boards[0].replica_cycles == (9, 5)
-    assert Inference(counted).posterior == pytest.approx([1 / 3, 2 / 3, 3 / 7, 4 / 7])
+    assert result_from_line(b"[0.25, 0.75]", 1, of(2)) == [0.25, 0.75]
+    counted, _ = result_from_line(board([1, 2, 3, 4], **OF_REPLICAS).encode(), 1, of(2, 2))
+    results = decode_boards(counted)
+    assert results[0].replica_cycles == (9, 5)
+    assert BM1.infer(results).posterior == pytest.approx([1 / 3, 2 / 3, 3 / 7, 4 / 7])
+
+
+def of(lines, replicas=1):
+    return MachineSection(lines=lines, replicas=replicas)
 
 
 def board(counts, reason=1, **more):
     return json.dumps({"number": 1, "boards": [{"counts": counts, "cycles": 5, "reason": reason} | more]})
 
 
+UNEVEN = {"cycles": 5, "reason": 1, "replica_cycles": [1] * 3, "replica_reasons": [1] * 3}
 OF_REPLICAS = {"cycles": 9, "replica_cycles": [9, 5], "replica_reasons": [1, 3]}
 
 
 @pytest.mark.parametrize(
-    ("line", "count", "replicas"),
+    ("line", "results", "replicas"),
     [
         *((line, 2, 1) for line in ("[1, -1]", "[1e999, 1]", "[1]", board([1]))),
         *((board(counts), 2, 1) for counts in ([1, True], [1, 4294967296], [-1, 1])),
@@ -72,12 +80,12 @@ OF_REPLICAS = {"cycles": 9, "replica_cycles": [9, 5], "replica_reasons": [1, 3]}
                 {"replica_reasons": [1]},
             )
         ),
-        (board([1, 2, 3, 4], replica_cycles=[1] * 3, replica_reasons=[1] * 3), 4, 3),
+        (json.dumps({"number": 1, "boards": [UNEVEN | {"counts": [1] * count} for count in (2, 4)]}), 6, 3),
     ],
 )
-def test_a_line_that_is_not_a_result_is_refused(line, count, replicas):
+def test_a_line_that_is_not_a_result_is_refused(line, results, replicas):
     with pytest.raises(InputLineError, match="line 3 of standard input"):
-        result_from_line(line.encode(), 3, count, replicas)
+        result_from_line(line.encode(), 3, of(results // replicas, replicas))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,280 @@
+"""A machine kind: what programming files, boards, drivers and posteriors ask of a machine, whichever it is.
+
+    host                                                     board
+    begin(frame) ──── settings, blocks ────▶ start ──▶ step, step, ... ─┐
+    proceed(reasons) ─ end, blocks ────────▶ resume ─▶ step, step, ... ─┤ until `proceed` resumes no board
+    infer(results) ◀── results, cycles, reasons ────────────────────────┘
+
+Register words travel by the name of their block in the register map. This folder knows the names and what the
+words mean to a machine; `pcie_shim` knows the addresses.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+Blocks: TypeAlias = Mapping[str, bytes]
+"""Words to write, by the name of their block in the register map."""
+
+OUTCOME: Final = np.dtype([("reason", "<u4"), ("zero", "<u4"), ("cycles", "<u8")])
+"""The part of the block OUTCOMES for one of several replicas."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameInput:
+    """Readings and settings of a frame, for all boards.
+
+    Attributes:
+        addresses: One table address per sensor column, in the order of the model; None for a missing reading.
+            With inputs per cell or replicas: an array of integers in the `input_shape` of the whole machine,
+            addresses or codes, with -1 in all lines of a missing reading.
+        prior_address: Row of the prior's table (prior select); with replicas one for all, or a tuple with one
+            for each.
+        prior_codes: uint16[total lines], a written prior; with replicas the same for all, or uint16[replicas, total
+            lines]; None: the image's own.
+        target_count: Count that stops the machines (thesis figure 3.3: number of target samples).
+        max_cycles: Maximum number of cycles.
+        bank: Set of seeds from which the RNGs restart.
+        stop: `slices`: all boards stop at the end of the slice in which the first one overflows; `own`: each
+            independently.
+    """
+
+    addresses: tuple[int | None, ...] | npt.NDArray[np.integer]
+    prior_address: int | tuple[int, ...] = 0
+    prior_codes: npt.NDArray[np.uint16] | None = None
+    target_count: int
+    max_cycles: int
+    bank: int = 0
+    stop: Literal["slices", "own"] = "slices"
+
+
+class FrameSettings(NamedTuple):
+    """The registers that start a frame on every kind of machine, in the order of the map."""
+
+    target_count: int
+    max_cycles: int
+    bank: int
+    prior_select: int
+
+
+class BoardResult(msgspec.Struct, frozen=True, array_like=True, tag="board"):
+    """The result of a board; its MessagePack form is part of a record between the services.
+
+    Attributes:
+        words: The result words, 32 bits each, little-endian, as received; replica after replica.
+        cycles: Cycles of its machine; with replicas, of the longest-running one.
+        reason: Stop reason, a key of `MachineKind.reasons`; with replicas, their `joint_reason`.
+        replica_cycles: Cycles of each replica; empty if the board has a single machine.
+        replica_reasons: Stop reason of each replica; empty if the board has a single machine.
+    """
+
+    words: bytes
+    cycles: int
+    reason: int
+    replica_cycles: tuple[int, ...] = ()
+    replica_reasons: tuple[int, ...] = ()
+
+    @property
+    def counts(self) -> npt.NDArray[np.uint32]:
+        """A copy of the result words: uint32[results], with replicas uint32[replicas, results of each]."""
+        counts = np.frombuffer(self.words, "<u4").astype(np.uint32)
+        return counts.reshape(len(self.replica_cycles), -1) if self.replica_cycles else counts
+
+
+class Inference(NamedTuple):
+    """The posterior for the results of all boards.
+
+    Attributes:
+        boards: The boards' results.
+        posterior: float64[all lines], the joint posterior; None if there is none. With replicas
+            float64[replicas * all lines], one posterior after the other, with zeros for a replica without
+            one; None if no replica has one.
+        totals: The sum of the counts of each board.
+        outcome: `posterior`, or the reason why there is none.
+    """
+
+    boards: Sequence[BoardResult]
+    posterior: npt.NDArray[np.float64] | None
+    totals: list[int]
+    outcome: str
+
+    @property
+    def best(self) -> int:
+        """The most probable line of the posterior; -1 without one."""
+        return -1 if self.posterior is None else int(self.posterior.argmax())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UsedRegisters:
+    """The registers of a board that a machine uses, as far as its parameters decide them.
+
+    Attributes:
+        lines: Lines of the model on the board.
+        replicas: Machines on the board.
+        inputs: Name of the block of inputs.
+        input_words: Inputs of all replicas, in words.
+        result_words: Results of all replicas, in words of the block RESULTS.
+        written: Words of the other blocks that a host may write, by name.
+        capabilities: Values of the capability registers (`CAP_LINES`) or their fields (`CAP_MACHINE.KIND`), by name.
+        size: The size of the machine in words for a user.
+    """
+
+    lines: int
+    replicas: int
+    inputs: str
+    input_words: int
+    result_words: int
+    written: Mapping[str, int] = field(default_factory=dict)
+    capabilities: Mapping[str, int]
+    size: str
+
+
+class BoardMachine(ABC):
+    """The machine of a board, which takes its inputs from the board's registers and leaves its results there.
+
+    It runs from one call to the next: `start` and `resume` obey a doorbell, `step` goes on with the same slice.
+    All three end at cycle `end` at the latest (0: no such end), with the results in RESULTS and OUTCOMES.
+    """
+
+    @abstractmethod
+    def prepare(self) -> None:
+        """Do in advance the work that would slow down the first frames, and reset the machine."""
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Stop, clear results and cycles, and restart the RNGs from bank 0."""
+
+    @abstractmethod
+    def start(self, settings: FrameSettings, end: int) -> None:
+        """Run a new frame; a StartError if registers do not fit the machine, which then has not changed."""
+
+    @abstractmethod
+    def resume(self, end: int) -> None:
+        """Run the next slice of the frame; a StartError as for `start`."""
+
+    @abstractmethod
+    def step(self, end: int) -> None:
+        """Run the next part of the slice."""
+
+    @property
+    @abstractmethod
+    def paused(self) -> bool:
+        """True if the machine has stopped only because of `end`."""
+
+    @property
+    @abstractmethod
+    def reason(self) -> int:
+        """The stop reason of the machine: a key of `MachineKind.reasons`."""
+
+    @property
+    @abstractmethod
+    def cycles(self) -> int:
+        """Cycles of this frame."""
+
+
+class FrameCourse(ABC):
+    """A frame on all boards, from its start through its slices.
+
+    Attributes:
+        starts: For each board its settings and the blocks to write before the start.
+        begun: First cycle of the slice.
+        end: Last cycle of the slice; 0 for that of the frame.
+    """
+
+    starts: Sequence[tuple[FrameSettings, Blocks]]
+    begun: int
+    end: int
+
+    @abstractmethod
+    def proceed(self, reasons: Sequence[Sequence[int]]) -> tuple[Sequence[int], Blocks]:
+        """Return the numbers of the boards to resume (none: the frame is over), and the blocks to write before it.
+
+        Args:
+            reasons: The last stop reasons of each board's replicas.
+        """
+
+
+class HostMachine(ABC):
+    """The machines of all boards, as the host sees them."""
+
+    @abstractmethod
+    def begin(self, frame: FrameInput) -> FrameCourse:
+        """Return the course of a frame; a StartError if it does not fit the machines."""
+
+    @abstractmethod
+    def slowest(self) -> FrameInput:
+        """Return the frame that takes the most time per cycle, to measure the speed of a board."""
+
+
+class MachineKind(ABC):
+    """A kind of Bayesian machine. Machines, their parameters and kernels have types of the kind's own.
+
+    Attributes:
+        name: Its name in programming files and deployments.
+        parameters: The type of its parameters: a dataclass.
+        reasons: Its stop reasons by the number in the status register, in words for users; 0 is not started.
+    """
+
+    name: ClassVar[str]
+    parameters: ClassVar[type]
+    reasons: ClassVar[Mapping[int, str]]
+
+    # ---- programming file -----------------------------------------------------------------------------
+
+    @abstractmethod
+    def sections(self, machine: Any) -> list[tuple[str, npt.NDArray[Any]]]:
+        """Return the tables of a machine in the order and types of the programming file."""
+
+    @abstractmethod
+    def due_sections(self, parameters: Any) -> Iterator[tuple[str, str, tuple[int, ...]]]:
+        """Yield the name, type and shape of each section that a file must have; -1 is any length."""
+
+    @abstractmethod
+    def machine(self, parameters: Any, sections: Mapping[str, npt.NDArray[Any]]) -> Any:
+        """Return the machine of a file; a MachineError if it cannot be built."""
+
+    # ---- board ----------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def registers(self, parameters: Any) -> UsedRegisters:
+        """Return the registers that a board with such a machine uses."""
+
+    @abstractmethod
+    def contents(self, machine: Any) -> Blocks:
+        """Return what registers contain when the board has been programmed, beyond `UsedRegisters.capabilities`."""
+
+    @abstractmethod
+    def kernel(self, machine: Any) -> Any:
+        """Return the fastest kernel that runs the machine."""
+
+    @abstractmethod
+    def on_board(self, kernel: Any, memory: Mapping[str, memoryview]) -> BoardMachine:
+        """Return a kernel behind the registers of a board: `memory` has every block of the map by name."""
+
+    # ---- host -----------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def on_host(self, machines: Sequence[Any]) -> HostMachine:
+        """Return the machines of all boards, in the order of the partition, as their driver sees them."""
+
+    @abstractmethod
+    def joint_reason(self, reasons: Sequence[int]) -> int:
+        """Return one stop reason for the replicas of a board whose frame is over."""
+
+    @abstractmethod
+    def infer(self, results: Sequence[BoardResult]) -> Inference:
+        """Return the posterior for the results of all boards."""
+
+    @abstractmethod
+    def posterior(self, machines: Sequence[Any], frame: FrameInput) -> npt.NDArray[np.float64]:
+        """Run the machines of all boards in this process, each to its own stop, and return the posterior.
+
+        Raises:
+            NoPosteriorError: There is none for these readings.
+            StartError: The frame does not fit the machines.
+        """
