@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -15,7 +14,6 @@ from toolchain.deployment import load_deployment
 from toolchain.outputs.mif import read_mif
 
 MODEL = TINY
-BOAT = Path(__file__).parents[2] / "casestudies" / "boat"
 
 
 def build(case, *arguments, target=TARGET):
@@ -41,17 +39,12 @@ def test_a_build(case):
     [
         (["--set", "sze=3"], ["model.py", "'sze'", "'size'"]),
         (["--set", "size"], ["--set size", "KEY=VALUE"]),
-        (["--set", "=3"], ["--set =3"]),
         (["--set", "size=3", "--set", "size=4"], ["--set size", "twice"]),
-        (["--partitions", "5"], ["4 lines", "5 boards", "1 to 4"]),
         (["--interface", "20"], ["--interface", "'20'"]),
-        (["--bits", "K"], ["--bits K:", "KEY=VALUE"]),
         (["--bits", "L=3"], ["--bits L=3", "it has K"]),
         (["--bits", "K=17"], ["--bits K=17", "1 to 16"]),
-        (["--bits", "K=1"], ["'K'", "2 values", "1 bit holds 1"]),
         (["--rng-table", "a.mif"], ["--rng-table", "--rng lfsr32"]),
         (["--rng", "table", "--rng-table", "/no.mif"], ["/no.mif", "No such file"]),
-        (["--replicas", "257"], ["--replicas", "256"]),
         (["--searched", "s"], ["--searched"]),
     ],
 )
@@ -83,10 +76,8 @@ def test_a_network_with_a_question(network):
     )
     deployment = load_deployment(network.parent / "out")
     assert deployment.name == "garden"
-    assert [(each.label, each.states) for each in deployment.searched] == [
-        ("rain", ("yes", "no")),
-        ("sprinkler", ("on", "off")),
-    ]
+    states = {each.label: each.states for each in deployment.searched}
+    assert states == {"rain": ("yes", "no"), "sprinkler": ("on", "off")}
     (shoes,) = deployment.variables
     assert (shoes.states, shoes.on_missing, shoes.offset, shoes.step) == (("wet", "dry"), "missing", 0, 1)
     assert "  shoes: 0 wet, 1 dry\n" in result.stdout
@@ -97,10 +88,8 @@ def test_a_network_with_a_fixed_and_a_selecting_variable(network):
     question = "--searched grass --known shoes --given sprinkler=on --prior-select rain"
     done(build(network, *question.split()))
     deployment = load_deployment(network.parent / "out")
-    assert [(each.name, each.kind) for each in deployment.variables] == [
-        ("shoes", "sensor"),
-        ("rain", "prior_select"),
-    ]
+    kinds = {each.name: each.kind for each in deployment.variables}
+    assert kinds == {"shoes": "sensor", "rain": "prior_select"}
     assert deployment.machine.prior_bits == 2
 
 
@@ -108,11 +97,8 @@ def test_a_network_with_a_fixed_and_a_selecting_variable(network):
     ("arguments", "named"),
     [
         ([], ["garden.bif", "--searched"]),
-        (["--searched", "grass", "--known", "rain,sprinkler"], ["rain and sprinkler", "given grass"]),
-        (["--searched", "gras"], ["'gras'", "rain, sprinkler, grass, shoes"]),
         (["--searched", "rain,,grass"], ["--searched rain,,grass"]),
         (["--searched", "rain", "--given", "grass"], ["--given grass", "KEY=VALUE"]),
-        (["--searched", "rain", "--given", "grass=damp"], ["'damp'", "wet, dry"]),
         (["--searched", "rain", "--set", "size=3"], ["--set size"]),
         (["--searched", "rain", "--prior-path", "x"], ["--prior-mode written"]),
     ],
@@ -138,47 +124,22 @@ def test_a_target_with_a_part_missing(case, missing):
     assert_refused(build(case, target=TARGET[:at] + TARGET[at + 2 :]), f"{missing} is missing")
 
 
-@pytest.mark.parametrize(
-    ("number", "code"),
-    [
-        pytest.param(signal.SIGINT, 130, marks=pytest.mark.process),
-        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.thorough),
-    ],
-)
-def test_signals_end_it_with_their_code(case, number, code):
-    (case / "model.py").write_text(
-        "import time\n\ndef model():\n    print('here', flush=True)\n    time.sleep(6000)\n"
-    )
-    command = [Path(sys.executable).parent / "toolchain", "build", case, "-o", case.parent / "out", *TARGET]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert "here\n" in process.stderr  # line by line, after what the command itself says
-        process.send_signal(number)
-        _, sentences = process.communicate(timeout=PROCESS_PATIENCE)
-    assert process.returncode == code
-    assert "Traceback" not in sentences
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_within_a_model_ends_it_with_its_code(case, number, code):
+    (case / "model.py").write_text(f"import signal\n\ndef model():\n    signal.raise_signal({int(number)})\n")
+    result = build(case)
+    assert result.exit_code == code
+    assert "error" not in result.output
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("module", ["toolchain.commands.main", "toolchain.deployment.address"])
-def test_help_and_a_subscriber_load_no_numpy(module):
-    code = f"import sys, {module}; print('numpy' in sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=PROCESS_PATIENCE
-    )
-    assert done.stdout == "False\n"
+def test_a_subscriber_loads_no_numpy():
+    code = "import sys, toolchain.deployment.address; sys.exit('numpy' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=PROCESS_PATIENCE)
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        ["check"],
-        ["inspect"],
-        ["regenerate", "project"],
-        ["build", "-o", "out", *TARGET],
-        ["fit", "-o", "f.toml", "--truth", "y=a", "--truth", "x=b", str(BOAT)],
-    ],
+    "command", [["check"], ["inspect"], ["regenerate", "project"], ["build", "-o", "out", *TARGET]]
 )
-def test_a_path_that_the_system_refuses_is_one_sentence(arguments):
-    name = "x" * 300
-    result = toolchain(*arguments, name)
-    assert_refused(result, "File name too long")
+def test_a_path_that_the_system_refuses_is_one_sentence(command):
+    assert_refused(toolchain(*command, "x" * 300), "File name too long")

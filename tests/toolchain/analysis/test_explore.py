@@ -1,18 +1,12 @@
 """Sweeps: every point is saved before the next begins, a sweep resumes where it stopped, and the front is right."""
 
-import os
-import re
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.corridor import corridor
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis import Sweep
@@ -148,8 +142,7 @@ def test_the_command(case):
     rows = result.stdout.splitlines()
     assert len(rows) == 5
     assert any(row.startswith("* address") for row in rows)
-    # The resources of a stored point are estimated again, because the estimator may have been calibrated
-    # since.
+    # the resources of a stored point are estimated again: the estimator may have been calibrated since
     path = case.parent / "r.jsonl"
     kept = Results(path).points.values()
     path.unlink()
@@ -185,7 +178,6 @@ def test_an_unwritable_file_is_refused_before_anything_is_measured(case, option,
         (["--rngs", "lfsr31"], ["--rngs lfsr31", "lfsr8, lfsr16"]),
         (["--targets", "0"], ["target count of 0"]),
         (["--prob-bits", "16", "--rngs", "lfsr16"], ["lfsr16"]),
-        (["--device", "d9"], ["--device d9", "proce-v-d8"]),
         (["--reading", "a=b"], ["--reading a=b", "--readings FILE"]),
         (["--frames", "0"], ["--frames is 0", "1 to 100000"]),
         (["--partitions", "13"], ["12 lines", "13 boards"]),
@@ -196,30 +188,18 @@ def test_mistakes(case, arguments, named):
     assert_refused(run(case, *arguments), *named)
 
 
-@pytest.mark.thorough
-def test_ctrl_c_keeps_what_is_done(case):
-    results = case.parent / "r.jsonl"
-    command = [Path(sys.executable).parent / "toolchain", "explore", case, "-o", results]
-    command += ["--frames", "40", "--max-cycles", "100000", "--rngs", "ideal", "--targets", "255,1023"]
-    environment = os.environ | {"NO_COLOR": "1"}
-    child = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    )
-    limit = time.monotonic() + PROCESS_PATIENCE
-    while (
-        child.poll() is None
-        and time.monotonic() < limit
-        and not (results.exists() and results.stat().st_size)
-    ):
-        time.sleep(0.05)
-    child.send_signal(signal.SIGINT)
-    out, err = child.communicate(timeout=PROCESS_PATIENCE)
-    assert child.returncode == 130, err
-    assert "Traceback" not in err
-    done = int(re.search(r"(\d+) of 16 machines are in", err)[1])
-    assert 1 <= done < 16
-    assert len(Results(results).points) == done
-    assert len(out.splitlines()) == done + 2
+def test_ctrl_c_keeps_what_is_done(case, monkeypatch):
+    def interrupted(task, *arguments):
+        if task.plan.options.target_count == 63:
+            signal.raise_signal(signal.SIGINT)
+        return run_task(task, *arguments)
+
+    monkeypatch.setattr("toolchain.analysis.sweep.run_task", interrupted)
+    ended = run(case, "--prob-bits", "8", "--targets", "15,63", "--rngs", "lfsr16", "--scales", "address")
+    assert ended.exit_code == 130, ended.stderr
+    assert "1 of 2 machines are in" in ended.stderr
+    assert len(Results(case.parent / "r.jsonl").points) == 1
+    assert len(ended.stdout.splitlines()) == 3
 
 
 def test_a_file_of_results_that_does_not_end_is_refused(tmp_path, monkeypatch):
