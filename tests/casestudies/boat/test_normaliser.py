@@ -38,15 +38,8 @@ def test_all_that_leaves_is_in_range(raw):
 
 def test_header_and_names_are_kept():
     values, head = read_raw({"header": HEAD, **RAW}, array=False)
-    assert readings_message(normalise(values), head, array=False) == {
-        "header": HEAD,
-        "D1": 2,
-        "D2": 0,
-        "D3": 100,
-        "B1": 0,
-        "B2": 180,
-        "B3": 270,
-    }
+    whole = {"D1": 2, "D2": 0, "D3": 100, "B1": 0, "B2": 180, "B3": 270}
+    assert readings_message(normalise(values), head, array=False) == {"header": HEAD, **whole}
 
 
 def test_arrays_hold_the_numbers_in_the_columns_order():
@@ -59,13 +52,10 @@ def test_arrays_hold_the_numbers_in_the_columns_order():
 
 @pytest.mark.parametrize("bad", [None, "12", math.nan, math.inf, True, [1.0]])
 def test_a_reading_that_is_not_a_number_is_refused_by_name(bad):
-    with pytest.raises(BadReadingError, match="B2"):
-        read_raw({**RAW, "B2": bad}, array=False)
-
-
-def test_a_missing_reading_is_refused_by_name():
-    with pytest.raises(BadReadingError, match="D3"):
-        read_raw({name: value for name, value in RAW.items() if name != "D3"}, array=False)
+    absent = {name: value for name, value in RAW.items() if name != "B2"}
+    for reading in (RAW | {"B2": bad}, absent):
+        with pytest.raises(BadReadingError, match="B2"):
+            read_raw(reading, array=False)
 
 
 @pytest.mark.parametrize("data", [None, [], [1.0] * 5, "AAAA"])

@@ -1,7 +1,5 @@
 """The pictures are written, and show what they should."""
 
-from typing import ClassVar
-
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -43,124 +41,89 @@ def pixels_of(path, colour):
     return np.argwhere(np.abs(picture - colour).max(axis=2) < 0.02)
 
 
-class TestPositions:
-    def test_the_probable_cell_and_the_true_position_are_in_one_place(self, tmp_path):
-        """A certain posterior in the cell of the truth: in panel b both marks are at the same pixels."""
-        path = tmp_path / "new" / "figure-4.4.png"
-        draw_positions(path, [instance(1, 25, 25, cell=24 * 32 + 24)])
-        assert imread(path).shape[:2] > (300, 500)
-        low, high = pixels_of(path, VIRIDIS_LOW), pixels_of(path, VIRIDIS_HIGH)
-        columns = np.flatnonzero(np.bincount(low[:, 1]) > 150)  # the panel's, but not the colour bar's
-        left, right, top = columns[0], columns[-1], low[:, 0].min()
+def test_the_probable_cell_and_the_true_position_are_in_one_place(tmp_path):
+    """A certain posterior in the cell of the truth: in panel b both marks are at the same pixels."""
+    path = tmp_path / "new" / "figure-4.4.png"
+    draw_positions(path, [instance(1, 25, 25, cell=24 * 32 + 24)])
+    assert imread(path).shape[:2] > (300, 500)
+    low, high = pixels_of(path, VIRIDIS_LOW), pixels_of(path, VIRIDIS_HIGH)
+    columns = np.flatnonzero(np.bincount(low[:, 1]) > 150)  # the panel's, but not the colour bar's
+    left, right, top = columns[0], columns[-1], low[:, 0].min()
 
-        def in_panel(pixels):
-            return pixels[
-                (pixels[:, 1] > left) & (pixels[:, 1] < right) & (pixels[:, 0] < top + right - left)
-            ]
+    def in_panel(pixels):
+        return pixels[(pixels[:, 1] > left) & (pixels[:, 1] < right) & (pixels[:, 0] < top + right - left)]
 
-        cell, marks = in_panel(high), in_panel(pixels_of(path, TRUTH_COLOUR))
-        assert len(cell) > 5
-        assert len(marks) > 20
-        assert np.abs(marks.mean(axis=0) - cell.mean(axis=0)).max() < 8
-        span = right - left
-        # x = y = 25 is three quarters of the way to the right and a quarter of the way down
-        assert (marks[:, 1].mean() - left) / span == pytest.approx(0.75, abs=0.04)
-        assert (marks[:, 0].mean() - top) / span == pytest.approx(0.25, abs=0.04)
-
-    @pytest.mark.parametrize("count", [1, 2, 5])
-    def test_any_number_and_any_grid(self, tmp_path, count):
-        instances = [instance(n, n, n, cell=0, width=8, height=6) for n in range(count)]
-        draw_positions(tmp_path / "x.png", instances, route=[i.truth for i in instances])
-        assert len(pixels_of(tmp_path / "x.png", VIRIDIS_LOW)) > 5000
-
-    @pytest.mark.parametrize("x", [-45, 35])
-    def test_the_label_covers_no_axis(self, tmp_path, x):
-        """The labels next to the map do not depend on the boat's position."""
-        draw_positions(tmp_path / "middle.png", [instance(1, 0, 10)])
-        draw_positions(tmp_path / "edge.png", [instance(1, x, 10)])
-        water = np.bincount(pixels_of(tmp_path / "middle.png", (0.918, 0.949, 0.973))[:, 1])
-        left, right = np.flatnonzero(water > 100)[[0, -1]] + [-3, 3]
-        middle, edge = imread(tmp_path / "middle.png"), imread(tmp_path / "edge.png")
-        assert np.array_equal(middle[:, :left], edge[:, :left])
-        assert np.array_equal(middle[:, right : right + 40], edge[:, right : right + 40])
-
-    def test_a_truth_that_is_not_known(self, tmp_path):
-        draw_positions(tmp_path / "x.png", [instance(1, truth=False)])
-        assert not len(pixels_of(tmp_path / "x.png", TRUTH_COLOUR))
-
-    def test_a_posterior_that_is_not_a_map(self):
-        line = Posterior(probabilities=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0)
-        with pytest.raises(OutputError):
-            posterior_grid(line)
-
-    def test_a_folder_that_refuses(self, tmp_path):
-        (tmp_path / "file").write_text("")
-        with pytest.raises(OutputError):
-            draw_positions(tmp_path / "file" / "x.png", [instance(1)])
+    cell, marks = in_panel(high), in_panel(pixels_of(path, TRUTH_COLOUR))
+    assert len(cell) > 5
+    assert len(marks) > 20
+    assert np.abs(marks.mean(axis=0) - cell.mean(axis=0)).max() < 8
+    span = right - left
+    # x = y = 25 is three quarters of the way to the right and a quarter of the way down
+    assert (marks[:, 1].mean() - left) / span == pytest.approx(0.75, abs=0.04)
+    assert (marks[:, 0].mean() - top) / span == pytest.approx(0.25, abs=0.04)
 
 
-class TestFarApart:
-    def test_the_corners_are_chosen_in_the_order_of_time(self):
-        middle = [instance(n, n / 10, 0) for n in range(10)]
-        corners = [instance(20, 40, 40), instance(21, -40, 40), instance(22, 40, -40)]
-        chosen = far_apart([*middle, *corners])
-        assert [i.report.number for i in chosen] == [0, 20, 21, 22]
-
-    def test_frames_without_a_truth_are_spread_over_time_and_those_without_a_posterior_not_chosen(self):
-        blind = [instance(n, truth=False) for n in range(10)]
-        assert [i.report.number for i in far_apart([*blind, instance(10)])] == [10]
-        assert [i.report.number for i in far_apart(blind)][::3] == [0, 9]
-        assert far_apart([Instance(heard=FrameReport(stamp_ns=1, heard_ns=1, outcome=""))]) == ()
-
-    def test_equal_places_are_not_chosen_twice(self):
-        chosen = far_apart([instance(n) for n in range(6)])
-        assert len({i.report.number for i in chosen}) == 4
+def test_any_number_and_any_grid_with_and_without_a_truth(tmp_path):
+    instances = [instance(n, n, n, cell=0, width=8, height=6) for n in range(5)]
+    draw_positions(tmp_path / "x.png", instances, route=[i.truth for i in instances])
+    assert len(pixels_of(tmp_path / "x.png", VIRIDIS_LOW)) > 5000
+    draw_positions(tmp_path / "x.png", [instance(1, truth=False)])
+    assert not len(pixels_of(tmp_path / "x.png", TRUTH_COLOUR))
 
 
-class TestShares:
-    STAGES: ClassVar = {
-        "rosbridge_in": 100,
-        "local_hops": 200,
-        "register_writes": 50,
-        "compute": 600,
-        "reads": 50,
-    }
+def test_pictures_that_cannot_be_drawn(tmp_path):
+    with pytest.raises(OutputError):
+        posterior_grid(Posterior(probabilities=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0))
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError):
+        draw_positions(tmp_path / "file" / "x.png", [instance(1)])
 
-    def test_means_and_shares(self):
-        double = {name: 2 * time for name, time in self.STAGES.items()}
-        shares = stage_shares([instance(1, **self.STAGES), instance(2, **double)])
-        assert [stage.name for stage in shares] == [
-            "rosbridge in",
-            "local hops",
-            "register writes",
-            "computing",
-            "register reads",
-            "rosbridge out",
-        ]
-        assert [stage.mean_us for stage in shares] == [150, 300, 75, 900, 75, 500]
-        assert sum(stage.share for stage in shares) == pytest.approx(1)
-        assert shares[3].part is StageKind.COMPUTING
-        assert shares[3].share == pytest.approx(900 / 2000)
 
-    def test_stages_that_nobody_told_are_left_out(self):
-        shares = stage_shares([instance(1, compute=500), instance(2)])
-        assert [(stage.name, stage.mean_us) for stage in shares] == [
-            ("computing", 500),
-            ("rosbridge out", 500),
-        ]
+def chosen(instances):
+    return [each.report.number for each in far_apart(instances)]
 
-    def test_nothing_heard(self):
-        assert stage_shares([]) == ()
 
-    def test_the_bars_are_as_long_as_the_times(self, tmp_path):
-        path = tmp_path / "figure-4.5.png"
-        draw_shares(path, stage_shares([instance(1, **self.STAGES)]), frames=1)
-        height = imread(path).shape[0]
+def test_the_corners_are_chosen_in_the_order_of_time():
+    middle = [instance(n, n / 10, 0) for n in range(10)]
+    corners = [instance(20, 40, 40), instance(21, -40, 40), instance(22, 40, -40)]
+    assert chosen([*middle, *corners]) == [0, 20, 21, 22]
+    assert len(set(chosen([instance(n) for n in range(6)]))) == 4
 
-        def bar(colour):
-            found = pixels_of(path, colour)
-            found = found[found[:, 0] < 0.75 * height]  # above the legend
-            return np.bincount(found[:, 0]).max()  # pixels in the fullest row
 
-        host, computing = bar((0.733, 0.733, 0.733)), bar((0.933, 0.4, 0.467))
-        assert computing / host == pytest.approx(3, rel=0.05)
+def test_frames_without_a_truth_are_spread_over_time_and_those_without_a_posterior_not_chosen():
+    blind = [instance(n, truth=False) for n in range(10)]
+    assert chosen([*blind, instance(10)]) == [10]
+    assert chosen(blind)[::3] == [0, 9]
+    assert far_apart([Instance(heard=FrameReport(stamp_ns=1, heard_ns=1, outcome=""))]) == ()
+
+
+STAGES = {"rosbridge_in": 100, "local_hops": 200, "register_writes": 50, "compute": 600, "reads": 50}
+
+
+def test_means_and_shares():
+    double = {name: 2 * time for name, time in STAGES.items()}
+    shares = stage_shares([instance(1, **STAGES), instance(2, **double)])
+    assert [stage.name for stage in shares] == [
+        *("rosbridge in", "local hops", "register writes", "computing", "register reads", "rosbridge out")
+    ]
+    assert [stage.mean_us for stage in shares] == [150, 300, 75, 900, 75, 500]
+    assert sum(stage.share for stage in shares) == pytest.approx(1)
+    assert shares[3].part is StageKind.COMPUTING
+    assert shares[3].share == pytest.approx(900 / 2000)
+    some = stage_shares([instance(1, compute=500), instance(2)])  # the others were not told
+    assert [(stage.name, stage.mean_us) for stage in some] == [("computing", 500), ("rosbridge out", 500)]
+    assert stage_shares([]) == ()
+
+
+def test_the_bars_are_as_long_as_the_times(tmp_path):
+    path = tmp_path / "figure-4.5.png"
+    draw_shares(path, stage_shares([instance(1, **STAGES)]), frames=1)
+    height = imread(path).shape[0]
+
+    def bar(colour):
+        found = pixels_of(path, colour)
+        found = found[found[:, 0] < 0.75 * height]  # above the legend
+        return np.bincount(found[:, 0]).max()  # pixels in the fullest row
+
+    host, computing = bar((0.733, 0.733, 0.733)), bar((0.933, 0.4, 0.467))
+    assert computing / host == pytest.approx(3, rel=0.05)

@@ -172,21 +172,6 @@ def test_a_folder_that_cannot_be_written_is_reported_at_the_start(flag, name, tm
 
 
 @pytest.mark.thorough
-async def test_a_simulator_sails_on_while_the_server_is_away():
-    async with FakeRosbridge() as fake, Process("simulator", "--uri", fake.uri, "--rate", "20") as simulator:
-        await fake.wait_for_op("publish", topic="/boat/raw", timeout=PROCESS_PATIENCE)
-        await fake.vanish()
-        fake.received.clear()
-        await fake.come_back()
-        await fake.wait_for_op("publish", topic="/boat/raw", count=2, timeout=PROCESS_PATIENCE)
-        simulator.signal(signal.SIGINT)
-        code, _out, err = await simulator.ended()
-    assert code == 130
-    _started, lost, _restored, _ended = err.splitlines()
-    assert lost.startswith("warning: ")
-
-
-@pytest.mark.thorough
 async def test_a_normaliser_says_what_went_wrong_once():
     """Each kind of bad reading, and that the server went and came back."""
     good = {"D1": 1.2, "D2": 2, "D3": 3, "B1": 0, "B2": 0, "B3": 0}

@@ -8,7 +8,6 @@ import sys
 import pytest
 
 from casestudies import DataFileError
-from casestudies.mrclam.model import X_LIMITS, Y_LIMITS
 from casestudies.mrclam.player import (
     LOST_DISTANCE,
     SIGHTINGS_TOPIC,
@@ -87,22 +86,12 @@ def test_wrong_files_are_refused_with_the_place(tmp_path, lines, place):
         read_recording(file(tmp_path, *lines))
 
 
-def test_paths_that_are_not_files(tmp_path):
-    with pytest.raises(DataFileError, match="no-such.csv"):
-        read_recording(tmp_path / "no-such.csv")
-    with pytest.raises(DataFileError):
-        read_recording(tmp_path)
-    binary = tmp_path / "picture.csv"
-    binary.write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(DataFileError, match="picture.csv"):
-        read_recording(binary)
-
-
-def test_the_area_is_the_models():
-    grid = area_grid()
-    assert ((grid.x_low, grid.x_high), (grid.y_low, grid.y_high)) == (X_LIMITS, Y_LIMITS)
-    assert grid.centre(0) == pytest.approx((-2 + 9 / 64, -7 + 14 / 64))
-    assert grid.cells == 1024
+def test_a_path_that_is_not_a_file_is_one_sentence(tmp_path):
+    (tmp_path / "binary").write_bytes(b"\x89PNG\xff\xfe")
+    for path in (tmp_path, tmp_path / "none.csv", tmp_path / "binary"):
+        ended = invoke(app, [path])
+        assert (ended.exit_code, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
+        assert ended.stderr.startswith(f"error: {path}")
 
 
 GRID = area_grid()
@@ -229,11 +218,3 @@ async def test_the_command_prints_a_line_a_frame_and_a_sum(tmp_path):
     numbers = json.loads((tmp_path / "n.json").read_text())
     assert numbers["without_result"] == 1
     assert numbers["distances_m"][1] == LOST_DISTANCE
-
-
-def test_a_wrong_file_is_one_sentence(tmp_path):
-    ended = invoke(app, [tmp_path / "none.csv"])
-    assert (ended.exit_code, ended.stdout) == (2, "")
-    assert ended.stderr.startswith("error: ")
-    assert "none.csv" in ended.stderr
-    assert ended.stderr.count("\n") == 1
