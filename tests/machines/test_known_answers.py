@@ -54,7 +54,7 @@ def shown(kernel):
     return kernel.reason, kernel.cycles, kernel.counts.tolist(), states
 
 
-OVERFLOW, MAX_CYCLES, SLICE = StopReason.OVERFLOW, StopReason.MAX_CYCLES, StopReason.SLICE
+OVERFLOW, MAX_CYCLES = StopReason.OVERFLOW, StopReason.MAX_CYCLES
 SEEDS = (StopReason.NONE, 0, [0, 0, 0, 0], "10101111 10010100")
 SIXTH = (OVERFLOW, 6, [2, 4, 1, 0], "11100101 00001001")
 FIFTH = (MAX_CYCLES, 5, [2, 3, 1, 0], "11110010 10000100")
@@ -109,16 +109,6 @@ def test_frames(make, machine, frames):
     if machine != {"sensor_bits": ()}:
         kernel.reset()
         assert shown(kernel) == SEEDS
-
-
-def test_slices_are_one_frame(make):
-    kernel = make(tiny())
-    kernel.start(start(run_until=2))
-    assert shown(kernel) == (SLICE, 2, [0, 2, 0, 0], "10111110 01010000")
-    kernel.resume(5)
-    assert shown(kernel) == (SLICE, *FIFTH[1:])
-    kernel.resume(0)
-    assert shown(kernel) == SIXTH
 
 
 @pytest.mark.parametrize(

@@ -21,13 +21,11 @@ from tests.machines.random_machines import machine_of, sessions
 
 @pytest.mark.parametrize("examples", [20, pytest.param(50, marks=pytest.mark.thorough)])
 def test_equals_machines_that_run_alone(examples):
-    settings(max_examples=examples, suppress_health_check=list(HealthCheck))(equals_machines_that_run_alone)()
+    machines = sessions(kinds=tuple(RngKind), shared=(True, False), replicas=st.sampled_from([2, 3, 5, 16]))
+    search = given(machines, st.booleans())(equals_machines_that_run_alone)
+    settings(max_examples=examples, suppress_health_check=list(HealthCheck))(search)()
 
 
-@given(
-    sessions(kinds=tuple(RngKind), shared=(True, False), replicas=st.sampled_from([2, 3, 5, 16])),
-    st.booleans(),
-)
 def equals_machines_that_run_alone(session, reference):
     """With every kind of generators, in either kernel, and whether or not each cell has a generator."""
     machine = session.machine

@@ -66,24 +66,17 @@ def test_a_subcommand_has_the_flags_and_exit_codes_of_the_command():
     assert invoke(app, ["bord"]).exit_code == 2
 
 
-@pytest.mark.parametrize(
-    ("words", "found"),
-    [("rosbayes lis", "listen"), ("rosbayes toolchain reg", "regenerate"), ("rosbayes hub --po", "--port")],
-)
 @pytest.mark.thorough
-def test_one_completion_serves_all_subcommands(words, found):
+def test_one_completion_serves_all_subcommands():
     shown = run_apart(
         "import sys; sys.argv = ['rosbayes']; from rosbayes.__main__ import app; app()",
         _ROSBAYES_COMPLETE="complete_bash",
-        COMP_WORDS=words,
-        COMP_CWORD=str(words.count(" ")),
+        COMP_WORDS="rosbayes toolchain reg",
+        COMP_CWORD="2",
     )
-    assert shown.split() == [found]
-    assert not [
-        each
-        for each in get_command(app).resolve_command(None, ["hub"])[1].params
-        if "completion" in each.name
-    ]
+    assert shown.split() == ["regenerate"]
+    hub = get_command(app).resolve_command(None, ["hub"])[1]
+    assert not [each for each in hub.params if "completion" in each.name]
 
 
 def test_its_version_is_the_packages():

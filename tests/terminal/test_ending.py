@@ -49,33 +49,22 @@ def end_of(body, *arguments, stdout=subprocess.DEVNULL):
     return ended.returncode, ended.stderr.splitlines()
 
 
+RAISE = "signal.raise_signal(signal.SIGTERM)"
+PLACES = {
+    "waiting": "threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()\ntime.sleep(20)",
+    "catching Exception": f"try:\n    {RAISE}\nexcept Exception:\n    pass\ntime.sleep(20)",
+    # Python drops the exception in these two; the next check finds it
+    "in a C callback": f"import ctypes\nctypes.CFUNCTYPE(None)(lambda: {RAISE})()\ncheck_signals()\ntime.sleep(20)",
+    "in a finaliser": f"class Held:\n    def __del__(self):\n        {RAISE}\nHeld()\ncheck_signals()\ntime.sleep(20)",
+    "after a coroutine": f"run_async(work())\n{RAISE}\ntime.sleep(20)",
+    "while forking": f"os.register_at_fork(after_in_parent=lambda: {RAISE})\nos.fork() or os._exit(0)\ncheck_signals()",
+}
+
+
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    "place",
-    [
-        "threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()\ntime.sleep(20)",
-        "try:\n    signal.raise_signal(signal.SIGTERM)\nexcept Exception:\n    pass\ntime.sleep(20)",
-        # Python drops the exception in these two; the next check finds it
-        "import ctypes\nctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGTERM))()\ncheck_signals()\ntime.sleep(20)",
-        "class Held:\n    def __del__(self):\n        signal.raise_signal(signal.SIGTERM)\nHeld()\ncheck_signals()\ntime.sleep(20)",
-        "signal.raise_signal(signal.SIGTERM)\ntime.sleep(20)",
-        "run_async(work())\nsignal.raise_signal(signal.SIGTERM)\ntime.sleep(20)",
-        "os.register_at_fork(after_in_parent=lambda: signal.raise_signal(signal.SIGTERM))\nos.fork() or os._exit(0)\ncheck_signals()",
-    ],
-    ids=[
-        "waiting",
-        "catching Exception",
-        "in a C callback",
-        "in a finaliser",
-        "at once",
-        "after a coroutine",
-        "while forking",
-    ],
-)
+@pytest.mark.parametrize("place", PLACES)
 def test_a_signal_ends_a_command_wherever_it_is(place):
-    code, lines = end_of(place)
-    assert code == ExitCode.TERMINATED
-    assert lines == ["asked to end (SIGTERM)"]
+    assert end_of(PLACES[place]) == (ExitCode.TERMINATED, ["asked to end (SIGTERM)"])
 
 
 @pytest.mark.parametrize("ending", ["return", "raise OSError"])
