@@ -3,16 +3,15 @@
 import contextlib
 import csv
 import errno
+import io
 import json
 import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 
 from posteriors.frame_report import FrameReport
 from posteriors.posterior import Posterior
@@ -20,8 +19,8 @@ from services.errors import SettingsError
 from services.output import posterior_file
 from services.output.axes import Axis, axes_of
 from services.output.posterior_file import open_result_file, record
-from services.output.posterior_lines import line
-from services.output.posterior_picture import ROWS, in_colour, picture
+from services.output.posterior_lines import drawing, line
+from services.output.posterior_picture import ROWS, picture
 from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source
 
 HASH = "0" * 64
@@ -152,13 +151,35 @@ class TestPicture:
         assert drawn.count("|\n") == 8
         assert drawn.endswith("each mark is a block of 8 x 3 cells")
 
-    def test_no_color_disables_colours(self, monkeypatch):
-        options = {"force_terminal": True, "color_system": "truecolor"}
-        assert in_colour(Console(**options))
-        with Path(os.devnull).open("w") as null:
-            assert not in_colour(Console(file=null))
-        monkeypatch.setenv("NO_COLOR", "1")
-        assert not in_colour(Console(**options))
+    @pytest.mark.parametrize(("terminal", "asked"), [(False, ""), (True, ""), (True, "1")])
+    def test_on_a_terminal_one_picture_changes_and_elsewhere_each_is_whole(
+        self, monkeypatch, terminal, asked
+    ):
+        out = io.StringIO()
+        out.isatty = lambda: terminal
+        monkeypatch.setattr("sys.stdout", out)
+        for name, value in {
+            "TERM": "xterm-256color",
+            "NO_COLOR": asked,
+            "COLUMNS": "40",
+            "LINES": "24",
+        }.items():
+            monkeypatch.setenv(name, value)
+        with drawing() as show:
+            for each in (A, EMPTY, B):
+                show(each, axes_of(each, None) if each is not EMPTY else [])
+        shown = out.getvalue()
+        if not terminal:
+            assert "\x1b" not in shown
+            assert shown.count("@@") == 3  # b has two such cells
+            lines = [row for row in shown.splitlines() if row.startswith("frame")]
+            assert lines == [line(A, axes_of(A, None)), line(EMPTY, []), line(B, axes_of(B, None))]
+            return
+        assert "\x1b[2K" in shown  # a line that is drawn again
+        assert "frame 9: " in shown  # the last one, though its turn had not come
+        assert (";5;" in shown) == (not asked)
+        assert ("@@" in shown) == bool(asked)
+        assert shown.endswith("\x1b[?25h")  # the cursor is back
 
 
 def save(path, *heard, deployment=GRID):
