@@ -117,18 +117,6 @@ async def test_a_large_message_is_taken_up_to_the_limit_of_the_settings(boat, li
                 await link.until(lambda: link.of(Reading) or (task.done() and task.result()))
 
 
-async def test_a_message_above_the_limit_of_its_topic_is_counted(boat, link):
-    async with FakeRosbridge() as fake:
-        subscriber = Subscriber(Settings(uri=fake.uri, topic_bytes=1 << 16), boat, link.make)
-        async with running(subscriber, link):
-            link.take(Begin(once=False))
-            await fake.wait_for_op("subscribe", topic="/boat/sensors")
-            await fake.publish("/boat/sensors", READING | {"image": "x" * (1 << 17)})
-            await fake.publish("/boat/sensors", READING)
-            await link.until(lambda: link.of(Reading))
-            assert subscriber.status().frames.lost == {LossReason.TOO_LARGE: 1}
-
-
 def test_the_status_shows_the_time_without_readings(boat, link, monkeypatch):
     monkeypatch.setattr("services.pipeline.subscriber.why_not_connected", lambda _: "")
     now = [1_000_000_000_000]
