@@ -38,9 +38,9 @@ _PATH: Final = re.compile(r"/[A-Za-z0-9._~/-]{0,200}")
 _HOST: Final = re.compile(r"[A-Za-z0-9.-]{1,253}")
 _LAST_PORT: Final = 65535
 _PORT: Final = re.compile(r"[0-9]+(/.*)?")
-"""The port of `robot:9090`, a URI that lacks its ws://, and not a name."""
+"""A port: `robot:9090` is a URI without its ws://, and does not name a robot."""
 _TAKEN_TIME: Final = 3.0
-"""Seconds to wait for another owner of a name."""
+"""Seconds to wait for an objection from another owner of a name."""
 
 
 class DiscoveryError(BridgeError):
@@ -139,7 +139,7 @@ async def announced_uri(uri: str) -> str:
 
 
 def find_uri(uri: str) -> str:
-    """Return the same as `announced_uri`, for a caller that does not await, even inside an event loop."""
+    """Return the same as `announced_uri`, for callers that cannot await, even inside an event loop."""
     if not uri.startswith(ROBOT):
         return uri
     # A loop of its own, because `asyncio.run` refuses to run inside another one.
@@ -162,8 +162,8 @@ async def announced(
 
     `host` is the address on which the server listens; `0.0.0.0` and `::` mean all addresses of this machine,
     and a loopback address is announced only to this machine. With `tls`, clients get the host name of this
-    machine, which must be in the certificate; `token` tells whether they need one. Without `interfaces`, it
-    answers on all of them.
+    machine, which must be in the certificate; `token` says whether they need one. Without `interfaces`, all
+    interfaces answer.
 
     Raises:
         DiscoveryError: `zeroconf` is not installed, there is no network, or another server has the name.

@@ -108,7 +108,7 @@ class SlowPeerError(BridgeError):
 
 
 class ServiceError(BridgeError):
-    """Raised when a service answers `result: false`, and by a handler to answer so.
+    """Raised when a service answers `result: false`; a handler raises it to give this answer.
 
     Attributes:
         reason: The unchanged text of the answer.
@@ -147,7 +147,7 @@ class FramesUnconnectedError(TransformError):
 
 
 class ExtrapolationError(TransformError):
-    """Raised when a transform is not known at a time, which is before the oldest or after the newest."""
+    """Raised when a transform is requested for a time before the oldest or after the newest known one."""
 
 
 class DefinitionError(UsageError):

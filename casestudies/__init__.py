@@ -1,6 +1,6 @@
 """Case studies, each with a model, a simulator or a data reader, and a page that describes it.
 
-Here are the errors of all of them, and the flag `--uri` of their commands.
+This module has their common errors, and the flag `--uri` of their commands.
 """
 
 from typing import Annotated, ClassVar

@@ -1,4 +1,4 @@
-"""A rectangle cut into cells."""
+"""A rectangle divided into cells."""
 
 import math
 from collections.abc import Sequence

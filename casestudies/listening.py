@@ -1,4 +1,4 @@
-"""A listener to results and true positions, which yields frames with their truth, matched by time stamp."""
+"""A listener that matches results with true positions by time stamp."""
 
 import asyncio
 import contextlib
@@ -118,7 +118,7 @@ class Truths:
         return self._resolve()
 
     def flush(self) -> list[Instance]:
-        """Return the frames that still wait for a truth that will not arrive."""
+        """Return the frames that still wait for a truth, because it will not arrive."""
         ended = [self._with_truth(instance) for instance in self._untrue]
         self._untrue.clear()
         return ended

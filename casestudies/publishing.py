@@ -22,10 +22,10 @@ RECENT_S: Final = 10.0
 
 
 class Readiness:
-    """Readiness of a process: true if it has worked within the last `RECENT_S` seconds."""
+    """Readiness of a process, which is ready if it has worked within the last `RECENT_S` seconds."""
 
     def __init__(self, work: str) -> None:
-        """Start with no work done; `work` names it in the past tense, such as "a reading was published"."""
+        """Start with no work done; `work` describes the work in the past tense, such as "a reading was published"."""
         self._work = work
         self._last: float | None = None
         self._done = 0
@@ -62,7 +62,7 @@ async def serve_readiness(name: str, readiness: Readiness) -> AsyncIterator[None
 
 
 SETTLED_S: Final = 3.0
-"""Seconds after which a server that does not know an advertised topic has refused it."""
+"""If a server does not list an advertised topic after this many seconds, it has refused it."""
 
 
 async def report_refused(ros: Ros, topic: str, type_: str) -> None:
@@ -80,7 +80,7 @@ async def report_refused(ros: Ros, topic: str, type_: str) -> None:
 
 
 class LossyPublication:
-    """A publication that drops messages while the server is away or slow, with one warning each time."""
+    """A publication that drops messages while the server is disconnected or slow, with one warning each time."""
 
     def __init__(self, publication: Publication) -> None:
         """Wrap a publication."""

@@ -2,7 +2,7 @@
 
 Start at `machines.posterior` (one call, for a notebook) or `make_kernel` (the machine of a board).
 `machines.bm1` defines a machine, `machines.reference` runs it cycle by cycle, and `machines.fast` gets the
-same results faster. Only `machines.fast` imports numba. `machines.kind` is what everybody else asks of a machine.
+same results faster. Only `machines.fast` imports numba. `machines.kind` is the interface for all other packages.
 """
 
 from collections.abc import Callable
@@ -45,7 +45,7 @@ def _bm1() -> "MachineKind":
 
 
 KINDS: Final[dict[str, Callable[[], "MachineKind"]]] = {"BM1": _bm1}
-"""The kinds of machines by name, imported when they are called, because the subscriber does without NumPy."""
+"""Functions that import and return the kinds of machines, by name; the subscriber must not import NumPy."""
 
 
 def kind_of(parameters: object) -> "MachineKind":

@@ -83,14 +83,14 @@ class BM1Machine:
 
 
 SHORTEST_SLICE: Final = 256
-"""Minimum end of the first slice, in cycles; each later slice ends at twice the cycle of the previous one."""
+"""Minimum end of the first slice, in cycles; each later slice ends at twice the cycle at which the previous one ended."""
 
 
 def first_slice(target_count: int) -> int:
     """Return the end of a frame's first slice: the smallest 256 * 2^k that is at least twice the target.
 
     A line needs at least as many cycles as the target, and twice as many if it counts in every other cycle.
-    An earlier end would cost every board a doorbell and an answer in vain.
+    An earlier end would cost every board a useless doorbell and answer.
     """
     end = SHORTEST_SLICE
     while end < 2 * target_count:

@@ -71,7 +71,7 @@ class BM1Kind(MachineKind):
         return BM1Machine(parameters, sections["prior"], columns, sections.get("rng"))
 
     def registers(self, parameters: BM1Parameters) -> UsedRegisters:
-        """Return the registers: a single machine with one input per column has them in SENSORS, others in INPUTS."""
+        """Return the registers; inputs are in SENSORS for a single machine with one input per column, otherwise in INPUTS."""
         inputs, results = math.prod(parameters.input_shape), math.prod(parameters.count_shape)
         size = f"{parameters.sensors} sensors and {parameters.lines} lines"
         if not _is_plain(parameters):
@@ -127,16 +127,16 @@ class BM1Kind(MachineKind):
         return _OnBoard(kernel, memory)
 
     def on_host(self, machines: Sequence[BM1Machine]) -> HostMachine:
-        """Return the machines of all boards, which have the lines of one model."""
+        """Return the machines of all boards, each with its lines of the model."""
         return _OnHost(machines)
 
     def joint_reason(self, reasons: Sequence[int]) -> int:
-        """Return one reason for replicas: SLICE if all of them were stopped because of other boards."""
+        """Return one stop reason for replicas: SLICE if all of them stopped only because of other boards."""
         joint = joint_reason([StopReason(reason) for reason in reasons], range(len(reasons)))
         return joint if joint is not StopReason.NONE else StopReason.SLICE
 
     def infer(self, results: Sequence[BoardResult]) -> Inference:
-        """Return the joint posterior: each board has its own lines, of every replica, and its own cycles."""
+        """Return the joint posterior; each board has some lines of every replica, and its own number of cycles."""
         joint: npt.NDArray[np.float64] | None = None
         totals: list[int] = []
         if results and results[0].replica_cycles:
@@ -285,7 +285,7 @@ class _OnBoard(BoardMachine):
 
 
 class _Course(FrameCourse):
-    """A frame whose boards share the lines of one model, or of several replicas of it."""
+    """A frame on boards that share the lines of one model, or of its replicas."""
 
     def __init__(
         self, starts: Sequence[tuple[FrameSettings, Blocks]], frame: FrameInput, replicas: int
@@ -303,7 +303,7 @@ class _Course(FrameCourse):
         self.end = 0 if end >= self._max_cycles else end
 
     def proceed(self, reasons: Sequence[Sequence[int]]) -> tuple[Sequence[int], Blocks]:
-        """With `slices` a machine is over for all boards if it has overflowed on one; with `own` none has a slice left."""
+        """With `slices`, a machine ends on all boards if it has overflowed on one; with `own`, there are no further slices."""
         over = {
             replica
             for of_board in reasons
@@ -400,7 +400,7 @@ class _OnHost(HostMachine):
         return self._sensor_words.pack(*words)
 
     def _prior_selects(self, frame: FrameInput) -> tuple[int, bytes]:
-        """Return the prior's address (of several, the one most out of range) and the words of PRIOR_SELECTS."""
+        """Return the prior's address (of several, the one farthest out of range) and the words of PRIOR_SELECTS."""
         given = frame.prior_address
         if isinstance(given, tuple):
             if self._replicas == 1 or len(given) != self._replicas:

@@ -10,14 +10,14 @@ class MachineError(Exception):
 
 
 class ParameterError(MachineError):
-    """Parameters, tables or codes from which no machine can be built."""
+    """Raised for parameters, tables or codes from which no machine can be built."""
 
 
 class StartError(MachineError):
-    """A start or a resume that does not fit the machine or its state."""
+    """Raised for a start or a resume that does not fit the machine or its state."""
 
 
 class NoPosteriorError(MachineError):
-    """Readings for which all counts are 0, so they cannot be normalised."""
+    """Raised if all counts are 0 for the readings, so that they cannot be normalised."""
 
     exit_code: ClassVar[int] = 4

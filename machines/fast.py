@@ -164,7 +164,7 @@ class FastBM1(BM1Kernel):
         self._take_outcome()
 
     def _take_outcome(self) -> None:
-        """Set cycles and reasons from the frame's outcome; a halted replica keeps its own."""
+        """Set cycles and reasons from the frame's outcome; a halted replica keeps its previous ones."""
         for replica, (live, _, cycles, overflow) in enumerate(self._frame.outcome.tolist()):
             self._cycles[replica] = cycles
             if live == 0:
@@ -224,6 +224,6 @@ def _occurring_codes(machine: BM1Machine) -> npt.NDArray[np.bool_]:
 
 
 def _blocks_in(kept_bytes: int, rows: int) -> int:
-    """Return the number of blocks of this many rows that fit into the memory."""
+    """Return how many blocks of this many rows fit into the memory."""
     block_bytes = max(rows, 1) * (BLOCK_WORDS * WORD_BITS // 8 + 1)
     return min(kept_bytes // block_bytes, KEPT_CYCLES // BLOCK_CYCLES)

@@ -1,6 +1,6 @@
-"""Machine code of the fast kernel, which computes and counts the words of a block, and its arrays.
+"""Compiled functions of the fast kernel, which compute and count the words of a block, and their arrays.
 
-Both are in one file because numba recompiles when this file changes, but not when an imported one does.
+They are in one file because numba recompiles when this file changes, but not when an imported one does.
 """
 
 from collections.abc import Callable
@@ -45,7 +45,7 @@ class Generators(NamedTuple):
 
 
 class _Store(NamedTuple):
-    """Words by slot (a block of cycles of a bank; the last one is scratch) and row (a code of a column)."""
+    """Words by slot (a block of cycles in a bank; the last slot is scratch) and row (a code of a column)."""
 
     words: Words  # [slots, rows * BLOCK_WORDS]
     filled: npt.NDArray[np.uint8]  # [slots, rows]: whether these words are cached
@@ -83,7 +83,7 @@ def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
 
 
 def store_of_frame(occurring: npt.NDArray[np.bool_], cells: int, slots: int) -> _Store:
-    """Allocate words for the codes of a frame of `cells` cells; each frame assigns the rows."""
+    """Allocate words for the codes of a frame of `cells` cells; rows are assigned anew for each frame."""
     none = np.zeros(min(int(occurring.sum()), cells), dtype=np.int64)
     return _store(np.full(occurring.shape, NO_ROW, dtype=np.int32), none, none, slots)
 
@@ -197,7 +197,7 @@ def _call_on_block(builder: Any, name: str, result: Any, block: Any) -> Any:
 
 
 def _count_code(_context: Any, words: Any, places: Any, _line: Any, _width: Any, mask: Any) -> Any:
-    """Count the ones of a line in a block: those in the AND of its rows and the mask."""
+    """Count the ones of a line in a block, which are those in the AND of its rows and the mask."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data, where, masks = (
@@ -219,7 +219,7 @@ _count = cast("Callable[[Words, npt.NDArray[np.uint32], int, int, Words], int]",
 
 
 def _fill_code(_context: Any, _code: Any, inverted: Any, words: Any, _place: Any) -> Any:
-    """Compute a block of words for a code in a column: random number < code, from the low bit up."""
+    """Compute a block of words for a code in a column: random number < code, from the lowest bit to the highest."""
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         shown, into = (context.make_array(signature.args[i])(context, builder, arguments[i]) for i in (1, 2))
@@ -285,7 +285,7 @@ def _select(
     new_rows: bool,
     rows: int,
 ) -> int:
-    """Find the lines of a replica that can count and the rows that each ANDs, and clear their counters.
+    """Find a replica's lines that can count and the rows to AND for each, and clear their counters.
 
     With `new_rows`, a code without a row gets the next one, from `rows` on. Returns the number of assigned
     rows.
@@ -364,7 +364,7 @@ def fill_blocks(
 
 @_jit
 def _mask(first: int, end: int, mask: Words) -> None:
-    """Set the mask to cycles `first` to `end` - 1 of a block."""
+    """Set the mask of a block to the cycles from `first` to `end` - 1."""
     for word in range(BLOCK_WORDS):
         start = word * WORD_BITS
         low = min(max(first - start, 0), WORD_BITS)
@@ -379,7 +379,7 @@ def _mask(first: int, end: int, mask: Words) -> None:
 def _cycle_of(
     words: Words, places: npt.NDArray[np.uint32], width: int, mask: Words, line: int, nth: int
 ) -> int:
-    """Return the cycle in a block of the `nth` one (from 1) of a line under the mask; it must exist."""
+    """Return the cycle in a block in which a line makes its `nth` one (from 1) under the mask; it must exist."""
     word = 0
     while True:
         made = mask[word]
@@ -471,8 +471,8 @@ def begin(
 ) -> int:
     """Select the lines of every replica and run its first slice; the result is in `frame.outcome`.
 
-    Returns the number of assigned rows. All rows are assigned before the first block is run, so that rows
-    mean the same in all replicas. A replica in which no line can count runs no cycle.
+    Returns the number of assigned rows. All rows are assigned before the first block is run, so that a row
+    has the same meaning in all replicas. A replica in which no line can count runs no cycle.
     """
     rows = _NO_ROWS
     for replica in range(codes.shape[0]):

@@ -173,7 +173,7 @@ def check_start(parameters: BM1Parameters, start: Start) -> None:
 
 
 def _are_plain_addresses(parameters: BM1Parameters, given: object) -> bool:
-    """Return whether these are one integer per column, all in range: a fast path for most frames."""
+    """Return whether the inputs are one integer per column, all in range; this is the fast path for most frames."""
     if type(given) is not tuple or parameters.input_shape != (len(given),):
         return False
     for address, bits in zip(given, parameters.sensor_bits, strict=True):  # noqa: SIM110 - all() of a generator would slow every frame

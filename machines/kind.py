@@ -1,4 +1,4 @@
-"""A machine kind: what programming files, boards, drivers and posteriors ask of a machine, whichever it is.
+"""A machine kind: the interface of any machine for programming files, boards, drivers and posteriors.
 
     host                                                     board
     begin(frame) ──── settings, blocks ────▶ start ──▶ step, step, ... ─┐
@@ -22,7 +22,7 @@ Blocks: TypeAlias = Mapping[str, bytes]
 """Words to write, by the name of their block in the register map."""
 
 OUTCOME: Final = np.dtype([("reason", "<u4"), ("zero", "<u4"), ("cycles", "<u8")])
-"""The part of the block OUTCOMES for one of several replicas."""
+"""The part of the block OUTCOMES that belongs to one replica."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,7 +111,7 @@ class Inference(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UsedRegisters:
-    """The registers of a board that a machine uses, as far as its parameters decide them.
+    """The registers of a board that a machine uses, according to its parameters.
 
     Attributes:
         lines: Lines of the model on the board.
@@ -121,7 +121,7 @@ class UsedRegisters:
         result_words: Results of all replicas, in words of the block RESULTS.
         written: Words of the other blocks that a host may write, by name.
         capabilities: Values of the capability registers (`CAP_LINES`) or their fields (`CAP_MACHINE.KIND`), by name.
-        size: The size of the machine in words for a user.
+        size: The size of the machine, described for a user.
     """
 
     lines: int
@@ -135,10 +135,10 @@ class UsedRegisters:
 
 
 class BoardMachine(ABC):
-    """The machine of a board, which takes its inputs from the board's registers and leaves its results there.
+    """The machine of a board, which reads its inputs from the board's registers and writes its results there.
 
-    It runs from one call to the next: `start` and `resume` obey a doorbell, `step` goes on with the same slice.
-    All three end at cycle `end` at the latest (0: no such end), with the results in RESULTS and OUTCOMES.
+    It runs only within calls: `start` and `resume` begin a slice after a doorbell, `step` continues the slice.
+    All three stop at cycle `end` at the latest (0: no such limit), with the results in RESULTS and OUTCOMES.
     """
 
     @abstractmethod
@@ -151,7 +151,7 @@ class BoardMachine(ABC):
 
     @abstractmethod
     def start(self, settings: FrameSettings, end: int) -> None:
-        """Run a new frame; a StartError if registers do not fit the machine, which then has not changed."""
+        """Run a new frame, or raise a StartError and change nothing if the registers do not fit the machine."""
 
     @abstractmethod
     def resume(self, end: int) -> None:
@@ -192,7 +192,7 @@ class FrameCourse(ABC):
 
     @abstractmethod
     def proceed(self, reasons: Sequence[Sequence[int]]) -> tuple[Sequence[int], Blocks]:
-        """Return the numbers of the boards to resume (none: the frame is over), and the blocks to write before it.
+        """Return the numbers of the boards to resume (none: the frame is over), and the blocks to write before that.
 
         Args:
             reasons: The last stop reasons of each board's replicas.
@@ -212,7 +212,7 @@ class HostMachine(ABC):
 
 
 class MachineKind(ABC):
-    """A kind of Bayesian machine. Machines, their parameters and kernels have types of the kind's own.
+    """A kind of Bayesian machine. Each kind has its own types of machines, parameters and kernels.
 
     Attributes:
         name: Its name in programming files and deployments.
@@ -246,7 +246,7 @@ class MachineKind(ABC):
 
     @abstractmethod
     def contents(self, machine: Any) -> Blocks:
-        """Return what registers contain when the board has been programmed, beyond `UsedRegisters.capabilities`."""
+        """Return the contents of registers after programming, except `UsedRegisters.capabilities`."""
 
     @abstractmethod
     def kernel(self, machine: Any) -> Any:

@@ -16,13 +16,13 @@ COUNTER_BITS_MAX: Final = 32
 """Maximum width of a counter in bits: that of a result register."""
 
 STEPS_PER_CLOCK_MAX: Final = 256
-"""Maximum number of steps per clock: hardware unrolls them, and the reference makes them one by one."""
+"""Maximum number of steps per clock: hardware unrolls them, and the reference kernel executes them one by one."""
 
 RNG_BANKS_MAX: Final = 65536
 """Maximum number of seed sets."""
 
 REPLICAS_MAX: Final = 256
-"""Maximum number of machines on a board, which is the room for outcomes in the register map."""
+"""Maximum number of machines on a board: the register map has room for so many outcomes."""
 
 CYCLES_MAX: Final = 2**63 - 1
 """Maximum of `max_cycles` and `run_until`: 64-bit registers whose values must fit into a signed number."""
@@ -48,7 +48,7 @@ _LFSR_BITS: Final = {RngKind.LFSR8: 8, RngKind.LFSR16: 16, RngKind.LFSR24: 24, R
 
 
 class RngReset(StrEnum):
-    """Start of a frame's random numbers: at the bank of the frame, or where the last frame ended (`free`)."""
+    """Where a frame's random numbers start: at the bank of the frame, or where the last frame ended (`free`)."""
 
     BANK = "bank"
     FREE = "free"

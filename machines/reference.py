@@ -54,7 +54,7 @@ class ReferenceBM1(BM1Kernel):
         self._resume(going, int(start.run_until))
 
     def _resume(self, going: list[int], run_until: int) -> None:
-        """Run until every replica has overflowed, or has reached the last cycle of the frame or slice."""
+        """Run until each replica has overflowed or has reached the last cycle of the frame or slice."""
         running = going
         while running:
             self._cycle(running)

@@ -30,7 +30,7 @@ POLYNOMIALS: Final = {
     RngKind.LFSR24: (24, 23, 22, 17),
     RngKind.LFSR32: (32, 22, 2, 1),
 }
-"""Exponents of each LFSR's maximal-length polynomial, except 0, in descending order."""
+"""Non-zero exponents of the maximal-length polynomial of each LFSR, in descending order."""
 
 
 class RandomNumbers(Protocol):
@@ -80,7 +80,7 @@ class LFSR:
 
     @property
     def period(self) -> int:
-        """Number of steps after which a state repeats."""
+        """Number of steps after which the states repeat."""
         return (1 << self.bits) - 1
 
     @property
@@ -94,7 +94,7 @@ class LFSR:
         return ((states << np.uint64(1)) & np.uint64(self.period)) | parity
 
     def jump(self, states: Words, steps: Words) -> Words:
-        """Return each state after its number of steps, in a few look-ups."""
+        """Return each state after its own number of steps, by a few table look-ups."""
         steps = steps % np.uint64(self.period)
         for bit, tables in enumerate(jump_tables(self.kind, 1)):
             taken = (steps >> np.uint64(bit)) & np.uint64(1) == 1
@@ -105,7 +105,8 @@ class LFSR:
         """Return the initial states of the generators with these numbers.
 
         Their distances from a base state are scattered, not evenly spaced: evenly spaced phases of 3, 5
-        or 17 columns XOR to 0, because these divide 2**32 - 1, and the AND of such columns is wrong at any length.
+        or 17 columns XOR to 0, because these numbers divide 2**32 - 1, and more cycles do not correct the AND of
+        such columns.
         """
         base = BASE_STATE & self.period or 1
         distances = ((numbers + np.uint64(1)) * np.uint64(GOLDEN)) >> np.uint64(32)
@@ -136,7 +137,7 @@ class LFSRNumbers:
 
 @dataclass(frozen=True, slots=True)
 class TableNumbers:
-    """Generators that all repeat one recorded table; a state is an index.
+    """Generators that all repeat one table of recorded numbers; a state is an index.
 
     Generator n of `count` starts at floor(n * length / count), and bank b adds b / banks of the distance to
     the start of the next generator.

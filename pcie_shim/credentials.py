@@ -8,7 +8,8 @@ the proof of the board. Neither proof reveals the key or is valid for another li
       │◀─ AUTHENTICATE host nonce, proof ────│   HMAC("rosbayes host" + both nonces)
       │── reply: proof, then the greeting ──▶│   HMAC("rosbayes board" + both nonces)
 
-The proofs protect only the beginning of a link; on a network that is not trusted, ssh or WireGuard carries it.
+The proofs protect only the beginning of a link; on a network that is not trusted, tunnel the link through ssh or
+WireGuard.
 """
 
 import hashlib

@@ -29,7 +29,7 @@ class Endpoint:
         path: Path of the unix socket; empty for TCP.
         host: Name or address of the TCP host; empty for a unix socket.
         port: TCP port; 0 for a unix socket.
-        key: Key of a link over TCP, empty for none; a unix socket needs none, since it is private.
+        key: Key of a link over TCP, empty for none; a unix socket is private and needs none.
     """
 
     path: str = ""

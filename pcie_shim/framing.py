@@ -5,9 +5,9 @@
     │ "BM"   │ operation│ flags│ sequence│ address│ count  │ CRC-32│ count words   │
     └────────┴──────────┴──────┴─────────┴────────┴────────┴───────┴───────────────┘
 
-All numbers are little-endian. The CRC is that of the other 16 bytes of the header and the words. A request to read, and
-the reply to a write, have a count and no words. It corresponds to the data link layer of thesis 2.3, which adds sequence numbers and CRCs to
-read and write requests. `FrameDecoder` uses one buffer as long as the link is open.
+All numbers are little-endian. The CRC covers the other 16 bytes of the header and the words. Read requests and
+replies to writes have a count and no words. The framing corresponds to the data link layer of thesis 2.3, which adds
+sequence numbers and CRCs to read and write requests. `FrameDecoder` uses one buffer as long as the link is open.
 """
 
 from __future__ import annotations

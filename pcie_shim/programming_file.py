@@ -162,7 +162,7 @@ _Parameters = TypeVar("_Parameters")
 
 
 class _Identity(_Checked, Generic[_Parameters]):
-    """The input of the image hash."""
+    """The data from which the image hash is computed."""
 
     machine: str
     parameters: _Parameters
@@ -186,13 +186,13 @@ class _Manifest(_Checked, Generic[_Parameters]):
 
 
 class _Named(BaseModel):
-    """The part of an identity that says which parameters it has."""
+    """The part of an identity that names its parameters."""
 
     machine: str
 
 
 class _Kind(BaseModel):
-    """The part of a manifest that says of which kind its machine is."""
+    """The part of a manifest that names the kind of machine."""
 
     identity: _Named
 

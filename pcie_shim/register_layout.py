@@ -8,7 +8,7 @@ from machines.kind import UsedRegisters
 from pcie_shim import register_map as rm
 
 ALL_ONES: Final = 0xFFFFFFFF
-"""The all-ones word, which all registers read as if no device answers."""
+"""The word of all ones, which every read returns if no device answers."""
 
 WORD: Final = struct.Struct("<I")
 """One register."""
@@ -29,7 +29,7 @@ def next_doorbell(number: int) -> int:
 
 
 def register_values(fields: Mapping[str, int]) -> dict[int, int]:
-    """Return the values of registers by address, from those of registers (`CAP_LINES`) and fields (`CAP_MACHINE.RNG`)."""
+    """Return register values by address, from values of registers (`CAP_LINES`) and fields (`CAP_MACHINE.RNG`) by name."""
     values: dict[int, int] = {}
     for name, value in fields.items():
         register, _, field = name.partition(".")
@@ -40,5 +40,5 @@ def register_values(fields: Mapping[str, int]) -> dict[int, int]:
 
 
 def interface_room(registers: UsedRegisters) -> tuple[int, int]:
-    """Return the maximum numbers of input words and result words in the register map, for such inputs."""
+    """Return the maximum numbers of input words and result words in the map, if the inputs use these registers."""
     return BLOCKS[registers.inputs].words, rm.RESULTS_WORDS

@@ -1,4 +1,4 @@
-"""Posteriors as ROS messages: writing, reading, pairing with the reports of their frames, and receiving."""
+"""Posteriors as ROS messages: writing, reading, receiving, and pairing with the reports of their frames."""
 
 from posteriors.emulation import posterior
 from posteriors.errors import BadResultError, LabelError, NoResultError, PosteriorError

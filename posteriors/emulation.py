@@ -24,7 +24,7 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
 
     Raises:
         LabelError: The deployment has no variable of this name.
-        PosteriorError: The machine has replicas, or readings for each line, which `machines.posterior` takes.
+        PosteriorError: The machine has replicas or readings for each line; use `machines.posterior`.
         ToolchainError: The deployment is damaged, or a reading cannot be used.
         NoPosteriorError: All counts are 0 for these readings.
     """

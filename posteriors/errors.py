@@ -1,4 +1,4 @@
-"""Errors in received posteriors; like all errors of a connection, they are `BridgeError`s with an exit code."""
+"""Errors of received posteriors, which are `BridgeError`s with an exit code, like all errors of a connection."""
 
 from bridge.errors import BridgeError, NoMessageError
 

@@ -27,7 +27,7 @@ class StageTimes:
     reads: FiniteFloat | None = None
     boards_compute: FiniteFloat | None = None
     rosbridge_out: FiniteFloat | None = None
-    """Of the previous frame, because this one has not been sent yet."""
+    """That of the previous frame, because this one has not been sent yet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +81,7 @@ _REPLICA_KEYS: Final = {"replica_cycles": "%s", "replica_reasons": "%s"}
 
 
 def _template(level: str, name: str, keys: Mapping[str, str]) -> str:
-    """Return a DiagnosticStatus as JSON, with `%` placeholders for the message, the hardware and the values."""
+    """Return a DiagnosticStatus as JSON, with `%` in place of message, hardware and values."""
     pairs = ",".join(f'{{"key":"{key}","value":"{form}"}}' for key, form in keys.items())
     return f'{{"level":{level},"name":"rosbayes: {name}","message":%s,"hardware_id":%s,"values":[{pairs}]}}'
 
@@ -95,7 +95,7 @@ _times: Final = attrgetter(*_STAGES)
 
 
 def write_frame_report(report: FrameReport, ros_version: Literal[1, 2]) -> dict[str, Any]:
-    """Return a report, in which no number may be None, as a diagnostic_msgs/DiagnosticArray."""
+    """Return a report as a diagnostic_msgs/DiagnosticArray; none of its numbers may be None."""
     published = "true" if report.published else "false"
     statuses = [
         _FRAME

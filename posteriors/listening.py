@@ -35,7 +35,7 @@ QUEUE_SIZE: Final = 64
 FIRST_TIMEOUT: Final = 30.0
 """Default timeout for the first posterior, in seconds."""
 _DISORDER_NS: Final = 50_000_000
-"""Maximum delay of a report behind the posterior that was published after it, in nanoseconds."""
+"""Maximum time in nanoseconds by which a report may arrive after its posterior, although it was published before."""
 _REPORT_TIMEOUT: Final = 1.0
 """Seconds that a posterior waits for its report."""
 
@@ -295,8 +295,8 @@ def listen(
 ) -> int:
     """Call a function with each posterior, in this thread, without asyncio.
 
-    The connection runs in its own thread, so a slow function only loses the oldest posteriors in its queue. A
-    lost connection is restored. Ctrl-C ends the loop normally.
+    The connection runs in its own thread, so a slow function loses posteriors, the oldest first, but not the
+    connection. A lost connection is restored. Ctrl-C ends the loop normally.
 
     Args:
         server: The URI of a rosbridge server, or an unopened `connect(...)` with further options (a token, a

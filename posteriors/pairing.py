@@ -18,12 +18,12 @@ WAITING: Final = 256
 
 
 class Pairing:
-    """Pairing of posteriors with reports, for any order of arrival between the two topics.
+    """Pairing of posteriors with reports, whichever of the two arrives first.
 
-    Servers preserve the order within a topic, but not all preserve the order between topics. So the next
-    posterior belongs to the next report of a published frame, unless the times of arrival (`heard_ns`) show
-    that one of the two was lost: a posterior never belongs to a report that arrived more than `disorder_ns`
-    after it, nor to one that arrived more than `disorder_ns` before it if the next report did not.
+    Servers preserve the order within a topic, but not always between topics. So the next posterior belongs to
+    the next report of a published frame, unless their times of arrival (`heard_ns`) show that one of the two has
+    lost its counterpart: if the report arrived more than `disorder_ns` after the posterior, the posterior's report was
+    lost; if it arrived more than `disorder_ns` before, and the next report fits, the report's posterior was lost.
 
     Attributes:
         announced_only: Number of reports whose posterior never arrived.

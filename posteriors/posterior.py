@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 RESULTS_TOPIC: Final = "/BMresults"
 RESULTS_TYPE: Final = "std_msgs/Float64MultiArray"
 MAX_RESULT: Final = 1 << 23
-"""Size of the largest posterior as JSON in bytes: 64 boards of 4096 lines, 26 bytes per number, and the rest
+"""Maximum size of a posterior as JSON in bytes: 64 boards of 4096 lines, 26 bytes per number, and the rest
 of the message.
 """
 REPLICA: Final = "replica"
@@ -38,8 +38,8 @@ class Posterior:
 
     probabilities: tuple[float, ...]
     """Row-major over the labelled dimensions, the first slowest; they sum to 1. If the first label is
-    `replica`, these are several posteriors in sequence; each sums to 1, or to 0 if all counts of the replica
-    are 0.
+    `replica`, these are several posteriors in sequence; each sums to 1, or to 0 if all counts of its
+    replica are 0.
     """
     labels: tuple[str, ...]
     """Names of the searched variables, in the order of the dimensions."""
@@ -104,7 +104,7 @@ class Posterior:
     def latency_us(self) -> float | None:
         """Microseconds from the receipt of the reading by the subscriber to the arrival here.
 
-        None if unknown, or if the clocks of the two computers disagree.
+        None if unknown, or if the clocks of the two computers differ too much.
         """
         return self._since(self.report.received_ns if self.report else None)
 

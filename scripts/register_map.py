@@ -1,13 +1,13 @@
 """Generator of the register map's constants, page, VHDL and C header from the SystemRDL file (`scripts/registers`).
 
-It is needed only for development: what it writes is committed, so SystemRDL tools are not needed at run time. The hash
+It is needed only for development: its output is committed, so SystemRDL tools are not needed at run time. The hash
 of the map covers the definition (names, addresses, sizes, fields, access, resets, encodings), but not the
 explanations. PeakRDL writes the C header. The other files are written here, because:
 
 - peakrdl-markdown repeats every element of an array, leaves out the values of encodings, and has no links.
-- peakrdl-regblock-vhdl requires write buffers for 64-bit registers, in which the low word has no effect until the high
-  one is written, where a board accepts single words; it needs a second decoder for accesses that are refused depending
-  on address, state and value; and it needs a VHDL package from its wheel.
+- peakrdl-regblock-vhdl buffers the low word of a 64-bit register until the high one is written, but a board accepts
+  single words. It also needs a second decoder for accesses that are refused depending on address, state and value, and
+  a VHDL package from its wheel.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ library ieee;
 _WORD: Final = "std_logic_vector(31 downto 0)"
 _FULL: Final = 0xFFFFFFFF
 _ENUMERATIONS: Final = {"board_state", "error_code"}
-"""Encodings that are in the constants module: the others are those of machine kinds, in `machines`."""
+"""Encodings in the constants module; the others belong to machine kinds, and are in `machines`."""
 
 
 # The map, as the compiler of SystemRDL has read it
@@ -67,7 +67,7 @@ class Field:
         self.encoding: Any = node.get_property("encode")
         self.text = _one_line(node.get_property("desc"))
         self.pulses: bool = node.get_property("singlepulse")
-        """True if written ones are output for one clock and read as 0."""
+        """True if a written 1 is output for one clock, and reads as 0."""
         self.driven: bool = node.is_hw_writable
         """True if the hardware provides the value that is read."""
 
@@ -94,7 +94,7 @@ class Block:
         """True if reading the low word holds the high word for the next read."""
 
     def value(self, writable: bool | None = None) -> int:
-        """Return the reset value of all fields, or of those that software can write or cannot."""
+        """Return the reset value of all fields, or only of those that software can (True) or cannot (False) write."""
         chosen = (each for each in self.fields if writable is None or ("w" in each.access) is writable)
         return sum((each.reset or 0) << each.low for each in chosen if not (writable and each.pulses))
 
@@ -115,7 +115,7 @@ class RegisterMap:
 
     @cached_property
     def encodings(self) -> dict[Any, str]:
-        """Every encoding that a field has, in the order of first use, and the name of this field."""
+        """Every encoding of a field in the order of first use, and the name of its first field."""
         found: dict[Any, str] = {}
         for block in self.blocks:
             for field in block.fields:
@@ -374,7 +374,7 @@ def _reset(block: Block) -> str:
 
 
 def _is_word(block: Block, word: int) -> str:
-    """Return the condition that selects one of a register's words."""
+    """Return the condition that selects one word of a register."""
     return f"unsigned(word_i) = {block.name}_ADDRESS / 4{f' + {word}' if word else ''}"
 
 
@@ -403,7 +403,7 @@ def _writes(written: list[Block]) -> list[str]:
 
 
 def _reads(registers: list[Block]) -> list[str]:
-    """Return the processes that hold high words and select what software reads."""
+    """Return the processes that hold high words, and select the word that software reads."""
     lines = [
         "  -- Reading a low word holds the high one until that is read, so that the pair is never torn.",
         "  hold_high_words : process (clk_i) is",
@@ -495,7 +495,7 @@ FILES: Final = {
 
 
 def main(arguments: Sequence[str] | None = None, *, root: Path = ROOT) -> int:
-    """Write all files, or with `--check` compare them with the SystemRDL file's output."""
+    """Write all files, or with `--check` compare the existing ones with what would be written."""
     description = "Makes the constants module, the page, the VHDL and the C header from hdl/bm_registers.rdl."
     parser = ScriptParser(prog="scripts/registers", description=description)
     parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if a file is out of date")

@@ -65,7 +65,7 @@ class OverflowedQueueError(StackError):
 
 
 class OutdatedError(StackError):
-    """The folder of a service has changed since its start, and the master requires the new deployment."""
+    """A service's deployment folder has changed since its start, and the master requires the new deployment."""
 
     exit_code = ExitCode.CHILD
 

@@ -210,7 +210,7 @@ def load_settings(**flags: Any) -> Settings:
 
 
 def _expected(name: str, message: str) -> str:
-    """Return the expected value of a setting, for a timeout both limits."""
+    """Describe the expected value of a setting; for a timeout, both limits."""
     known = Settings.model_fields.get(name)
     if known is not None and known.annotation is float:
         return f"expected seconds from {SHORTEST_S:g} to {LONGEST_S:g}"
@@ -218,7 +218,7 @@ def _expected(name: str, message: str) -> str:
 
 
 def metrics_endpoint(text: str) -> Endpoint:
-    """Return the address `[HOST:]PORT`, on loopback without a host, or raise a SettingsError."""
+    """Parse an address `[HOST:]PORT`, on loopback if it has no host, or raise a SettingsError."""
     try:
         return parse_endpoint(f"tcp://{text}" if ":" in text else f"tcp://127.0.0.1:{text}")
     except PcieShimError:

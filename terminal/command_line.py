@@ -24,7 +24,7 @@ class CommandLine(typer.Typer):
     """A command, or a group of commands, whose failures are one sentence on standard error and an exit code."""
 
     def __init__(self, **settings: Any) -> None:
-        """Take the settings of `typer.Typer`, and add those that all commands share."""
+        """Create a `typer.Typer` with these settings and those that all commands share."""
         super().__init__(
             cls=_Group,
             pretty_exceptions_enable=False,
@@ -63,7 +63,7 @@ class CommandLine(typer.Typer):
 
 
 class _Command(TyperCommand):
-    """A command that refuses blank and non-finite values, which no flag accepts."""
+    """A command that refuses blank and non-finite values for all flags."""
 
     def invoke(self, ctx: Any) -> Any:
         with _noticing_closed_pipe():
@@ -88,7 +88,7 @@ class _Command(TyperCommand):
 
 
 class _Later(_Command):
-    """A place-holder with the name and purpose of a subcommand; its callback returns the subcommand."""
+    """A placeholder with the name and purpose of a subcommand; its callback imports and returns the subcommand."""
 
 
 class _Group(TyperGroup):

@@ -8,7 +8,7 @@ from terminal.output import say, warn
 
 
 def report_wait(uri: str) -> Callable[[str, str], None]:
-    """Return a callback for a client's `on_state` that reports the wait for a server at the start."""
+    """Return a callback for a client's `on_state` that says at the start that the client waits for its server."""
     is_missing = False
 
     def on_state(state: str, reason: str) -> None:
@@ -26,7 +26,7 @@ def report_wait(uri: str) -> Callable[[str, str], None]:
 def report_connection(uri: str) -> Callable[[str, str], None]:
     """Return a callback for a client's `on_state` that reports each lost and restored connection once.
 
-    It hides all warnings of the client, which logs each loss itself.
+    It hides the client's own warnings, which would repeat each loss.
     """
     log_libraries(logging.ERROR, "%(name)s: %(message)s")
     missing = ""

@@ -80,7 +80,7 @@ def _signal_behind(error: BaseException) -> StoppedError | None:
 
 
 def _system_sentence(error: OSError) -> str | None:
-    """Return the sentence for a limit of the system or an unwritable output; None if the error is a bug."""
+    """Return the sentence for an exceeded limit of the system or an unwritable output; None if the error is a bug."""
     if error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     if error.errno in _NO_SPACE:

@@ -20,7 +20,7 @@ from pydantic import BaseModel
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """Properties of a flag that its field lacks: `names` other than `--field-name`, the word for its value, its default."""
+    """Properties of a flag that its field does not have: `names` other than `--field-name`, a word for its value, a text for its default."""
 
     names: tuple[str, ...] = ()
     metavar: str | None = None
@@ -49,7 +49,7 @@ def default_of(model: type[BaseModel], name: str) -> str:
 
 
 def flags_of(model: type[BaseModel], names: Sequence[str], *, prefix: str) -> list[inspect.Parameter]:
-    """Return the flags of fields: None if it is not given, because then a variable `PREFIX...` or the default holds."""
+    """Return the flags of fields. The value of an omitted flag is None, and a variable `PREFIX...` or the default applies."""
     return [_flag_of(model, name, f"{prefix}{name.upper()}") for name in names]
 
 

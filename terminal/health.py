@@ -32,7 +32,7 @@ _END_TIMEOUT = 2.0
 
 
 class NoHealthError(Exception):
-    """A status socket did not answer; the text gives the reason, without its subject, the process."""
+    """A status socket did not answer; the text is the rest of a sentence that begins with the process."""
 
 
 def status_socket(directory: str | os.PathLike[str], name: str) -> str:
@@ -65,7 +65,7 @@ def read_status(path: str, timeout: float) -> bytes:
 
 @contextlib.contextmanager
 def silence_explained(path: str, timeout: float) -> Iterator[None]:
-    """Raise a NoHealthError for an OSError or a TimeoutError while the process at a status socket is asked."""
+    """Turn an OSError or a TimeoutError of a query at a status socket into a NoHealthError, within the context."""
     try:
         yield
     except TimeoutError:
@@ -83,7 +83,7 @@ def foreign_socket_error(path: str) -> NoHealthError:
 
 
 def is_ready(path: str, timeout: float) -> tuple[bool, str]:
-    """Return whether a process is ready, and the reason, or raise a NoHealthError without a valid answer."""
+    """Return whether a process is ready, and the reason, or raise a NoHealthError if it gives no valid answer."""
     data = read_status(path, timeout)
     try:
         status = json.loads(data)
@@ -103,7 +103,7 @@ def resources() -> dict[str, float]:
 
 
 def _listen(path: str) -> socket.socket:
-    """Listen at a path, in place of a killed process, or raise an OSError, for example if another process listens."""
+    """Listen at a path, even if a killed process has left a socket there; raise an OSError if another process listens."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)  # a full backlog means that a process is listening
         if probe.connect_ex(path) == errno.ECONNREFUSED:
@@ -122,7 +122,7 @@ def _listen(path: str) -> socket.socket:
 
 @contextlib.contextmanager
 def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[socket.socket | None]:
-    """Listen within the context; yield None without a directory, or after a warning without a socket."""
+    """Listen within the context; yield None without a directory, or after a warning if the socket cannot be created."""
     listener = None
     path = "" if directory is None else status_socket(os.path.abspath(directory), name)
     if path:
@@ -153,7 +153,7 @@ async def serve_health(
     import asyncio
 
     class Answering(asyncio.Protocol):
-        """One connection. The protocol of asyncio's streams would keep the error of a client that has gone."""
+        """One connection. It does not use asyncio's streams, which would keep the error of a client that has gone."""
 
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
             writing = cast("asyncio.Transport", transport)
@@ -175,7 +175,7 @@ async def serve_health(
 
 @contextlib.contextmanager
 def in_thread(serving: Callable[[], AbstractAsyncContextManager[None]]) -> Iterator[None]:
-    """Enter a context in the event loop of a thread, for a process whose main thread blocks."""
+    """Hold a context open in the event loop of another thread, for a process whose main thread blocks."""
     import asyncio
 
     entered: Future[None] = Future()

@@ -5,8 +5,8 @@
     logging of libraries ──────────────────┤
     relayed lines of children ─────────────┘
 
-The format is that of `BM_LOG_FORMAT`, which children inherit. Whatever a peer sent is escaped, so that it can
-neither begin a line nor control a terminal.
+`BM_LOG_FORMAT` selects the format; children inherit it. Text from a peer is escaped, so that it can neither begin a
+line nor control a terminal.
 """
 
 import json
@@ -24,7 +24,7 @@ from structlog.typing import EventDict, FilteringBoundLogger
 from terminal.one_line import lines_of, one_line
 
 PARENT_VARIABLE: Final = "ROSBAYES_PARENT"
-"""Environment variable that a process sets for its children, which exit with it and report nothing."""
+"""Environment variable that a process sets for its children, so that they exit with it."""
 FORMAT_VARIABLE: Final = "BM_LOG_FORMAT"
 
 _CLEAR_LINE: Final = "\r\x1b[K"
@@ -37,12 +37,12 @@ _text: Final = structlog.dev.ConsoleRenderer(
 
 
 class _Process:
-    """State of this process's lines."""
+    """State of this process's output on standard error."""
 
     name = ""
-    """Its name in JSON lines if it is not that of its command; set at start-up."""
+    """The name of the process in JSON lines if it differs from that of its command; set at start-up."""
     shows_progress = False
-    """True while the last line of the terminal is a progress, which the next line replaces."""
+    """True while the last line of the terminal shows progress, which the next line replaces."""
 
 
 class LogFormat(StrEnum):
@@ -53,7 +53,7 @@ class LogFormat(StrEnum):
 
 
 def log_format() -> LogFormat:
-    """Return the format in force; that of an invalid variable, which the settings report, is text."""
+    """Return the current format; text if the variable is invalid, which the settings report."""
     value = os.environ.get(FORMAT_VARIABLE, "")
     return LogFormat(value) if value in set(LogFormat) else LogFormat.TEXT
 
@@ -84,7 +84,7 @@ def json_line(level: str, message: str, *, process: str = "", **fields: object) 
 
 
 def formatted(level: str, text: str, *, name: str = "") -> str:
-    """Return a text for the user in the format in force: after `name: level: `, or with the level as a field."""
+    """Return a text for the user in the current format: after `name: level: `, or as JSON with the level as a field."""
     if log_format() is LogFormat.JSON:
         return json_line(level, text)
     prefix = f"{name}: " if name else ""
@@ -92,7 +92,7 @@ def formatted(level: str, text: str, *, name: str = "") -> str:
 
 
 def relayed(line: str, process: str) -> str:
-    """Return a line of a child in the format in force; JSON of a child of the same version remains as it is."""
+    """Return a line of a child in the current format; a JSON line from a child of the same version is not changed."""
     if log_format() is LogFormat.TEXT or _is_record(line):
         return one_line(line)
     return json_line("info", line, process=process)
@@ -107,14 +107,14 @@ def _is_record(line: str) -> bool:
 
 
 def write_line(text: str) -> None:
-    """Print a text that is in the format in force on standard error."""
+    """Print a text, already in the current format, on standard error."""
     stream = SurvivingStream(sys.stderr)
     stream.write(text + "\n")
     stream.flush()
 
 
 def write_progress(text: str) -> None:
-    """Show a text without a line's end, which the next line replaces."""
+    """Show a text that the next line replaces."""
     stream = SurvivingStream(sys.stderr)
     stream.write(text)
     stream.flush()
@@ -128,7 +128,7 @@ class SurvivingStream:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write a text if the stream still accepts it, in place of the progress."""
+        """Write a text in place of the progress, if the stream still accepts it."""
         try:
             if _Process.shows_progress:
                 _Process.shows_progress = False
@@ -138,7 +138,7 @@ class SurvivingStream:
             return len(text)
 
     def flush(self) -> None:
-        """Flush the stream if it is still there."""
+        """Flush the stream, if it still exists."""
         with suppress(OSError, ValueError):
             self._stream.flush()
 
@@ -156,7 +156,7 @@ class _StandardError:
 
 
 def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
-    """Return the logger of a process; its lines contain its name, and the number of the frame if any.
+    """Return the logger of a process; its lines contain the name of the process, and the number of the frame if any.
 
     The first call in a process sets the minimum level: debug, info or warning.
     """
@@ -198,7 +198,7 @@ def escape_last_resort() -> None:
 
 
 class _OneLine(logging.Formatter):
-    """Formatter with one line per record: a library may quote untrusted text. Tracebacks keep their lines."""
+    """Formatter with one line per record, because a library may quote untrusted text. Tracebacks keep their lines."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         return one_line(super().formatMessage(record))

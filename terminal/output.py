@@ -22,12 +22,12 @@ ERROR_DESCRIPTOR: Final = "ROSBAYES_ERROR_DESCRIPTOR"
 
 
 def say(text: str) -> None:
-    """Print one line for the user on standard error, even if that has been closed."""
+    """Print one line for the user on standard error; do nothing if it has been closed."""
     write_line(formatted("info", one_line(text)))
 
 
 def warn(sentence: str, *, name: str = "") -> None:
-    """Print a warning in one line on standard error; `name` is that of the process, if a text shall have it."""
+    """Print a warning in one line on standard error; `name` is that of the process, if a text line shall contain it."""
     write_line(formatted("warning", one_line(sentence), name=name))
 
 
@@ -86,7 +86,7 @@ def print_json_line(value: Any) -> None:
 
 
 def open_standard_streams() -> None:
-    """Open /dev/null for closed standard streams (`>&-`), so that an event loop cannot get their numbers."""
+    """Open /dev/null for closed standard streams (`>&-`), so that no other file gets their descriptors."""
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
             os.fstat(number)

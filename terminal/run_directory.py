@@ -3,9 +3,9 @@
     $XDG_RUNTIME_DIR/rosbayes, otherwise /tmp/rosbayes-UID    unless BM_RUN_DIRECTORY or --run-directory names one
         master.status.sock  subscriber.sock  board0.sock  ...
 
-Only this user can enter the default one. A master that starts processes locks the directory (flock), and its
-children inherit the lock. So the kernel frees it when the last of them has ended, however it ended: the sockets that
-killed processes leave are replaced at the next start.
+Only this user can enter the default directory. A master that starts processes locks the directory (flock), and its
+children inherit the lock. So the kernel releases it when the last of them has ended, even if it was killed. Sockets
+that killed processes leave are replaced at the next start.
 """
 
 import contextlib
@@ -21,11 +21,11 @@ from terminal.health import SUFFIX
 from terminal.output import warn
 
 _LONGEST_RUNTIME = 40
-"""Bytes of XDG_RUNTIME_DIR at most: a socket's path has 107."""
+"""Maximum length of XDG_RUNTIME_DIR in bytes, because the path of a socket has at most 107."""
 
 
 class OccupiedError(Exception):
-    """The run directory is locked by another run, or by processes of one that is about to end."""
+    """The run directory is locked by another run, or by remaining processes of one that is ending."""
 
     exit_code = ExitCode.USAGE
 
@@ -61,7 +61,7 @@ def run_directory(given: Path | None) -> Path:
 
 
 def status_directory(given: Path | None, name: str) -> Path | None:
-    """Return the run directory of a process without a master, or None after a warning: this must not end it."""
+    """Return the run directory of a process without a master; after a warning None, because lacking one must not end the process."""
     try:
         return run_directory(given)
     except OutputError as error:

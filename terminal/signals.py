@@ -27,7 +27,7 @@ _received: list[int] = []
 
 
 def stopped_error(number: int) -> StoppedError:
-    """Return the error, with exit code and sentence, for the signal that ends a process."""
+    """Return the error for a signal that ends a process, with exit code and sentence."""
     return StoppedError(*_ENDS[signal.Signals(number)])
 
 
@@ -35,7 +35,7 @@ def raise_on_signals() -> None:
     """Make SIGINT, SIGTERM and SIGHUP raise `StoppedError` in the main thread.
 
     A second signal is ignored, because the duration of the clean-up is bounded. Python drops an exception
-    that is raised while the thread runs a callback from C code, forks, or runs a finaliser, so code calls
+    that is raised while the thread runs a callback from C code, forks, or runs a finaliser. So code must call
     `check_signals` before it blocks. C code may also print it, and raise another one in its place, as numba does
     while it is imported.
     """
@@ -58,7 +58,7 @@ def _report_dropped(dropped: sys.UnraisableHookArgs) -> None:
 
 
 def _report_printed(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-    """Print an exception at which a program ends, except those of signals, which `terminal.ending` reports."""
+    """Print an exception that ends the program, except those of signals, which `terminal.ending` reports."""
     if not isinstance(error, StoppedError):
         sys.__excepthook__(kind, error, traceback)
 
@@ -75,7 +75,7 @@ def check_signals() -> None:
 
 
 def ignore_signals() -> None:
-    """Ignore the signals that end a process, once it has ended its work."""
+    """Ignore the signals that end a process, because it has finished its work."""
     for number in _ENDS:
         signal.signal(number, signal.SIG_IGN)
 

@@ -25,7 +25,7 @@ _PIECE: Final = 1 << 18
 
 
 def open_regular(path: Path, error: type[ToolchainError], most: int | None = None) -> BinaryIO:
-    """Open a regular file for reading, because a FIFO or a device could block forever or never end.
+    """Open a regular file for reading; others are refused, because a FIFO or a device could block or never end.
 
     Raises:
         error: The file is missing, cannot be read, is not a regular file, or has more than `most` bytes.
@@ -83,7 +83,7 @@ Model = TypeVar("Model", bound=BaseModel)
 _MOST_BYTES: Final = 4 << 20
 """Maximum size of a configuration file in bytes; a deployment has a few kilobytes."""
 _MOST_SIGNS: Final = 100_000
-"""Maximum number of `[`, `{` and `=`, because tables and keys need a thousand times their size in memory; a
+"""Maximum number of `[`, `{` and `=`, because tables and keys need a thousand times as much memory as their text; a
 deployment of 4,096 boards has 30,000.
 """
 _MOST_PARTS: Final = 32
@@ -106,7 +106,7 @@ class TomlFile:
     error: type[ToolchainError]
     """The type of its errors."""
     text: str
-    """Its text, for the lines of mistakes."""
+    """Its text, to find the lines of mistakes."""
     tables: dict[str, Any]
     """Its tables, not yet validated."""
 
@@ -210,7 +210,7 @@ def _split(place: Sequence[str | int]) -> tuple[str, int | None, str]:
 
 
 def nearest_name(word: str, known: Sequence[str]) -> str:
-    """Return the advice for a wrong name: the nearest valid one, or all valid ones."""
+    """Return advice on a wrong name: the nearest valid name, or all valid ones."""
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     return f"did you mean '{close[0]}'?" if close else f"expected one of {', '.join(known) or 'none'}"
 

@@ -1,4 +1,4 @@
-"""Flags made from dataclasses, so that each option is declared once; flags of several commands; values of flags.
+"""Flags: made from dataclasses, so that each option is declared once; shared by commands; values of flags.
 
 @dataclass                                               def explore(sweep: Sweep, model: ...)
 class Sweep:                                   ──▶           explore --steps LIST --banks N [MODEL]
@@ -47,7 +47,7 @@ StopWhen: TypeAlias = Annotated[Stop, STOP]
 
 
 def add_commands(app: CommandLine, *commands: Callable[..., None]) -> None:
-    """Add functions to a command line, each under its own name; a dataclass parameter becomes a flag per field."""
+    """Add functions to a command line as commands of the same names; a dataclass parameter becomes a flag per field."""
     for command in commands:
         parameters = inspect.signature(command, eval_str=True).parameters
         kinds = {name: each.annotation for name, each in parameters.items()}

@@ -43,8 +43,8 @@ class GoalResult:
 class Goal:
     """One active goal: `async for feedback in goal`, then `await goal.result(timeout)`.
 
-    The iteration ends with the goal. If the connection is lost, iteration and result fail, because the server
-    forgets the sender of a goal and never reports its end; likewise after an `async with` that left it unfinished.
+    The iteration ends with the goal. If the connection is lost, iteration and result fail, because the server then
+    never reports the end of the goal; they also fail once an `async with` was left before the end.
 
     Attributes:
         action: Name of the action.
@@ -293,7 +293,7 @@ class ActionServer(Handle):
         task.add_done_callback(lambda _task: self._goals.pop(identity, None))
 
     def lost(self) -> None:
-        """Cancel the handlers of a lost connection, because nobody waits for their results."""
+        """Cancel the handlers after a lost connection, because nobody waits for their results."""
         # Each task removes its own entry when it has ended, so the dictionary does not change here.
         for _goal, task in self._goals.values():
             task.cancel()

@@ -101,7 +101,7 @@ class Subscription(Handle):
         topic: Name of the topic.
         lost: Number of messages dropped because the queue was full.
         discarded: Number of messages above the topic's limit (`max_bytes`).
-        blind_seconds: Total time without a connection; each message has the time just before it.
+        blind_seconds: Total time without a connection (see also `Message.blind_seconds`).
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class Subscription(Handle):
         self.discarded += 1
 
     def leave_out(self, reason: str) -> None:
-        """Raise an error in the reader, after the queued messages, because the topic is left out."""
+        """Make the reader raise an error after the queued messages, because the topic is left out."""
         _log.warning("%s %s", self.topic, reason)
         self._left_out = reason
         self._wake()
@@ -182,7 +182,7 @@ class Subscription(Handle):
         self.blind_seconds += seconds
 
     def _pass_on_blind_seconds(self, message: Message) -> Message:
-        """Add the blind seconds of the message to drop to those of the next message."""
+        """Add the blind seconds of a message that is about to be dropped to those of the next one."""
         queue = self._queue
         blind = queue[0].blind_seconds
         if self._size == 1:
@@ -287,7 +287,7 @@ class Subscription(Handle):
         )
 
     async def _why_silent(self, begun: float) -> str:
-        """Return the end of an error's sentence: the reason why the topic has been silent."""
+        """Return why the topic has been silent, as a clause that ends the sentence of an error."""
         session = self._session
         # First what is known here; asking the server takes time, and it may be the reason itself.
         if self.discarded:

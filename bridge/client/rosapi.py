@@ -1,6 +1,6 @@
-"""Questions to rosapi: parameters, topics, services and nodes, and the types of what a client sends.
+"""Questions to rosapi: parameters, topics, services, nodes, and the definitions of types to check messages with.
 
-rosapi is a node beside most rosbridge servers, which answers service calls below `/rosapi`; many servers lack it.
+rosapi is a node that runs beside most rosbridge servers, and answers service calls below `/rosapi`.
 """
 
 import asyncio
@@ -144,7 +144,7 @@ class Params:
 
 
 class TypeChecks:
-    """The checks of one client. A server that does not answer is not asked again on the same connection."""
+    """The checks of what one client sends. A server that does not answer is not asked again on the same connection."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -176,7 +176,7 @@ class TypeChecks:
         publications.define(type_name, definitions)
 
     async def check_request(self, service: str, args: Mapping[str, Any], limit: float) -> None:
-        """Check a request for a service, whose type the server is asked for, for at most `limit` seconds each.
+        """Check a request for a service; each question to rosapi about its type takes at most `limit` seconds.
 
         Raises:
             MessageTypeError: It has a field that the type does not have, or an array of another shape.

@@ -43,16 +43,16 @@ from bridge.errors import (
 )
 
 FIRST_DELAY: Final = 0.1
-"""First and maximum delay in seconds before an attempt to reconnect."""
+"""Delay in seconds before the first attempt to reconnect; it doubles up to `MAX_DELAY`."""
 MAX_DELAY: Final = 2.0
 ATTEMPT_TIMEOUT: Final = 5.0
 """Timeout in seconds of one attempt to reconnect."""
 STEADY: Final = 5.0
 """Minimum duration in seconds of a connection that resets the back-off."""
 SILENCE: Final = 2.0
-"""Seconds without a message after which a subscription is looked at again."""
+"""Seconds without a message after which a subscription is checked."""
 LONGEST_SILENCE: Final = 30.0
-"""Longest delay in seconds between two looks, which doubles with each."""
+"""Maximum delay in seconds between two checks; it doubles with each."""
 _ROSAPI_TIMEOUT: Final = 1.0
 KEPT_STATUSES: Final = 16
 """Number of status messages of the server that are stored."""
@@ -351,9 +351,9 @@ class Session:
         self._set_state(State.RECONNECTING, reason)
 
     def _leave_out(self, topic: str | None) -> str:
-        """Handle a message that was too large for the connection; return the end of the sentence about the loss.
+        """Leave out the topic of a message that was too large for the connection; return a clause for the error.
 
-        Its topic is left out, if its beginning named one; otherwise the next such message ends the connection again.
+        If the beginning of the message did not name the topic, the next such message ends the connection again.
         """
         subscriptions = self.core.subscriptions
         numbers = subscriptions.leave_out(topic)
@@ -365,7 +365,7 @@ class Session:
         return f"; the largest so far was one of {largest}, with {size} bytes" if size else ""
 
     def why_left_out(self) -> str:
-        """Return the end of an error's sentence: the reason why a topic is left out."""
+        """Return why a topic is left out, as a clause that ends the sentence of an error."""
         return (
             f"is left out: a message of it has more than the {self.core.wire.max_size} bytes (max_size) that this "
             f"client of {self.uri} accepts"
@@ -447,7 +447,7 @@ class Session:
         return websocket is not None and websocket.is_open and not websocket.is_closing
 
     def check_thread(self) -> None:
-        """Raise an error if this is another thread than that of the event loop, whose data is not locked."""
+        """Raise an error if this is not the thread of the event loop, because the data is not locked."""
         if get_ident() != self._thread and self._thread is not None:
             raise WrongThreadError(
                 f"the client of {self.uri} belongs to the thread of its event loop: call it there with "
@@ -469,7 +469,7 @@ class Session:
         return websocket
 
     def send_now(self, data: bytes) -> None:
-        """Write a message to the socket, after `must_wait` or `wait_turn` has found one, without another `await`."""
+        """Write a message to the socket; call it after `must_wait` or `wait_turn`, without an `await` in between."""
         wire, websocket = self.core.wire, self._websocket or self._connected()
         websocket.send((data,) if wire.fragment_size is None else wire.pieces(data))
         if len(data) > self._largest_sent:  # noqa: PLR1730 - `max` takes ten times as long
@@ -510,7 +510,7 @@ class Session:
                 websocket.count_unread(len(message))
 
     def watch_silence(self) -> None:
-        """Look after silent subscriptions from now on, until all have had a message on this connection."""
+        """Check for silent subscriptions from now on, until all have had a message on this connection."""
         self._renewal_delay = SILENCE
         if self._websocket is not None:
             self._schedule_renewal()
@@ -523,7 +523,7 @@ class Session:
         )
 
     def _renew_subscriptions(self) -> None:
-        """Repeat subscriptions to topics of unknown type, and renew those that should have messages."""
+        """Repeat subscriptions without a type, and renew those that should have had messages."""
         self._retry_timer = None
         if not self.is_open:
             return  # a new connection looks again
@@ -583,7 +583,7 @@ class Session:
         return answer.values
 
     def context_since(self, since: float) -> str:
-        """Return the end of an error's sentence: the lost connection or the last status since a time."""
+        """Return a clause for an error: the lost connection, or the last status message since a time."""
         if self._lost_at > since:
             return f"; meanwhile the connection was lost: {self.last_error}"
         return f"; the server reported: {self.statuses[-1].text[:200]}" if self._status_at > since else ""

@@ -27,7 +27,7 @@ class Transforms:
     """
 
     def __init__(self, subscribe: "Callable[..., Subscription]") -> None:
-        """Take the client's method `subscribe`, not the client, which imports this module."""
+        """Store the client's method `subscribe` instead of the client, whose module imports this one."""
         self.tree = TransformTree()
         self._subscribe = subscribe
         # Set by each message; `lookup` clears it before it waits for the next.
@@ -66,7 +66,7 @@ class Transforms:
         Args:
             target: Name of the frame in which coordinates are wanted.
             source: Name of the frame in which they are given.
-            stamp_ns: Nanoseconds since 1970, between stored transforms interpolated; None for the latest.
+            stamp_ns: Nanoseconds since 1970, for which stored transforms are interpolated; None for the latest.
             timeout: Maximum seconds to wait until it is known.
 
         Raises:

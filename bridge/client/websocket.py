@@ -43,9 +43,9 @@ WRITE_LIMIT: Final = 1 << 16
 CLOSE_TIMEOUT: Final = 1.0
 """Timeout in seconds of the closing handshake."""
 _OVERSLEPT: Final = 0.5
-"""Delay of the watchdog in seconds that means that this process was suspended, not the server."""
+"""If the watchdog wakes this many seconds late, this process was suspended, not the server."""
 _SIZE: Final = re.compile("[1-9][0-9]{2,17}")
-"""A limit that a server may announce: less than 100 bytes could not even be an operation."""
+"""A limit that a server may announce: no operation fits into less than 100 bytes."""
 
 
 class _NoDebug(logging.LoggerAdapter[logging.Logger]):
@@ -156,7 +156,7 @@ class WebSocket(WebSocketTransport):
         return self._client_protocol.handshake_exc
 
     def begin(self) -> None:
-        """Begin to call back after the handshake."""
+        """Start the callbacks, after the handshake."""
         self.opened = True
         self.last_heard = time.monotonic()
         self._schedule(self._limits.ping_interval)
@@ -185,7 +185,7 @@ class WebSocket(WebSocketTransport):
         self._answered.set()
 
     def messages_received(self, messages: list[bytes]) -> None:
-        """Pass messages on."""
+        """Call back with the messages."""
         if self.opened:
             self._on_messages(messages)
         else:

@@ -37,7 +37,7 @@ TYPED_ARRAYS: Final = {
     85: ("<f4", "f"),
     86: ("<f8", "d"),
 }
-"""Element types by tag: as NumPy and as the module `array` name them."""
+"""Element types by tag, in the notation of NumPy and in that of the module `array`."""
 _BYTES_TAG: Final = 64
 _TAGS: Final = {name[1:]: tag for tag, (name, _code) in TYPED_ARRAYS.items()}
 _TEXT: Final = frozenset({str})
@@ -55,7 +55,7 @@ def decode(
     Args:
         data: A whole WebSocket message.
         max_size: Maximum of bytes.
-        max_depth: Maximum of nested maps, arrays and tags, including the outermost (an empty one inside
+        max_depth: Maximum nesting of maps, arrays and tags, including the outermost (an empty one inside
             the last does not count).
         arrays: Form of typed arrays and byte strings: `list` makes lists of numbers, and bytes of `uint8[]`;
             `numpy` makes read-only one-dimensional arrays that share the message's memory.
@@ -126,7 +126,7 @@ def _decoder(tag: int, arrays: Arrays) -> _Decoder:
 
 
 def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
-    """Refuse decoded values that ROS messages cannot contain, and finish byte strings and arrays."""
+    """Refuse values that ROS messages cannot contain, and convert byte strings and arrays to the requested form."""
     from_bytes = _decoders("numpy")[_BYTES_TAG] if arrays == "numpy" else None
     # A stack instead of recursion, and types of whole containers at once: most are long lists of numbers.
     inner: list[Any] = [message]
@@ -168,10 +168,10 @@ def encode(
         message: The object. NumPy arrays (of any shape, flattened in C order) become typed arrays, and byte
             strings remain byte strings; for typed arrays from other values, use `typed_array`.
         max_size: Maximum of bytes.
-        max_depth: Maximum of nested maps and arrays.
+        max_depth: Maximum nesting of maps and arrays.
         pack_floats: Whether lists of numbers with at least one float become typed arrays of float64, with NaN
-            for None (null in JSON). This is for a server that has the message as JSON without a definition of
-            its type. Lists of only integers remain lists, because their width is unknown.
+            for None (null in JSON). This is for a server that has a message's JSON, but no definition of its type.
+            Lists of only integers remain lists, because their width is unknown.
 
     Raises:
         EncodeError: A type is not supported, a key is not a string, or the message is too deep or too large.

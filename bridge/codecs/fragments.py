@@ -135,7 +135,7 @@ class Reassembler:
             self._give_up(key)
 
     def clear(self) -> None:
-        """Forget everything: the connection is lost."""
+        """Drop everything, because the connection is lost."""
         self._sets.clear()
         self.waiting_bytes = 0
 
@@ -165,7 +165,7 @@ class Reassembler:
 
 
 def split(message: bytes, fragment_size: int, fragment_id: FragmentId) -> Iterator[bytes]:
-    """Split an operation as JSON into fragments of at most `size` bytes, but at least one character.
+    """Split the JSON of an operation into fragments of at most `fragment_size` bytes, but at least one character.
 
     Yields:
         The message itself if it fits into one fragment, otherwise its fragments as JSON, in order, numbered
@@ -185,7 +185,7 @@ def split(message: bytes, fragment_size: int, fragment_id: FragmentId) -> Iterat
 
 
 def _ends(message: bytes, fragment_size: int) -> Iterator[int]:
-    """Find the ends of fragments of whole characters."""
+    """Yield the ends of the fragments, which do not divide characters."""
     inside, mask = _CONTINUATION
     begin = 0
     while begin < len(message):

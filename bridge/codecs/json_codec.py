@@ -4,8 +4,8 @@ Inbound:
 
 * One WebSocket message holds one object. The last of several equal keys wins, as in the servers' parsers.
 * `NaN`, `Infinity`, `-Infinity`, which some servers leak although JSON excludes them, and numbers beyond float64
-  (`1e999`) are read as None, which is how the reference server's `null` is read.
-  Only messages that are not strict JSON need this second attempt.
+  (`1e999`) are read as None, like the `null` that the reference server sends instead.
+  For this, messages that are not strict JSON are parsed a second time.
 * Integers beyond 64 bits become floats.
 
 Outbound: NaN and infinities are either sent as `null`, as by the reference server, or refused with their
@@ -65,7 +65,7 @@ def excerpt(data: bytes | str) -> str:
 
 
 def text_of(value: Any) -> str:
-    """Return the explanation of a server as text; some servers send an object instead of a string."""
+    """Return a server's explanation as text; some servers send an object instead of a string."""
     if isinstance(value, str):
         return value
     if value is None:
@@ -290,7 +290,7 @@ def _all_finite(value: Any) -> bool:
 
 
 def envelope_of(data: bytes) -> bytes:
-    """Return the candidate envelope of an operation: everything up to its first `"msg":`, or nothing."""
+    """Return what may be the envelope of an operation: everything up to its first `"msg":`, or nothing."""
     at = data.find(_KEY, 0, LONGEST)
     return data[: at + len(_KEY)] if at > 0 else b""
 
@@ -298,10 +298,9 @@ def envelope_of(data: bytes) -> bytes:
 def topic_of(envelope: bytes) -> str | None:
     """Return the topic of an envelope, or None if it is not one.
 
-    It is an envelope if, completed by an empty message and a brace, it is a publish operation with only a
-    topic and a message. The brace closes the operation, so the message is the value of its last key. Neither
-    `op` nor `topic` has that value, so this key is `msg`, and any other object in its place is also the
-    message.
+    An envelope followed by an empty message and a brace is a publish operation with the keys `op`, `topic` and
+    `msg` only. The empty message is the value of the last key, so that key is `msg`, and whatever object
+    follows the envelope is the message.
     """
     try:
         operation: Any = orjson.loads(envelope + b"{}}")
@@ -314,7 +313,7 @@ def topic_of(envelope: bytes) -> str | None:
 
 
 def topic_in(beginning: bytes) -> str | None:
-    """Return the topic of a publish operation in JSON or CBOR of which only the beginning is known."""
+    """Return the topic of a publish operation from its beginning, in JSON or CBOR; None if it is not there."""
     match = _JSON_TOPIC.search(beginning.split(b'"msg"', 1)[0])
     if match is not None:
         return match[1].replace(b"\\/", b"/").decode(errors="replace")

@@ -1,7 +1,7 @@
 """Checks of outbound messages against the definition of their type: names of fields, and shapes of arrays.
 
-They find the mistakes of a program (a misspelt field, nested arrays), which are in its first message already. Values of
-scalars are left to the server.
+They find mistakes of a program (a misspelt field, nested arrays), which show in its first message already. The values
+of scalars are not checked.
 """
 
 import difflib
@@ -26,7 +26,7 @@ _TIMES: Final = frozenset({"time", "duration", "builtin_interfaces/Time", "built
 
 
 class FieldType(NamedTuple):
-    """Type of a field: that of its elements in the form of ROS 1, and its length (`SCALAR`, 0, or fixed)."""
+    """Type of a field: the type of its elements in the form of ROS 1, and its length (`SCALAR`, 0, or fixed)."""
 
     element: str
     length: int
@@ -166,7 +166,7 @@ class MessageCheck:
 
 
 def check_from_rosapi(answer: Any) -> MessageCheck | None:
-    """Return the check of the first type of rosapi's answer, to which the others belong; None if it cannot be read."""
+    """Return the check of the first type in rosapi's answer, whose parts the others are; None if it cannot be read."""
     definitions = definitions_from_rosapi(answer)
     match answer:
         case {"typedefs": [{"type": str(name)}, *_]} if (key := _key(name)) in definitions:
@@ -196,7 +196,7 @@ def _misshapen(type_name: str, place: str, field: FieldType, value: Any) -> Mess
 
 
 def _shown(value: Any) -> str:
-    """Return the shape of a value for a sentence."""
+    """Describe the shape of a value for an error."""
     shape: tuple[int, ...] = getattr(value, "shape", ())
     if shape:
         return f"an array of shape {'x'.join(map(str, shape))}"

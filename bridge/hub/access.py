@@ -103,7 +103,7 @@ def _presented(request: Request) -> list[str]:
 
 
 def choose_subprotocol(offered: Sequence[Subprotocol]) -> Subprotocol | None:
-    """Return the hub's subprotocol if it is offered, or None, upon which the client disconnects."""
+    """Return the hub's subprotocol if it is offered; otherwise None, and a client that offered others disconnects."""
     return SUBPROTOCOL if SUBPROTOCOL in offered else None
 
 
@@ -131,7 +131,7 @@ def read_tokens(path: Path) -> tuple[str, ...]:
 
 
 def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
-    """Return the context for TLS 1.2 or later from the hub's certificate and its key without passphrase.
+    """Return the context for TLS 1.2 or later from the hub's certificate and its key, which has no passphrase.
 
     Raises:
         HubError: A file cannot be read, or the two do not belong together.
@@ -154,7 +154,7 @@ def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address to listen on can be reached only from this machine."""
+    """Return whether a listening address can be reached only from this machine."""
     if host == "localhost":
         return True
     try:

@@ -6,7 +6,7 @@ never waits, never reads the monotonic clock, and never raises because of data f
 
 Invalid operations are refused as on the reference server: with a line in the log and on `/rosout`, but
 without an answer unless the client requested status messages (`set_level`). Only calls and goals are
-answered, with `result: false` and a sentence in `values`. The client is served further.
+answered, with `result: false` and a sentence in `values`. The client stays connected.
 
 Messages are not checked against their types, but all output is strict JSON, with `null` for every NaN and
 infinity received.
@@ -119,7 +119,7 @@ class Broker:
         return client
 
     def disconnect(self, client: Client) -> None:
-        """Remove a client, if that was not done yet, and fail the calls and goals that it had yet to answer."""
+        """Remove a client, unless it was removed before, and fail the calls and goals that it has not answered."""
         if self.graph.clients.pop(client.number, None) is None:
             return
         dropped = sum(subscription.lane.dropped for subscription in client.subscriptions.values())
@@ -147,7 +147,7 @@ class Broker:
             self._refuse(client, str(error), self._operation_id, with_status=client.wants_status)
 
     def receive_turn(self, client: Client, messages: list[bytes], now: float) -> int:
-        """Perform messages of a client in order, each of at most `limits.message_bytes`, as many as one turn allows.
+        """Perform a client's messages in order, as many as one turn allows; each has at most `limits.message_bytes`.
 
         Returns the number of messages performed. The others need another turn, after the client has read its answers
         if its outbox is congested.
@@ -167,7 +167,7 @@ class Broker:
         return number
 
     def _perform(self, client: Client, data: bytes, now: float, *, is_whole: bool) -> None:
-        """Perform the operation in a message, which may be a fragment only if the message arrived whole."""
+        """Perform the operation in a message; `is_whole` is False for a reassembled one, which cannot be a fragment."""
         operation: Any = None
         raw: bytes | None = data
         if len(data) <= self.limits.message_bytes:

@@ -10,7 +10,7 @@
 
     caller ── send_action_goal ──▶ hub ── send_action_goal ──▶ server
     caller ◀── action_feedback ─── hub ◀── action_feedback ─── server     any number, the oldest may be dropped
-    caller ─ cancel_action_goal ─▶ hub ─ cancel_action_goal ─▶ server     a wish: the server still ends the goal
+    caller ─ cancel_action_goal ─▶ hub ─ cancel_action_goal ─▶ server     a request: the server still ends the goal
     caller ◀─── action_result ──── hub ◀─── action_result ──── server
 
 The hub replaces the caller's id by a key of its own, because ids of different clients may be equal. It ends a call or
@@ -61,7 +61,7 @@ _CANCEL_ALL: Final = "/_action/cancel_goal"
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """A client that waits for an answer, with its id, name and encoding."""
+    """A client that waits for an answer, with the id, name and encoding in its request."""
 
     client: Client
     id: OperationId
@@ -71,7 +71,7 @@ class Caller:
 
     @classmethod
     def of(cls, client: Client, operation: Operation, kind: str) -> Self:
-        """Read the caller of an operation, which names a service or an action, or raise a RefusedOperationError."""
+        """Read the caller from an operation that names a service or an action, or raise a RefusedOperationError."""
         return cls(
             client,
             operation_id(operation),
@@ -81,13 +81,13 @@ class Caller:
         )
 
     def operation(self, op: str, kind: str, **fields: object) -> bytes:
-        """Return an operation for this client about the `kind` (service or action) that it named."""
+        """Return an operation for this client; `kind` (service or action) is the key of the name in its request."""
         identity = {} if self.id is None else {"id": self.id}
         return orjson.dumps({"op": op, kind: self.name, **fields, **identity})
 
 
 def _filled(filler: Filler | None, values: Any, room: int) -> Any:
-    """Return arguments or results with all fields, which may grow by `room` bytes, and named ones instead of a list."""
+    """Return arguments or results as an object with absent fields filled in, growing by at most `room` bytes."""
     if values is None:
         values = {}
     if filler is not None:
@@ -99,7 +99,7 @@ def _filled(filler: Filler | None, values: Any, room: int) -> Any:
 
 
 class _Exchange:
-    """Services or actions by name, and what is asked of them. The last client to offer a name serves it."""
+    """Services or actions by name, and their open calls or goals. The last client to offer a name serves it."""
 
     # A kind of exchange: the field that names it in operations, which kind of type it has, the operation that ends what
     # was asked, and the additional fields of one that failed.
@@ -142,7 +142,7 @@ class _Exchange:
         names.add(key)
 
     def unadvertise(self, client: Client, operation: Operation, _now: float) -> None:
-        """Withdraw an offer; what was asked of it may still be answered."""
+        """Withdraw an offer; open calls or goals may still be answered."""
         name = text(operation, self.kind)
         names = self._names_of(client)
         if absolute(name) not in names:
@@ -228,7 +228,7 @@ class Calls(_Exchange):
         return self._deadlines[0][0] if self._deadlines else inf
 
     def leave(self, client: Client) -> None:
-        """Remove a disconnected client, and fail the calls that it had yet to answer."""
+        """Remove a disconnected client, and fail the calls that it has not answered."""
         super().leave(client)
         for key in list(client.calls):
             self._take(key)

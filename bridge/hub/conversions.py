@@ -48,7 +48,7 @@ DUMMY: Final = "structure_needs_at_least_one_member"
 
 
 class Builder:
-    """Builder of rosbags' objects from JSON; fields that are left out get their default."""
+    """Builder of rosbags' objects from JSON; absent fields get their default."""
 
     def __init__(self, store: "Typestore", max_values: int) -> None:
         self._store = store
@@ -100,7 +100,7 @@ class Builder:
         ]
 
     def _count(self, values: int) -> None:
-        """Count values, and refuse a message with too many before they are built."""
+        """Add to the count of a message's values, and refuse too many before they are built."""
         self._values += max(values, 1)
         if self._values > self._max_values:
             raise ValueError(f"it has more than {self._max_values} values")
@@ -137,7 +137,7 @@ def _scalar(value: Any, element: str, place: str) -> Any:
 
 
 def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | bytes:
-    """Return an array's numbers, checked: their types, their range, and their number unless `length` is 0."""
+    """Return an array's numbers after checking their types, their range and, unless `length` is 0, their count."""
     if isinstance(values, str) and element in _BYTES:
         values = b64decode(values, validate=True)
     if not isinstance(values, list | bytes) or (length and len(values) != length):
@@ -164,7 +164,7 @@ def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | 
 def typed_converter(store: "Typestore", name: str, known: dict[str, Convert | None]) -> Convert | None:
     """Return the function that converts a message's arrays of numbers, or None for a type that has none.
 
-    `known` has the functions of the types inside it that were met before.
+    `known` stores the functions of the types that occur inside this one.
     """
     converts: dict[str, Convert] = {}
 

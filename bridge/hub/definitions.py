@@ -73,7 +73,7 @@ class MessageDefinitions:
                 self._store = _store(Stores.ROS2_JAZZY if self.ros_version == 2 else Stores.ROS1_NOETIC)
 
     def name(self, type_name: str) -> str:
-        """Return a message type's name as this ROS version writes it."""
+        """Return a message type's name in the form of this ROS version."""
         return ros2_type(type_name) if self.ros_version == 2 else ros1_type(type_name)
 
     def filler(self, type_name: str) -> Filler | None:
@@ -102,7 +102,7 @@ class MessageDefinitions:
         return self._fillers[name]
 
     def fields(self, name: str) -> Mapping[str, tuple[str, int]]:
-        """Return the types of a known message's fields or of their elements, and their lengths, as `element_of`."""
+        """Return the type and length of each field of a known message, as `element_of` gives them."""
         if name in TIMES:
             return dict.fromkeys(_TIME_FIELDS[self.ros_version], ("uint32", -1))
         store, known = self._known(name)

@@ -27,7 +27,7 @@ class Dispatcher:
         # The clients whose outboxes hold messages for their throttles.
         self.throttled: set[Client] = set()
         self.deadline = inf
-        """When the broker must be woken at the latest (monotonic seconds): for a throttle, a call or a fragment."""
+        """Time at which the broker must be woken (monotonic seconds): for a throttle, a call or a fragment."""
         self.work = 0
         """Units of work in the current turn (see `bridge.hub.broker.TURN_WORK`)."""
 
@@ -61,7 +61,7 @@ class Dispatcher:
         self.mark_ready(client)
 
     def as_png(self, payload: bytes) -> bytes:
-        """Return an operation as a picture, or unchanged if that is too large, which is rare: no answer may be lost."""
+        """Return an operation as a picture, or unchanged if the picture is too large, because no answer may be lost."""
         wrapped = as_png(payload)
         return wrapped if len(wrapped) <= self._limits.message_bytes else payload
 
@@ -95,7 +95,7 @@ class Dispatcher:
         return min((client.outbox.deadline for client in self.throttled), default=inf)
 
     def send_status(self, client: Client, sentence: str, operation_id: object, now: float) -> None:
-        """Send a status message about an error, and drop the oldest of a client that does not read."""
+        """Send a status message about an error; if the client does not read, the oldest ones are dropped."""
         status: dict[str, object] = {"op": "status", "level": "error", "msg": sentence}
         if isinstance(operation_id, str | int) and not isinstance(operation_id, bool):
             status["id"] = operation_id
@@ -114,5 +114,5 @@ class Dispatcher:
 
 
 def fragment_size_of(requested: float) -> int:
-    """Return the size of fragments for the requested one; 0 means whole messages."""
+    """Return the fragment size to use when a client requests this one; 0 means whole messages."""
     return max(int(requested), SMALLEST_FRAGMENT) if requested else 0

@@ -56,7 +56,7 @@ class OutgoingMessage:
     data: bytes
     """The message as JSON."""
     _parsed: dict[str, Any] | None
-    """The same, or None if it was not parsed yet."""
+    """The parsed message, or None if it was not parsed yet."""
     _type: str
     """Its type, or the empty string."""
     _time_ns: int
@@ -109,7 +109,7 @@ class OutgoingMessage:
 
 @lru_cache(maxsize=1024)
 def _cbor_prefix(name: str) -> bytes:
-    """Return the bytes before the CBOR of a message of topic `name`: a map of three without its last value."""
+    """Return the bytes before the CBOR of a message of topic `name`: a map of three entries, up to the last value."""
     import cbor2
 
     return b"\xa3" + b"".join(map(cbor2.dumps, ("op", "publish", "topic", name, "msg")))

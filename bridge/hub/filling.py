@@ -2,8 +2,8 @@
 
 The reference server builds a ROS message from the JSON and forwards that (`_to_object_inst` in
 rosbridge_library/internal/message_conversion.py): an absent field has the message's default, and the stamp of a
-`std_msgs/Header` without one is the time of receipt. So is that of an absent header, as the specification says
-(ROSBRIDGE_PROTOCOL.md, 3.3.3). Unlike the reference server, the hub does not check present values.
+`std_msgs/Header` without one is the time of receipt. An absent header gets the same stamp, as the specification
+says (ROSBRIDGE_PROTOCOL.md, 3.3.3). Unlike the reference server, the hub does not check present values.
 
     {"op":"publish","topic":"/t","msg":{"data":[1.5]}}                                     as received
     {"op":"publish","topic":"/t","msg":{"data":[1.5],"layout":{"dim":[],"data_offset":0}}} as forwarded
@@ -60,11 +60,11 @@ class Filler:
         self.count = -1 if is_time else len(defaults)
 
     def named(self, values: list[Any]) -> dict[str, Any]:
-        """Return the message with these values in the order of the fields, as arguments of services may be given."""
+        """Return a message from values in the order of its fields; arguments of services may be such a list."""
         return dict(zip(self._defaults, values, strict=False))
 
     def fill(self, message: dict[str, Any], room: int) -> bytes | None:
-        """Fill the absent fields of a message in place; a value of another type than its field's stays.
+        """Fill the absent fields of a message in place; values of a wrong type are kept.
 
         Args:
             message: The message.
@@ -75,7 +75,7 @@ class Filler:
             is empty if nothing was absent, and None if the message must be written again.
 
         Raises:
-            RefusedOperationError: They would grow by more.
+            RefusedOperationError: The parts would grow by more than `room`.
         """
         if len(message) == self.count:
             return None if self.parts and _fill_parts(self.parts, message, room) else b""

@@ -37,7 +37,7 @@ class Client:
     calls: set[str] = field(default_factory=set)
     """Keys of the calls that the client made and that are not answered yet."""
     requests: set[str] = field(default_factory=set)
-    """Keys of the calls that the client has yet to answer."""
+    """Keys of the calls that the client must answer."""
     actions: set[str] = field(default_factory=set)
     """Absolute names of the actions that the client offers."""
     goals: dict[OperationId, str] = field(default_factory=dict)
@@ -111,7 +111,7 @@ class TopicSubscription:
     typed: bool = False
     """True if the client named a type, which becomes the type of the topic."""
     options: dict[OperationId, SubscribeOptions] = field(default_factory=dict)
-    """Options by operation; the least of each applies, as on the reference server."""
+    """Options by operation; the smallest value of each applies, as on the reference server."""
 
 
 @dataclass(eq=False, slots=True)
@@ -123,7 +123,7 @@ class Topic:
     largest: int
     """Maximum bytes of a message as JSON, so that it fits into an operation of the largest size."""
     type: str = ""
-    """Type as this hub's ROS version writes it; empty until a client names it."""
+    """Type in the form of this hub's ROS version; empty until a client names it."""
     advertisements: dict[Client, Advertisement] = field(default_factory=dict)
     subscriptions: dict[Client, TopicSubscription] = field(default_factory=dict)
     latching: bool = False

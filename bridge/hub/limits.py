@@ -61,7 +61,7 @@ class HubLimits:
         advertisements_per_client: Open advertise operations (topic and id) of one client.
         subscriptions_per_client: Open subscribe operations (topic and id) of one client.
         services_per_client: Services that one client offers, and as many actions.
-        calls_per_client: Open calls that one client made, and as many that it has yet to answer.
+        calls_per_client: Open calls that one client made, and as many that it must answer.
         goals_per_client: Open goals that one client sent, and as many that it executes.
         call_timeout: A call without an answer fails after this time; a client may request less.
         queue_length: Messages of a topic queued for a slow client that did not request a length, oldest

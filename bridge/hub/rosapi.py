@@ -50,7 +50,7 @@ class Rosapi:
     def __init__(
         self, graph: Graph, limits: HubLimits, definitions: MessageDefinitions, wall_clock: Callable[[], int]
     ) -> None:
-        """_Answer about `graph`; `wall_clock` returns nanoseconds since 1970."""
+        """Serve questions about `graph`; `wall_clock` returns nanoseconds since 1970."""
         self._graph = graph
         self._limits = limits
         self._definitions = definitions
@@ -97,7 +97,7 @@ class Rosapi:
         return service.startswith(PREFIX) and service.removeprefix(PREFIX) in self._services
 
     def call(self, service: str, args: object) -> Values:
-        """_Answer one call of a service for which `offers` returned true, and return the answer's `values`.
+        """Answer one call of a service for which `offers` returned true, and return the answer's `values`.
 
         `args` is an object, or a list in the order of the service's fields; an omitted field is an empty
         string, as in ROS.
@@ -119,7 +119,7 @@ class Rosapi:
         return answer(*given)
 
     def service_type_name(self, type_name: str) -> str:
-        """Return a service type's name as this ROS version writes it."""
+        """Return a service type's name in the form of this ROS version."""
         return ros2_type(type_name, "srv") if self.ros_version == 2 else ros1_type(type_name)
 
     # --- topics

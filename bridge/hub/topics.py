@@ -165,7 +165,7 @@ class Topics:
     def _deliver(
         self, topic: Topic, parsed: dict[str, Any], payload: bytes, prefix: bytes, now: float
     ) -> None:
-        """Deliver a message, which is in `payload` as JSON, after a prefix and before a brace."""
+        """Deliver a message; `payload` is its JSON between `prefix` and a closing brace."""
         begin, dispatcher, subscriptions = len(prefix), self._dispatcher, topic.subscriptions
         size = len(payload) - begin - 1
         # Rewriting can lengthen a message (1e15 becomes 1000000000000000.0).

@@ -150,14 +150,14 @@ class WebSocketTransport(asyncio.Protocol):
             self._transport.write(data)
 
     def count_unread(self, size: int) -> None:
-        """Count bytes that the peer has caused, and end the connection if it reads none of very many."""
+        """Count bytes of answers to the peer, and end the connection if very many remain unread."""
         self._unread = self._unread + size if self.paused else 0
         if self.never_reads:
             self.abort()
 
     @property
     def never_reads(self) -> bool:
-        """True if the connection was ended because the peer read none of very many answers."""
+        """True if the connection was ended because very many answers remained unread."""
         return self._unread > _MAX_UNREAD * self._max_size
 
     def ping(self) -> None:
@@ -186,7 +186,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Write everything sent inside the block at once at its end."""
+        """At the end of the block, write everything sent inside it at once."""
         if self._held is not None:
             yield
             return
@@ -296,7 +296,7 @@ class WebSocketTransport(asyncio.Protocol):
             self._read_turn(data, at)
 
     def _read_turn(self, data: bytes, at: int) -> None:
-        """Handle bytes for one turn, and the rest after other tasks had their turn."""
+        """Handle as many bytes as one turn allows, and the rest after other tasks had their turn."""
         at = self._read(data, at)
         if at < len(data) or self._postponed or self.is_blocked:
             self._interrupt(data, at)

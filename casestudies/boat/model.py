@@ -29,7 +29,7 @@ TURN = 360
 def model(
     width: int = 32, height: int = 32, distance_step: int = 1, bearing_step: int = 1, array: bool = False
 ) -> Model:
-    """Return the boat's model; a cell's likelihood is that of its centre.
+    """Return the boat's model; the likelihood of a cell is that of its centre.
 
     Args:
         width: Cells along x; the thesis ran 32 and describes 64.

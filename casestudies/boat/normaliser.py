@@ -39,7 +39,7 @@ def normalise_bearing(raw: float) -> int:
 
 
 def normalise(raw: tuple[float, ...]) -> tuple[int, ...]:
-    """Return the machine's readings for raw ones in the order of `SENSOR_NAMES`."""
+    """Return the machine's readings for raw readings, both in the order of `SENSOR_NAMES`."""
     return tuple(
         normalise_distance(value) if is_distance(name) else normalise_bearing(value)
         for name, value in zip(SENSOR_NAMES, raw, strict=True)

@@ -17,7 +17,7 @@ from terminal.errors import OutputError
 
 
 class StageKind(StrEnum):
-    """The parts of the system that the thesis measured, and the host's sockets, which it did not measure."""
+    """The parts of the system that the thesis measured, and the host's sockets, which it did not."""
 
     ROSBRIDGE = "rosbridge"
     HOST = "between the host's processes"
@@ -54,7 +54,7 @@ _STAGES: Final[tuple[tuple[str, StageKind, Callable[[Instance], float | None]], 
 
 
 def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
-    """Return the stages in order, without those that no published frame reports.
+    """Return the stages in order, except those that no published frame reports.
 
     `rosbridge out` is measured here, from the sending of a result to its arrival; the others come from
     `/bm/frame`.
@@ -84,7 +84,7 @@ _PART_COLOURS: Final = {
 _TRUTH_COLOUR: Final = "#ff4d4d"
 _DPI: Final = 130
 _EDGE: Final = 0.2
-"""Share of the map's width, at each edge, in which a label is not centred."""
+"""Share of the map's width at each edge; within it, labels are not centred."""
 
 
 def check_pictures_possible() -> None:
@@ -97,7 +97,7 @@ def check_pictures_possible() -> None:
 
 
 def far_apart(instances: Iterable[Instance], count: int = POSITIONS_SHOWN) -> tuple[Instance, ...]:
-    """Return results whose true positions lie far from each other, in the order of time.
+    """Return results whose true positions are far from each other, in the order of time.
 
     The first result is chosen, then repeatedly the one furthest from all those chosen. Results without a
     truth are used only if there are no others.

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
 KEPT: Final = 2000
-"""Number of frames kept for pictures and numbers by a viewer that runs until Ctrl-C."""
+"""Number of frames that a viewer keeps for pictures and numbers if it runs until Ctrl-C."""
 HEADING: Final = "frame     true y, x     mean y, x  distance     cycles   time (ms)"
 
 

@@ -1,4 +1,4 @@
-"""Conversion of the downloaded data set into CSV files of the seconds in which a robot hardly moved.
+"""Conversion of the downloaded data set into CSV files, with a line for each second in which a robot hardly moved.
 
 python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR
 """
@@ -24,12 +24,12 @@ from terminal.errors import OutputError
 from terminal.output import check_writable, warn
 
 LARGEST_FILE: Final = 1 << 28
-"""Size limit of a file, in bytes; the largest of the data set has some 20 million."""
+"""Maximum size of a file in bytes; the largest file of the data set has about 20 million."""
 LEAST_LANDMARKS: Final = 3
 MOST_MOVED_M: Final = 0.12
 WINDOW_S: Final = 1.0
 _REFERENCE_GAP_S: Final = 0.2
-"""Time in seconds beyond which two positions are not interpolated."""
+"""Maximum time in seconds between two positions to interpolate between them."""
 _REFERENCE_STD_M: Final = 0.001
 """Precision of the motion capture in metres, from the data set's page."""
 _SUBJECTS: Final = range(1, 21)
@@ -78,7 +78,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """One second of a track: its middle, the reference pose then, and each landmark's median sighting."""
+    """One second of a track: its middle, the reference pose at that time, and the median sighting of each landmark."""
 
     time: float
     x: float
@@ -94,7 +94,7 @@ def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[
         Each line's place, for error messages, and its numbers.
 
     Raises:
-        DataFileError: The file cannot be read, or a line does not hold these numbers.
+        DataFileError: The file cannot be read, or a line does not contain these numbers.
     """
     try:
         if stat.S_ISFIFO(path.stat().st_mode):  # opening it would block until something writes to it
@@ -262,7 +262,7 @@ def _write(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) ->
 
 
 def robots_in(folder: Path) -> list[int]:
-    """Return the robots that the folder has measurements of, or raise a DataFileError."""
+    """Return the robots whose measurements are in the folder, or raise a DataFileError."""
     found = sorted(
         int(match[1])
         for path in folder.glob("Robot*_Measurement.dat")

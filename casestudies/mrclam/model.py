@@ -1,7 +1,7 @@
 """The robot's model: P(range | cell) and P(bearing | cell) for each landmark, with an outlier floor.
 
-Column order range_6, bearing_6, range_7, bearing_7, ... for the landmarks of the file in its order; line = y *
-width + x from the lower left corner. Readings of a landmark that is not seen are missing.
+Columns are range_6, bearing_6, range_7, bearing_7, ... for the landmarks in the order of the file; line = y * width
++ x from the lower left corner. Readings of a landmark that is not seen are missing.
 `unquantised_posterior` fuses the same readings in float64, without bins, codes or counts, as a reference.
 """
 
@@ -74,7 +74,7 @@ def model(
         fit: The file that `toolchain fit` learned from a recording, instead of sigmas and floors set by hand.
 
     Raises:
-        ModelError: The file does not hold landmarks, or a size is not positive.
+        ModelError: The file does not contain landmarks, or a size is not positive.
     """
     if bearing_values < 1:
         raise ModelError(
@@ -128,7 +128,7 @@ def unquantised_posterior(
 ) -> NDArray[np.float64]:
     """Return the posterior over the cells, float64[width * height] with line = y * width + x.
 
-    There is one reading for each landmark, in the same order. An outlier's density is the floor everywhere,
+    There is one reading for each landmark, in the same order. The density of outliers is the floor everywhere,
     relative to the peak. Without a floor, readings that are impossible on every line raise a ModelError.
     """
     y, x = cell_centres(interval("y", *Y_LIMITS, cells=height), interval("x", *X_LIMITS, cells=width))

@@ -102,7 +102,7 @@ def sightings_message(frame: RecordedFrame, header: Mapping[str, Any]) -> dict[s
 
 
 def _landmarks(path: Path, columns: Sequence[str]) -> tuple[int, ...]:
-    """Return the landmarks that the file has columns for."""
+    """Return the landmarks for which the file has columns."""
     landmarks = tuple(int(match[1]) for column in columns if (match := _SIGHTING_COLUMN.fullmatch(column)))
     wanted = [*_REFERENCE_COLUMNS, *(f"bearing_{landmark}_rad" for landmark in landmarks)]
     missing = [column for column in wanted if column not in columns]
@@ -162,14 +162,14 @@ def _number(text: str, where: str, column: str) -> float:
 
 
 LOST_DISTANCE: Final = 9.0
-"""Distance in metres at which a frame without a result is counted: the width of the area."""
+"""Distance in metres that counts for a frame without a result: the width of the area."""
 _REPEAT_S: Final = 1.0
 """Seconds between publications of the first frame, until its result arrives."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlayedFrame:
-    """A recorded frame and its result: the published posterior, or None and why there is none."""
+    """A recorded frame and its result: the published posterior, or None and the reason."""
 
     frame: RecordedFrame
     posterior: "Posterior | None"
@@ -255,7 +255,7 @@ async def _take_turn(
     limit_s: float,
     repeat_s: float,
 ) -> "Instance | None":
-    """Publish a frame until its result arrives and return it, or None after the limit; skip late results of others."""
+    """Publish a frame until its result arrives, and return the result, or None after the limit; skip late results of other frames."""
     from bridge.stamps import header
 
     stamps: set[int] = set()

@@ -1,4 +1,4 @@
-"""Comparison of the VHDL board with the emulated board: both get the same accesses and must answer alike.
+"""Comparison of the VHDL board with the emulated board: both get the same accesses and must give the same answers.
 
     random accesses --+--> AXI4-Lite --> bm1 (GHDL)  --> answers, counters, states of the generators
                       +--> EmulatedBoard             --> the same?
@@ -64,11 +64,11 @@ class SlowKernel:
         return getattr(self.kernel, name)
 
     def start(self, start: Start) -> StopReason:
-        """Run a frame's first cycle; the board continues with `resume`."""
+        """Run the first cycle of a frame; the board continues with `resume`."""
         return self.kernel.start(replace(start, run_until=1) if self.slow else start)
 
     def resume(self, run_until: int, halted: Collection[int] = ()) -> StopReason:
-        """Run a slice's next cycle, or all of it."""
+        """Run the next cycle of a slice, or all of them."""
         return self.kernel.resume(self.kernel.cycles + 1 if self.slow else run_until, halted)
 
 
@@ -191,14 +191,14 @@ class Both:
         self.compare_states()
 
     async def compare_everything(self) -> None:
-        """Compare every implemented word, and the first unimplemented word after each block."""
+        """Compare all implemented words, and the first unimplemented word after each block."""
         for block in rm.BLOCKS:
             for word in range(block.words):
                 if await self.read(block.address + 4 * word) is None and block.address not in _NOT_COMPARED:
                     break
 
     async def wait_for_seeds(self) -> None:
-        """Wait until the generators are loaded, which takes one clock for each after a reset."""
+        """Wait until the generators are loaded after a reset, which takes one clock for each."""
         for _ in range(self.slow.rng_state.size + 8):
             if self.dut.core.seeds_ready.value == 1 and self.dut.rstn_i.value == 1:
                 return
@@ -343,7 +343,7 @@ class Session:
         return drawn
 
     async def write_settings(self) -> None:
-        """Write target, limits and bank, often such that two reasons to stop occur in the same cycle."""
+        """Write target, limits and bank, often such that two stop reasons occur in the same cycle."""
         p, both = self.parameters, self.both
         target = int(
             self.random.choice(
@@ -566,7 +566,7 @@ class Session:
 
 @cocotb.test()
 async def same_as_the_emulated_board(dut: Any) -> None:
-    """Run a session, drawn from the case's seed, on both boards."""
+    """Run a session on both boards; it is drawn from the seed of the case."""
     case = random_case(int(os.environ["HDL_SEED"]))
     frames = int(os.environ.get("HDL_FRAMES", FRAMES))
     for channel in ("awvalid", "wvalid", "arvalid", "bready", "rready"):

@@ -40,7 +40,7 @@ _GOOD: Final = {
 
 
 async def verdict_on(dut: Any, **others: int) -> tuple[ErrorCode, bool]:
-    """Return the verdict on the good access with some values changed, and whether the doorbell rings."""
+    """Return the verdict on the access `_GOOD` with some values changed, and whether the doorbell rings."""
     for name, value in (_GOOD | others).items():
         getattr(dut, name).value = value
     await Timer(1, "ns")

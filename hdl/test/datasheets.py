@@ -149,7 +149,7 @@ def page(unit: Unit) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the pages, or with `--check` report those that are out of date."""
+    """Write the pages, or with `--check` report outdated ones."""
     parser = argparse.ArgumentParser(
         prog="scripts/datasheets",
         description="Write purpose, generics and ports of each unit into its datasheet.",

@@ -1,4 +1,4 @@
-"""Synthesis by GHDL and yosys: the hardware of an image as Verilog, and as the logic cells of an FPGA.
+"""Synthesis by GHDL and yosys of an image's hardware: to Verilog, and to the logic cells of an FPGA.
 
 Tables are left out: they are memories, and only the logic around them is counted.
 """

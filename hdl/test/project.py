@@ -68,7 +68,7 @@ def reference_kernel(machine: BM1Machine) -> BM1Kernel:
 
 
 def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -> Image:
-    """Return a board's image of a machine, whose interface has some words more than the machine needs."""
+    """Return a board's image of a machine; its interface has this many words more than the machine needs."""
     used = BM1.registers(machine.parameters)
     inputs, results = used.input_words, used.result_words
     return Image(
@@ -83,7 +83,7 @@ def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -
 
 
 def image_of_parameters(parameters: BM1Parameters) -> Image:
-    """Return a board's image of a machine whose tables are all ones, because synthesis leaves them out."""
+    """Return a board's image of a machine with tables of all ones, because synthesis leaves tables out."""
     from toolchain.outputs.mif import LENGTH
 
     prior, *tables = (

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MOST_CELLS: Final = 450
-"""Maximum number of cells over all replicas, of which a simulator runs some thousand cycles per second.
+"""Maximum number of cells over all replicas; a simulator runs some thousand cycles per second of so many.
 """
 
 _KINDS: Final = (RngKind.LFSR32, RngKind.LFSR16, RngKind.TABLE, RngKind.LFSR24, RngKind.LFSR8)
@@ -131,7 +131,7 @@ def codes(
 
 
 def _numbers(random: np.random.Generator, parameters: BM1Parameters) -> NDArray[np.uint32] | None:
-    """Return a table of random numbers if the machine plays one; its length is seldom a power of two."""
+    """Return a table of random numbers if the machine uses one; its length is seldom a power of two."""
     if parameters.rng is not RngKind.TABLE:
         return None
     length = int(random.choice([1, 2, 17, 64, 199, 500]))

@@ -33,7 +33,7 @@ class Connection:
     """A connection of a host or loader, which begins with the board's challenge or greeting."""
 
     def __init__(self, connection: socket.socket, key: bytes, greeting: bytes) -> None:
-        """Greet, or ask for the proof that the peer has the key, if there is one."""
+        """Send the greeting, or if the board has a key, first a challenge."""
         no_delay(connection)
         if connection.family != socket.AF_UNIX:
             # a host whose machine or cable failed must not hold the board forever
@@ -63,7 +63,7 @@ class Connection:
             self.send(greeting)
 
     def receive(self) -> bool:
-        """Receive once; return False if nothing arrived or the connection is closed, which clears `open`."""
+        """Receive once; return False if nothing arrived, or if the connection is closed (`open` is then False)."""
         try:
             count = self.socket.recv_into(self.decoder.room(), 0, socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -75,7 +75,7 @@ class Connection:
         return self.open
 
     def answer(self, handle: Callable[[Frame], None]) -> None:
-        """Handle all complete frames, and answer refusals with ERROR."""
+        """Handle all complete frames with `handle`, and answer its refusals with ERROR."""
         while self.open:
             sequence = address = 0
             try:
@@ -98,7 +98,7 @@ class Connection:
             self.open = False
 
     def _authenticate(self, frame: Frame) -> None:
-        """Check the peer's proof, and answer with the board's and the greeting."""
+        """Check the peer's proof, and answer with the board's proof and the greeting."""
         answer = bytes(frame.payload)
         nonce, proof = answer[: credentials.NONCE_BYTES], answer[credentials.NONCE_BYTES :]
         expected = credentials.host_proof(self._key, self._nonce, nonce)
@@ -125,7 +125,7 @@ class HostConnection(Connection):
     def __init__(
         self, connection: socket.socket, key: bytes, greeting: bytes, token: bytes, programmed: int
     ) -> None:
-        """Store the token of the greeting, and how often the board was programmed until then."""
+        """Store the token of the greeting, and the number of images loaded so far."""
         super().__init__(connection, key, greeting)
 
         # A loader that shows this token may program the board although this host holds it: it is the same host.

@@ -42,7 +42,7 @@ _CYCLES_MAX: Final = 2**63 - 1  # of registers whose values must fit into a sign
 
 
 class RefusedError(PcieShimError):
-    """The board refuses an access.
+    """Raised when the board refuses an access.
 
     Attributes:
         code: The error code for the host.
@@ -181,9 +181,9 @@ class EmulatedBoard:
             self._allow(BLOCKS[name].address, count, _READ_WRITE)
 
     def _measured_speed(self, image: Image, machine: BoardMachine) -> float:
-        """Return the cycles per second of the slowest frame, whose inputs are left in the registers.
+        """Return the cycles per second of the slowest frame, and leave its inputs in the registers.
 
-        It measures CPU time of the thread, so that other load does not permanently make the board look slow.
+        It measures CPU time of the thread, so that load at this moment does not make the board appear slow for ever.
         """
         host = image.kind.on_host([image.machine])
         settings, blocks = host.begin(host.slowest()).starts[0]
@@ -290,7 +290,7 @@ class EmulatedBoard:
         self._put(rm.CONTROL, 0)
 
     def close(self) -> None:
-        """Do nothing: the board ends with its process."""
+        """Do nothing, because the board ends with its process."""
 
     def _ring(self, doorbell: int, number: int) -> None:
         """Check a doorbell, and run the first chunk."""
@@ -337,7 +337,7 @@ class EmulatedBoard:
             self._run(machine, machine.step, self._chunk_end(machine.cycles))
 
     def _run(self, machine: BoardMachine, chunk: Callable[[int], None], end: int) -> None:
-        """Run one chunk, to cycle `end`; the results are in the registers then, for a host that looks at them."""
+        """Run one chunk, to cycle `end`; then write the results to the registers, where a host may read them."""
         began = time.perf_counter_ns()
         chunk(end)
         elapsed = time.perf_counter_ns() - began

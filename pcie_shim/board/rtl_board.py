@@ -32,8 +32,8 @@ _DETAILS: Final = {
 class RtlBoard:
     """A board like `EmulatedBoard`, whose registers and machine are those of simulated hardware.
 
-    While it is blank, there is no hardware, and an emulated blank board answers. The error of a simulation that
-    ends, hangs or answers garbage is a SimulationError, after which the board is useless.
+    While it is blank, there is no hardware, and an emulated blank board answers. If the simulation ends,
+    hangs or answers garbage, a SimulationError is raised, and the board is unusable from then on.
     """
 
     def __init__(self, simulate: Callable[[Image], Simulation]) -> None:
@@ -177,7 +177,7 @@ class RtlBoard:
             self._refuse(refused, is_first=refused == address)
 
     def _check_extent(self, address: int, count: int) -> None:
-        """Refuse what cannot be requested from the hardware, whose address has the width of the map."""
+        """Refuse an access outside the map, which the hardware's address cannot express."""
         if not count or address >= rm.BAR_SIZE:
             raise RefusedError(ErrorCode.OUTSIDE, f"nothing is at {address:#06x}")
         if address + 4 * count > rm.BAR_SIZE:
@@ -185,7 +185,7 @@ class RtlBoard:
             raise RefusedError(ErrorCode.TOO_LONG, f"{count} words from {address:#06x} on exceed the map")
 
     def _refuse(self, address: int, *, is_first: bool) -> NoReturn:
-        """Refuse an access with the error that the hardware reports for this word of it."""
+        """Refuse an access with the error that the hardware reports for one of its words."""
         status = self._word(rm.STATUS)
         code = ErrorCode((status & rm.STATUS_ERROR_MASK) >> rm.STATUS_ERROR_SHIFT)
         if code is ErrorCode.OUTSIDE and not is_first:

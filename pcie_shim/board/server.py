@@ -70,7 +70,7 @@ class Board(Protocol):
         """Return `count` words from `address` on, little-endian, or raise a RefusedError."""
 
     def write(self, address: int, words: bytes | memoryview) -> None:
-        """Write little-endian words from `address` on; a doorbell among them, taken last, starts the machine.
+        """Write little-endian words from `address` on; a doorbell among them takes effect last, and starts the machine.
 
         Raises:
             RefusedError: The board is busy, or an address or value is invalid.
@@ -417,7 +417,7 @@ def _accepted(listener: socket.socket) -> socket.socket | None:
 
 
 def _has_left(peer: _Peer, handle: Callable[[_Peer, Frame], None]) -> bool:
-    """Handle what a peer has sent so far, and return whether it has disconnected."""
+    """Handle everything that a peer has sent so far, and return whether it has disconnected."""
     while peer.open and peer.receive():
         peer.answer(partial(handle, peer))
     return not peer.open

@@ -22,9 +22,9 @@ MOST_WORDS: Final = 256
 ACCESS_CLOCKS: Final = 8
 """Upper bound of an access in clocks, once the memories are filled."""
 ANSWER_S: Final = 20.0
-"""Seconds for an answer, in addition to ten times those that its clocks usually take."""
+"""Timeout of an answer in seconds, in addition to ten times the usual duration of its clocks."""
 START_S: Final = 600.0
-"""Seconds until the first answer, before which the simulator elaborates the hardware."""
+"""Timeout of the first answer in seconds, because the simulator elaborates the hardware before it."""
 
 _ANSWER: Final = re.compile(rb"([0-9A-Fa-f]) ([0-9A-Fa-f]{8}) ((?:[0-9A-Fa-f]{8})*)")
 _CLOSE_S: Final = 1.0
@@ -40,7 +40,7 @@ class Answer(NamedTuple):
     clocks: int
     """Clocks that the request took."""
     words: bytes
-    """The words that were read before that, little-endian."""
+    """The words that were read before a refusal, little-endian."""
 
 
 class Simulation:
@@ -159,7 +159,7 @@ class Simulation:
         return line
 
     def _ended(self) -> NoReturn:
-        """Fail because the child has closed its pipes."""
+        """Raise the error for a child that has closed its pipes."""
         try:
             code = self._child.wait(_CLOSE_S)
         except subprocess.TimeoutExpired:

@@ -1,4 +1,4 @@
-"""One board of the mini-cluster: its link, the known contents of its registers, its part of a frame."""
+"""A board of the mini-cluster as its host drives it: link, known contents of the registers, part of a frame."""
 
 import select
 import struct
@@ -55,7 +55,7 @@ class DrivenBoard:
     """One board: its link, and the known contents of its registers."""
 
     def __init__(self, index: int, endpoint: Endpoint, image: Image, *, reprogram: bool = False) -> None:
-        """Store the number of the board, its place and image; `reprogram` is that of `MiniCluster.open`."""
+        """Store the board's number, endpoint and image; `reprogram` is the argument of `MiniCluster.open`."""
         self.index = index
         self.endpoint = endpoint
         self.image = image
@@ -216,11 +216,11 @@ class DrivenBoard:
         self._ring(self._changed(blocks), rm.TARGET_COUNT + at, words[at:], _START, end)
 
     def resume(self, blocks: Blocks, end: int) -> None:
-        """Post the next slice of the frame, after these blocks."""
+        """Post the writes of these blocks, and the start of the frame's next slice."""
         self._ring(self._changed(blocks), rm.RUN_UNTIL, b"", _RESUME, end, 0)
 
     def _changed(self, blocks: Blocks) -> list[RegisterWrite]:
-        """Return the blocks to write, which the board is known to have from then on."""
+        """Return the blocks whose contents must be written, and record them as known."""
         writes: list[RegisterWrite] = []
         for name, words in blocks.items():
             if self._blocks.get(name) != words:

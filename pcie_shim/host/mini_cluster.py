@@ -34,7 +34,7 @@ from pcie_shim.programming_file import Image
 SLACK_S: Final = 5.0
 """Seconds that a board may take beyond the time for its cycles at its measured speed."""
 FIRST_WAIT_S: Final = 0.01
-"""Maximum wait in seconds in which only the board that was started last is polled."""
+"""Maximum wait in seconds during which only the board that was started last is polled."""
 PROGRAMMING_S: Final = 30.0
 """Minimum timeout of each step of programming a blank board, in seconds."""
 
@@ -45,9 +45,9 @@ class FrameOutput:
 
     Attributes:
         boards: One result per board, in the order of the partition.
-        register_writes_ns: Posting settings, sensors, starts and resumes.
-        compute_ns: Waiting for the boards, including their computing and the transport.
-        reads_ns: Copying the results.
+        register_writes_ns: Time for posting settings, sensors, starts and resumes.
+        compute_ns: Time of waiting for the boards, which compute and transfer in it.
+        reads_ns: Time for copying the results.
         boards_compute_ns: Computing time of the slowest board, summed over the slices. The rest of
             `compute_ns` is transport, or other boards on the same core.
         slices: Number of slices.
@@ -326,7 +326,7 @@ class MiniCluster:
         raise board_error(board, error) from error
 
     def _make_ready(self) -> None:
-        """Reopen the boards that were interrupted by a failed frame."""
+        """Reopen the boards whose frame was abandoned."""
         while self._interrupted:
             self._open(self._interrupted.pop(), self._timeout)
         for board in self._boards:

@@ -80,7 +80,7 @@ class Done(NamedTuple):
 
 
 _ENDS_S: Final = 1.0
-"""Seconds by which the end of this host's previous link may reach a board on the network after its next link."""
+"""On a network, a board may learn this many seconds too late that this host's previous link has ended."""
 _RETRY_S: Final = 0.02
 _CLOSING_CODES: Final = (ErrorCode.STALE, ErrorCode.HELD, ErrorCode.BAD_FRAME)
 
@@ -128,7 +128,7 @@ class SocketLink:
         """Prove to the board that this host has the key, check the board's proof, and return the greeting's frame.
 
         Raises:
-            KeyRefusedError: One of the two has no key, or another one.
+            KeyRefusedError: One of the two has no key, or the keys differ.
         """
         key = self.endpoint.key
         if frame.operation != framing.AUTHENTICATE:
@@ -220,7 +220,7 @@ class SocketLink:
     # ---- registers ------------------------------------------------------------------------------------
 
     def read32(self, address: int) -> int:
-        """Read one register; a DeviceGoneError where ID reads all ones."""
+        """Read one register; raise a DeviceGoneError if ID reads all ones."""
         (value,) = WORD.unpack(self.read_block(address, 1))
         if value == ALL_ONES and address == register_map.ID:
             self._give_up(
@@ -423,7 +423,7 @@ class SocketLink:
             raise LinkClosedError(f"The link to the board at {self.endpoint} is closed: {self._closed}")
 
     def _limit(self, seconds: float) -> None:
-        """Let the kernel limit blocking calls, which is cheaper than Python's timeouts (a system call each)."""
+        """Set a timeout of blocking calls in the kernel, because Python's timeouts cost a system call each."""
         # 0 microseconds would mean no limit
         value = struct.pack("@ll", *divmod(max(1, round(seconds * 1e6)), 10**6))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)

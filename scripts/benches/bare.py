@@ -1,4 +1,4 @@
-"""A WebSocket client with negligible cost: frames are encoded once, and only counted when received."""
+"""A WebSocket client that costs almost nothing: frames are encoded once, and only counted when received."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ Result = TypeVar("Result")
 
 TYPE = "std_msgs/Float64MultiArray"
 LIMIT = 30.0
-"""Seconds to wait for what a server or client does at once."""
+"""Seconds to wait for an action that a server or client performs at once."""
 
 
 class Bare(asyncio.Protocol):
-    """The client; `on_frames` is called with the number of frames that came, and the last one's payload."""
+    """The client; `on_frames` is called with the number of received frames, and the payload of the last one."""
 
     def __init__(self) -> None:
         self.ready: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -70,7 +70,7 @@ class Bare(asyncio.Protocol):
 
 
 async def soon(awaited: Awaitable[Result], what: str) -> Result:
-    """Wait for an awaitable, for a limited time.
+    """Wait for an awaitable, at most `LIMIT` seconds.
 
     Raises:
         StackError: It did not complete in time.

@@ -38,9 +38,9 @@ TURNS = 3
 IN_FLIGHT = 32
 """Number of messages in flight when servers are compared."""
 WINDOW = {SMALL: 400, LARGE: 100}
-"""Messages by which a receiving client may lag, by their number of values: fewer than the hub would drop."""
+"""Maximum number of messages by which a receiving client may lag, by number of values; the hub drops none yet."""
 COUNTS = {SMALL: (12_000, 12_000, 600), LARGE: (1_000, 2_000, 200)}
-"""Messages to publish, receive and send in round trips per turn, by number of values (50 ms or more)."""
+"""Number of messages per turn to publish, to receive and in round trips, by number of values (50 ms or more)."""
 SERVER_MESSAGES = {"hub": 100_000, "Tornado double": 8_000}
 SERVER_TURNS = 5
 OURS, CBOR = "ours", "ours, CBOR"
@@ -119,7 +119,7 @@ async def client(name: str, uri: str) -> AsyncIterator[Child]:
 
 
 async def published(child: Child, uri: str, topic: str, values: int, number: int) -> tuple[float, float]:
-    """Return the messages per second that the client publishes, and CPU microseconds for each."""
+    """Return the messages per second that the client publishes, and the CPU microseconds per message."""
     async with bare(uri) as counter:
         counter.send(subscribe(topic, queue_length=1000))
         await settled(counter)
@@ -140,7 +140,7 @@ async def published(child: Child, uri: str, topic: str, values: int, number: int
 async def received(
     child: Child, uri: str, topic: str, values: int, number: int, form: str
 ) -> tuple[float, float]:
-    """Return the messages per second that the client receives, and CPU microseconds for each."""
+    """Return the messages per second that the client receives, and the CPU microseconds per message."""
     async with bare(uri) as publisher:
         publisher.send(advertise(topic) + subscribe(f"{topic}/heard"))
         await settled(publisher)
@@ -203,7 +203,7 @@ async def bench() -> int:
 
 
 def show(servers: dict[str, list[float]], found: Figures) -> None:
-    """Print medians and their ratios to the better of roslibpy's transports."""
+    """Print medians, and their ratios to those of the better transport of roslibpy."""
     columns = (OURS, CBOR, *THEIRS)
     table = Table(title="clients on the hub (float64 values in a message; medians)")
     for column in ("values", "", *columns, "ours to roslibpy", "CBOR to roslibpy"):

@@ -1,4 +1,4 @@
-"""Cycle time, from a reading's publication to its result's arrival, compared with an echo's (the floor).
+"""Cycle time, from publishing a reading to the arrival of its result, compared with that of an echo (the floor).
 
 processes  client --reading--> hub --> subscriber -> master -> pcie-app -> 4 boards -> pcie-app -> master -> publisher --> hub --> client
 fused      client --reading--> hub --> master --------------> 4 boards --------------> master -----------------------> hub --> client
@@ -37,12 +37,12 @@ BOUND = 2.5
 WINDOW = 4
 """Number of readings in flight when frames per second are measured."""
 TURN = 50
-"""Readings of one turn, after which another alternative is measured."""
+"""Number of readings in a turn, after which another alternative is measured."""
 FLOOR, STACKS = "floor (echo)", {"processes": BOAT_TOPIC, "fused": BOAT_TOPIC + "_fused"}
 BOAT_FLAGS = ("--loop", "--queue", "all")
 
 Times = defaultdict[str, list[float]]
-"""Microseconds by what was measured."""
+"""Times in microseconds, by name of the measured quantity."""
 
 
 def readings(seed: int, count: int) -> list[dict[str, int]]:
@@ -89,7 +89,7 @@ def cpu_us(pids: list[int]) -> float:
 
 
 class Measured:
-    """The echo or a stack: where readings go and answers come from, and the times of its cycles and their stages."""
+    """The echo or a stack: its topics for readings and answers, and the times of its cycles and their stages."""
 
     def __init__(self, publication: Publication, answers: Subscription, master: int) -> None:
         self._publication, self._answers = publication, answers
@@ -110,8 +110,8 @@ class Measured:
         """Measure the stages of some frames.
 
         The stages on the wire are measured with this client's clock, which the host shares: from the reading's stamp to
-        its receipt by the subscriber, and from the start of the publication to the result's arrival here. Not in the
-        timed turns, because subscribing to /bm/frame is work for the hub and the client.
+        its receipt by the subscriber, and from the start of the publication to the result's arrival here. This is not
+        done in the timed turns, because a subscription to /bm/frame costs the hub and the client time.
         """
         frames = ros.subscribe("/bm/frame", "diagnostic_msgs/DiagnosticArray")
         await ros.call("/rosapi/get_time")  # so that the hub knows the subscription
@@ -129,7 +129,7 @@ class Measured:
         await frames.close()
 
     async def at_full_rate(self, some: list[dict[str, int]]) -> None:
-        """Measure answers per second with WINDOW readings in flight, and the CPU time of each process for them."""
+        """Measure answers per second with WINDOW readings in flight, and the CPU time of each process per answer."""
         before = {command: cpu_us(pids) for command, pids in self._pids.items()}
         started = time.perf_counter()
         for at, reading in enumerate(some):

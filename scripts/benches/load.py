@@ -1,7 +1,7 @@
-"""The hub with hundreds of clients, of which some read slowly or attack it, and `master --loop` at full rate.
+"""The hub with hundreds of clients, some of which read slowly or attack it, and `master --loop` at full rate.
 
-Every message to the hub's clients contains its time of sending, from which subscribers in this process compute its
-delay. The clients are bare sockets and share the machine with the hub, so the figures are those of both.
+Every message to the hub's clients contains its time of sending, so that subscribers in this process can compute its
+delay. The clients are bare sockets, which share the machine with the hub, so the figures include both.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run
 
 TOPICS, PUBLISHERS, SLOW = 200, 50, 50
 RATE, SLOT = 2000, 0.01
-"""Messages per second over all topics, and the seconds in which some of them are published at once."""
+"""Messages per second over all topics, and interval in seconds; the messages of an interval are published at once."""
 PROBE_HZ = 100
 WARM_UP = 200
 """Readings before the first minute."""
@@ -40,9 +40,9 @@ WARM_UP = 200
 
 @dataclass
 class Row:
-    """A phase of the bench: milliseconds of all messages, their number per second, and MiB of the processes.
+    """A phase of the bench: delays of all messages in ms, their number per second, and MiB of the processes.
 
-    The ratios of a phase are those to the first one of its part.
+    Ratios are relative to the first phase of the same part.
     """
 
     part: str
@@ -59,7 +59,7 @@ class Row:
 
 
 def mib_of(*pids: int) -> float:
-    """Return the resident MiB of processes."""
+    """Return the resident memory of processes in MiB."""
     pages = sum(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in pids)
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
@@ -122,13 +122,13 @@ async def crowd(uri: str, hub: int, clients: int, seconds: float) -> list[Row]:
 
 
 class Attack(NamedTuple):
-    """Messages that an attacker sends once and repeatedly, and those of its helpers."""
+    """Messages that an attacker sends once, those that it repeats, and those of its helpers."""
 
     once: bytes = b""
     again: bytes = b""
     pause: float = 0.02
     readers: bytes = b""
-    """Message that twenty other connections send once, before they read all that arrives."""
+    """Message that twenty other connections send once; then they read everything that arrives."""
     reads: bool = True
     silent: int = 0
     """Number of connections that send nothing."""
@@ -183,7 +183,7 @@ async def probed(uri: str, row: Row) -> AsyncIterator[None]:
 
 
 async def attacked(uri: str, hub: int, name: str, seconds: float) -> Row:
-    """Measure two other clients, and the hub's greatest size, during an attack."""
+    """Measure two other clients, and the hub's maximum memory, during an attack."""
     row, attack = Row("under attack", name), ATTACKS[name]
     async with AsyncExitStack() as stack:
         for _ in range(20 if attack.readers else 0):
@@ -210,7 +210,7 @@ async def attacked(uri: str, hub: int, name: str, seconds: float) -> Row:
 
 
 async def minutes_of(uri: str, hub: int, master: int, count: int) -> list[Row]:
-    """Keep some readings of the boat in flight, and measure minute by minute."""
+    """Keep some of the boat's readings in flight, and measure each minute."""
     pids = [hub, *(pid for group in processes_of(master).values() for pid in group)]
     some, rows = readings(1, 1000), []
     async with connect(uri) as ros:

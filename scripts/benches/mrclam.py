@@ -1,4 +1,4 @@
-"""Real robot data through the whole stack: distances of posteriors' means from the reference.
+"""Real robot data through the whole stack: distance between each posterior's mean and the reference.
 
 recording --> player --> hub --> master and its processes, one deployment for both robots --> hub --> player
 """
@@ -28,9 +28,9 @@ from toolchain.models import Model, exact_posterior
 TOPIC, TYPE = "/mrclam/sightings", "mrclam_msgs/Sightings"
 RECORDINGS = ("ds1_robot3.csv", "ds1_robot5.csv")
 BOUND = 1.15
-"""Limit of the stack's median distance, as a multiple of float64 fusion's."""
+"""Limit of the stack's median distance, as a multiple of that of fusion in float64."""
 MAX_CYCLES = 2**22
-"""Cycle limit; in frames with three outliers the best line counts once in 4e5 cycles, more than 2^17."""
+"""Limit of cycles, above 2^17, because in frames with three outliers the best line counts once in 4e5 cycles."""
 
 Figures = dict[str, Any]
 """One robot's run with one model, by column; distances are in metres, the exact ones from float64 inference."""
@@ -39,7 +39,7 @@ Figures = dict[str, Any]
 def exact_distance(
     frame: RecordedFrame, landmarks: tuple[Landmark, ...], cells: int, fitted: Model | None
 ) -> float:
-    """Return the distance of the mean of float64 inference without quantising from the reference."""
+    """Return the distance from the reference to the mean of exact inference (float64, without quantising)."""
     seen = {sighting.landmark: sighting for sighting in frame.sightings}
     posterior: NDArray[np.float64]
     if fitted is None:
@@ -59,7 +59,7 @@ def exact_distance(
 
 
 async def fit(arguments: argparse.Namespace) -> Model:
-    """Return the model with learnt tables, which are first learnt from robot 3 if the file does not exist.
+    """Return the model with the learnt tables in a file; if it does not exist, learn them from robot 3 first.
 
     Raises:
         StackError: The toolchain failed.

@@ -1,4 +1,4 @@
-"""Accounts of readings: each that reached the stack has a result, or is counted with a reason that a fault explains."""
+"""Accounts of readings: each reading that reached the stack has a result, or is counted under a reason that a fault explains."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 from scripts.campaigning.observer import Finding, Flaw, Reading
 
 PASSED_OVER = "passed over"
-"""Reason that needs no fault, but a newer reading that came before the result."""
+"""Reason that no fault has to explain, but a newer reading that arrived before the result."""
 UNUSABLE = "with an unusable variable"
-"""Reason that needs no fault, but a reading with such a variable."""
+"""Reason that no fault has to explain, but a reading with an unusable variable."""
 WITH_PUBLISHER = "lost with the publisher"
 """Reason of results that may have arrived, because the publisher was killed before it confirmed them."""
 WITH_APP, FAILED, ROSBRIDGE_AWAY = "lost with pcie-app", "failed on a board", "rosbridge away"
 NOT_LOST = "on some topics only"
 MOST_IN_TRANSIT = 5
-"""Maximum number of readings, and of results, that a step may cut off between two processes."""
+"""Maximum number of readings, and of results, that may be lost between two processes in a step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +40,12 @@ class Excuses:
 
     Attributes:
         reasons: Reasons under which the stack may count losses.
-        readings: Whether readings may be lost on their way to the master, where no counter can include them (a
+        readings: Whether readings may be lost before the master, whose counters then cannot include them (a
             killed subscriber or master, a cut connection).
-        results: Whether results may be lost so on their way from the publisher.
+        results: Whether results may be lost in the same way after the publisher.
         most: Maximum number of each; higher only if a process or connection was held before.
-        until: Time of publication of the first reading that has a result again. Those before it are either judged
-            by now or lost, because everything keeps its order; those after it have no excuse.
+        until: Time of publication of the first reading that has a result again. Because nothing overtakes, earlier
+            readings are judged by then or lost, and later ones have no excuse.
     """
 
     reasons: frozenset[str] = frozenset()
@@ -56,7 +56,7 @@ class Excuses:
 
 
 def judge(added: Counters, readings: Iterable[Reading], excuses: Excuses) -> list[Finding]:
-    """Compare the master's counters with the readings of the same time, when nothing is in flight."""
+    """Compare the increase of the master's counters with the readings of the same period, when nothing is in flight."""
     findings = []
     given = [each for each in readings if each.forwarded]
     missing = [each for each in given if not each.arrived]

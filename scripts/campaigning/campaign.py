@@ -1,4 +1,4 @@
-"""The campaign: rounds of faults until enough frames are judged (see scripts/campaign)."""
+"""The campaign: rounds of faults, until enough frames are judged (see scripts/campaign)."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from scripts.running.flags import ScriptParser
 from scripts.running.processes import ROOT, Process, run_script
 
 STEPS, CALM = 10, 200
-"""Number of steps in a round, and of results between two of them."""
+"""Number of steps in a round, and of results without faults between two steps."""
 SHORT_CALM = 150
 LIMIT = 24 * 3600.0
 MOST_KIB, MOST_DESCRIPTORS = 32 * 1024, 8
-"""Growth of a process at rest in the second half of a round, when buffers and caches are filled."""
+"""Maximum growth of a process in the second half of a round, when its buffers and caches are full."""
 
 
 async def run(options: argparse.Namespace, folder: Path) -> int:
@@ -79,7 +79,7 @@ async def run(options: argparse.Namespace, folder: Path) -> int:
 
 
 def listed(counts: Counter[str]) -> str:
-    """Return counts for a line."""
+    """Return counts as text."""
     return ", ".join(f"{name} {number}" for name, number in sorted(counts.items()) if number) or "none"
 
 

@@ -36,15 +36,15 @@ _AGAIN = 0.05
 
 @dataclass(slots=True)
 class Weather:
-    """The treatment of data by a proxy.
+    """How a proxy treats data.
 
     Attributes:
         open: Whether data is forwarded; otherwise connections remain open and silent.
         delay: Seconds by which each piece is delayed.
         rate: Bytes per second; 0 for no limit.
-        spoil: Whether a bit of the next piece is changed.
+        spoil: Whether one bit of the next piece is flipped.
         repeat: Whether the last piece is sent again before the next one.
-        cut_inside: Whether the next piece is cut in its middle, and its connection with it.
+        cut_inside: Whether the connection is cut in the middle of the next piece.
         insert: Bytes to send to each client before its next message.
     """
 
@@ -61,7 +61,7 @@ class Weather:
 
 
 class Proxy:
-    """A listener that forwards each connection; `on_reading` may inspect the stream from the server."""
+    """A listener that forwards each connection."""
 
     def __init__(self, listen: str | int, connect: str | int, rng: random.Random) -> None:
         """Store two addresses, each the path of a Unix socket or a port of this machine."""
@@ -93,7 +93,7 @@ class Proxy:
             writer.transport.abort()
 
     def finish(self) -> None:
-        """Close all connections properly, after all their data."""
+        """Close all connections properly, after forwarding all data."""
         for writer in self._writers:
             with contextlib.suppress(OSError, RuntimeError):
                 writer.write_eof()
@@ -155,7 +155,7 @@ class Proxy:
     async def _give(
         self, piece: bytes, former: bytes, writer: asyncio.StreamWriter, *, to_client: bool
     ) -> bool:
-        """Forward a piece according to the weather, and return whether the connection remains."""
+        """Forward a piece according to the weather; return whether the connection remains open."""
         weather = self.weather
         if weather.delay:
             await asyncio.sleep(weather.delay)
@@ -198,10 +198,10 @@ async def _websocket_frame(reader: asyncio.StreamReader) -> bytes:
 
 
 class Client:
-    """A connection to the hub that is restored whenever it is lost."""
+    """A client of the hub that reconnects whenever its connection is lost."""
 
     def __init__(self, port: int, take: Callable[[str, Any], None], lost: Callable[[], None]) -> None:
-        """Store functions to call with messages, by topic, and at the loss of a connection."""
+        """Store the functions that take messages, by topic, and the one to call when the connection is lost."""
         self._uri = f"ws://127.0.0.1:{port}"
         self._take, self._lost = take, lost
         self._connection: ClientConnection | None = None
@@ -219,7 +219,7 @@ class Client:
             await asyncio.gather(self._task, return_exceptions=True)
 
     async def publish(self, stamp: int, values: dict[str, object]) -> None:
-        """Publish a reading, if there is a connection."""
+        """Publish a reading if there is a connection; otherwise drop it."""
         secs, nsecs = divmod(stamp, 10**9)
         message = {"header": {"stamp": {"secs": secs, "nsecs": nsecs}, "frame_id": ""}, **values}
         if self._connection is not None:

@@ -19,7 +19,7 @@ BOARDS = 2
 BANKS = 4
 TARGET, MAX_CYCLES = 127, 1 << 17
 FIRST_SLICE = 256
-"""End of the first slice of a frame; each further slice ends at twice the cycle of the previous one."""
+"""End of the first slice of a frame; each further slice ends at twice the cycle at which the previous one ended."""
 BUILD_OPTIONS = ("--partitions", "2", "--counter-bits", "7", "--rng-banks", "4")
 WORDS = {StopReason.OVERFLOW: "overflow", StopReason.SLICE: "slice", StopReason.MAX_CYCLES: "max cycles"}
 
@@ -29,7 +29,7 @@ POOL: tuple[Addresses, ...] = (
     *((0, 0), (2, 1), (3, 2), (5, 3), (6, 4), (3, None), (None, 2), (None, None)),
     *((4, 1), (5, 1), (6, 1), (0, 3)),  # sensors that contradict each other need several slices
 )
-"""The readings of a campaign; few, because the reference kernel is slow."""
+"""The readings of a campaign, only a few because the reference kernel is slow."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Faults of a campaign: their kinds, the losses that they explain, and seeded schedules."""
+"""Faults of a campaign: kinds of faults, the losses that each explains, and seeded schedules."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from scripts.campaigning.stack import BOARD_NAMES, BOARDS_PARENT, SERVICES, Topo
 
 
 class Kind(StrEnum):
-    """A kind of fault, as named with `--only`."""
+    """A kind of fault, named as in `--only`."""
 
     SIGNALS = "signals"
     ROSBRIDGE = "rosbridge"
@@ -72,9 +72,9 @@ SHORT: tuple[Step, ...] = (
 # --- what a fault explains -------------------------------------------------------------------
 
 ENDS = {"master": 1, "hub": 2, "boards": 3}
-"""Number of times per round that a role may be ended: the fourth failure of a board within a minute ends a master."""
+"""Maximum number of times per round that a board may be ended, because its fourth failure within a minute ends the master."""
 MOST_ENDS = 2
-"""The same for the other roles, and their connections to the master."""
+"""The same for the other roles and for their connections to the master."""
 _ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memory"}
 _FAILS_BOARD = {*_ENDS_LINK, "stop", "hold"}
 _CUTS_ROSBRIDGE = {"gone", "finish", "nonsense", "cut-inside", "files"}
@@ -84,11 +84,11 @@ _REASONS = {
     "master": {PASSED_OVER, ROSBRIDGE_AWAY},
     "hub": {ROSBRIDGE_AWAY},
 }
-"""By ended service, the reasons under which readings are lost."""
+"""Reasons under which readings are lost, by the service that is ended."""
 
 
 def ended_roles(fault: Fault) -> tuple[str, ...]:
-    """Return the roles whose limit of ends a fault uses up by one; a board's failed frame is such an end."""
+    """Return the roles for which a fault counts as an end (see `ENDS`); a failed frame counts as an end of its board."""
     if fault.what == "misbehave":
         return ("boards", "boards")  # it has been killed before
     if fault.target == BOARDS_PARENT and fault.what == "kill":
@@ -114,7 +114,7 @@ def _reasons(fault: Fault, topology: Topology) -> set[str]:
 
 
 def excuses_of(step: Step, topology: Topology, until: float = 0.0) -> Excuses:
-    """Return what a step explains: counted losses, and those of messages that no process had."""
+    """Return the losses that a step explains, both counted ones and those of messages between processes."""
     reasons: set[str] = set()
     readings = results = False
     for fault in step:
@@ -134,7 +134,7 @@ def excuses_of(step: Step, topology: Topology, until: float = 0.0) -> Excuses:
 
 
 class Schedule:
-    """Generator of a round's steps, within the limits of ends that a master tolerates."""
+    """Generator of a round's steps, with at most as many ended processes as a master tolerates."""
 
     def __init__(self, rng: random.Random, topology: Topology, kinds: list[Kind]) -> None:
         """Draw faults of these kinds for a topology from the random generator."""

@@ -1,4 +1,4 @@
-"""Injection of faults into a stack, each of which begins, lasts and is undone."""
+"""Injection of faults into a stack: each begins, lasts for a while, and is undone."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from scripts.campaigning.stack import Stack, Topology, used_by
 from scripts.running.patience import FACTOR
 
 _FEWEST = 3
-"""Limit of descriptors under which a process can open nothing more."""
+"""Limit of descriptors so low that a process cannot open anything more."""
 _STARTS_BEFORE = 20
 _MISBEHAVING = 300.0 * FACTOR
-"""Seconds within which a restarted board must have computed some frames."""
+"""Timeout in seconds for a restarted board to compute some frames."""
 
 
 class Injector:
@@ -29,7 +29,7 @@ class Injector:
     def __init__(
         self, stack: Stack, topology: Topology, clock: Path, publish: Callable[[str, int], Awaitable[None]]
     ) -> None:
-        """Store a file for the clock's offset, and a function that publishes special readings (kind, number)."""
+        """Store the file of the clock's offset, and the function that publishes special readings (kind, number)."""
         self._stack = stack
         self._topology = topology
         self._clock = clock
@@ -38,7 +38,7 @@ class Injector:
         self._killed: set[str] = set()
 
     def steppable_clock(self) -> dict[str, str]:
-        """Return the variables under which processes have a clock that can be stepped."""
+        """Return the environment variables that give processes a clock that can be stepped."""
         self._clock.write_bytes(struct.pack("<q", 0))
         paths = [str(Path(__file__).with_name("clock")), *filter(None, [os.environ.get("PYTHONPATH")])]
         return {"PYTHONPATH": os.pathsep.join(paths), "CAMPAIGN_CLOCK": str(self._clock)}
@@ -79,8 +79,8 @@ class Injector:
     async def _misbehave(self, fault: Fault) -> None:
         """Restart a board that misbehaves once after some frames, and wait until it has done so.
 
-        Each frame starts the board at least once, so it has if another frame fails, or after enough frames that
-        do not, because the host is not disturbed by this misbehaviour.
+        Each frame starts the board at least once. So it has misbehaved if another frame fails, or, if the host
+        tolerates this misbehaviour, after enough frames.
         """
         await self._stack.kill(fault.target)
         await self._stack.wait(fault.target)
@@ -132,7 +132,7 @@ class Injector:
                 await link.start()
 
     async def _limit(self, fault: Fault) -> None:
-        """Limit a process's descriptors or memory, while connections are restored or many readings come."""
+        """Limit a process's descriptors or memory while connections are restored or many readings arrive."""
         pid = await self._stack.pid(fault.target)
         try:
             which, least = resource.RLIMIT_NOFILE, _FEWEST

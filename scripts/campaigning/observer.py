@@ -1,8 +1,7 @@
-"""The observer, which judges each result of the stack without code of the services, sockets or clocks.
+"""The observer, which judges each result of the stack; it uses no sockets, no clocks and no code of the services.
 
-It is informed of the published readings, of those that reached the stack, of faults, and of
-messages on `/bm/frame` and `/BMresults`. It reports everything wrong; counters are judged when nothing is in
-flight (`accounts.py`).
+Its caller reports published readings, readings that reached the stack, faults, and messages on `/bm/frame` and
+`/BMresults`. It records everything that is wrong. Counters are judged when nothing is in flight (`accounts.py`).
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import Any
 from scripts.campaigning.expected import BANKS, BOARDS, LINES, Addresses, Outcome
 
 REMEMBERED = 20_000
-"""Readings by which a repeated result is recognised."""
+"""Number of readings that are stored to recognise a repeated result."""
 DEPLOYMENT = "campaign"
 LAYOUT = {"dim": [{"label": "x", "size": LINES, "stride": LINES}], "data_offset": 0}
 
@@ -33,13 +32,13 @@ class Flaw(StrEnum):
     DUPLICATE = "duplicate"
     OUT_OF_ORDER = "out of order"
     UNREPORTED = "without a report"
-    """A result that no report announced."""
+    """A result arrived that no report had announced."""
     WITHOUT_RESULT = "announced only"
-    """A report that announced a result which did not follow, although nothing cut the connection."""
+    """A report announced a result that did not follow, although nothing cut the connection."""
     UNCOUNTED = "lost without being counted"
     MISCOUNTED = "counted, but not lost"
     UNEXPLAINED = "lost without a cause"
-    """Counted under a reason that no fault in force explains."""
+    """A loss was counted under a reason that no current fault explains."""
     SILENT = "no results"
     """No result came within a generous limit."""
     ENDED = "ended"
@@ -61,13 +60,13 @@ class Reading:
     """A published reading.
 
     Attributes:
-        index: Its place among all readings.
+        index: Its index among all readings.
         addresses: Its addresses; None if it is unusable.
         published: Time of its publication, in seconds of the campaign's clock.
         crowded: Whether the reading before it had no result yet, so that one may replace the other.
         forwarded: Whether all its bytes have been sent to the stack.
-        arrived: Whether its result has come.
-        settled: Whether it is included in counters that were judged.
+        arrived: Whether its result has arrived.
+        settled: Whether it is included in counters that have been judged.
     """
 
     index: int
@@ -92,7 +91,7 @@ class Observer:
     """Judges results in the order of their arrival."""
 
     def __init__(self, expected: Callable[[Addresses, int], Outcome]) -> None:
-        """Store the function from addresses and bank to the correct outcome."""
+        """Store the function that returns the correct outcome for addresses and a bank."""
         self._expected = expected
         # All readings by stamp, except the oldest settled ones.
         self._readings: dict[int, Reading] = {}
@@ -136,7 +135,7 @@ class Observer:
         self._undisturbed = False
 
     def calm(self) -> None:
-        """Record the end of a fault; what it has disturbed may still be in flight until `settle`."""
+        """Record the end of a fault; disturbed frames may still be in flight until `settle`."""
         self.in_fault = False
 
     def reconnected(self) -> None:
@@ -148,11 +147,11 @@ class Observer:
         return stamp in self._readings and self._readings[stamp].arrived
 
     def newest_since(self, index: int) -> Reading | None:
-        """Return the newest reading with a result, if its index is this or higher."""
+        """Return the newest reading with a result, if its index is at least this one."""
         return self._newest if self._newest is not None and self._newest.index >= index else None
 
     def pending_readings(self) -> list[Reading]:
-        """Return the readings since the last `settle`, and older ones that had not reached the stack then."""
+        """Return the readings since the last `settle`, and older ones that had not reached the stack by then."""
         return [each for each in self._readings.values() if not each.settled]
 
     def settle(self) -> None:

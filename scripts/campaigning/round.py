@@ -1,10 +1,11 @@
-"""One round of a campaign: a stack that is subjected to one fault after the other, and judged after each.
+"""One round of a campaign: faults are injected into one stack one after the other, and it is judged after each.
 
     start ─▶ recover ─▶ settle ─▶ calm ─┬▶ inject a step's faults ─▶ recover ─▶ settle ─▶ calm ─┐
                                         └──────────────────────────────────────────────────────┘
 
-`recover` waits for the result of a reading published from then on, `settle` until nothing is in flight, and then judges
-the counters; `calm` wants results without a fault, and settles strictly.
+`recover` waits for the result of a reading that is published after the fault. `settle` waits until nothing is in
+flight, and then judges the counters. `calm` requires results while there is no fault, and then settles without
+excuses.
 """
 
 from __future__ import annotations
@@ -34,13 +35,13 @@ _ANSWER = 0.1 * FACTOR
 _ANSWER_LIMIT = 10.0 * FACTOR
 """The same without a fault, when only one reading is in flight."""
 _RECOVERY_LIMIT = 180.0 * FACTOR
-"""Seconds within which results must come again; generous, and no measure of the stack."""
+"""Timeout in seconds for new results after a fault; generous, because it does not judge the stack's speed."""
 _CALM_LIMIT = 5.0 * FACTOR
-"""Seconds within which a further result must come, on average."""
+"""Seconds within which a further result must arrive, on average."""
 _SETTLE_LIMIT = 30.0 * FACTOR
-"""Seconds until nothing is in flight, even if a board does not answer or the machine is busy."""
+"""Timeout in seconds until nothing is in flight, sufficient even if a board does not answer or the machine is busy."""
 _QUIET = 0.6 * FACTOR
-"""Seconds without a change after which nothing is in flight any more."""
+"""Seconds without a change that show that nothing is in flight."""
 _stamps = count(time.time_ns() // 10**9 * 10**9, 1_000_000)
 now = time.monotonic
 """The campaign's clock, in seconds."""
@@ -53,10 +54,10 @@ class RoundResult:
     findings: list[Finding] = field(default_factory=list)
     frames: int = 0
     steps: int = 0
-    """Number of steps that were taken; the last one led to the findings."""
+    """Number of steps that were taken; the last one led to the findings, if any."""
     losses: Counter[str] = field(default_factory=Counter)
     recoveries: list[tuple[float, str]] = field(default_factory=list)
-    """Seconds until results arrived again after a step's end, which are only reported, and the step."""
+    """Seconds from a step's end to the next result, and the step; they are only reported."""
     resources: dict[tuple[str, int], list[tuple[int, int]]] = field(default_factory=dict)
     """By role and process: resident KiB and descriptors after each step."""
     words: str = ""
@@ -106,7 +107,7 @@ class Round:
         return dict(zip(("near", "far"), self._last, strict=True))
 
     async def _drive(self) -> None:
-        """Publish readings, each after the result of the previous one has arrived or is late."""
+        """Publish readings, each when the result of the previous one has arrived or is late."""
         while True:
             if self._paused or not self._client.connected.is_set():
                 await asyncio.sleep(0.01)
@@ -146,7 +147,7 @@ class Round:
     # --- a round -------------------------------------------------------------------------------
 
     async def run(self, steps: list[Step]) -> RoundResult:
-        """Run all steps, or up to the first one with findings."""
+        """Run the steps, up to the first one with findings."""
         result, observer = self._result, self.observer
         if any(fault.kind is Kind.CLOCK for step in steps for fault in step):
             self.stack.environment |= self._injector.steppable_clock()
@@ -231,7 +232,7 @@ class Round:
         self._paused = False
 
     async def _calm(self) -> None:
-        """Compute frames without faults, settle strictly, and sample the processes' resources."""
+        """Compute frames without faults, settle without excuses, and sample the processes' resources."""
         observer = self.observer
         observer.calm()
         wanted = observer.results + self._calm_frames

@@ -23,15 +23,15 @@ from scripts.running.processes import Process
 SERVICES = ("subscriber", "publisher", "pcie-app")
 BOARD_NAMES = tuple(f"board{at}" for at in range(BOARDS))
 BOARDS_PARENT = "boards"
-"""The process from which a master's boards are forked."""
+"""Role of the process from which a master's boards are forked."""
 START_LIMIT, END_LIMIT = 120.0 * FACTOR, 30.0 * FACTOR
-"""Seconds until a process must have started or ended, even on a busy machine."""
+"""Timeouts in seconds for a process to start and to end, even on a busy machine."""
 BOARD_TIMEOUT = 2.0 * FACTOR
-"""Seconds that a board may take; short, because some faults silence boards."""
+"""Timeout of a board in seconds; short, because some faults silence boards."""
 
 
 class Topology(StrEnum):
-    """The starter of the processes, which determines the places of proxies."""
+    """Who starts the processes, and so where the proxies are."""
 
     OWN = "processes"
     """The master starts services and boards; a proxy stands between them and rosbridge."""
@@ -59,7 +59,7 @@ class Topology(StrEnum):
 
     @property
     def own_parts(self) -> tuple[str, ...]:
-        """Roles whose processes the campaign starts, in order."""
+        """Roles whose processes the campaign starts, in the order of starting."""
         services = SERVICES if self is Topology.APART else ()
         return ("hub", *(BOARD_NAMES if self.apart else ()), *services, "master")
 
@@ -69,7 +69,7 @@ class NotThereError(Exception):
 
 
 def free_port() -> int:
-    """Return a port that is free, as is the next one."""
+    """Return a free port whose next one is free too."""
     while True:
         with socket.socket() as probe, socket.socket() as following, contextlib.suppress(OSError):
             probe.bind(("127.0.0.1", 0))
@@ -250,7 +250,7 @@ def used_by(pid: int) -> tuple[int, int, int]:
 
 
 def _stat(pid: int) -> list[str]:
-    """Return the state and the parent of a process and more, as in /proc; those of a zombie if it has ended."""
+    """Return the fields of /proc/PID/stat from the state and the parent on; those of a zombie if the process has ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     except OSError:

@@ -1,4 +1,4 @@
-"""The demo: processes that are started in order and ended together (see scripts/demo)."""
+"""The demo: its processes are started in order and ended together (see scripts/demo)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The flags of the scripts, whose help has the style of the commands: NUMBER, a|b, [default: 10]."""
+"""The flags of the scripts; their help has the style of the commands: NUMBER, a|b, [default: 10]."""
 
 import argparse
 from pathlib import Path
@@ -11,7 +11,7 @@ _KINDS: dict[Any, str] = {int: "NUMBER", float: "NUMBER", Path: "FILE"}
 
 
 class ScriptParser(argparse.ArgumentParser):
-    """A parser that shows kinds of values and defaults by itself; `shown` is a default that the code computes."""
+    """A parser that adds kinds of values and defaults to the help; `shown` is a default that the code computes."""
 
     def add_argument(self, *names: str, shown: str = "", **options: Any) -> argparse.Action:
         """Add a flag or an argument; see `argparse`."""

@@ -1,6 +1,6 @@
-"""The one factor that scales every limit of the scripts: TEST_PATIENCE, 1 unless the environment sets it.
+"""The factor that scales all time limits of the scripts: TEST_PATIENCE, 1 unless the environment sets it.
 
-No check judges how long something takes. A limit only ends a wait for what never comes, so all are generous.
+No check judges how long something takes. A limit only ends a wait for an event that never comes, so all are generous.
 """
 
 from __future__ import annotations
@@ -15,4 +15,4 @@ PRODUCT_LIMITS: Final = {
     "BM_SEEN_TIMEOUT": 10 * FACTOR,
     "BM_RESTART_WINDOW": 60 * FACTOR,
 }
-"""The environment in which stacks are checked, so that a slow machine is not taken for a dead peer."""
+"""Environment variables for the checked stacks, so that a slow machine is not mistaken for a dead peer."""

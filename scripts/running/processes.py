@@ -22,12 +22,12 @@ from toolchain.errors import ToolchainError
 
 ROOT = Path(__file__).resolve().parents[2]
 SILENCE = 1.5
-"""Seconds of silence, after which a `Screen` shows that the work goes on."""
+"""Seconds without a line after which a `Screen` shows that the work continues."""
 BOAT_TOPIC, BOAT_TYPE = "/boat/sensors", "boat_msgs/Sensors"
 
 
 class Process:
-    """One process of a script, whose lines go to a log, and to `show` if they are meant for the screen."""
+    """One process of a script; its lines go to a log, and also to `show` if they are meant for the screen."""
 
     def __init__(self, name: str, log: Path, *, show: Callable[[str], None] | None = None) -> None:
         self.name = name
@@ -75,7 +75,7 @@ class Process:
         """Wait for a line that matches.
 
         Raises:
-            StackError: The process ended before it printed one.
+            StackError: The process ended before it printed such a line.
         """
         seen = 0
         while True:
@@ -128,10 +128,10 @@ class Process:
 
 
 class Screen:
-    """The lines of a script and, during silence, the work that it waits for.
+    """The lines of a script, and while there are none, the work that it waits for.
 
-    On a terminal that is one line with the time so far, which the next line replaces. Elsewhere it is a line for each
-    work, followed by dots.
+    On a terminal, the work is one line with the time so far, which the next line replaces. Elsewhere it is a line
+    followed by dots.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""All tests, one kind after the other (see scripts/test)."""
+"""The runs of all tests, one kind after the other (see scripts/test)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from scripts.running.processes import ROOT
 
 FLAKY_MOST = 2
-"""Number of tests with processes that may fail once and pass when they are run again, alone."""
+"""Maximum number of tests with processes that may fail once, and pass when they are run again alone."""
 
 
 def pytest(*arguments: str) -> tuple[int, list[str]]:
@@ -24,7 +24,7 @@ def pytest(*arguments: str) -> tuple[int, list[str]]:
 
 
 def main() -> int:
-    """Run all kinds, print what failed last, and return the exit code."""
+    """Run all kinds, print the failures at the end, and return the exit code."""
     kinds = [
         ("tests without processes", ("-m", "not process and not thorough", "-n", "2", "--dist", "worksteal")),
         ("tests with processes", ("-m", "process and not thorough")),
@@ -33,7 +33,7 @@ def main() -> int:
         kinds.append(("thorough tests", ("-m", "thorough", "-n", "2", "--dist", "worksteal")))
     failed: list[str] = []
     once: list[str] = []
-    """Tests with processes that failed; a wait that another program has spoiled does not fail twice."""
+    """Tests with processes that failed once; they run again, because a disturbance by another program does not recur."""
     for name, flags in kinds:
         print(f"-- {name}", flush=True)
         code, names = pytest(*flags, "--durations", "10")

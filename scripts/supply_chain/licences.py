@@ -15,7 +15,7 @@ RULES = tomllib.loads(Path(__file__).with_name("licences.toml").read_text(encodi
 
 
 def licence_of(component: dict[str, Any]) -> str:
-    """Return a component's licence: what a person read in the package, or what its metadata say."""
+    """Return a component's licence, from licences.toml if a person has read it in the package, otherwise from its metadata."""
     stated = [
         each.get("expression")
         or each["license"].get("id")
@@ -26,7 +26,7 @@ def licence_of(component: dict[str, Any]) -> str:
 
 
 def is_allowed(licence: str) -> bool:
-    """Return whether one choice of the licences of an SPDX expression is allowed."""
+    """Return whether an SPDX expression permits a choice of allowed licences."""
     if SPDX.validate(licence).errors:
         return False
     parsed = SPDX.parse(licence)

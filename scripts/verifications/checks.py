@@ -1,4 +1,4 @@
-"""Verdicts and counts, common to the verifications."""
+"""Verdicts and counts, shared by the verifications."""
 
 from __future__ import annotations
 
@@ -43,6 +43,6 @@ class Tally:
         sys.stdout.flush()
 
     def end(self) -> int:
-        """Print the counts, and return the exit code: 1 also if a flag selected nothing."""
+        """Print the counts, and return the exit code, which is also 1 if a flag selected nothing."""
         print(f"{self.passed} passed, {self.failed} failed")
         return 1 if self.failed or not self.passed else 0

@@ -40,7 +40,7 @@ from toolchain.hardware.simulation import Simulator
 SESSIONS: Final = 60
 """Number of random machines in the matrix."""
 BOARD: Final = 1
-"""The partition of the boat that is simulated: 256 lines, in the middle of the map."""
+"""The board of the boat that is simulated: 256 lines in the middle of the map."""
 _COMPILING_S: Final = 1200.0
 _ENDING_S: Final = 30.0
 _ANSWER_S: Final = 120.0
@@ -51,7 +51,7 @@ _BIN: Final = Path(sys.executable).parent
 
 
 def boat_failure(engine: str, count: int) -> str | None:
-    """Run frames on emulated boards, and with one of them simulated; return why they differ, or None."""
+    """Run frames on emulated boards, and again with one of them simulated; return why the results differ, or None."""
     source = ("--uri", "ws://localhost:9090", "--topic", "/boat", "--type", "boat_msgs/Sensors")
     boat = ROOT / "casestudies" / "boat"
     with tempfile.TemporaryDirectory(prefix="hdl-boat-") as where:
@@ -92,7 +92,7 @@ def boat_failure(engine: str, count: int) -> str | None:
 
 
 def _frames(image: Image, count: int) -> list[FrameInput]:
-    """Return frames, each with the most likely readings of a line of this board; in some, one is missing."""
+    """Return frames, each with the most probable readings of a line of this board; in some, one reading is missing."""
     machine = image.machine
     frames = []
     for at in range(count):
@@ -107,7 +107,7 @@ def _frames(image: Image, count: int) -> list[FrameInput]:
 
 @contextlib.contextmanager
 def _board(*flags: str) -> Iterator[None]:
-    """Run the command `board` until the end of the block, which begins when it listens."""
+    """Run the command `board` during the block, which begins when the board listens."""
     process = subprocess.Popen([str(_BIN / "board"), *flags], stderr=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
@@ -128,7 +128,7 @@ def _board(*flags: str) -> Iterator[None]:
 def _outcomes(
     endpoints: Sequence[str], images: Sequence[Image], frames: Sequence[FrameInput]
 ) -> tuple[list[list[tuple[bytes, int, int]]], float]:
-    """Return counts, cycles and reason of each board in each frame, and the seconds of all frames."""
+    """Return counts, cycles and reason of each board in each frame, and the duration of all frames in seconds."""
     with MiniCluster.open(endpoints, images, timeout=_ANSWER_S, slack=_ANSWER_S) as cluster:
         cluster.run(frames[0])  # the first frame also warms up
         began = time.monotonic()
@@ -141,7 +141,7 @@ def _outcomes(
 
 
 def _speed(endpoint: str) -> int:
-    """Return a board's own measurement of its cycles per second."""
+    """Return a board's cycles per second, as measured by the board."""
     with SocketLink.open(parse_endpoint(endpoint), timeout=_ANSWER_S) as link:
         return link.read32(register_map.CAP_SPEED)
 

@@ -1,4 +1,4 @@
-"""Software of others that verifications need: packages of PyPI and npm, pinned by hash, and programs of Debian."""
+"""Installation of other software for verifications: packages of PyPI and npm, pinned by hash, and programs of Debian."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def run(*command: str | Path, cwd: Path | None = None) -> None:
 
 
 def cached(name: str, locks: tuple[Path, ...], make: Callable[[Path], None]) -> Path:
-    """Return the folder that `make` has filled for these lock files, in $XDG_CACHE_HOME/rosbayes."""
+    """Return the folder in $XDG_CACHE_HOME/rosbayes for these lock files, after `make` has filled it once."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache").absolute() / "rosbayes"
     digest = hashlib.sha256(sys.version.encode() + b"".join(lock.read_bytes() for lock in locks))
     folder = home / f"{name}-{digest.hexdigest()[:12]}"
@@ -70,7 +70,7 @@ def make_environment(folder: Path, lock: Path) -> None:
 
 
 def pip(folder: Path) -> tuple[str | Path, ...]:
-    """Return the beginning of a command of the pip in `folder`/venv."""
+    """Return the command line of the pip in `folder`/venv, without its arguments."""
     return folder / "venv" / "bin" / "python", "-m", "pip", "-q", "--disable-pip-version-check"
 
 
@@ -116,7 +116,7 @@ def install_roslib() -> Path:
 
 
 def install_programs(packages: Mapping[str, str]) -> None:
-    """Install the Debian packages of the programs that are missing.
+    """Install the Debian packages of missing programs.
 
     Args:
         packages: The package of each program.

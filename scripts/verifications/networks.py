@@ -36,7 +36,7 @@ LOCK: Final = Path(__file__).with_name("networks.lock")
 NETWORKS: Final = 24
 FORMATS: Final = (".bif", ".bifxml", ".net", ".uai")
 READ_TOLERANCE: Final = 1e-5
-"""Tolerance of a probability, because pyagrum writes six digits into the other formats."""
+"""Tolerance of a probability, because pyagrum writes only six digits in the other formats."""
 INFERENCE_TOLERANCE: Final = 1e-6
 MACHINE_TOLERANCE: Final = 0.1
 """Maximum total variation between exact inference and a BM1 that counts to 4095."""
@@ -47,7 +47,7 @@ _JOINED: Final = re.compile(r"(\S+) and (\S+) are not independent given")
 
 
 class Table(NamedTuple):
-    """A variable of the independent library: its labels, parents, and table with the axes child and then parents."""
+    """A variable of pyagrum: its labels, its parents, and its table, whose axes are the child and then the parents."""
 
     labels: tuple[str, ...]
     parents: list[str]
@@ -55,7 +55,7 @@ class Table(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """A question of naive fusion, with rows of readings: the state of each known variable."""
+    """A question that is naive fusion, with rows of readings (the state of each known variable)."""
 
     searched: tuple[str, ...]
     known: tuple[str, ...]
@@ -67,7 +67,7 @@ class Asked(NamedTuple):
 
 
 def plain(label: str) -> str:
-    """Return a label as pyagrum accepts it: in hexadecimal if it is not an identifier."""
+    """Return a label that pyagrum accepts: in hexadecimal if it is not an identifier."""
     return label if _IDENTIFIER.fullmatch(label) else "x_" + label.encode().hex()
 
 
@@ -84,14 +84,14 @@ def load(pyagrum: Any, path: Path) -> Any:
 
 
 def array_of(table: Any, order: list[str]) -> NDArray[np.float64]:
-    """Return a table of pyagrum, whose axes have the reverse of the names' order, with its axes in an order."""
+    """Return a table of pyagrum as an array with the axes in this order; pyagrum's own axes are in reverse order of its names."""
     names = list(reversed(table.names))
     found: NDArray[np.float64] = np.transpose(table.toarray(), [names.index(name) for name in order])
     return found
 
 
 def tables_of(network: Any) -> dict[str, Table]:
-    """Return the tables of all variables, in the order of their numbers."""
+    """Return the tables of all variables, in the order of their ids in pyagrum."""
     tables = {}
     for number in range(network.size()):
         variable, table = network.variable(number), network.cpt(number)
@@ -102,9 +102,9 @@ def tables_of(network: Any) -> dict[str, Table]:
 
 
 def uai(tables: dict[str, Table]) -> str:
-    """Return a network as UAI defines it, with the child last in its scope and varying fastest.
+    """Return a network as UAI, with the child last in each scope and varying fastest, as the format requires.
 
-    In pyagrum's own writer the first parent varies fastest, but the format requires the last.
+    This replaces pyagrum's own writer, in which the first parent varies fastest instead of the child.
     """
     number = {name: str(at) for at, name in enumerate(tables)}
     lines = [
@@ -146,7 +146,7 @@ def infer(pyagrum: Any, network: Any, asked: Asked) -> NDArray[np.float64]:
 
 
 def difference(joint: JointDistribution, tables: dict[str, Table], suffix: str) -> float:
-    """Return the largest difference between our tables and the library's, infinite if shapes or labels differ."""
+    """Return the maximum difference between our tables and those of pyagrum; infinity if shapes or labels differ."""
     ours = {each.symbol.name: each for each in joint.factors if isinstance(each, Distribution)}
     number = {name: str(at) if suffix == ".uai" else name for at, name in enumerate(tables)}
     if ours.keys() != set(number.values()):
@@ -169,7 +169,7 @@ def difference(joint: JointDistribution, tables: dict[str, Table], suffix: str) 
 def questions(
     joint: JointDistribution, chance: random.Random
 ) -> tuple[list[Asked], list[tuple[str, str, list[str]]]]:
-    """Return three questions of a network that a BM1 can compute, and pairs of variables that were refused."""
+    """Return three questions about a network that a BM1 can compute, and the pairs of variables that were refused."""
     names = [symbol.name for symbol in joint.symbols]
     asked: list[Asked] = []
     refused: list[tuple[str, str, list[str]]] = []
@@ -198,7 +198,7 @@ def questions(
 
 
 def draw(model: Model, chance: random.Random) -> tuple[int, ...]:
-    """Draw readings from the model, so that each row is possible."""
+    """Draw rows of readings from the model, so that each row is possible."""
     prior = model.prior_distribution
     line = chance.choices(range(model.lines), weights=prior.tolist())[0]
     return tuple(
@@ -207,7 +207,7 @@ def draw(model: Model, chance: random.Random) -> tuple[int, ...]:
 
 
 def machine_difference(asked: Asked) -> float:
-    """Return the largest total variation between exact inference and a BM1 with 16-bit codes and ideal RNG."""
+    """Return the maximum total variation between exact inference and a BM1 with 16-bit codes and an ideal RNG."""
     model = asked.model
     codes = quantise(model, prob_bits=16)
     parameters = BM1Parameters(
@@ -226,7 +226,7 @@ def machine_difference(asked: Asked) -> float:
 
 
 def check(tally: Tally, pyagrum: Any, path: Path) -> None:
-    """Compare one network: as our readers read it in all formats, and its posteriors."""
+    """Compare one network: the tables that our readers find in all formats, and its posteriors."""
     began = time.monotonic()
     network = load(pyagrum, path)
     tables = tables_of(network)
@@ -281,7 +281,7 @@ def verify(only: list[str]) -> int:
 
 
 def install(folder: Path) -> None:
-    """Install pyagrum and pgmpy, without what they depend on, where only this verification finds them."""
+    """Install pyagrum and pgmpy, without their dependencies, in a folder that only this verification uses."""
     options = ("--no-deps", "--require-hashes", "--only-binary", ":all:", "-r", LOCK)
     pip = (sys.executable, "-m", "pip", "-q", "--disable-pip-version-check")
     run(*pip, "install", *options, "--target", folder / "packages")

@@ -27,7 +27,7 @@ READY = "server listening"
 """Line in the server's log once it accepts connections."""
 DEFAULT_PORT = 9090
 GLIBC = (2, 35)
-"""The oldest C library for which the server's wheel was built."""
+"""Minimum version of glibc for the server's wheel."""
 
 _LIBRARY = re.compile(r"[^/]+\.data/data/lib/([^/]+\.so[.0-9]*)|[^/]+\.libs/([^/]+)")
 _SERVER = "rosbridge_server_rs/rosbridge_server_rs_jazzy"
@@ -41,7 +41,7 @@ _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 0x1
 
 
 def install() -> Path:
-    """Return the server's folder (bin, lib), which is first installed if it is missing.
+    """Return the server's folder (bin, lib), after installing it if it is missing.
 
     Raises:
         SettingsError: The machine is not supported, the download fails, or a folder cannot be written.
@@ -96,7 +96,7 @@ def _interface_flags(control: socket.socket, name: str) -> int:
 
 
 def network_is_alone() -> bool:
-    """Return whether loopback is the only interface of this process's network that is up."""
+    """Return whether loopback is the only active interface in the network of this process."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
         others = [name for _, name in socket.if_nameindex() if name != "lo"]
         return not any(_interface_flags(control, name) & _IFF_UP for name in others)

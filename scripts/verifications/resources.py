@@ -78,12 +78,12 @@ CALIBRATION: Final = (
     machine(8, 2, replicas=4, sensor_mode=_THRESHOLD),
     machine(4, 2, replicas=4, prior_mode=_WRITTEN),
 )
-"""Machines to which the estimator's `COSTS` are fitted; GHDL 2.0 needs at least one sensor.
+"""Machines from which the estimator's `COSTS` are fitted; GHDL 2.0 needs at least one sensor.
 """
 
 
 def main() -> int:
-    """Synthesise the machines one after the other; exit 1 if an error exceeds the stated one."""
+    """Synthesise the machines one after the other; exit 1 if an error exceeds `WORST_ERROR`."""
     parser = ScriptParser(prog="scripts/verify resources", description=__doc__.splitlines()[0])
     parser.add_argument("--calibrate", action="store_true", help="fit the costs again to other machines")
     parser.add_argument(
@@ -114,7 +114,7 @@ def main() -> int:
 
 
 def described(p: BM1Parameters) -> str:
-    """Return the parameters that distinguish a machine."""
+    """Describe a machine by the parameters that distinguish it."""
     plain = machine(1, 1)
     names = (name for name in p.__slots__ if name not in {"lines", "sensor_bits"})
     others = [f"{name}={getattr(p, name)}" for name in names if getattr(p, name) != getattr(plain, name)]
@@ -122,7 +122,7 @@ def described(p: BM1Parameters) -> str:
 
 
 def _compared(p: BM1Parameters) -> Netlist:
-    """Return a machine's netlist, and print it next to the estimate."""
+    """Return a machine's netlist, after printing it next to the estimate."""
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="resources-rosbayes-") as folder:
         found = synthesised(image_of_parameters(p), Path(folder))
@@ -147,7 +147,7 @@ def _is_near(errors: tuple[float, float, int]) -> bool:
 
 
 def _fit(machines: Sequence[BM1Parameters], netlists: Sequence[Netlist]) -> None:
-    """Print the costs with the least squares of relative errors, next to the current ones."""
+    """Print the costs that minimise the squares of relative errors, next to the current ones."""
     parts = [logic_of(each).parts for each in machines]
     counts = np.array([[sum(part.counts.get(of, 0) for part in each) for of in Of] for each in parts], float)
     aluts = _costs(counts / np.array([[each.aluts] for each in netlists]))
@@ -159,7 +159,7 @@ def _fit(machines: Sequence[BM1Parameters], netlists: Sequence[Netlist]) -> None
 
 
 def _costs(relative: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the non-negative costs for which the rows' sums are nearest to 1."""
+    """Return the non-negative costs for which the weighted sums of the rows are nearest to 1."""
     kept = np.full(relative.shape[1], True)
     while True:
         costs = np.zeros(len(kept))

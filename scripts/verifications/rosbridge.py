@@ -1,6 +1,6 @@
 """Verification of the client and of deployments on a real ROS 2 rosbridge server and on the hub (see scripts/verify).
 
-this project's client ──▶ server ──▶ this project's client: every operation, and what the server does with it
+this project's client ──▶ server ──▶ this project's client: every operation, and how the server treats it
 plain client (websockets and json) ──▶ server ──▶ master ──▶ server ──▶ plain client: a deployment's results
 """
 
@@ -45,9 +45,9 @@ from services.errors import SettingsError, StackError
 LIMIT: Final = 600.0 * FACTOR
 """Time limit of the verification, in seconds."""
 PATIENCE: Final = 20.0 * FACTOR
-"""Seconds within which whatever a check waits for must come."""
+"""Timeout in seconds of each wait in a check."""
 SILENCE: Final = 1.0
-"""Seconds of silence that show that a message does not arrive."""
+"""Seconds without a message after which a check concludes that none will arrive."""
 OUT: Final = ROOT / "out" / "verify"
 ARRAY: Final = "std_msgs/Float64MultiArray"
 ARRAY_TYPES: Final = {"ros1": ARRAY, "ros2": "std_msgs/msg/Float64MultiArray"}
@@ -64,7 +64,7 @@ FARTHEST: Final = 1.5
 """Maximum distance of a posterior's mean from the true cell, in cells."""
 SIZE: Final = 32
 TAIL: Final = 12
-"""Number of lines of a log that are shown when a check fails."""
+"""Number of log lines that are shown when a check fails."""
 
 
 # Servers and masters
@@ -97,7 +97,7 @@ class Stand:
         self.uri = f"ws://127.0.0.1:{port}"
         self.deployments = deployments
         self.logs: list[Path] = []
-        """Logs of the current check, of which the last lines are printed if it fails."""
+        """Logs of the current check, whose last lines are printed if it fails."""
         self._server: Process | None = None
         self._log = Path()
         self._count = 0
@@ -150,7 +150,7 @@ class Stand:
         fragments_out: int | None = None,
         **options: Any,
     ) -> Message:
-        """Return a message as it arrives through the server."""
+        """Send a message through the server, and return it as it arrives."""
         topic = self.topic()
         async with self.clients(fragment_size=fragments_out) as (subscriber, publisher):
             subscription = subscriber.subscribe(topic, type_name, **options)
@@ -295,7 +295,7 @@ async def check_fragments(stand: Stand) -> None:
 
 
 async def check_qos(stand: Stand) -> None:
-    """Check quality of service: a late subscriber gets latched messages, an incompatible one none."""
+    """Check quality of service: a late subscriber gets latched messages, and an incompatible one gets none."""
     offer = Qos(reliability="best_effort", depth=5)
     same((await stand.passed({"data": [1.5]}, offer=offer)).msg["data"], [1.5])
     for wish in (
@@ -340,7 +340,7 @@ async def check_latch(stand: Stand) -> None:
 
 
 async def check_throttle(stand: Stand) -> None:
-    """Check a throttle of one message per minute, for one of two subscribers to a topic."""
+    """Check a throttle of one message per minute, requested by one of two subscribers to a topic."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher):
         slow = subscriber.subscribe(topic, ARRAY, throttle_rate=60_000)
@@ -398,7 +398,7 @@ async def check_goal(stand: Stand) -> None:
 
 
 async def check_wrong_type(stand: Stand) -> None:
-    """Check that the error of a wait contains the server's message about a wrong type."""
+    """Check that the error of a subscriber that gets no message contains the server's message about a wrong type."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher):
         await publisher.advertise(topic, ARRAY)
@@ -412,7 +412,7 @@ async def check_wrong_type(stand: Stand) -> None:
 
 
 async def check_nan(stand: Stand) -> None:
-    """Check that a message that the server would drop silently is refused, and the error names the place."""
+    """Check that a message that the server would drop silently (NaN) is refused, and that the error names the field."""
     async with stand.clients() as (_subscriber, publisher):
         publication = await publisher.advertise(stand.topic(), ARRAY)
         try:
@@ -424,7 +424,7 @@ async def check_nan(stand: Stand) -> None:
 
 
 async def check_killed(stand: Stand) -> None:
-    """Check that everything is restored after a server is killed, and that the gap's length is reported."""
+    """Check that everything is restored after a server was killed, and that the length of the gap is reported."""
     forms: tuple[Compression, ...] = ("none", "cbor", "cbor-raw", "png")
     topics = {form: stand.topic() for form in forms}
     async with stand.clients() as (subscriber, publisher):
@@ -520,7 +520,7 @@ Received = list[tuple[str, dict[str, Any]]]
 
 @contextlib.asynccontextmanager
 async def robot(stand: Stand, received: Received, sent: list[Sent]) -> AsyncIterator[PlainClient]:
-    """Listen to the stack's topics, and publish the readings of one cell after the other while the block runs."""
+    """During the block, listen to the stack's topics, and publish the readings of one cell after the other."""
 
     async def publish(client: PlainClient) -> None:
         while True:
@@ -576,7 +576,7 @@ def check_result(msg: dict[str, Any], reading: Sent) -> None:
 
 
 def check_frame(msg: dict[str, Any], after: int, sent: list[Sent]) -> tuple[int, Sent]:
-    """Check a frame's message, and return its number and the reading that was published before its stamp."""
+    """Check a `/bm/frame`, and return its number and the reading that was published before its stamp."""
     values = {pair["key"]: pair["value"] for pair in msg["status"][0]["values"]}
     expect(values["published"] == "true", f"its {FRAME_TOPIC} says published = {values['published']}")
     number = int(values["number"])
@@ -591,7 +591,7 @@ def check_frame(msg: dict[str, Any], after: int, sent: list[Sent]) -> tuple[int,
 
 
 def check_received(stand: Stand, received: Received, sent: list[Sent], count: int) -> None:
-    """Check the number of results, and that each has a frame message and belongs to its stamp's reading.
+    """Check the number of results, and that each has a `/bm/frame` and belongs to the reading with its stamp.
 
     Raises:
         CheckError: A result is wrong; the text has its number.

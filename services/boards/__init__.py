@@ -1,1 +1,1 @@
-"""The boards as the services see them: emulated ones as processes, those of a deployment, frames and results."""
+"""Boards in the services: processes of emulated boards, the boards of a deployment, their frames and results."""

@@ -14,7 +14,7 @@ from services.sockets.status import BoardStatus
 from toolchain.deployment import Deployment
 
 TICK = 0.2
-"""Seconds between attempts to reopen a board, and for each of them."""
+"""Seconds between attempts to reopen a board, and timeout of each attempt."""
 
 
 class DeployedBoards:
@@ -61,7 +61,7 @@ class DeployedBoards:
         return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
 
     def status(self, output: FrameOutput | None) -> list[BoardStatus]:
-        """Return the state of each board, with its part of the last output; for use in another thread."""
+        """Return the state of each board, with its part of the last output; may be called from another thread."""
         # a copy, because the boards' thread changes it meanwhile
         gone = dict(self.gone)
         return [
@@ -130,7 +130,7 @@ class DeployedBoards:
             self._times_gone[board] += 1
 
     def recover(self) -> list[int]:
-        """Try once to reopen the missing boards, and return the numbers of those that are back (BoardMismatchError)."""
+        """Try once to reopen the missing boards, and return the numbers of those that are back, or raise a BoardMismatchError."""
         back: list[int] = []
         if self._cluster is None:
             return back

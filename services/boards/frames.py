@@ -18,11 +18,11 @@ _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(list[BoardResult])
 
 PriorRow = int | tuple[int, ...]
-"""Row of the prior's table; with replicas, one for each."""
+"""Row of the prior's table; with replicas, a row for each."""
 
 
 class BoardAwayError(BoardError):
-    """A board that failed an earlier frame is not back yet."""
+    """Raised while a board that failed an earlier frame is not back yet."""
 
 
 def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> FrameInput:
@@ -56,7 +56,7 @@ def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> Fram
 
 
 def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.NDArray[np.int64], PriorRow]:
-    """Return the inputs of sensors (-1: missing) and the prior's row, where replicas or lines have their own readings."""
+    """Return the sensors' inputs (-1: missing) and the prior's row of a machine whose replicas or lines have their own readings."""
     variables = deployment.variables
     if len(addresses) != len(variables):
         raise FrameInputError(
@@ -102,12 +102,12 @@ def _row(deployment: Deployment, variable: Variable, given: int | list[int] | No
 
 
 def encode_boards(boards: Sequence[BoardResult]) -> msgspec.Raw:
-    """Return the boards' part of a `FrameResult`, which the master forwards undecoded."""
+    """Encode the boards' part of a `FrameResult`, which the master forwards without decoding it."""
     return msgspec.Raw(_encoder.encode(boards))
 
 
 def decode_boards(result: FrameResult) -> list[BoardResult]:
-    """Return the boards' results of a record."""
+    """Decode the boards' results in a record."""
     return _decoder.decode(result.boards)
 
 

@@ -27,7 +27,7 @@ class SimulatedHardware:
     """The simulator of an engine, and the boards that use it."""
 
     def __init__(self, engine: Engine, folder: Path, images: Mapping[int, Image]) -> None:
-        """Choose the simulator, and compile the images of boards into the folder, as far as they are known.
+        """Choose the simulator, and compile the given images of boards into the folder.
 
         Raises:
             SettingsError: The simulator is not installed, or the VHDL is missing.
@@ -51,7 +51,7 @@ class SimulatedHardware:
             self._compiled(image)
 
     def board(self, index: int) -> RtlBoard:
-        """Return a blank board, which has started the hardware of its image if that is known (SimulationError)."""
+        """Return a blank board, with the hardware of its image running if that is known, or raise a SimulationError."""
         board = RtlBoard(self._simulate)
         if (image := self._images.get(index)) is not None:
             board.prepare(image)

@@ -28,11 +28,11 @@ from terminal.run_directory import remove_stale_sockets
 from terminal.signals import ENDING_SIGNALS, check_signals, run_async, stopped_error
 
 _ENDING_TIME: Final = 5.0
-"""Seconds in which boards of a killed process of the same master end, even if they are stopped for a moment."""
+"""Seconds in which the boards of a killed process exit, even if they are suspended for a moment."""
 _STOPPING_S: Final = 2.0
 """Seconds after which a board that does not end is killed."""
 _LISTENS: Final = 128
-"""Added to the number of a board whose sign says that it listens; otherwise it only lives."""
+"""Added to a board's number in the sign that it listens; the number alone is a sign of life."""
 
 
 def serve_one(
@@ -88,7 +88,7 @@ def serve_one(
 
 
 def _await_free(endpoint: Endpoint, limit: float) -> None:
-    """Wait until no other process listens at an endpoint, or raise an error; later, a socket there counts as ours."""
+    """Wait until no other process listens at an endpoint, or raise an error, because a socket there counts as ours later."""
     deadline = time.monotonic() + limit
     for each in (endpoint, endpoint.programming):
         while is_served(each.path):
@@ -165,7 +165,7 @@ class BoardProcesses:
             self._remove_sockets()
 
     async def _keep(self, at: int) -> None:
-        """Start a board, and restart it until boards have ended too often."""
+        """Start a board, and restart it until the boards have exited too often."""
         child = self._children[at]
         while True:
             self._heard[at] = time.monotonic()
@@ -194,7 +194,7 @@ class BoardProcesses:
         )
 
     def _sign(self, sign: int) -> None:
-        """Write a sign of a board, in its process; the parent reads them all the time."""
+        """Write a sign of a board, in the board's process; the parent reads the signs."""
         with suppress(OSError):
             os.write(self._write_sign, bytes([sign]))
 
@@ -204,7 +204,7 @@ class BoardProcesses:
         self._report()
 
     def _hear(self, at: int, *, listens: bool) -> None:
-        """Take a sign of a board, and print that all boards are ready, or that one is back."""
+        """Handle a sign of a board, and print when all boards are ready, or when one is back."""
         self._heard[at] = time.monotonic()
         if not listens:
             return

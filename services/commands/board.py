@@ -141,7 +141,7 @@ def _endpoint(listen: str, key_file: Path | None, *, insecure: bool) -> Endpoint
 
 
 def main() -> None:
-    """Run the command and exit at once, because a regular unloading of the kernels takes half a second."""
+    """Run the command and exit at once, because unloading the kernels in the regular way takes half a second."""
     try:
         app()
     except SystemExit as end:

@@ -11,7 +11,7 @@ from terminal.flags import Group, expanded, flags_of
 
 
 def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Give a command the flags of these settings; its parameter `settings` gets all settings."""
+    """Give a command the flags of the named settings; its parameter `settings` gets all settings."""
 
     def load(**flags: Any) -> Settings:
         end_with_parent()  # first, because the parent may have ended already

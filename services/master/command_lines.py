@@ -8,11 +8,11 @@ from services.sockets.reporting import shifted
 from services.supervision.child import RESTARTS, own_command
 
 METRICS_PORTS = {"subscriber": 1, "publisher": 2, "pcie-app": 3, "board": 4}
-"""Ports of the processes' metrics after that of the master; board N has the N-th after board 0."""
+"""Ports of the processes' metrics, counted from the master's; board N has the N-th after that of board 0."""
 
 
 def _metrics(settings: Settings, role: str) -> list[str]:
-    """Return the flags for the metrics of a process; the master has checked that others may read them."""
+    """Return the flags for the metrics of a process; the master has checked who may read them."""
     if not settings.metrics:
         return []
     return ["--metrics", shifted(settings.metrics, METRICS_PORTS[role]), "--insecure"]
@@ -37,7 +37,7 @@ _SETTINGS = {
     "publisher": ("uri", "ca", "ros_version", "connect_timeout", "seen_timeout"),
     "pcie-app": ("boards", "stop", "peer_timeout", "board_timeout", "key_file"),
 }
-"""Settings of a service besides those of all services. They become flags, so that `ps` shows them."""
+"""Settings of one service beyond those that all services have. They become flags, so that `ps` shows them."""
 
 
 def service_command(role: str, endpoint: Endpoint, settings: Settings, *, reprogram: bool) -> list[str]:

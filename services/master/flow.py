@@ -41,7 +41,7 @@ from services.supervision.child import RESTARTS
 from toolchain.deployment import Deployment
 
 MOST_AT_PUBLISHER = 8
-"""Maximum number of results that the publisher has not acknowledged; after that, frames wait."""
+"""Maximum number of results that the publisher has not acknowledged; frames wait when it is reached."""
 
 _LOSSES = {
     Outcome.NO_POSTERIOR: LossReason.NO_POSTERIOR,
@@ -108,7 +108,7 @@ class FrameFlow:
         # Causes of unusable messages of which the user has been warned: one warning each.
         self._reported_causes: set[str] = set()
         self.latencies = Latencies()
-        """Those of the published frames."""
+        """Latencies of the published frames."""
         # Times of the last frames that failed on a board, as many as may fail within `restart_window` and one more.
         self._failures: deque[float] = deque(maxlen=RESTARTS + 1)
         self.published = 0
@@ -185,7 +185,7 @@ class FrameFlow:
             self._at_publisher.clear()
 
     def awaited(self, peer: Peer) -> Awaited | None:
-        """Return the frame or the results that a peer has not answered yet."""
+        """Return the frame or the results for which a peer has not sent an answer yet."""
         if peer is self._peers.app and self._computing is not None:
             what, since = f"answer frame {self._computing.number}", self._computing.sent / 1e9
             return Awaited(what, since, self._settings.board_timeout + ANSWER_TIME)
@@ -247,7 +247,7 @@ class FrameFlow:
             self._follow(number, bank, waiting)
 
     def _follow(self, number: int, bank: int, waiting: WaitingReading) -> None:
-        """Log a sent frame, and notify the subscriber, which logs it with its number."""
+        """Log a sent frame, and tell the subscriber its number, for its own log."""
         waited = (time.monotonic_ns() - waiting.arrived) // 1000
         self._log.debug("handed on to pcie-app", frame=number, bank=bank, waited_us=waited)
         subscriber, reading = self._peers.subscriber.protocol, waiting.reading

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 ROLE = "master"
 ANSWER_TIME = 60.0
-"""Seconds that a service may take beyond its own limits before it counts as stuck."""
+"""Seconds by which a service may exceed its own timeouts before it counts as stuck."""
 
 COMPILING_TIME = 60.0
 """Additional seconds for the run's own boards to listen, because without a cache they compile their kernels.
@@ -85,7 +85,7 @@ class Peer:
         self.missed = False
 
     def cut(self) -> None:
-        """Kill its process if the master started it, otherwise close the connection; either is renewed."""
+        """Kill its process if the master started it, otherwise close the connection; the task of the peer restores either."""
         if self.child is not None:
             self.child.kill()
         elif self.protocol is not None:
@@ -94,7 +94,7 @@ class Peer:
 
 @dataclass(frozen=True, slots=True)
 class Awaited:
-    """A pending task of a peer: description, begin (monotonic, s) and limit in seconds."""
+    """A pending task of a peer: description, start (monotonic, s) and time limit in seconds."""
 
     what: str
     since: float
@@ -105,7 +105,7 @@ class PeerEvents(Protocol):
     """Receiver of the events of peers."""
 
     def ready(self, peer: Peer) -> None:
-        """Handle that a peer is ready."""
+        """Handle a peer that has become ready."""
 
     def received(self, peer: Peer, record: AnyRecord) -> None:
         """Handle a record of a reading, a frame or a result."""
@@ -242,7 +242,7 @@ class Peers:
 
     @property
     def _compiling_time(self) -> float:
-        """Additional seconds for boards to listen. The exit of the run's own boards is detected at once."""
+        """Additional seconds to wait for boards to listen. An exit of the run's own boards is detected at once."""
         return 0.0 if self._boards is None else COMPILING_TIME
 
     async def start(self, events: PeerEvents) -> None:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from services.output.posterior_lines import Show
 
 ASK_EVERY = 5.0
-"""Seconds between two questions to all children whether they make progress."""
+"""Seconds between two checks whether all children make progress."""
 _ANSWER_TIME = 2.0
 _LOCK_EVERY = 0.05
 _PROGRESS_EVERY = 1.0
@@ -230,12 +230,12 @@ class Master:
 class ChildrenWatch:
     """The progress of the processes that a master started, according to their status sockets.
 
-    A child that is being restarted does not count: the master knows of it. One that is stopped or stuck
-    while nothing is expected of it would otherwise go unnoticed.
+    Otherwise a child that is stopped or stuck while nothing is expected of it would go unnoticed. A child that is
+    being restarted does not count.
     """
 
     def __init__(self, peers: Iterable[Peer], directory: Path) -> None:
-        """Take the services of the master, and the directory of their sockets."""
+        """Store the services of the master, and the directory of their sockets."""
         self._peers = peers
         self._directory = directory
         # When all of them last answered (monotonic, s). At first they have as long to start.
@@ -263,5 +263,5 @@ class ChildrenWatch:
 async def run_master(
     settings: Settings, deployment: Deployment, *, once: bool, count: int | None, json: bool, plot: bool
 ) -> int:
-    """Run a master until its end (see `Master.run`), made inside the loop that its futures belong to."""
+    """Create a master inside the event loop, to which its futures belong, and run it to its end (see `Master.run`)."""
     return await Master(settings, deployment, once=once, count=count, json=json, plot=plot).run()

@@ -1,4 +1,4 @@
-"""Dimensions of posteriors, with units and names of states, and cells in words: the same for all commands."""
+"""Dimensions of posteriors with units and names of states, and cells in words, for all commands."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The newest posterior of a master's run, for its own terminal."""
+"""The newest posterior of a run, for the terminal of its master."""
 
 import time
 

@@ -17,11 +17,11 @@ from services.errors import SettingsError
 from services.output.axes import Axis
 
 MOST_NUMBERS: Final = 1 << 26
-"""Maximum number of probabilities in an archive (512 MiB), which is in memory until it is written."""
+"""Maximum number of probabilities in an archive (512 MiB), because it stays in memory until it is written."""
 _EVERY: Final = 5.0
 """Minimum number of seconds between two writes of an archive."""
 _SHARE: Final = 20
-"""Writing an archive takes at most this fraction of the time (its inverse)."""
+"""Writing an archive takes at most 1 / `_SHARE` of the time."""
 _NOT_KNOWN: Final = -1
 
 

@@ -32,9 +32,9 @@ def in_colour(console: Console) -> bool:
 
 
 def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool, rows: int = ROWS) -> Text:
-    """Draw a posterior in colour or with characters from " " to "@", `width` wide, in `rows` lines with text.
+    """Draw a posterior in colour or with characters " " to "@", `width` characters wide, in `rows` lines with text.
 
-    Of three or more dimensions, the two largest are drawn, and the others are summed out.
+    Of three or more dimensions, the two longest are drawn, and the others are summed out.
     """
     # the words around the picture stay on the screen
     width, rows = min(width, WIDTH), max(min(rows, ROWS), 2)

@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 _WATCH_INTERVAL = 1.0
 _PLAIN_WIDTH = 140
 _SHOWN = 200
-"""Maximum number of characters shown of a sentence or name, because another process may answer anything."""
+"""Maximum number of characters shown of a sentence or name, because other processes' texts have no limit."""
 _SILENT_SHOWN = 20
 """Maximum number of silent processes shown, because a folder may contain thousands of abandoned sockets."""
 _SENTENCES = 3
-"""Maximum number of silent processes in an error."""
+"""Maximum number of silent processes named in an error."""
 
 
 def plain(text: str) -> str:
@@ -110,7 +110,7 @@ def _processes(stack: StackStatus) -> Table:
 
 
 def _stages(process: ProcessStatus) -> Table:
-    """Return the latencies of the published frames, that of the whole frame first."""
+    """Return the latencies of a process's published frames, that of the whole frame first."""
     table = _table("latency of")
     for heading in ("p50 ms", "p99 ms", "frames"):
         table.add_column(heading, justify="right")
@@ -208,7 +208,7 @@ async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) 
         0 if everything is ready, otherwise 6.
 
     Raises:
-        SettingsError: No process answers, or not the master that is needed, and `watch` is false.
+        SettingsError: No process answers, or a master is needed and does not answer, and `watch` is false.
     """
     from rich.console import Console
     from rich.live import Live

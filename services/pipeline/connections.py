@@ -1,7 +1,7 @@
 """Connections to the rosbridge servers of a deployment, and what these know about its topics.
 
-`connect_all` connects each server once. rosapi, where a server has it, then tells whether a topic of readings has
-a publisher, and whether results can be received.
+`connect_all` connects each server once. If a server has rosapi, this tells whether a topic of readings has a
+publisher, and whether results can be received.
 """
 
 import asyncio
@@ -25,9 +25,9 @@ OnState = Callable[[str, State, str], None]
 AFTER: Final = 2.0
 """Seconds in which a publisher may appear before a mistyped name is suspected."""
 ROSAPI_TIME = 2.0
-"""Seconds in which a server may answer; many have no rosapi, and then nothing is known."""
+"""Seconds in which rosapi may answer; many servers lack it, and then nothing is known."""
 SETTLED_TIME = 3.0
-"""Seconds after which a server that knows nothing of an advertised topic has refused it."""
+"""If a server does not list an advertised topic after this many seconds, it has refused it."""
 CHECK_INTERVAL = 10.0
 
 
@@ -43,7 +43,7 @@ async def connect_all(
     """Connect to each server once, and return the connections by URI.
 
     The URI in the settings replaces all others. Connections are added to `by_uri` as they are created, so that
-    the status names a server that is waited for; `options` are those of `connect`.
+    the status names also a server that is not reached yet; `options` are those of `connect`.
 
     Raises:
         BridgeError: A server is unreachable, is not a rosbridge server, or is not announced.
@@ -68,7 +68,7 @@ async def connect_all(
 
 
 def reconnect_now(rosbridges: Mapping[str, Ros]) -> None:
-    """Try at once to reach the servers that are away: another service has reached one."""
+    """Try at once to reach the lost servers, because another service has reached one."""
     for ros in rosbridges.values():
         ros.reconnect_now()
 

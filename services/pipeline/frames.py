@@ -1,6 +1,6 @@
 """Assembly of complete readings from the messages of one or several topics, and the queue before the boards.
 
-Without sockets and clocks: messages in, complete sets of addresses out.
+It has no sockets and no clock: messages go in, complete sets of addresses come out.
 """
 
 from collections import Counter, deque
@@ -21,7 +21,7 @@ QUEUE_ALL_DEPTH = 256
 """Maximum number of frames that wait with `queue = all` before the run ends with an error."""
 
 UNPAIRED_WARNING = 8
-"""Number of unpaired messages of every needed topic after which a gap between stamps is reported."""
+"""If every needed topic has this many unpaired messages, a gap between their stamps is reported."""
 
 Item = TypeVar("Item")
 
@@ -131,7 +131,7 @@ class FrameAssembler:
         self._newest: list[tuple[int, bool]] = [(0, True)] * count
         self._since_pair = [0] * count
         self.absent: Counter[str] = Counter()
-        """Number of frames without a topic that was alive, by topic."""
+        """Number of frames that lack a topic although it was alive, by topic."""
 
     @property
     def unpaired(self) -> int:
@@ -140,7 +140,7 @@ class FrameAssembler:
 
     @property
     def deadline(self) -> int | None:
-        """Monotonic ns at which `due` has a reading, unless messages complete it before; None for never."""
+        """Monotonic ns at which `due` has a reading, unless messages complete it earlier; None if none waits."""
         return self._synchroniser.deadline
 
     def take(

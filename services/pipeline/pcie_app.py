@@ -181,7 +181,7 @@ class PcieApp:
         self._searching = asyncio.ensure_future(search())
 
     def _answer(self, master: int, record: Record) -> None:
-        """Send the result of a frame, unless its master is gone: the next one counts frames from 1 too."""
+        """Send the result of a frame, unless its master is gone; the next master's frames have the same numbers."""
         if master == self._link.masters:
             self._link.send(record)
 

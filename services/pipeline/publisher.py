@@ -126,7 +126,7 @@ class Publisher:
         return msgspec.structs.replace(published, missed=max(published.missed, refused))
 
     async def _check_delivery(self, *, settled: bool) -> None:
-        """Look which topics the servers do not pass on, and report each once.
+        """Find topics that the servers do not pass on, and report each once.
 
         Raises:
             NotReceivableError: Nobody can receive the result of a run of one frame.

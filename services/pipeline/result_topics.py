@@ -43,7 +43,7 @@ class ResultTopics:
 
     Attributes:
         rosbridges: The connections by URI.
-        advertised: The output topics, once they are advertised, and `reports` that of the frame reports.
+        advertised: The output topics, once they are advertised; `reports` is the topic of the frame reports.
     """
 
     def __init__(self, settings: Settings, deployment: Deployment) -> None:
@@ -89,7 +89,7 @@ class ResultTopics:
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
     def served_by(self, uri: str) -> tuple[str, str]:
-        """Return the texts for a server's topics and the server; a single server is just `rosbridge`."""
+        """Return a server's topics and its name as texts; a single server is named `rosbridge`."""
         if len(self.rosbridges) == 1:
             return "", "rosbridge"
         topics = [publication.topic for ros, publication in self._outputs if ros is self.rosbridges.get(uri)]
@@ -199,7 +199,7 @@ class ResultTopics:
 
 
 def _sent(publication: Publication, message: dict[str, Any]) -> bool:
-    """Send a message if its server accepts it at once, and return whether it does."""
+    """Send a message if its server accepts it at once; return whether it was sent."""
     try:
         publication.publish_nowait(message)
     except (DisconnectedError, SlowPeerError):

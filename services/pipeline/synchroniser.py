@@ -85,7 +85,7 @@ class Synchroniser(Generic[Item]):
     """
 
     def __init__(self, needed: Sequence[bool], tolerance_ns: int) -> None:
-        """Start without messages; `needed` tells for each topic whether every set needs it."""
+        """Start without messages; `needed` says for each topic whether every set must contain it."""
         self.unpaired = 0
         self.deadline: int | None = None
         self.absent: list[int] = []
@@ -130,7 +130,7 @@ class Synchroniser(Generic[Item]):
         return None
 
     def forget(self) -> None:
-        """Drop the waiting messages, as unpaired."""
+        """Drop the waiting messages, and count them as unpaired."""
         for topic in self._topics:
             self._drop(topic, len(topic.waiting))
         self.deadline = None

@@ -36,7 +36,7 @@ def blocking_lines() -> Iterator[tuple[int, bytes]]:
 
 
 async def lines() -> AsyncIterator[tuple[int, bytes]]:
-    """Yield the lines of `blocking_lines` without blocking the loop, so that a signal ends the wait."""
+    """Yield the same as `blocking_lines` without blocking the event loop, so that a signal ends the wait."""
     kind = os.fstat(sys.stdin.fileno()).st_mode
     # the loop supports only pipes, and files never block
     if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)):

@@ -1,7 +1,7 @@
 """Local sockets between services: length-prefixed MessagePack records, and the handshake.
 
-A frame is four bytes of length (little-endian) and that many bytes of MessagePack. The core does not perform
-I/O; it has an asyncio wrapper and a blocking one.
+A framed record is its length in four bytes (little-endian), followed by that many bytes of MessagePack. The core does
+not perform I/O; it has an asyncio wrapper and a blocking one.
 """
 
 from __future__ import annotations

@@ -25,14 +25,14 @@ _ANSWER_TIME: Final = 2.0
 """Seconds in which the event loop must return the status."""
 
 _Family = tuple[type[CounterMetricFamily | GaugeMetricFamily], str, str, str, Mapping[str, float]]
-"""Kind, name, help, the label besides `process` (empty without one), and the values by that label."""
+"""Kind, name, help, the label besides `process` (empty if there is none), and the values by that label."""
 
 
 @contextlib.asynccontextmanager
 async def serve_metrics(
     address: Endpoint, name: str, get_status: Callable[[], ProcessStatus]
 ) -> AsyncIterator[None]:
-    """Serve metrics within the context; an occupied port only causes a warning, because a robot's run goes on."""
+    """Serve metrics within the context; an occupied port only causes a warning, because it must not end a robot's run."""
     # a registry of its own: the default one adds metrics of Python under names that are not ours
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_StatusCollector(get_status))
@@ -53,7 +53,7 @@ async def serve_metrics(
 
 
 class _StatusCollector(Collector):
-    """The metrics of the status, which the thread of a request gets from the event loop that owns it."""
+    """Collector of metrics from the status; the thread of a request asks the event loop, which owns the status."""
 
     def __init__(self, get_status: Callable[[], ProcessStatus]) -> None:
         # The function may be called only in the loop, whose state it reads.
@@ -70,7 +70,7 @@ class _StatusCollector(Collector):
 
 
 def families(status: ProcessStatus) -> Iterator[Metric]:
-    """Return the metrics of a process, each family in turn."""
+    """Yield the metrics of a process, one family after another."""
     info = GaugeMetricFamily(
         "rosbayes_process", "The process, and its deployment.", labels=["process", "version", "deployment"]
     )

@@ -99,9 +99,9 @@ class Ready(Record, tag="ready", frozen=True):
 
 
 class Rosbridge(Record, tag="rosbridge", frozen=True):
-    """Subscriber or publisher to the master: whether it has a rosbridge server now.
+    """Subscriber or publisher to the master: whether it is connected to a rosbridge server now.
 
-    The master passes the return of a server on to the other, which then does not wait to try again.
+    If a server is back, the master tells the other service, which then reconnects at once.
     """
 
     connected: bool
@@ -194,7 +194,7 @@ class FrameFailed(Record, tag="failed", frozen=True):
 
 
 class Publish(Record, tag="publish", frozen=True):
-    """Master to publisher: a result with the frame's own data."""
+    """Master to publisher: a result, with the data of its frame."""
 
     result: FrameResult
     # Those of its reading, for the report of the frame and its latency.
@@ -209,9 +209,9 @@ class Publish(Record, tag="publish", frozen=True):
 class Published(Record, tag="published", frozen=True):
     """Publisher to master: the outcome of a result.
 
-    `seen` is whether it was seen on the wire (None if that was not checked). `best_line` has `best_probability`;
-    `total_ns` is the time from the reading's receipt to the result's sending. `missed` counts the outputs, of several,
-    whose servers were away. `out_ns` is the duration of publishing.
+    `seen` is whether it was seen on the wire (None if that was not checked). `best_probability` is that of `best_line`;
+    `total_ns` is the time from the reading's receipt to the result's sending. `missed` counts the outputs
+    whose servers were not connected, if there are several. `out_ns` is the duration of publishing.
     """
 
     number: int

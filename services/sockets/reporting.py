@@ -35,7 +35,7 @@ _SAMPLES = 6
 """Number of samples, one per second: a rate covers the last five seconds."""
 
 GetStatus = Callable[[], ProcessStatus]
-"""Function that returns the status of a process; identity, rate, CPU time and memory are added here."""
+"""Function that returns the status of a process, to which identity, rate, CPU time and memory are added here."""
 
 
 class Report:
@@ -118,7 +118,7 @@ def _check(directory: Path | None) -> None:
 
 
 def check_metrics(metrics: str, *, insecure: bool) -> None:
-    """Raise a SettingsError if other machines could read metrics, and that was not permitted."""
+    """Raise a SettingsError if other machines could read the metrics without permission."""
     # a host name counts as another machine, even if it resolves to this one
     if metrics and not insecure and not metrics_endpoint(metrics).is_loopback:
         raise SettingsError(
@@ -128,7 +128,7 @@ def check_metrics(metrics: str, *, insecure: bool) -> None:
 
 
 def shifted(metrics: str, ports: int) -> str:
-    """Return an address for metrics some ports further, for another process of the same run."""
+    """Return the address for the metrics of another process of the run, whose port is this many ports higher."""
     if not metrics:
         return ""
     endpoint = metrics_endpoint(metrics)

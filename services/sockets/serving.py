@@ -2,8 +2,8 @@
 
 master ──connects──▶ service   a second one is refused with `Trouble`
 ◀───Hello────           role, version, deployment
-────Hello───▶           another one of these is refused with `Trouble`
-◀─Notice, Ready         what was said before, and the states that last
+────Hello───▶           a difference is refused with `Trouble`
+◀─Notice, Ready         stored notices, and lasting states
 ◀──records──▶
 """
 
@@ -26,9 +26,9 @@ from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 
 GREETING_TIME = 5.0
-"""Seconds in which a client must send its hello before another may connect."""
+"""Seconds in which a client must send its hello; after them, another may connect."""
 MAX_UNSAID = 4
-"""Maximum number of the latest messages for the user that are stored for the next master."""
+"""Maximum number of notices that are stored for the next master; the oldest are dropped."""
 _REPORT_ATTEMPTS = 100
 _REPORT_INTERVAL = 0.02
 
@@ -197,7 +197,7 @@ class MasterLink(Link):
         self.send(record)
 
     def notice(self, level: str, sentence: str) -> None:
-        """Send a message for the user now, or later to the next master, because a service may wait before it has one."""
+        """Send a message for the user, or store it for the next master, because a service may start before its master."""
         if not self.send(record := Notice(level, sentence)):
             self._unsaid.append(record)
 
@@ -208,7 +208,7 @@ def listening(endpoint: Endpoint, role: str, deployment: Deployment) -> MakeLink
 
 
 async def report_failure(link: Link, error: BaseException) -> None:
-    """Send the error that ends a service to its master; a bug is only printed by the service itself."""
+    """Send the error that ends a service to its master; a bug is not sent, because the service prints it."""
     code = exit_code_of(error)
     if code == ExitCode.BUG or not isinstance(error, Exception):
         return

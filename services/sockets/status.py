@@ -1,4 +1,4 @@
-"""Status of processes: the records, and how one process or all of a run are asked (`terminal.health`)."""
+"""Status of processes: the records, and queries of one process or of all in a run (`terminal.health`)."""
 
 from __future__ import annotations
 
@@ -189,13 +189,13 @@ def reasons(counts: Mapping[Reason, int]) -> dict[str, int]:
 
 _decoder = msgspec.json.Decoder(ProcessStatus)
 _BACKLOG_EVERY = 0.01
-"""Seconds between two attempts to connect to a process that answers nobody at the moment."""
+"""Seconds between two attempts to connect to a process whose backlog is full."""
 
 
 async def read_process_status(path: str, timeout: float) -> ProcessStatus:
     """Return the status of the process at a status socket, or raise a NoHealthError after `timeout` seconds.
 
-    No thread reads it, because Python waits for ever for a thread that has no memory to start.
+    It does not use a thread, because Python waits for ever for a thread that cannot start for lack of memory.
     """
     data = bytearray()
     loop = asyncio.get_running_loop()
@@ -215,7 +215,7 @@ async def read_process_status(path: str, timeout: float) -> ProcessStatus:
 
 
 def _connected(asking: socket.socket, path: str) -> bool:
-    """Try to connect; False if the backlog is full, for which no event loop can wait."""
+    """Try to connect; return False if the backlog is full, because an event loop cannot wait for room in it."""
     try:
         asking.connect(path)
     except BlockingIOError:

@@ -62,9 +62,9 @@ _decoder: Final = msgspec.json.Decoder(_ErrorReport)
 
 
 class _Pipe:
-    """The reading end of a pipe from a child, which gives each line to a function.
+    """The reading end of a pipe from a child; each line is passed to a function.
 
-    Its own pipe instead of one of asyncio, because processes forked by the child may keep it open after the exit.
+    It is not a pipe of asyncio, because processes forked by the child may keep it open after the child's exit.
     """
 
     def __init__(self, take: Callable[[str], None]) -> None:
@@ -78,7 +78,7 @@ class _Pipe:
         asyncio.get_running_loop().add_reader(self._reader, self.read)
 
     def read(self, *, last: bool = False) -> None:
-        """Take what has arrived; the `last` line may have no end."""
+        """Read what has arrived; the `last` line may lack its end."""
         while self._is_open:
             try:
                 data = os.read(self._reader, 1 << 16)
@@ -121,7 +121,7 @@ class Child:
         directory: LockedRunDirectory | None = None,
         ends: deque[float] | None = None,
     ) -> None:
-        """Store the command; `ends`, one longer than the permitted restarts, may be shared with other children."""
+        """Store the command; `ends` holds one more entry than restarts are permitted, and may be shared with other children."""
         self.name = name
         self._command = command
         # The run directory, whose lock the child holds too, so that the next run waits for its end.
@@ -276,7 +276,7 @@ class ForkedChild(Child):
 
 
 class _Forked:
-    """A forked process, with the interface of `asyncio.subprocess.Process` as far as `Child` uses it."""
+    """A forked process, with the part of the interface of `asyncio.subprocess.Process` that `Child` uses."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid

@@ -15,7 +15,7 @@ class ServiceManager:
     """The service manager, if there is one; a slow or absent one never delays or ends this process."""
 
     def __init__(self) -> None:
-        """Take the variables of the service manager out of the environment: they do not concern children."""
+        """Remove the variables of the service manager from the environment, because they do not concern children."""
         # Its datagram socket; empty without a service manager.
         self._address = os.environ.pop(_SOCKET, "")
         if self._address.startswith("@"):  # an abstract socket
@@ -47,7 +47,7 @@ class ServiceManager:
         self._send("STOPPING=1")
 
     def _send(self, *assignments: str) -> bool:
-        """Send assignments, and return whether they were accepted: its queue may be full."""
+        """Send assignments; return whether they were accepted, because the manager's queue may be full."""
         if self._address and assignments:
             with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
                 sender.setblocking(False)

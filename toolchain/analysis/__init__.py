@@ -1,6 +1,6 @@
-"""Analyses of a machine before it is on a board: accuracy, cycles, resources, energy. Here are their options.
+"""Analyses of a machine before it is on a board: accuracy, cycles, resources, energy.
 
-The options are dataclasses of flags, without NumPy, so that `--help` is fast.
+This module has their options: dataclasses of flags, without NumPy, so that `--help` is fast.
 """
 
 import itertools
@@ -77,7 +77,7 @@ class InspectOptions(ReadingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """The options of a sweep: comma-separated lists are combined, the rest is the same for all machines."""
+    """The options of a sweep: all combinations of the comma-separated lists; the other options are the same for all machines."""
 
     prob_bits: Annotated[str, typer.Option(help="Bits of a code, comma-separated.", metavar="LIST")] = (
         "4,6,8,10"
@@ -101,7 +101,7 @@ class Sweep:
     banks: Annotated[int, typer.Option(help="Number of seed sets for each frame.")] = 2
 
     def __post_init__(self) -> None:
-        """Refuse lists and numbers that are none, before a model is read."""
+        """Refuse malformed lists and numbers before a model is read."""
         if self.partitions < 1 or self.max_cycles < 1 or self.banks < 1:
             raise BuildError("--partitions, --max-cycles and --banks are numbers from 1")
         self._lists()

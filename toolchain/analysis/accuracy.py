@@ -1,8 +1,8 @@
-"""Accuracy of a machine's posteriors compared with exact inference, separating the quantisation loss.
+"""Accuracy of a machine's posteriors compared with exact inference, apart from the quantisation loss.
 
-Three posteriors of each frame are compared: of the model (float64), of the codes (float64), and of the
-machine (counts). Codes compared with the model show the quantisation loss, the machine compared with its
-codes the sampling loss. Means over frames have confidence intervals.
+Each frame has three posteriors: of the model (float64), of the codes (float64), and of the machine (counts). The
+difference between codes and model is the quantisation loss, that between machine and codes the sampling loss. Means
+over frames have confidence intervals.
 """
 
 import math
@@ -63,7 +63,7 @@ def share_of_frames(share: float, frames: int) -> Interval:
 
 
 EXPECTED_COUNT: Final = 5.0
-"""Minimum expected count of lines with z-scores, because lower counts are not approximately normal."""
+"""Minimum expected count of a line to get a z-score, because lower counts are not approximately normal."""
 
 _TIE: Final = 1e-9
 
@@ -90,7 +90,7 @@ class ZScores:
     Attributes:
         cycles: The length c.
         counts: Number of counts.
-        draws: Number of independent draws of random numbers for the intervals: the banks.
+        draws: Number of independent draws of random numbers, the banks, for the intervals.
         rms: Root mean square: 1 for independent bits, 1.6 if the variance is 2.6 times as large.
         mean: 0 if the counts are unbiased.
         beyond_three: Share beyond -3 or 3; 0.0027 for a normal distribution.
@@ -121,7 +121,7 @@ class Accuracy:
         frames: Number of frames.
         posteriors: Number of posteriors: one per frame, or one per replica of a frame.
         banks: Number of seed sets with which each was run.
-        impossible: Share of posteriors for which no line can count although, if there is a model, it has one.
+        impossible: Share of posteriors for which no line can count, although the model, if any, has a posterior.
         without: Share of runs without a posterior, including those whose counts remained 0.
         overflow: Share of runs that ended with an overflow.
         machine: The machine against the model; None without a model.
@@ -145,7 +145,7 @@ class Accuracy:
 
 
 class _Differences:
-    """Differences of many frames; the runs of a frame, and its replicas, are averaged."""
+    """Differences of many frames; runs and replicas of a frame are averaged."""
 
     def __init__(self) -> None:
         self._frames: dict[int, list[tuple[float, float, float]]] = {}
@@ -177,8 +177,8 @@ def measure(
 ) -> Accuracy:
     """Run a machine on readings and compare its posteriors with exact inference.
 
-    A replica has the same counts as a single machine with the same bank, so one machine is run for all of
-    them: successive readings, one per replica, form a frame, which ends with the last of them. Without a
+    A replica has the same counts as a single machine with the same bank, so a single machine is run for all
+    replicas: successive readings, one per replica, form a frame, which ends when the last one ends. Without a
     `model`, only the codes are known. Readings that are impossible in the model are omitted. `advance` is
     called after every reading.
 

@@ -47,7 +47,7 @@ class Claims:
     """Results of all experiments.
 
     Attributes:
-        lines: Cycles by the number of lines: their median, with the quartiles as interval.
+        lines: Cycles by the number of lines: the median, with the quartiles as interval.
         sensors: The same by the number of sensors.
         targets: The same by the target count.
         faults: Total variation by the share of flipped bits, for each way to compute a posterior.
@@ -173,7 +173,7 @@ class Faults:
     """Ways to compute a posterior while bits are flipped; each returns None if there is none."""
 
     def __init__(self, machine: BM1Machine, *, seed: int) -> None:
-        """Play the generators of each bank for `FAULT_CYCLES`."""
+        """Compute the random numbers of each bank for `FAULT_CYCLES`."""
         numbers = random_numbers(machine)
         self._shown = np.empty((_BANKS, FAULT_CYCLES, machine.parameters.columns), dtype=np.uint16)
         for bank, of_bank in enumerate(self._shown):
@@ -192,7 +192,7 @@ class Faults:
         return _normalised(self.counts(frame.codes, bank=frame.bank, stream_rate=rate)[0])
 
     def numbers(self, frame: DrawnFrame, rate: float) -> _Floats | None:
-        """Flip a bit of a random number, which a whole column uses."""
+        """Flip a bit of a random number, which is used by a whole column."""
         return _normalised(self.counts(frame.codes, bank=frame.bank, number_rate=rate)[0])
 
     def tables(self, frame: DrawnFrame, rate: float) -> _Floats | None:
@@ -200,7 +200,7 @@ class Faults:
         return _normalised(self.counts(self.flipped(frame.codes, _BITS, rate), bank=frame.bank)[0])
 
     def fixed_point(self, frame: DrawnFrame, rate: float) -> _Floats | None:
-        """Multiply the codes in 8 bits with an exponent common to all lines; flip a bit of a factor or product."""
+        """Multiply the codes in 8 bits with an exponent that all lines share; flip a bit of a factor or of a product."""
         top = 2**_BITS - 1
         product = np.full(frame.codes.shape[1], top, dtype=np.uint16)
         for row in frame.codes:
@@ -232,10 +232,10 @@ class Faults:
         stream_rate: float = 0.0,
         number_rate: float = 0.0,
     ) -> tuple[NDArray[np.int64], int]:
-        """Run a frame of codes, uint16[columns, lines], and return the counts, int64[lines], and its cycles.
+        """Run a frame of codes, uint16[columns, lines], and return the counts, int64[lines], and the cycles.
 
-        The bit of a cell in a cycle is flipped with probability `stream_rate`, and a bit of a random number,
-        which a whole column uses, with `number_rate`.
+        The bit of a cell in a cycle is flipped with probability `stream_rate`, and a bit of a random number, which is
+        used by a whole column, with probability `number_rate`.
         """
         counts = np.zeros(codes.shape[1], dtype=np.int64)
         for begun in range(0, FAULT_CYCLES, 512):
@@ -270,7 +270,7 @@ KINDS: Final[dict[str, Callable[[Faults, DrawnFrame, float], _Floats | None]]] =
     "8-bit fixed point": Faults.fixed_point,
     "32-bit floating point": Faults.floating_point,
 }
-"""The compared ways, by their names in the picture."""
+"""The ways to compare, by their names in the picture."""
 
 
 def _normalised(weights: NDArray[np.integer]) -> _Floats | None:

@@ -75,7 +75,7 @@ class EmulatedBoards:
         return sum(machine.parameters.lines for machine in self.machines)
 
     def run(self, addresses: Inputs, prior_address: int, bank: int) -> FrameRun:
-        """Run a frame like the host: in slices of 256 * 2^k until a board overflows, or each board alone."""
+        """Run a frame like the host: in slices of 256 * 2^k cycles until a board overflows, or each board alone."""
         end = first_slice(self.target_count) if self.stop is Stop.SLICES else 0
         if end >= self.max_cycles:
             end = 0
@@ -123,7 +123,7 @@ class EmulatedBoards:
 
 
 def inputs_of_boards(inputs: Inputs, machines: Sequence[BM1Machine]) -> list[Inputs]:
-    """Return the inputs of a frame for each board: all of them, or those of its lines."""
+    """Return each board's inputs of a frame: all inputs, or those of its lines."""
     if isinstance(inputs, tuple):
         return [inputs] * len(machines)
     ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
@@ -133,12 +133,12 @@ def inputs_of_boards(inputs: Inputs, machines: Sequence[BM1Machine]) -> list[Inp
 
 
 def one_replica(machine: BM1Machine) -> BM1Machine:
-    """Return one replica of a board as a single machine, which has the same counts."""
+    """Return a single machine that has the same counts as one replica of a board."""
     return replace(machine, parameters=replace(machine.parameters, replicas=1))
 
 
 def joined(machines: Sequence[BM1Machine]) -> BM1Machine:
-    """Return the whole machine of which the boards are parts."""
+    """Join the machines of all boards to the whole machine."""
     first = machines[0]
     return BM1Machine(
         replace(first.parameters, lines=sum(machine.parameters.lines for machine in machines)),

@@ -1,4 +1,4 @@
-"""The logic and the memories of a machine in an FPGA, counted in units of the VHDL.
+"""Logic and memories of a machine in an FPGA, as the sum of the units of its VHDL.
 
 A unit's cost is fitted to the synthesis of small machines by GHDL and yosys (`scripts/verify resources
 --calibrate`; docs/how-to/design-space.md); registers are counted from the VHDL. Tables go into memory blocks, then
@@ -66,15 +66,15 @@ WORD_BITS: Final = 32
 """Width of a word that the host writes or reads."""
 
 _BOARD_REGISTERS: Final = 1032
-"""Of bm1_axi, bm_register_block, bm1_registers and bm1_control, without target and replicas."""
+"""Registers of bm1_axi, bm_register_block, bm1_registers and bm1_control, without target and replicas."""
 _REPLICA_BITS: Final = 5
-"""Of bm1_control for a replica: its stop reason, whether it runs and whether it is halted."""
+"""Registers of bm1_control for each replica: its stop reason, whether it runs and whether it is halted."""
 _FEW_WORDS: Final = 8
-"""Maximum number of words in memory LABs, whose output needs registers, unlike that of a memory block."""
+"""Memories of at most this many words are in memory LABs, whose output needs registers, unlike that of a memory block."""
 
 
 class Of(StrEnum):
-    """Units of logic."""
+    """The kinds of units."""
 
     BOARD = "board"
     """bm1_axi, bm_register_block, bm1_guard, and bm1_control of a single machine."""
@@ -102,7 +102,7 @@ WORST_ERROR: Final = 0.06
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Logic of an FPGA for one unit: look-up tables, bits of carry chains among them, and the ALMs that hold them."""
+    """Logic of an FPGA for one unit: look-up tables, how many of them are in carry chains, and the ALMs that hold them."""
 
     aluts: float
     alms: float
@@ -173,7 +173,7 @@ def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH) -> Logic:
     """Return the logic of a machine, without memories.
 
     Args:
-        parameters: The machine; of one board.
+        parameters: The parameters of the machine on one board.
         table_length: Length of the table of random numbers, if one is used.
 
     Raises:
@@ -263,13 +263,13 @@ class _Memory:
 
     @property
     def blocks(self) -> int:
-        """Minimum number of M20Ks for one of them."""
+        """Minimum number of M20Ks for one table."""
         return min(math.ceil(self.words / deep) * math.ceil(self.width / wide) for deep, wide in BLOCK_SHAPES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memories:
-    """The memories of a machine; `logic_tables` did not get a block and are in memory LABs."""
+    """The memories of a machine; `logic_tables` are those in memory LABs, for which no block was left."""
 
     table_bits: int
     blocks: int

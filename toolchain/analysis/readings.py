@@ -30,7 +30,7 @@ class Readings:
     """Frames of readings.
 
     Attributes:
-        source: Their origin, a clause.
+        source: Their origin, as a clause.
         addresses: int64[frames, sensors], in the order of the columns; `MISSING` for a missing reading. If
             lines have their own readings, int64[frames, sensors, lines].
         prior_addresses: int64[frames], the row of the prior; `MISSING` if none is selected.
@@ -84,7 +84,7 @@ def check_frames(frames: int) -> None:
 
 
 def check_columns(recording: Path | None, columns: Sequence[str] | None) -> None:
-    """Refuse, with a BuildError, columns of a recording where there is none."""
+    """Refuse, with a BuildError, columns of a recording if there is no recording."""
     if recording is None and columns:
         raise BuildError(f"--reading {columns[0]} refers to a recording; add --readings FILE")
 
@@ -113,7 +113,7 @@ def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -
 def readings_of_lines(
     drawn: Readings, model: Model, machine: BM1Machine, *, scale: Scale, seed: int
 ) -> Readings:
-    """Return drawn readings in the form for a machine whose lines have their own readings.
+    """Convert drawn readings for a machine whose lines have their own readings.
 
     The cell of the true line reads the drawn value. The model does not define the readings of the other
     lines, which are drawn from the mean of all lines. With sensor_mode `threshold`, the likelihoods are
@@ -189,7 +189,7 @@ def _distribution(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _normalised(distribution: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a distribution that sums to 1 exactly, from one of a model, which does so within 1e-6."""
+    """Normalise a distribution of a model, which sums to 1 only within 1e-6."""
     exact: NDArray[np.float64] = distribution / distribution.sum()
     return exact
 
@@ -199,7 +199,7 @@ def recorded_readings(
 ) -> Readings:
     """Return at most `frames` readings of a recording (CSV, MCAP or bag), spread over its length.
 
-    `given` are NAME=COLUMNs of variables whose column has another name, with `*` for the same text in both;
+    `given` are NAME=COLUMN for variables whose column has another name, with `*` for the same text in both;
     in a bag, messages of other topics may be `tolerance_s` apart from a row.
 
     Raises:

@@ -1,7 +1,8 @@
 """Resources and energy of a BM1 on the FPGAs of its boards, and the number of boards that it needs.
 
 Tables are memories, so that their content can be changed without a new compilation. Nothing here was measured on a
-board: logic is estimated, and energy counts toggles of nets, which all cost the same, and states its assumptions.
+board. Logic is estimated; energy is estimated from toggles of nets, with the same energy for each net, and the
+assumed constants are listed.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """Resources of a machine on an FPGA, whose PCIe controller is a block without logic."""
+    """Resources of a machine on an FPGA; its PCIe controller is a hard block and needs no logic."""
 
     device: Device
     logic: Logic
@@ -92,7 +93,7 @@ def estimate(parameters: BM1Parameters, device: Device, *, table_length: int = L
 def boards_needed(
     parameters: BM1Parameters, device: Device, *, largest_lines: int = 4096, table_length: int = LENGTH
 ) -> tuple[int, str]:
-    """Return the minimum number of boards for a machine, and the reason as a sentence, or raise a BuildError."""
+    """Return the minimum number of boards for a machine, and why, as a sentence; or raise a BuildError."""
 
     def on(lines: int) -> Estimate:
         return estimate(replace(parameters, lines=lines), device, table_length=table_length)
@@ -181,7 +182,7 @@ class Energy:
     static_w: float
 
     def frame_j(self, cycles: float, clock_hz: float) -> tuple[float, float]:
-        """Return the energy of a frame in joules: for toggles, and for leakage."""
+        """Return the energy of a frame in joules: that of toggles, and that of leakage."""
         return cycles * self.cycle_j, cycles / clock_hz * self.static_w
 
 

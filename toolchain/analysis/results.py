@@ -1,4 +1,4 @@
-"""Results of a sweep: one point per machine, a line in a file, with their Pareto front, their table and their picture."""
+"""Results of a sweep: a file with one point per machine, the Pareto front, a table and a picture."""
 
 import math
 import os
@@ -24,9 +24,9 @@ class Point(BaseModel):
     Attributes:
         key: SHA-256 of everything on which the results depend.
         total_variation: Compared with the model, mean over frames; None if no frame had a posterior.
-        total_variation_low: Its 95 % interval's ends.
-        total_variation_high: Its 95 % interval's ends.
-        quantising: The same of exact inference on the codes.
+        total_variation_low: Lower end of its 95 % interval.
+        total_variation_high: Upper end of its 95 % interval.
+        quantising: The same for exact inference on the codes.
         kl_bits: KL(machine || model).
         map_agreement: Share of frames with the same most probable line.
         z_rms: Root mean square of z-scores; 1 is ideal.
@@ -35,7 +35,7 @@ class Point(BaseModel):
         cycles_95: Their 95th percentile.
         alms: ALMs of the largest board; None for generators that FPGAs do not have.
         blocks: Memory blocks of the largest board.
-        fits: Whether that fits the device.
+        fits: Whether these fit the device.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -89,7 +89,7 @@ class Results:
             self.points[point.key] = point
 
     def check_writable(self) -> None:
-        """Create the file if it is missing, or raise a BuildError, before a long run, if it cannot be written."""
+        """Create the file if it is missing; raise a BuildError before a long run if it cannot be written."""
         try:
             os.close(self._opened())
         except OSError as reason:
@@ -178,11 +178,11 @@ COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa337
 MARKERS: Final = "osD^v<>P"
 _SUFFIXES: Final = (".png", ".svg", ".pdf")
 _KINDS_INSIDE: Final = 5
-"""Maximum length of a legend inside the picture, where a longer one would cover points."""
+"""Maximum length of a legend inside the picture, because a longer one would cover points."""
 
 
 def check_pictures_possible(path: Path | None = None) -> None:
-    """Raise a BuildError, before a long run, for a picture that cannot be drawn or written."""
+    """Raise a BuildError before a long run if its picture cannot be drawn or written."""
     if find_spec("matplotlib") is None:
         raise BuildError(
             "a plot needs matplotlib, which is not installed: run pip install matplotlib, or omit --plot"

@@ -48,7 +48,7 @@ def _fingerprint(model: Model, readings: Readings) -> str:
 
 
 def tasks(model: Model, sweep: Sweep, readings: Readings, device: Device) -> list[Task]:
-    """Return the machines of a sweep that can be built; a BuildError if there are none."""
+    """Return the machines of a sweep that can be built, or raise a BuildError if there are none."""
     found: dict[str, Task] = {}
     refused, inputs = "", _fingerprint(model, readings)
     for options in sweep.options():
@@ -78,7 +78,7 @@ def tasks(model: Model, sweep: Sweep, readings: Readings, device: Device) -> lis
 
 
 def run_task(task: Task, readings: Readings, device: Device, banks: int) -> Point:
-    """Measure one machine; a ToolchainError if it cannot be built or run."""
+    """Measure one machine, or raise a ToolchainError if it cannot be built or run."""
     model, options, parameters = task.plan.model, task.plan.options, task.plan.parameters
     quantised = quantise(model, prob_bits=options.prob_bits, scale=options.scaling)
     machines = split(whole_machine(task.plan, quantised), options.partitions)
@@ -115,7 +115,7 @@ def run_task(task: Task, readings: Readings, device: Device, banks: int) -> Poin
 
 
 def with_resources(task: Task, point: Point, device: Device) -> Point:
-    """Return a point with the current estimate of the resources of its largest board."""
+    """Return a point with resources of its largest board from the current estimate."""
     parameters, options = task.plan.parameters, task.plan.options
     if options.rng is RngKind.IDEAL:
         return point

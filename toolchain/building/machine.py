@@ -24,7 +24,7 @@ _MOST_CODES: Final = 1 << 30
 MACHINE_KEYS: Final = tuple(
     key for key in MachineSection.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
 )
-"""The parameters with the same names in `[machine]`, whose `lines` are those of all boards."""
+"""The parameters with the same names in `[machine]`; its `lines` are those of all boards."""
 
 
 def machine_options(source: BuildOptions | MachineSection) -> dict[str, Any]:
@@ -38,7 +38,7 @@ class MachinePlan:
 
     model: Model
     options: BuildOptions
-    """The options; only the number of boards may still change, which the parameters do not contain."""
+    """The options; only the number of boards may still change, because the parameters do not contain it."""
     parameters: BM1Parameters
     """The parameters of the whole machine, with the lines of all boards."""
 
@@ -50,7 +50,7 @@ class MachinePlan:
 
 
 def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
-    """Derive the parameters of the whole model's machine from model and options; a BuildError if they contradict."""
+    """Derive the parameters of the machine for the whole model, or raise a BuildError if model and options contradict."""
     if options.sensor_mode is not SensorMode.COLUMN and options.scaling is Scale.ADDRESS:
         raise BuildError(
             f"--scale address is impossible with --sensor-mode {options.sensor_mode}: lines use different addresses in a "

@@ -1,4 +1,4 @@
-"""The options of a build, everything except the model (thesis 3.2, 3.4), and the file of `--sources`."""
+"""The options of a build, which are everything except the model (thesis 3.2, 3.4), and the file of `--sources`."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ MOST_SOURCES: Final = 256
 
 
 class SourceTable(Source):
-    """A `[[source]]` of a sources file, and what it has; without a `uri`, that of `--uri` is used."""
+    """A `[[source]]` of a sources file with its variables; without a `uri`, that of `--uri` is used."""
 
     variables: dict[Name, MessagePath] | None = None
-    """The path of each variable in the message, by its name; None for all variables of no other source."""
+    """Paths in the message by variable; None for all variables that no other source has."""
     prior: MessagePath | None = None
     """The path of a written prior in the message, or None."""
 
@@ -121,7 +121,7 @@ class SourcesFile:
 
 
 def read_sources(path: Path, uri: str | None) -> SourcesFile:
-    """Read a sources file; `uri` is the server of sources that name none. A BuildError names the line."""
+    """Read a sources file, or raise a BuildError with the line; `uri` is the server of sources that name none."""
     toml = TomlFile.read(path, BuildError)
     tables = toml.tables.get("source")
     for at, table in enumerate(tables if isinstance(tables, list) else ()):
@@ -164,7 +164,7 @@ TARGET_COUNT: Final = typer.Option(help="Count that stops a machine.", show_defa
 
 @dataclass(frozen=True, kw_only=True)
 class TargetOptions:
-    """The flags of a build for the topics."""
+    """The flags of a build about topics."""
 
     uri: Annotated[str, URI] = ""
     topic: Annotated[str, TOPIC] = ""
@@ -201,7 +201,7 @@ class DeploymentEdits:
 
 @dataclass(frozen=True, kw_only=True)
 class MachineOptions:
-    """The flags of a build for the machine, except those that name a file or have a text form."""
+    """The flags of a build about the machine, except those that name a file or need parsing."""
 
     partitions: Partitions = 1
     scale: Annotated[
@@ -254,7 +254,7 @@ class MachineOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class BuildOptions(MachineOptions, TargetOptions):
-    """The options of a build: those of its flags, and what the other flags name."""
+    """The options of a build: the values of its flags, and the contents of files that flags name."""
 
     interface: tuple[int, int] | None = None
     """Inputs and results of the boards' registers; None for the thesis's 20 x 1200, or the size of the model
@@ -268,7 +268,7 @@ class BuildOptions(MachineOptions, TargetOptions):
     """The date of the build, ISO 8601: part of the images' manifests, but not of their hashes."""
 
     def __post_init__(self) -> None:
-        """Refuse a server, topic, type or path that is none, before a model is read."""
+        """Refuse a malformed server, topic, type or path before a model is read."""
         try:
             self.all_sources, Output(topic=self.output), self.written_prior
         except ValidationError as reason:
@@ -297,7 +297,7 @@ class BuildOptions(MachineOptions, TargetOptions):
 
 
 def refused_option(reason: ValidationError) -> BuildError:
-    """Return a pydantic error as an error with the flag of the field."""
+    """Return the error for an option that pydantic refuses, with the flag of the field."""
     detail = reason.errors(include_url=False)[0]
     key = str(detail["loc"][0]) if detail["loc"] else ""
     flag = "--output" if reason.title == "Output" else _FLAGS.get(key, "--" + key.replace("_", "-"))

@@ -18,15 +18,15 @@ from toolchain.models.conditional import middle_bin
 from toolchain.models.model import Known, Model
 
 _HALVINGS: Final = 12
-"""Number of halvings of the logarithmic range of a floor, for more than the two reported digits."""
+"""Number of bisection steps over the logarithmic range of a floor, enough for the two reported digits."""
 
 _ROUNDING: Final = 1e-12
-"""Divergence in bits below which there are only rounding errors of float64."""
+"""Divergences in bits below this are only rounding errors of float64."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ColumnLoss:
-    """The loss of one column by quantising."""
+    """The quantisation loss of one column."""
 
     name: str
     """The known variable's name, or `prior`."""
@@ -48,7 +48,7 @@ class ColumnLoss:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VanishedFloor:
-    """An outlier floor that became code 0 somewhere."""
+    """An outlier floor for which some code is 0."""
 
     name: str
     what: str
@@ -84,8 +84,8 @@ def quantise(
 ) -> Quantised:
     """Return the codes of a model with `prob_bits` bits (1 to 16), and the quantisation loss.
 
-    `scale` is the part of a table that is first divided by its maximum; not addresses if cells have their own
-    readings.
+    `scale` is the part of a table that is first divided by its maximum. If cells have their own readings, it cannot
+    be `address`.
     """
     prior = model.prior_distribution
     prior_codes, prior_loss = _quantised_prior(model, prob_bits, scale)
@@ -150,7 +150,7 @@ def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
 
 
 def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[np.float64]) -> ColumnLoss:
-    """Compare P(S, K) with its quantised form, float64[values, lines], whose rows may have any factor."""
+    """Compare P(S, K) with its quantised form, float64[values, lines], each row of which may have any factor."""
     weight = exact.sum(axis=1)
     remaining = quantised.sum(axis=1)
     alive = (remaining > 0) & (weight > 0)

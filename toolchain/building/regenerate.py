@@ -56,7 +56,7 @@ def _defined(**values: object) -> dict[str, object]:
 
 
 def _in_order(variables: tuple[Variable, ...], given: str | None) -> tuple[Variable, ...]:
-    """Return the variables in the order in which the columns read them.
+    """Return the variables in a new order of columns.
 
     A column keeps its table and its conversion to addresses; its name, source and path change.
     """
@@ -99,7 +99,7 @@ def regenerate_memories(directory: Path, model: Model | None = None, *, build_da
     the columns get the order of the model; sizes, widths and everything about topics do not change.
 
     Raises:
-        BuildError: The model now needs another machine, and so a new build.
+        BuildError: The model now needs another machine, so a new build is necessary.
         DeploymentError: The deployment is missing or damaged.
     """
     deployment = load_deployment(directory)
@@ -161,7 +161,7 @@ def _options(deployment: Deployment, image: Image) -> BuildOptions:
 
 
 def _with_widths(model: Model, deployment: Deployment) -> Model:
-    """Return the model with the address widths of the deployment; otherwise it must need the same machine."""
+    """Return the model with the address widths of the deployment, or raise a BuildError if it needs another machine."""
     sizes = [(each.label, each.size) for each in model.searched]
     built_sizes = [(each.label, each.size) for each in deployment.searched]
     kinds = {variable.name: variable.kind for variable in model.variables}

@@ -13,7 +13,7 @@ REPORT_NAME: Final = "report.txt"
 def build_report(
     model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str = ""
 ) -> str:
-    """Return what was built and what was lost, in plain sentences; no dates or paths: same input, same bytes."""
+    """Return what was built and what was lost, in plain sentences, without dates or paths: same input, same bytes."""
     machine = deployment.machine
     grid = " x ".join(f"{d.label} {d.size}" for d in model.searched)
     names = ", ".join(known.name for known in model.known)
@@ -60,7 +60,7 @@ def loss_heading(sensor_mode: SensorMode) -> str:
 
 
 def many_sentence(machine: MachineSection) -> str:
-    """Describe a frame's readings and results where they are not one number a variable and one posterior."""
+    """Describe a frame's readings and results, unless they are one number per variable and one posterior."""
     sentence = {
         SensorMode.COLUMN: "",
         SensorMode.CELL: f" Each of the {machine.lines} lines has a reading of its own (sensor_mode = cell).",

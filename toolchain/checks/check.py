@@ -26,7 +26,7 @@ from toolchain.outputs.output_files import Change, compare_files, memory_files, 
 def check_model(
     model: Model, options: BuildOptions, fit: Callable[[MachinePlan], MachinePlan] = lambda plan: plan
 ) -> list[Finding]:
-    """Return the findings about a model and the machine for it, the worst first; `fit` may add boards to the plan."""
+    """Return the findings about a model and the machine for it, the worst first; `fit` may increase the number of boards of the plan."""
     refused: list[Finding] = []
     try:  # besides, so that both mistakes are found at once
         partition_lines(model.lines, options.partitions)
@@ -164,13 +164,13 @@ _WITHOUT_HEADER: Final = frozenset(
         "Twist", "TwistWithCovariance", "Vector3", "Wrench",
     )
 )  # fmt: skip
-"""Types without a header in a package whose other types have one; those of std_msgs never have one."""
+"""Types without a header, in packages in which most types have one; no type of std_msgs has one."""
 _LEAST_TOLERANCE_S: Final = 0.005
-"""Below this, the receipts of two messages that were sent together hardly ever pair."""
+"""Minimum tolerance in seconds at which messages that were sent together pair by their times of receipt."""
 
 
 def source_findings(deployment: Deployment) -> Iterator[Finding]:
-    """Find topics that are paired by receipt, because their messages have no header."""
+    """Find topics that are paired by time of receipt, because their messages have no header."""
     if len(deployment.sources) < 2:
         return
     bare = [source.topic for source in deployment.sources if not _may_have_header(source.type)]

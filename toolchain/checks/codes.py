@@ -25,7 +25,7 @@ def code_findings(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def loss_findings(quantised: Quantised, options: BuildOptions) -> Iterator[Finding]:
-    """Find floors that vanish, and frames in which the true line has code 0."""
+    """Find floors whose codes are 0, and frames in which the true line has code 0."""
     for floor in quantised.floors:
         yield warning(Check.VANISHED_FLOOR, floor.name, floor.what, floor.advice)
     mass = sum(loss.mass for loss in quantised.losses)
@@ -133,7 +133,7 @@ def _dead_prior(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def _readings(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find readings with code 0 on every line; a frame with one ends as `impossible`."""
+    """Find readings with code 0 on every line; a frame with such a reading ends as `impossible`."""
     deployment, model = machine.deployment, machine.model
     alive = _alive(machine)
     if not alive.any() or machine.parameters.sensor_mode is not SensorMode.COLUMN:

@@ -1,4 +1,4 @@
-"""Findings of a check, and the whole machine in which they are found."""
+"""Findings of a check, and the whole machine that is checked."""
 
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -103,7 +103,7 @@ class CheckedMachine:
         return ["the prior", *(variable.name for variable in self.deployment.sensors)]
 
     def addressable_rows(self, column: int) -> NDArray[np.uint16]:
-        """Return the rows of a column (from 0) that readings, and permitted missing readings, address."""
+        """Return the rows of a column (from 0) that readings can address, including permitted missing ones."""
         return _addressable(self.deployment.sensors[column], self.tables[column])
 
     def prior_rows(self) -> NDArray[np.uint16]:

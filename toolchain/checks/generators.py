@@ -188,14 +188,14 @@ def _table(board: BM1Machine) -> NDArray[np.uint32]:
 
 
 Bit = tuple[int, int]
-"""A column, 0 being the prior, and a bit of its numbers."""
+"""A column (0 is the prior) and a bit of its numbers."""
 
 _MOST_PAIRS: Final = 20_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """Bits that XOR to 0 in every cycle, in one group: a bank, or a line's cells in a bank."""
+    """Bits that XOR to 0 in every cycle, in one group: a bank, or the cells of one line in a bank."""
 
     group: int
     bits: tuple[Bit, ...]
@@ -203,7 +203,7 @@ class Relation:
 
 @dataclass(frozen=True, slots=True)
 class Relations:
-    """At most one relation of the fewest bits for each group, and the number of groups that were searched."""
+    """The relations found, at most one per group and with the fewest bits, and the number of groups that were searched."""
 
     found: tuple[Relation, ...]
     groups: int
@@ -229,7 +229,7 @@ def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> Relat
 
 
 def _bit_words(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> NDArray[np.uint64]:
-    """Return each bit's values in the first steps, as many as the state has bits: uint64[groups, bits].
+    """Return each bit's values in as many first steps as the state has bits: uint64[groups, bits].
 
     Two bits with the same word are always the same, because so many steps determine a linear sequence.
     """

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from toolchain.checks.finding import Finding
 
 _NO_ROBOT = TargetOptions(uri="ws://127.0.0.1:9090", topic="/readings", type="std_msgs/Float64MultiArray")
-"""A target for a check, which does not need one, unlike the options of a build."""
+"""A placeholder for a check, which needs no topics, although the options of a build do."""
 
 
 def build(

@@ -193,7 +193,7 @@ def read_named(options: BuildOptions, flags: BuildFlags) -> BuildOptions:
 
 
 def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
-    """Return the plan with as many boards as the lines need on a device, and the reason as a sentence."""
+    """Return the plan with as many boards as the lines need on a device, and why, as a sentence."""
     if name is None:
         return plan, ""
     from toolchain.analysis.logic import device_named

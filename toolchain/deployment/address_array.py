@@ -1,7 +1,7 @@
 """Conversion of arrays of readings to addresses or codes: one per line, one per replica, or both (thesis 4.4).
 
-Each number is converted as in `toolchain.deployment.address`. Rows are in order (replica after replica, line
-after line), and a reading of a sensor is missing on all lines of a machine or on none. Likelihoods
+Each number is converted as in `toolchain.deployment.address`. Numbers are in order (replica after replica, line
+after line). A reading of a sensor is missing either on all lines of a machine or on none. Likelihoods
 (`sensor_mode = threshold`) and written priors become codes.
 """
 
@@ -56,7 +56,7 @@ def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int
 
     Args:
         prior: One number per line of the machine, such as a posterior of an earlier frame. With replicas,
-            this prior is for all of them, and `replicas` times as many numbers are one prior for each.
+            it is the prior of all of them, unless there are `replicas` times as many numbers, one prior for each.
         lines: Lines of the machine, over all boards.
         prob_bits: Bits of a code (W), 1 to 16.
         replicas: Machines on a board. With several, uint16[replicas, lines] is returned.

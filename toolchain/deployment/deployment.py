@@ -119,7 +119,7 @@ class Deployment(DeploymentFile):
         return next((variable for variable in self.variables if variable.kind == "prior_select"), None)
 
     def machine_addresses(self, addresses: Iterable[int | None]) -> tuple[tuple[int | None, ...], int]:
-        """Return the addresses of the sensors by column, and the row of the prior; None if missing."""
+        """Return the addresses of the sensors by column, and the row of the prior; each is None if missing."""
         sensors: list[int | None] = []
         row = 0
         for variable, address in zip(self.variables, addresses, strict=True):
@@ -182,7 +182,7 @@ def with_hash(deployment: Deployment) -> Deployment:
 
 
 _FORMER_KEYS: Final = ("integrity", "integrity_frames")
-"""Keys that earlier versions wrote or read, and that did not enter the hash."""
+"""Keys of earlier versions that were not part of the hash."""
 
 
 def load_deployment(directory: Path, *, images: bool = True, edited: bool = False) -> Deployment:

@@ -114,7 +114,7 @@ States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda state
 
 
 def states_fit(name: str, states: tuple[str, ...], size: int) -> None:
-    """Raise a ValueError if the number of state names differs from the number of values."""
+    """Raise a ValueError if there are state names, but not as many as values."""
     if states and len(states) != size:
         raise ValueError(f"{name} has {size} values, but {len(states)} states are named")
 
@@ -142,7 +142,7 @@ class Queue(StrEnum):
     """The readings that wait if they arrive faster than frames are computed."""
 
     LATEST = "latest"
-    """Only the newest waits; passed-over readings are counted."""
+    """Only the newest waits; the readings that it replaces are counted."""
     ALL = "all"
     """All wait, in order."""
 
@@ -277,7 +277,7 @@ class MachineSection(Section):
 
     @property
     def kind(self) -> "MachineKind":
-        """The kind of the machine, which knows its frames and results."""
+        """The kind of the machine, which defines its frames and results."""
         return KINDS[self.type]()
 
     @property

@@ -32,7 +32,7 @@ class Simulator(StrEnum):
     GHDL = "ghdl"
     """GHDL: interprets the VHDL; compiled within seconds."""
     VERILATOR = "verilator"
-    """Verilator, on GHDL's translation to Verilog: a hundred times as fast, compiled within minutes."""
+    """Verilator, after a translation to Verilog by GHDL: a hundred times as fast, compiled within minutes."""
 
     @property
     def tools(self) -> tuple[str, ...]:
@@ -65,7 +65,7 @@ def check_tools(simulator: Simulator) -> None:
 
 
 def compiled(image: Image, simulator: Simulator, folder: Path, on_compile: Callable[[str], None]) -> Compiled:
-    """Return the simulation of an image's hardware, after compiling it if the folder does not have it yet.
+    """Return the simulation of an image's hardware, compiled unless it is in the folder already.
 
     Args:
         image: Image of the board.
@@ -74,8 +74,8 @@ def compiled(image: Image, simulator: Simulator, folder: Path, on_compile: Calla
         on_compile: Called with a sentence before a compilation.
 
     Raises:
-        HardwareToolError: A tool is missing or failed, the machine exists only emulated, or the folder is
-            unusable.
+        HardwareToolError: A tool is missing or failed, the machine exists only in emulation, or the folder
+            is unusable.
     """
     check_tools(simulator)
     if image.machine.parameters.rng is RngKind.IDEAL:
@@ -105,7 +105,7 @@ def compiled(image: Image, simulator: Simulator, folder: Path, on_compile: Calla
 
 
 def _compile(image: Image, simulator: Simulator, kept: Path) -> None:
-    """Compile a simulation beside its place, so that what is there is complete."""
+    """Compile a simulation in a temporary folder and move it, so that the folder never holds an incomplete one."""
     with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=kept.parent, ignore_cleanup_errors=True) as where:
         finished = Path(where) / "finished"
         finished.mkdir()
@@ -152,7 +152,7 @@ def _compile_verilator(image: Image, folder: Path) -> None:
 
 
 def _key(image: Image, simulator: Simulator) -> str:
-    """Return a name that differs if image, sources or tools differ."""
+    """Return a folder name that differs if image, sources or tools differ."""
     parts = [f"{simulator} {image.image_hash} {image.partition}"]
     parts += [run_tool([tool, "--version"], Path("/")) for tool in simulator.tools]
     names = [*SOURCES, _TABLE_VHDL, _BENCH_VHDL, _TABLE_VERILOG, _BENCH_CPP]

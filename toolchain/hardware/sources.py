@@ -31,7 +31,7 @@ SOURCES: Final = (
     "bm1_axi.vhd",
     "bm1.vhd",
 )
-"""The hardware's files in the order of analysis; the generated package of parameters follows the first."""
+"""The hardware's files in the order of analysis; the generated package of parameters comes after the first."""
 
 PARAMETERS: Final = "bm1_parameters.vhd"
 

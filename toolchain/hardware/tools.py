@@ -28,7 +28,7 @@ def run_tool(
     *,
     separate: bool = False,
 ) -> str:
-    """Run a tool in a folder and return its output, with `separate` without its warnings.
+    """Run a tool in a folder and return its output, without its warnings if `separate` is True.
 
     Raises:
         HardwareToolError: It is not installed, failed, or did not end in time.

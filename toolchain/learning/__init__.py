@@ -19,7 +19,7 @@ class FitMethod(StrEnum):
 
 
 class FitPrior(StrEnum):
-    """The shape of a counted table before any reading."""
+    """The table that counting starts from."""
 
     MODEL = "model"
     """The table of the model."""

@@ -3,11 +3,11 @@
 **Normals.** A reading is `mean(S) + bias + noise` with noise N(0, sigma^2), or, for a share of the readings,
 uniform over the range of the variable. Bias, sigma and share are estimated by expectation maximisation from
 the residuals at the true position; within a cell, the mean is assumed linear. A pool of variables may share
-sigma and bias. Every variable has its own share of outliers, initialised with one outlier and one good
-reading (the mode of a Beta(2, 2) prior).
+sigma and bias. Every variable has its own share of outliers, estimated as if it had one more outlier and one more
+good reading (the mode with a Beta(2, 2) prior).
 
 **Counts.** P(k | s) = (n(k, s) + a q(k | s)) / (n(s) + a): a Dirichlet prior with the weight of `a` readings
-in every cell and the shape q, the table of the model or a uniform one. Likewise P(s) = (n(s) + a M q(s)) / (n + a M)
+in every cell; q is the table of the model or a uniform one. Likewise P(s) = (n(s) + a M q(s)) / (n + a M)
 for M cells.
 """
 
@@ -28,14 +28,14 @@ from toolchain.learning.fitted import Fit, FitFile, FittedRecording, FittedVaria
 from toolchain.models.model import Known, Model
 
 LEAST_READINGS: Final = 10
-"""Minimum number of readings of a pool, below which it keeps the values set by hand."""
+"""Minimum number of readings of a pool; with fewer, it keeps the values set by hand."""
 
 _ROUNDS: Final = 1000
 _SETTLED: Final = 1e-10
 _LEAST_SIGMA: Final = 0.05
-"""Minimum sigma in steps, because rounded recordings, and those simulated without noise, have no variance."""
+"""Minimum sigma in steps, because recordings that are rounded or simulated without noise have no variance."""
 _TO_SIGMA: Final = 1.4826
-"""Factor from the median absolute deviation of a normal to its sigma."""
+"""Ratio of a normal's sigma to its median absolute deviation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -272,7 +272,7 @@ def _support(name: str, lines: NDArray[np.int64], refused: int) -> Support:
 
 
 def _pools(names: Sequence[str], patterns: Sequence[str]) -> list[list[str]]:
-    """Return the groups of variables that share a normal: those of each pattern, and every other one alone."""
+    """Return the groups of variables that share a normal: one per pattern, and every other variable alone."""
     left = list(names)
     pools = []
     for pattern in patterns:

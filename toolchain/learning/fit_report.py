@@ -24,9 +24,9 @@ from toolchain.models.model import Model, cell_centres, exact_posterior
 
 _CHUNK: Final = 1 << 20
 _MOST_BITS: Final = 60
-"""Surprise at a cell with a probability of 0."""
+"""Maximum surprise in bits, for a cell with probability 0."""
 _MOST_STATES: Final = 12
-"""Maximum number of states of a confusion matrix."""
+"""Maximum number of states for which a confusion matrix is shown."""
 
 
 def run_fit(
@@ -129,7 +129,7 @@ def _comparison(
     truth_columns: Mapping[str, str],
     reading_columns: Mapping[str, str],
 ) -> str:
-    """Return how well the exact posterior finds the truth, before and after the fit."""
+    """Describe how well the exact posterior finds the truth, before and after the fit."""
     truth = locate(model, _joined([recording], truth_columns), recording.rows)
     readings = _joined([recording], reading_columns)
     if not len(truth.rows):

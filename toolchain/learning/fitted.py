@@ -39,7 +39,7 @@ class FittedRecording(Section):
 
 
 class FittedVariable(Section):
-    """A `[[variable]]`, a known variable; a counted one has only name and rows, since its table is an array."""
+    """A `[[variable]]`, a known variable; a counted one has only name and rows, because its table is an array elsewhere."""
 
     name: str
     rows: int = Field(ge=0)

@@ -73,7 +73,7 @@ def existing_model_path(case: Path) -> Path:
 
 @contextmanager
 def _importing_from(folder: Path) -> Iterator[None]:
-    """Let `model.py` import modules in its folder, which is last on the path so that they hide nothing."""
+    """Let `model.py` import modules in its folder, which is last on the path so that they do not hide others."""
     sys.path.append(str(folder))
     try:
         yield
@@ -101,7 +101,7 @@ def _model_function(path: Path) -> Callable[..., object]:
 
 
 def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
-    """Call the user's file; an exception becomes one sentence with its line.
+    """Call a function of the user's file; an exception becomes one sentence with its line.
 
     An error raised by the file keeps its text; an error of the toolchain also gets the line of the file.
     """

@@ -1,7 +1,7 @@
 """Conditional distributions P(K | S): normals over the bins of a reading, wrapped for bearings.
 
-The address of a reading is the bin of half a step around it. Its probability is the integral of the Gaussian
-over the bin, not the density at the centre, so coarse bins are exact too.
+The address of a reading is that of the bin around it, from half a step below to half a step above. Its probability
+is the integral of the Gaussian over the bin, not the density at the centre, so coarse bins are exact too.
 """
 
 import math
@@ -186,7 +186,7 @@ def _mass(
 
 
 def middle_bin(bin_in_sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mass of a bin with the mean at its centre, to which a floor is relative."""
+    """Return the probability of a bin whose centre is the mean; floors are relative to it."""
     return 1 - 2 * _upper_tail(bin_in_sigmas / 2)
 
 

@@ -32,7 +32,7 @@ class Distribution:
     given: tuple[Symbol, ...]
     """The symbols that it depends on."""
     table: NDArray[np.float64]
-    """float64[symbol's size, size of each given], summing to 1 over the first axis."""
+    """float64[size of the symbol, size of each given], summing to 1 over the first axis."""
     normal: Normal | None = None
     """The normals behind the table, or None; their arrays are indexed by the values of the given symbols, the
     last one fastest.
@@ -73,7 +73,7 @@ def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) ->
 
     Args:
         symbol: The symbol.
-        values: float64[symbol's size, size of each given].
+        values: float64[size of the symbol, size of each given].
         given: The symbols that it depends on.
 
     Raises:
@@ -110,7 +110,7 @@ def conditional_normal(
     floor: float = 0.0,
     outliers: float = 0.0,
 ) -> Distribution:
-    """Return P(symbol | given), normal around a function of the given symbols; wrapped if the type wraps.
+    """Return P(symbol | given), normal around a function of the given symbols; wrapped if the symbol's type wraps.
 
     Args:
         symbol: An integer or interval symbol; each value gets the integral of the normal over its interval.
@@ -143,7 +143,7 @@ def conditional_normal(
 
 
 def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distribution:
-    """Return P(symbol | given) of a symbol that is a function of the given ones: 1 at its value, 0 elsewhere.
+    """Return P(symbol | given) for a function of the given symbols: 1 at its value, 0 elsewhere.
 
     Args:
         symbol: The symbol; with `on_range = clamp`, values beyond its ends become the ends.

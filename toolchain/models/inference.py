@@ -1,9 +1,9 @@
-"""Exact inference on a product of factors: what is independent, and sums over the symbols that a question omits.
+"""Exact inference on a product of factors: tests of independence, and sums over the symbols that a question omits.
 
-Symbols are separated by the moral graph without the searched and given ones. The others are eliminated one by one,
-exactly, in float64. The order is planned before anything is computed, by two rules: the next name is the one with the
-smallest table, or the one whose elimination joins the fewest pairs of names (min-fill). The order with the smaller
-tables is taken; if both need a table above the limit, the question is refused.
+Independence is tested on the moral graph without the searched and given symbols. The other symbols are eliminated one
+by one, exactly, in float64. The order is planned before anything is computed, by two rules: the next name is the one
+with the smallest table, or the one whose elimination joins the fewest pairs of names (min-fill). The order with the
+smaller tables is used; if both need a table above the limit, the question is refused.
 """
 
 import math
@@ -23,9 +23,9 @@ from toolchain.models.model import MAX_ENTRIES
 
 _NAMED: Final = 6
 _CHEAP: Final = 2**16
-"""Entries of all tables of an order, below which no other order is planned."""
+"""If the tables of an order have fewer entries than this, no other order is planned."""
 _MOST_COUNTED: Final = 64
-"""Maximum number of neighbours whose pairs are counted."""
+"""Maximum number of neighbours of a name whose pairs are counted."""
 
 _Graph: TypeAlias = dict[str, set[str]]
 """The names that share a term with each name."""
@@ -88,7 +88,7 @@ def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, i
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """An order of elimination; `largest` is its largest table, which ends the plan if it is above the limit."""
+    """An order of elimination; planning stops if `largest`, the size of its largest table, exceeds the limit."""
 
     order: tuple[str, ...]
     entries: int
@@ -119,7 +119,7 @@ def _order(terms: Iterable[Term], names: set[str], sizes: Mapping[str, int]) -> 
 def _planned(
     graph: _Graph, names: set[str], sizes: Mapping[str, int], cost: Callable[[_Graph, str], int]
 ) -> _Plan:
-    """Return the order in which the name with the lowest cost is always the next one."""
+    """Return the order that eliminates the name with the lowest cost next."""
     graph = {name: set(neighbours) for name, neighbours in graph.items()}
     costs = {name: cost(graph, name) for name in names}
     # The name breaks ties, so the same question gives the same sums, bit for bit. A changed cost is a new
@@ -169,7 +169,7 @@ def _entries(graph: _Graph, name: str, sizes: Mapping[str, int]) -> int:
 
 
 def _fill(graph: _Graph, name: str) -> int:
-    """Return the number of pairs of neighbours that are not neighbours of each other; at most, if there are many."""
+    """Return how many pairs of a name's neighbours are not neighbours of each other; an upper bound if there are many."""
     neighbours = graph[name]
     if len(neighbours) > _MOST_COUNTED:
         return len(neighbours) ** 2
@@ -226,7 +226,7 @@ class Links:
         return found
 
     def joined(self, observed: Sequence[str]) -> bool:
-        """Return whether two of some symbols are connected."""
+        """Return whether any two of these symbols are connected."""
         return any(len(component.intersection(observed)) > 1 for component in self.components())
 
     def path(self, start: str, end: str) -> list[str]:
@@ -240,7 +240,7 @@ class Links:
         return path[::-1]
 
     def lengths(self, start: str, ends: Sequence[str]) -> dict[str, int]:
-        """Return the number of symbols on the shortest path to each connected one of some symbols."""
+        """Return the number of symbols on the shortest path to each of these symbols that is connected."""
         before = self._reached(start)
         count = {start: 1}
         for name in before:  # nearer ones are first
@@ -248,7 +248,7 @@ class Links:
         return {end: count[end] for end in ends if end in count}
 
     def _reached(self, start: str) -> dict[str, str]:
-        """Return every symbol connected to one, with its predecessor on the shortest path."""
+        """Return every symbol connected to `start`, with its predecessor on the shortest path."""
         before = {start: start}
         waiting = deque([start])
         while waiting:
@@ -260,7 +260,7 @@ class Links:
         return before
 
     def drawn(self, path: Sequence[str]) -> str:
-        """Return a path as text with arrows, common children between their parents; a long one is cut."""
+        """Return a path as text with arrows, with common children between their parents; a long one is shortened."""
         arrows = [self._arrow(before, after) for before, after in pairwise(path)]
         if len(path) > _LONGEST_DRAWN:
             arrows[_SHOWN:-_SHOWN] = [f" ... {path[-1 - _SHOWN]}"]
@@ -307,7 +307,7 @@ def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
 
 
 def without_idle(factor: Factor) -> Factor:
-    """Return the factor without symbols that have no influence in it."""
+    """Return the factor without symbols on which its values do not depend."""
     scope, table = list(factor.scope), factor.table
     for axis in range(len(scope) - 1, 0, -1):
         first = np.take(table, [0], axis=axis)

@@ -200,8 +200,8 @@ class Question:
     def _refusal(self, active: Sequence[Factor], observed: Sequence[str]) -> ModelError:
         """Return an error with two dependent observed symbols, the path between them, and advice.
 
-        If not all are independent, two of them are not, regardless of the others (a property of
-        d-separation).
+        If the observed symbols are not all independent, two of them are dependent, regardless of the others (a property
+        of d-separation).
         """
         cut = {symbol.name for symbol in self.searched} | set(self.given)
         factors, terms = self._factors(active, observed)
@@ -237,7 +237,7 @@ class Question:
     def _fusion(
         self, own: Mapping[str, Sequence[Term]], weight: NDArray[np.float64], sizes: Mapping[str, int]
     ) -> Model:
-        """Return the model from the observed symbols' terms and the searched symbols' weight, float64[lines]."""
+        """Return the model from the terms of the observed symbols and the weight of the searched ones, float64[lines]."""
         searched = [symbol.name for symbol in self.searched]
         tables = {
             name: product(terms, (name, *searched), sizes).reshape(sizes[name], -1)

@@ -20,19 +20,19 @@ from toolchain.deployment.sections import NAME_MAX
 from toolchain.errors import ModelError
 
 MAX_LINES: Final = 2**24
-"""Values of all searched dimensions together: 4,096 boards with the maximum number of lines in the register
+"""Maximum number of values of all searched dimensions together: 4,096 boards with the maximum number of lines in the register
 map.
 """
 MAX_VALUES: Final = 2**16 - 1
-"""Values of a known variable: a column has at most 16 address bits, and the top address means a missing
+"""Maximum number of values of a known variable: a column has at most 16 address bits, and the top address means a missing
 reading.
 """
 MAX_ENTRIES: Final = 2**24
-"""Entries of a factor of a joint distribution (128 MiB as float64)."""
+"""Maximum number of entries of a factor of a joint distribution (128 MiB as float64)."""
 MAX_TABLE_ENTRIES: Final = 2**26
-"""Entries of a known variable's table (512 MiB as float64)."""
+"""Maximum number of entries of a known variable's table (512 MiB as float64)."""
 MAX_MODEL_ENTRIES: Final = 2**28
-"""Entries of the tables of all known variables of a question together."""
+"""Maximum number of entries of the tables of all known variables of a question together."""
 
 
 def check_size(what: str, entries: int, most: int, advice: str = "") -> None:

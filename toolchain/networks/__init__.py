@@ -1,4 +1,4 @@
-"""Readers of network files: BIF, XMLBIF, UAI, NET and XDSL become joint distributions, also compressed (.gz)."""
+"""Readers of network files: BIF, XMLBIF, UAI, NET and XDSL, also compressed (.gz), become joint distributions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def is_network(path: Path) -> bool:
 
 
 def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error") -> JointDistribution:
-    """Return the joint distribution of a file whose name ends in one of `SUFFIXES`, or one of them and `.gz`.
+    """Return the joint distribution in a network file; its name ends in one of `SUFFIXES`, and `.gz` may follow.
 
     Raises:
         NetworkFileError: The file is missing, too large, or not a network; the sentence contains file and

@@ -21,8 +21,8 @@ class Scanner:
     def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str = "") -> None:
         """Scan the bytes of a file.
 
-        `signs` are tokens themselves, and end a word. `comments` is a regular expression for comments, or
-        only for the beginning of /* ... */.
+        Each of `signs` is a token, and ends a word. `comments` is a regular expression for comments; of /* ... */ only
+        for the beginning.
         """
         self._path = path
         try:
@@ -78,7 +78,7 @@ class Scanner:
         return found
 
     def words(self, end: str, what: str, most: int) -> list[str]:
-        """Consume at most `most` words up to a sign and the sign, with or without commas."""
+        """Consume at most `most` words, with or without commas, and the sign `end` after them."""
         found: list[str] = []
         while True:
             piece = self.next()
@@ -109,7 +109,7 @@ class Scanner:
         return int(word)
 
     def numbers(self, end: str, wanted: int, what: str, *, between: str = ",") -> NDArray[np.float64]:
-        """Consume numbers up to a sign and the sign, ignoring the signs `between`: float64[wanted]."""
+        """Consume numbers and the sign `end` after them, ignoring the signs `between`: float64[wanted]."""
         stop = self._text.find(end, self._end)
         if stop < 0:
             self._start = self._end = len(self._text)
@@ -133,7 +133,7 @@ class Scanner:
         return self._floats(words, wanted, what, begin)
 
     def skip(self, end: str) -> None:
-        """Consume everything up to a sign and the sign, except for signs in brackets and quotes."""
+        """Consume everything up to and including the sign `end`, ignoring signs in brackets and quotes."""
         depth = 0
         while True:
             piece = self.next()
@@ -167,7 +167,7 @@ class Scanner:
         return self._signs.fullmatch(piece) is not None
 
     def _floats(self, words: list[str], wanted: int, what: str, begin: int) -> NDArray[np.float64]:
-        """Return words as numbers; the last one may be the rest of the text, and is only counted."""
+        """Return words as numbers; a last word beyond those wanted may be the rest of the text, and is only counted."""
         values = []
         for word in words[:wanted]:
             try:
@@ -410,7 +410,7 @@ def read_uai(data: bytes, builder: NetworkBuilder) -> None:
 
 
 def _check_uai_order(child: str, values: NDArray[np.float64], text: Scanner) -> None:
-    """Refuse a table that is a distribution only if the child, last in its scope, varies slowest."""
+    """Refuse a table that would be a distribution only if the child, the last in its scope, varied slowest."""
     flat = values.ravel()
     fastest, slowest = (
         flat.reshape(-1, values.shape[-1]).sum(axis=1),

@@ -33,7 +33,7 @@ class XmlLine:
 
 
 def _entries(text: str, wanted: int, child: str, line: XmlLine) -> list[str]:
-    """Return the words of a table, or raise a NetworkFileError for another number of them."""
+    """Return the words of a table, or raise a NetworkFileError if there are not as many as wanted."""
     words = text.split(maxsplit=wanted)
     if len(words) != wanted:
         count = f"more than {wanted}" if len(words) > wanted else str(len(words))
@@ -52,7 +52,7 @@ def _decimals(words: Sequence[str], child: str, line: XmlLine) -> NDArray[np.flo
 class XmlFile:
     """A parser that calls `started(name, attributes)` and `ended(name, text)` for every element.
 
-    The text is that between the last start and the end, so it is complete for elements without others inside.
+    The text is that between the last start tag and the end tag, so it is complete for elements without children.
     `open` are the names of the open elements; `ended` is called after its element was removed.
     """
 
@@ -123,7 +123,7 @@ _XDSL_NODES: Final = {"cpt": "probabilities", "deterministic": "resultingstates"
 
 @dataclass(slots=True)
 class _XdslNode:
-    """A node while it is read; its table is processed after the last node, because parents may follow."""
+    """A node while it is read; its table is processed after the last node, because its parents may come later."""
 
     kind: str
     name: str
@@ -207,12 +207,12 @@ _XMLBIF_TEXTS: Final = {"NAME", "OUTCOME", "FOR", "GIVEN", "TABLE"}
 
 
 def read_xmlbif(data: bytes, builder: NetworkBuilder) -> None:
-    """Read an XMLBIF file without entities; in a TABLE, the GIVENs are in order and the FOR is fastest."""
+    """Read an XMLBIF file without entities; in a TABLE, the GIVENs are in order and the FOR varies fastest."""
     _XmlbifReader(builder).read(data)
 
 
 class _XmlbifReader:
-    """A reader of elements; definitions are processed after the last variable, which may follow them."""
+    """A reader of elements; definitions are processed at the end, because their variables may come later."""
 
     def __init__(self, builder: NetworkBuilder) -> None:
         self._builder = builder

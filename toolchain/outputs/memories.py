@@ -1,9 +1,8 @@
-"""The memories of a machine on each board, each with its MIF: priors, tiles, random numbers (thesis 3.2).
+"""The memories of a machine on each board, with a MIF for each: priors, tiles, random numbers (thesis 3.2).
 
 All tiles of a column have the same reading, so a column is one memory: its address is that of the reading,
 and a word contains the codes of all lines of the board, with line 0 in the lowest bits. The prior elements
-are also one memory. If each line has its own reading, each tile is a separate memory with its bits of these
-words.
+are also one memory. If each line has its own reading, each tile is a separate memory, with its bits of these words.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence

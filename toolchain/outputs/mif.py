@@ -1,4 +1,4 @@
-"""Memory initialisation files (MIF), the text in which an FPGA's memories get their contents (thesis 3.2).
+"""Memory initialisation files (MIF), the text files with the initial contents of an FPGA's memories (thesis 3.2).
 
 Files are written in one canonical form, with one hexadecimal entry per line, and read in every form of
 Quartus: five radices, runs (`A : D0 D1;`), ranges (`[A0..A1] : D;`) and both kinds of comments. The random
@@ -23,7 +23,7 @@ MOST_BYTES: Final = 1 << 30
 """Maximum size of a file in bytes."""
 
 MOST_WORDS: Final = 1 << 24
-"""Maximum depth of a memory, because a few bytes could declare any depth."""
+"""Maximum depth of a memory, because a few bytes of a file could declare any depth."""
 
 MOST_WIDTH: Final = 1 << 20
 """Maximum width of a word in bits: 4096 lines with the widest codes have 65,536."""
@@ -82,7 +82,7 @@ def read_mif(path: Path) -> Mif:
 
 
 def parse_mif(text: str, name: str = "the MIF") -> Mif:
-    """Return the contents of a memory from a text; a MifError contains the line and the expected token."""
+    """Return the contents of a memory from the text of a MIF; a MifError contains the line and the expected token."""
     return _Reader(text, name).read()
 
 

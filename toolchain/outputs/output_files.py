@@ -1,4 +1,4 @@
-"""The files of a deployment: their contents, the Quartus project among them, and the change of each (thesis 3.2)."""
+"""The files of a deployment, including the Quartus project: their contents, and how writing changes each (thesis 3.2)."""
 
 import filecmp
 import re
@@ -111,7 +111,7 @@ foreach revision {{{names}}} {{
 
 
 class Change(StrEnum):
-    """The change of a file by writing."""
+    """How writing changes a file."""
 
     UNCHANGED = "unchanged"
     CHANGED = "changed"

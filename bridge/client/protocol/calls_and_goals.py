@@ -43,7 +43,7 @@ MAX_SERVED_GOALS: Final = 64
 
 
 class _Pending:
-    """Names of the services or actions that were asked for something, by id on the wire."""
+    """Pending calls or goals: names of their services or actions, by id on the wire."""
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
@@ -58,12 +58,12 @@ class _Pending:
         self._names.pop(identity, None)
 
     def lost(self) -> None:
-        """Drop everything of a lost connection, because servers forget who has asked."""
+        """Drop everything after a lost connection, because servers forget their clients' calls and goals."""
         self._names.clear()
 
 
 class PendingCalls(_Pending):
-    """The pending calls."""
+    """Calls of this client that have no answer yet."""
 
     def send(self, service: str, args: Mapping[str, Any]) -> str:
         """Call a service, unless `MAX_CALLS` calls are pending; return the id for its `CallAnswered`."""
@@ -91,7 +91,7 @@ class PendingCalls(_Pending):
 
 
 class PendingGoals(_Pending):
-    """The active goals."""
+    """Goals of this client that have not ended."""
 
     def send(self, action: str, type_name: str, goal: Mapping[str, Any], *, feedback: bool) -> str:
         """Send a goal (see `bridge.client.Ros.send_goal`), and return its id in events."""
@@ -146,7 +146,7 @@ class PendingGoals(_Pending):
 
 
 class _Served:
-    """Types of the services or actions by name."""
+    """Services or actions that this client serves: their types, by name."""
 
     # Field of operations with the name, and the end of the names of operations.
     kind: ClassVar[str]
@@ -165,7 +165,7 @@ class _Served:
             self._send_advertise(name)
 
     def advertise(self, name: str, type_name: str) -> None:
-        """Serve something (see `bridge.client.Ros.advertise_service` and `advertise_action`)."""
+        """Serve a service or an action (see `bridge.client.Ros.advertise_service` and `advertise_action`)."""
         key = absolute(check_name(name))
         split_type(type_name)
         if key in self._types:
@@ -178,11 +178,11 @@ class _Served:
         self._wire.write(op=f"advertise_{self.kind}", **{self.kind: name}, type=spelt)
 
     def _spelt(self, type_name: str) -> str:
-        """Return the name of a type for the server."""
+        """Return a type's name in the form of the server's ROS version."""
         raise NotImplementedError
 
     def unadvertise(self, name: str) -> None:
-        """Stop serving something."""
+        """Stop serving a service or an action."""
         key = absolute(name)
         del self._types[key]
         self._wire.write(op=f"unadvertise_{self.kind}", **{self.kind: key})
@@ -210,11 +210,11 @@ class ServedServices(_Served):
         return self._wire.type_name(type_name, "srv")
 
     def answer(self, ticket: int, values: Mapping[str, Any] | str, *, ok: bool = True) -> None:
-        """Answer a request with fields, or with `ok=False` a reason as text, unless its connection was lost.
+        """Answer a request with fields, or without `ok` with a reason as text; no effect if its connection was lost.
 
         The reference server drops an answer whose `values` are not an object, and the caller waits for ever
-        (rosbridge_library/capabilities/service_response.py, `service_response_msg_fields`), so the text is in a
-        field of its own, which it ignores and the hub passes on.
+        (rosbridge_library/capabilities/service_response.py, `service_response_msg_fields`), so the text is sent in an
+        additional field, which that server ignores and the hub passes on.
 
         Raises:
             EncodeError: The values cannot be encoded as JSON; the request is still pending.
@@ -272,7 +272,7 @@ class ServedActions(_Served):
         return ros2_type(type_name, "action")
 
     def feed_back(self, goal: str, values: Mapping[str, Any]) -> None:
-        """Send feedback of a goal, unless it has ended."""
+        """Send feedback on a goal, unless it has ended."""
         action = self._goals.get(goal)
         if action is not None:
             self._wire.write(op="action_feedback", id=goal, action=action, values=values)

@@ -119,7 +119,7 @@ class ClientCore:
         return UnusableReceived(f"a CBOR message other than publish arrived: {excerpt(data)}")
 
     def _receive_wrapped(self, operation: dict[str, Any], now: float) -> Event | None:
-        """Handle a fragment or a PNG, which contain a message, possibly nested."""
+        """Handle a fragment or a PNG; the message inside may be wrapped again."""
         # Servers send a PNG in fragments; deeper nesting could only be an attack.
         wrapped = ["fragment", "png"]
         data: bytes | str | None = None

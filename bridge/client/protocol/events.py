@@ -36,7 +36,7 @@ class CallAnswered:
 
 @dataclass(frozen=True, slots=True)
 class ServiceRequested:
-    """A request to a service of this client; pass its ticket to `Services.answer`."""
+    """A request to a service of this client; pass its ticket to `ServedServices.answer`."""
 
     service: str
     args: dict[str, Any]

@@ -105,7 +105,7 @@ class Publications:
         return ros1_type(type_name) in self._definitions
 
     def define(self, type_name: str, definitions: Definitions) -> None:
-        """Check the next message of each publication of a type, if its definition is among these."""
+        """Store a type's definition, if it is among these, and check the next message of each publication of the type."""
         self._definitions[ros1_type(type_name)] = definitions
         for advertised in self._advertised.values():
             if same_type(advertised.type, type_name):
@@ -119,7 +119,7 @@ class Publications:
             advertised.unchecked = set(advertised.holders)
 
     def publish(self, advertisement: int, msg: Mapping[str, Any]) -> bytes:
-        """Return the bytes of a message of an advertised topic, which bypass the outbox."""
+        """Return the encoded message of an advertised topic, which bypasses the outbox."""
         advertised = self._advertisements[advertisement]
         prefix = advertised.prefix
         try:

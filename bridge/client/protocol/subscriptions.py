@@ -118,7 +118,7 @@ class _Subscribed:
         return before != (self.throttle_rate, self.queue_length)
 
     def measure(self, topic: str, size: int) -> MessageDiscarded | None:
-        """Compare the size of a message with the topic's limit; return the event if it is above."""
+        """Return an event if a message of this size exceeds the topic's limit."""
         if size > self.max_size:
             self.discarded += 1
             return MessageDiscarded(topic, size, self.max_size, self.discarded, self.all_numbers)
@@ -149,7 +149,7 @@ class _Known(NamedTuple):
 
 
 _UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, Delivery(), "", sys.maxsize))
-"""Placeholder before the first envelope is known, with which no valid message begins."""
+"""Placeholder until an envelope is known; no valid message begins with it."""
 
 
 class Subscriptions:
@@ -318,7 +318,7 @@ class Subscriptions:
         ]
 
     def renew(self, topic: str) -> bool:
-        """Renew the subscription of a topic that is silent although published; return whether it gives up CBOR.
+        """Renew the subscription of a topic that is silent although published; return whether it stops asking for CBOR.
 
         rosbridge for ROS 2 fixes the quality of service when it subscribes, so it does not hear a best-effort
         publisher that starts later. Servers fail to write some types as CBOR, so the second and later renewals
@@ -340,8 +340,8 @@ class Subscriptions:
     def receive_known(self, data: bytes) -> tuple[str, dict[str, Any], tuple[int, ...]] | None:
         """Return the fields of `MessageReceived` for a message with a known envelope.
 
-        None if `ClientCore.receive` has to handle it. The fields are a plain tuple, because creating a named one takes
-        a tenth of the time that a small message takes.
+        None if `ClientCore.receive` has to handle it. The fields are a plain tuple, because a named one would add a
+        tenth to the time of a small message.
         """
         envelope, size, topic, subscribed = self._known
         if not data.startswith(envelope):
@@ -391,10 +391,7 @@ class Subscriptions:
     def receive(
         self, operation: dict[str, Any], now: float, data: bytes | str, *, from_cbor: bool = False
     ) -> MessageReceived | MessageDiscarded | UnusableReceived | None:
-        """Handle a publish, decoded from `data` (from CBOR with arrays according to `numpy`).
-
-        None if it is not subscribed, or throttled.
-        """
+        """Handle a publish operation, decoded from `data`; None if its topic is not subscribed to, or throttled."""
         topic = operation.get("topic")
         msg = operation.get("msg")
         if type(topic) is not str or type(msg) is not dict:

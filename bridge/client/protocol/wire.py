@@ -10,7 +10,7 @@ from bridge.errors import OptionError
 from bridge.names import Kind, RosVersion, ros1_type, ros2_type
 
 SMALLEST_LIMIT: Final = 2048
-"""Smallest limit of a server that is believed, so that subscriptions and advertisements can always be sent."""
+"""Smaller limits of a server are raised to this one, so that subscriptions and advertisements can always be sent."""
 
 
 class Wire:
@@ -36,7 +36,7 @@ class Wire:
         self.sendable = max_size
 
     def type_name(self, name: str, kind: Kind = "msg") -> str:
-        """Return a type name in the server's ROS version, or if unknown in ROS 1, which all servers accept."""
+        """Return a type name in the form of the server's ROS version; while unknown, of ROS 1, which all servers accept."""
         return ros2_type(name, kind) if self.ros_version == 2 else ros1_type(name)
 
     def write(self, **operation: Any) -> None:
@@ -67,7 +67,7 @@ class Wire:
         self._outbox.clear()
 
     def pieces(self, data: bytes) -> Sequence[bytes]:
-        """Return a message, or its fragments if it is too large for one."""
+        """Return a message, or its fragments if it exceeds the size of one."""
         if self.fragment_size is None or len(data) <= self.fragment_size:
             return (data,)
         return tuple(split(data, self.fragment_size, f"fragment:{self.number()}"))

@@ -1,4 +1,4 @@
-"""This project's client under measurement, with commands of scripts/bench bridge on standard input."""
+"""This project's client under measurement, which reads commands of scripts/bench bridge from standard input."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ACK_EVERY = 50
 
 
 def message_of(count: int) -> dict[str, Any]:
-    """Return a message of numbers such as sensors measure, as an array if there are many."""
+    """Return a message of numbers like those of sensors, as an array if there are many."""
     values = (np.arange(count) + 1) / 7.0
     return {"data": values if count > 16 else values.tolist()}
 

@@ -1,4 +1,4 @@
-"""roslibpy as a client under measurement, with commands of scripts/bench bridge on standard input.
+"""roslibpy as a client under measurement, which reads commands of scripts/bench bridge from standard input.
 
 It runs in roslibpy's own environment, so it does not import this project. ROSLIBPY_TRANSPORT selects the transport.
 """

@@ -1,11 +1,11 @@
 """A server of the reference server's design, for scripts/bench bridge: Tornado, threads, message classes.
 
 It is not rosbridge_suite, which needs ROS, but does the same work for a message of one type: Tornado reads
-it; a queue passes it to the connection's thread, which parses it and fills a message object, checking every
-field against its type; the message is serialised and sent through a socket, as between ROS nodes; the
-subscription's thread reads it, creates a message object, extracts the values and writes them as JSON; the
-text is passed to Tornado's loop, which alone may use the connections. Everything else is omitted, in this
-server's favour.
+it. A queue passes it to the connection's thread, which parses it, checks every field against its type, and
+fills a message object. The message is serialised and sent through a socket, as between ROS nodes. The
+subscription's thread reads it, creates a message object, and writes the values as JSON. The text is passed to
+Tornado's loop, because only the loop may use the connections. All other work of rosbridge_suite is omitted,
+which makes this server faster.
 
 It prints its URI. It runs in an environment with Tornado, so it does not import this project.
 """
@@ -36,7 +36,7 @@ PYTHON_TYPES = {"string": (str,), "uint32": (int,), "float64": (int, float)}
 
 
 class Message:
-    """A ROS message with an attribute for each field, which is its default at first."""
+    """A ROS message with an attribute for each field, initially its default."""
 
     layout: Message
     data: list[float]
@@ -68,7 +68,7 @@ def fitting(kind: str, value: Any) -> Any:
 
 
 def taken_out(value: Any) -> Any:
-    """Return a message's content for JSON."""
+    """Return the content of a message for JSON."""
     if isinstance(value, Message):
         return {name: taken_out(getattr(value, name)) for name in value.fields}
     return [taken_out(item) for item in value] if isinstance(value, list) else value
@@ -101,7 +101,7 @@ class Connection(tornado.websocket.WebSocketHandler):  # type: ignore[misc]  # t
         return True
 
     def work(self) -> None:
-        """Perform the operations used in measurements."""
+        """Perform the operations in the queue, as far as measurements use them."""
         while (text := self.incoming.get()) is not None:
             operation = json.loads(text)
             if operation["op"] == "publish":
@@ -130,7 +130,7 @@ class Connection(tornado.websocket.WebSocketHandler):  # type: ignore[misc]  # t
             self.send({"op": "publish", "topic": topic, "msg": taken_out(message)})
 
     def send(self, operation: dict[str, Any]) -> None:
-        """Encode an operation in this thread, and have the loop send it."""
+        """Encode an operation in this thread, and let the loop send it."""
         self.loop.add_callback(self.hand_out, json.dumps(operation))
 
     def hand_out(self, text: str) -> None:

@@ -1,7 +1,8 @@
 """A clock that can be stepped, for processes that have this folder in PYTHONPATH.
 
-libfaketime is not suitable: if it also changes the monotonic clock, waits change too; otherwise Python's
-sleep fails. The offset is read from shared memory, because a process without free descriptors must also know the time.
+libfaketime is not suitable: if it changes the monotonic clock too, waits change their length; if it does not,
+Python's sleep fails. The offset is read from shared memory, because a process without free descriptors must also know
+the time.
 """
 
 import mmap
@@ -16,7 +17,7 @@ _real_time_ns = time.time_ns
 
 
 def _time_ns() -> int:
-    """Return the time of day, moved by the shared number of seconds."""
+    """Return the time of day, shifted by the shared offset."""
     seconds: int = struct.unpack("<q", _shared[:8])[0]
     return _real_time_ns() + seconds * 10**9
 

@@ -1,6 +1,7 @@
 """The campaign's model: a position among 16 cells, measured by two small sensors.
 
-Readings are addresses already (whole numbers from 0), so that the observer needs no code of the stack to know them.
+Readings are the addresses themselves (whole numbers from 0), so the observer needs no code of the stack to convert
+them.
 """
 
 import numpy as np

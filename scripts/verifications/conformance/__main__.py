@@ -1,4 +1,4 @@
-"""Other projects' tests on the hub: roslibpy's own suites, and what users of roslib do (scripts/verify conformance)."""
+"""Tests of other projects on the hub: roslibpy's own suites, and typical uses of roslib (scripts/verify conformance)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NODE_SCRIPT: Final = Path(__file__).with_name("roslib.mjs")
 LIMIT: Final = 240 * FACTOR
 """Time limit of one suite, in seconds."""
 PORT_OF_THE_SUITES: Final = "9090"
-"""Port in the suites' files, replaced by that of the hub in the copies that run here."""
+"""Port in the suites' files; in the copies that run here, it is replaced by the port of the hub."""
 SUITES: Final = {
     "1": (
         *("ros1/test_topic.py", "ros1/test_ros.py", "ros1/test_service.py", "ros1/test_param.py"),
@@ -46,7 +46,7 @@ STEP: Final = 0.3
 
 @asynccontextmanager
 async def hub_of(ros_version: str, folder: Path) -> AsyncIterator[int]:
-    """Run a hub during the block; its port."""
+    """Run a hub during the block, and yield its port."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = int(free.getsockname()[1])
@@ -104,7 +104,7 @@ async def roslib(ros_version: str, folder: Path) -> str | None:
 
 
 async def failure_of(*command: str, folder: Path, **environment: str) -> str | None:
-    """Run a suite, print its last line, and return its lines about failures if it ends with another code than 0."""
+    """Run a suite, print its last line, and if its exit code is not 0, return its lines about failures."""
     process = await asyncio.create_subprocess_exec(
         *command,
         cwd=folder,

@@ -1,7 +1,7 @@
 """Verification of the compose file on a separate container engine (see scripts/verify).
 
-The engine is scripts/container-engine's, so a bare Debian machine suffices. The image is built from a copy of
-this folder. After each fault, a client container recomputes results with the reference kernel.
+scripts/container-engine provides the engine, so a bare Debian machine suffices. The image is built from a copy of
+the project. After each fault, a client container recomputes results with the reference kernel.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from toolchain.deployment import load_deployment
 ENGINE: Final = ROOT / "scripts" / "container-engine"
 BUILD_LIMIT = 900.0 * FACTOR
 DOWNLOAD_FAILED, NOT_ABLE, TERMINATED = 3, 4, 143
-"""Exit codes: after a failed download, if this machine cannot run containers, and of a service after SIGTERM."""
+"""Exit codes for a failed download and for a machine that cannot run containers, and that of a service after SIGTERM."""
 ROBOT_PORT, BOARD_PORT = 9191, 7100
 MINE: Final = "build/mine"
 
@@ -48,7 +48,7 @@ MINE: Final = "build/mine"
 
 
 def check_build(stack: Stack) -> None:
-    """Build the image from a copy of this folder, with the wheels of the lock file."""
+    """Build the image from a copy of the project, with the wheels of the lock file."""
     stack.compose("config", "--quiet")
     stack.compose("build", limit=BUILD_LIMIT)
 
@@ -66,7 +66,7 @@ def check_bits(stack: Stack) -> None:
 
 
 def kill(*services: str) -> Callable[[Stack], None]:
-    """Return a check that kills services, and recomputes results after their restart."""
+    """Return a check that kills these services, and recomputes results after their restart."""
 
     def check(stack: Stack) -> None:
         stack.kill(*services)
@@ -89,7 +89,7 @@ def check_stop(stack: Stack) -> None:
 
 
 def check_confined(stack: Stack) -> None:
-    """Check that containers are not root, have no capabilities, writable files, external network or open ports."""
+    """Check that containers do not run as root, and have no capabilities, writable files, external network or open ports."""
     output = stack.docker("exec", stack.container("master"), "cat", "/proc/self/status")
     fields = dict(line.split(":\t", 1) for line in output.splitlines() if ":\t" in line)
     expect(fields["Uid"].split() == ["10001"] * 4, f"it runs as {fields['Uid']}")
@@ -115,7 +115,7 @@ def check_confined(stack: Stack) -> None:
 
 
 def check_status(stack: Stack) -> None:
-    """Check that `status` shows the whole stack as ready, and the project, by which two stacks differ."""
+    """Check that `status` shows the whole stack as ready, and the name of the project, which distinguishes stacks."""
     expected = {*SERVICES, *BOARDS} - {"boards", "viewer"}
 
     def shown() -> bool:
@@ -127,7 +127,7 @@ def check_status(stack: Stack) -> None:
 
 
 def check_silent_board(stack: Stack) -> None:
-    """Stop a board's process, which is then silent like one without power, and continue it; then kill it so."""
+    """Suspend the process of a board, so that it is silent as without power, and resume it; suspend it again and kill it."""
 
     def silent(then: str) -> None:
         until(lambda: "board2" in stack.processes(), lambda: "status does not show board2")
@@ -146,7 +146,7 @@ def check_silent_board(stack: Stack) -> None:
 
 
 def check_lost_network(stack: Stack) -> None:
-    """Disconnect subscriber and publisher with open connections, as when a robot drives out of range."""
+    """Disconnect the network of subscriber and publisher while connections are open, as when a robot drives out of range."""
     lost = ("subscriber", "publisher")
     for service in lost:
         stack.docker("network", "disconnect", "rosbayes_ros", stack.container(service))
@@ -286,7 +286,7 @@ def check_hub_alone(stack: Stack) -> None:
 
 
 def check_refused(stack: Stack) -> None:
-    """Check that starts which cannot succeed end with a reason that names what the user typed."""
+    """Check that a start that cannot succeed ends with a reason that names the user's input."""
     broken = stack.project / "build" / "broken"
     broken.mkdir(parents=True, exist_ok=True)
     (broken / "deployment.toml").write_text("format = 1\n")
@@ -302,7 +302,7 @@ def check_refused(stack: Stack) -> None:
 
 
 def check_processor(stack: Stack) -> None:
-    """Check that, on a processor of another name, kernels are loaded from the image instead of compiled."""
+    """Check that a processor with another name loads the kernels from the image instead of compiling them."""
     settings = ("--read-only", "--tmpfs", "/tmp", "--env", "NUMBA_DEBUG_CACHE=1")  # noqa: S108 - the container's
     program = (
         "import llvmlite.binding as llvm; llvm.get_host_cpu_name = lambda: 'goldmont-plus'\n"
@@ -345,7 +345,7 @@ FULL: tuple[tuple[str, Check], ...] = (
 
 
 def verify(only: str, *, short: bool) -> int:
-    """Run the checks, or those with a word in their names, and return the exit code."""
+    """Run all checks, or those whose names contain a word of `only`, and return the exit code."""
     OUT.mkdir(parents=True, exist_ok=True)
     for log in OUT.glob("*.log"):
         log.unlink()

@@ -1,6 +1,6 @@
 """Client in a container next to the stack: it recomputes results of the boat with the reference kernel.
 
-client.py URI COUNT     compares cycles, counts and posterior of COUNT results exactly, and prints a line for each
+client.py URI COUNT     compares cycles, counts and posteriors of COUNT results exactly, and prints a line for each
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The sources of the image, with the wheels of the lock file and limits for this machine."""
+"""The sources of the image, with the wheels of the lock file, and time limits for this machine."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PROBE: Final = {
     "retries": 4,
     "start_period": f"{240 * FACTOR:g}s",
 }
-"""Health checks on a machine of any speed; a probe takes CPU time, so on a slow one there are fewer."""
+"""Settings of health checks; probes take CPU time, so a slow machine has fewer."""
 
 
 def home() -> Path:

@@ -25,7 +25,7 @@ KILLED: Final = 137
 """Exit code after SIGKILL."""
 CORE: Final = ("master", "subscriber", "publisher", "pcie-app")
 BOARDS: Final = ("board0", "board1", "board2", "board3")
-"""Processes of the container `boards` with the boat's deployment."""
+"""Names of the processes in the container `boards` with the boat's deployment."""
 BOAT: Final = ("hub", "boat-simulator", "boat-normaliser", "boat-viewer")
 SERVICES: Final = (*CORE, "boards", *BOAT, "viewer")
 CHECK: Final = "check"
@@ -36,7 +36,7 @@ def until(condition: Callable[[], object], otherwise: Callable[[], str], limit: 
     """Poll until a condition holds.
 
     Raises:
-        CheckError: It does not in time.
+        CheckError: It does not hold in time.
     """
     deadline = time.monotonic() + limit
     while not condition():
@@ -59,7 +59,7 @@ class Stack:
 
     @property
     def environment(self) -> dict[str, str]:
-        """The environment of docker commands, with only the check's variables of the compose file."""
+        """The environment of docker commands; variables of the compose file are only those of the check."""
         names = ("HOME", "LANG", "TMPDIR", "PATH", "DOCKER_HOST", "DOCKER_CONFIG")
         kept = {name: os.environ[name] for name in names if name in os.environ}
         extra = {"COMPOSE_ANSI": "never", "COMPOSE_PROGRESS": "plain", "BUILDKIT_PROGRESS": "plain"}
@@ -108,7 +108,7 @@ class Stack:
         return self.docker("compose", *arguments, limit=limit)
 
     def bits(self, count: int, uri: str = "ws://hub:9090", network: str = "rosbayes_ros") -> None:
-        """Let a client container recompute results that come from now on.
+        """Let a client container recompute results that arrive from now on.
 
         Raises:
             CheckError: One is wrong, or they do not arrive.
@@ -173,7 +173,7 @@ class Stack:
 
     @contextlib.contextmanager
     def cleared(self, **variables: str) -> Iterator[None]:
-        """Remove the project and set variables; at the end, save the logs of a failure and remove it again."""
+        """Remove the project and set variables; at the end of the block, save the logs if it failed, and remove the project again."""
         self.down()
         self.variables |= variables
         try:
@@ -222,7 +222,7 @@ class Stack:
         until(lambda: not waited_for(), lambda: f"{waited_for()} are not restarted")
 
     def signal(self, pid: int, name: str) -> None:
-        """Send a signal to a process inside the container of all boards, by the PID that `status` shows."""
+        """Send a signal to a process in the container `boards`, by the PID that `status` shows."""
         self.docker("exec", self.container("boards"), "sh", "-c", f"kill -{name} {pid}")
 
     def log(self, service: str, since: float = 0.0) -> str:
@@ -230,7 +230,7 @@ class Stack:
         return self.docker("logs", "--since", f"{since:.3f}", self.container(service), streams="both")
 
     def save_logs(self, check: str) -> None:
-        """Save all logs, as they are after a check, in the folder of results."""
+        """Save all logs after a check, in the folder of results."""
         with contextlib.suppress(CheckError):
             logs = self.compose("logs", "--timestamps", "--no-color")
             (OUT / f"{re.sub(r'[^A-Za-z0-9]+', '-', check)}.log").write_text(logs)
