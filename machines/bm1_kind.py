@@ -31,7 +31,7 @@ from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, RngKind, R
 from machines.posterior import joint_posterior, posterior, posterior_of_lines
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
-_SENSOR_BITS_MAX: Final = 64  # columns whose width the capability registers can tell
+_SENSOR_BITS_MAX: Final = 64  # columns whose widths fit into the capability registers
 
 
 class BM1Kind(MachineKind):
@@ -321,7 +321,7 @@ class _Course(FrameCourse):
         self._set_end(2 * self.end)
         if self._replicas == 1:
             return running, {}
-        # replicas stop one by one: those that are over on a board are halted on the others
+        # replicas stop one by one: those that have ended on one board are halted on the others
         mask = sum(1 << replica for replica in over)
         return running, {"HALT": mask.to_bytes(4 * -(-self._replicas // 32), "little")}
 
@@ -461,7 +461,7 @@ class _OnHost(HostMachine):
                 raise StartError("The frame has a written prior, but the prior of the machine is a table")
             return [None] * len(self._machines)
         if codes is None:
-            # written all the same, because the frame before may have written another
+            # written anyway, because the previous frame may have written another prior
             return [machine.prior[0].astype("<u4").tobytes() * self._replicas for machine in self._machines]
         shapes = {(self._total_lines,)} | (
             {(self._replicas, self._total_lines)} if self._replicas > 1 else set()

@@ -56,7 +56,7 @@ def read_key(path: Path) -> bytes:
             key = file.read(4096).strip()
     except OSError as error:
         raise CredentialsError(f"the key in {path} cannot be read: {error.strerror}") from None
-    # before its content is used: a key that others can read is none
+    # checked before the content is used, because a key that others can read protects nothing
     if mode & 0o077:
         raise CredentialsError(f"others may read the key in {path}: run chmod 600 {path}")
     if _KEY.fullmatch(key) is None:

@@ -296,7 +296,7 @@ def _read_manifest(content: bytes, name: str) -> tuple[MachineKind, _Manifest[An
         raise ImageMismatchError(
             f"{name} has format {magic[7]}, this software reads format {MAGIC[7]}: build the deployment again"
         )
-    # nothing of the manifest is believed before its hash was compared
+    # nothing of the manifest is used before its hash was compared
     start = _HEADER.size + length
     text = content[_HEADER.size : start]
     _check_hash(name, "its manifest", text, digest.hex(), "its header")

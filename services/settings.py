@@ -201,7 +201,7 @@ def load_settings(**flags: Any) -> Settings:
     # later children inherit the variable
     if "log_format" in given:
         use_log_format(settings.log_format)
-    # looked up only where the server is used: a board would wait for a robot that it never asks
+    # looked up only where the server is used: a board would wait for a robot that it never contacts
     if "uri" in flags and settings.uri is not None and settings.uri.startswith(ROBOT):
         from bridge.discovery import find_uri
 

@@ -186,7 +186,7 @@ class GoalRequest:
         self._end = end
         # Set by the server of the action when the sender asks for it, and never cleared.
         self._canceling = asyncio.Event()
-        # True after the first end that was sent; one that does not fit the type raises, and does not count.
+        # True once an end was sent; an end that does not fit the type raises an error instead, and does not count.
         self.ended = False
 
     @property

@@ -52,7 +52,7 @@ class Handle:
         if session.state is State.CLOSED:
             raise DisconnectedError(f"the client of {session.uri} was closed: connect() makes a new one")
         self._session = session
-        # Set once, by `end`, which `close` calls, or the session when the client is closed.
+        # Set once by `end`, which is called by `close`, or by the session when the client is closed.
         self._closed = False
 
     def _register(self) -> None:
@@ -118,7 +118,8 @@ class Subscription(Handle):
         super().__init__(session)
         self.topic = topic
         self._type = type_name
-        # The messages between `receive` and the reader. The deque drops the oldest itself; `_size` serves to count that.
+        # The messages between `receive` and the reader. The deque drops the oldest itself; `_size` is needed to count
+        # these.
         self._size = _check_queue_size(queue_size, topic)
         self._queue: deque[Message] = deque(maxlen=queue_size)
         self.lost = 0
@@ -130,8 +131,8 @@ class Subscription(Handle):
         self._blind = 0.0
         self._begun = time.monotonic()
 
-        # The waiting reader, if any, and its deadline. The alarm rings at `_rings`, at the latest at the deadline: one that
-        # was set for an earlier wait is kept, and sets the next.
+        # The waiting reader, if any, and its deadline. The alarm rings at `_rings`, no later than the deadline; an
+        # alarm of an earlier wait is kept, and sets the next one.
         self._waiter: asyncio.Future[None] | None = None
         self._deadline = inf
         self._alarm: asyncio.TimerHandle | None = None
@@ -145,7 +146,7 @@ class Subscription(Handle):
             topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length, delivery=delivery
         )
         session.readers[self._number] = self
-        # The reason, as the end of a sentence, if the topic is left out; it may have been before this subscription.
+        # If the topic is left out, perhaps since before this subscription: the reason, as the end of a sentence.
         self._left_out = session.why_left_out() if session.core.subscriptions.has_left_out(topic) else ""
         self._register()
         session.watch_silence()
@@ -208,7 +209,7 @@ class Subscription(Handle):
             raise TopicLeftOutError(f"{self.topic} {self._left_out}")
         self._waiter = waiter = asyncio.get_running_loop().create_future()
         try:
-            # Other tasks have their turn at each pass, and the event loop looks at its sockets without sleeping.
+            # Other tasks have their turn at each pass, and the event loop polls its sockets without sleeping.
             while time.monotonic() < busy_until and not waiter.done():  # noqa: ASYNC110 - an event would sleep
                 await asyncio.sleep(0)
             await waiter
@@ -241,7 +242,8 @@ class Subscription(Handle):
         self._alarm = asyncio.get_running_loop().call_later(max(self._deadline - now, 0), self._ring)
 
     def _ring(self) -> None:
-        # An alarm of an earlier wait is early for the present one, and sets the next; without a wait, none follows.
+        # An alarm of an earlier wait rings too early for the present one, and sets the next alarm; without a wait, it
+        # sets none.
         self._alarm = None
         now = time.monotonic()
         if self._deadline <= now:
@@ -289,7 +291,7 @@ class Subscription(Handle):
     async def _why_silent(self, begun: float) -> str:
         """Return why the topic has been silent, as a clause that ends the sentence of an error."""
         session = self._session
-        # First what is known here; asking the server takes time, and it may be the reason itself.
+        # First what is known here, because asking the server takes time, and the server may be the reason.
         if self.discarded:
             return f"; {self.discarded} messages of the topic were larger than its limit, and were discarded"
         if session.state is not State.CONNECTED:
@@ -371,7 +373,8 @@ class Publication(Handle):
                 await session.wait_turn(f"a message of {self.topic}", timeout)
             finally:
                 self._waiting -= 1
-        # Encoded only now, because the publication may have been closed, or the server's limit learnt, during the wait.
+        # Encoded only now, because during the wait the publication may have been closed, or the server's limit become
+        # known.
         session.send_now(self._encode(msg))
         if session.should_yield():
             await asyncio.sleep(0)

@@ -318,7 +318,7 @@ class Ros:
             MessageTypeError: The goal has a field that its type does not have, or an array of another shape.
             EncodeError: The goal cannot be sent as JSON.
         """
-        # In its turn among messages, which it might depend on.
+        # In order after earlier messages, because the call may depend on them.
         if self._session.must_wait():
             await self._session.wait_turn(f"a goal of {action}", timeout)
         await self._require_ros_2(action, min(timeout, DETECT_TIMEOUT))
@@ -405,7 +405,7 @@ class Ros:
 
     async def topics_for_type(self, type: str, timeout: float = 1.0) -> list[str] | None:
         """Return the names of the topics of a type; None without rosapi."""
-        await self.detect_ros_version()  # rosapi compares names of types as they are spelt
+        await self.detect_ros_version()  # rosapi compares type names literally
         args = {"type": self._session.core.wire.type_name(type)}
         return await ask_names(self._session, "topics_for_type", args, "topics", timeout)
 

@@ -155,7 +155,7 @@ class TypeChecks:
         # Whether a question went unanswered: a server without rosapi must not delay each call by a timeout.
         self._unanswered = False
         # Names of types by service, and checks by part and type; None for a type that the server does not know. Both
-        # are bounded, because a program may call services without end.
+        # are bounded, because a program may call any number of services.
         self._service_types: dict[str, str] = {}
         self._parts: dict[tuple[_Part, str], MessageCheck | None] = {}
 

@@ -236,7 +236,7 @@ class Session:
 
         # Number of unusable messages received. They are ignored, and do not affect others.
         self.unusable = 0
-        # Latest status messages of the server, newest last. Errors quote the last one: it often tells why an answer is
+        # Latest status messages of the server, newest last. Errors quote the last one: it often says why an answer is
         # missing. The count limits the lines in the log.
         self.statuses: deque[StatusReceived] = deque(maxlen=KEPT_STATUSES)
         self._status_at = 0.0
@@ -413,7 +413,7 @@ class Session:
 
     def _set_state(self, state: State, reason: str) -> None:
         self.state = state
-        # A new event for each change: clearing the old one could hide a change from a task that has yet to wake.
+        # A new event for each change: clearing the old one could hide a change from a task that has not woken yet.
         self._state_changed.set()
         self._state_changed = asyncio.Event()
         if self._on_state is not None:
@@ -526,7 +526,7 @@ class Session:
         """Repeat subscriptions without a type, and renew those that should have had messages."""
         self._retry_timer = None
         if not self.is_open:
-            return  # a new connection looks again
+            return  # a new connection begins to check again
         untyped = self.core.subscriptions.retry_untyped()
         self.flush()
         silent = self.core.subscriptions.silent()

@@ -105,7 +105,7 @@ class Reassembler:
         if begun is None:
             if total == 1:
                 return self._checked(data)
-            # The oldest gives way: a client that restarts must not be locked out by what it never completed.
+            # The oldest is dropped, so that a restarted client is not locked out by messages that it never completed.
             while len(self._sets) >= self._max_sets:
                 self._give_up(next(iter(self._sets)))
             begun = self._sets[key] = _Set(total, now)

@@ -37,7 +37,7 @@ _EXCERPT: Final = 60
 _COUNTED: Final = 4096
 # Number of occurrences of one character to check before searching for the whole word.
 _HOPS: Final = 64
-# Number of bytes for each level up to which the size of a message can show that it is not too deep.
+# With fewer bytes than this per permitted level, the size and the number of `[` can show that a message is not too deep.
 _SMALL: Final = 6
 # The first byte of `null`; testing for a number is ten times as fast as for a byte string.
 _N: Final = ord("n")
@@ -110,7 +110,7 @@ def is_deeper(data: bytes | str, limit: int) -> bool:
     if isinstance(data, str):
         data = data.encode("utf-8", "surrogatepass")
     if len(data) < _SMALL * limit:
-        # A level of an array takes two bytes, and one of an object five (`{"":}`), but for the innermost one (`{}`).
+        # A level of an array takes two bytes, and one of an object five (`{"":}`), except the innermost one (`{}`).
         arrays = data.count(b"[")
         if arrays + (len(data) - 2 * arrays + 3) // 5 <= limit:
             return False

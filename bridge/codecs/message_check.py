@@ -149,7 +149,7 @@ class MessageCheck:
             good = field.element in _BYTES or field.element not in _PRIMITIVES
             length = field.length if isinstance(value, str) else len(value)
         else:
-            # Elements are looked at only in lists, because NumPy's arrays of one dimension contain no arrays.
+            # Elements are checked only in lists, because NumPy's arrays of one dimension contain no arrays.
             flat = getattr(value, "ndim", 1) == 1 and not isinstance(value, Mapping) and _is_nested(value)
             good = flat and (
                 field.element not in _PRIMITIVES

@@ -119,7 +119,7 @@ def read_tokens(path: Path) -> tuple[str, ...]:
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text"
         raise HubError(f"the hub cannot read its tokens in {path}: {why}") from None
-    # A token is a password: a file that others read has given it away already.
+    # A token is a password: in a file that others can read, it is no longer secret.
     if mode & 0o077:
         raise HubError(f"others may read the hub's tokens in {path}: run chmod 600 {path}")
     tokens = tuple(line.strip() for line in lines if line.strip() and not line.startswith("#"))

@@ -101,8 +101,8 @@ def _filled(filler: Filler | None, values: Any, room: int) -> Any:
 class _Exchange:
     """Services or actions by name, and their open calls or goals. The last client to offer a name serves it."""
 
-    # A kind of exchange: the field that names it in operations, which kind of type it has, the operation that ends what
-    # was asked, and the additional fields of one that failed.
+    # A kind of exchange: its field in operations, the kind of its types, the operation that ends a call or a goal,
+    # and the additional fields of such an operation for a failure.
     kind: ClassVar[str]
     type_kind: ClassVar[Literal["srv", "action"]]
     answer: ClassVar[str]
@@ -130,7 +130,8 @@ class _Exchange:
         key, names = absolute(name), self._names_of(client)
         if key not in names and len(names) >= self._limits.services_per_client:
             raise RefusedOperationError(f"this client already offers {len(names)} {self.kind}s")
-        # As in ROS 1, a node that starts again takes its services over, although the old one has not been missed yet.
+        # As in ROS 1, a node that starts again takes its services over, although the loss of the old one has not been
+        # noticed yet.
         before = self._offers.get(key)
         if before is not None and before.client is not client:
             client.takeovers += 1
@@ -348,7 +349,7 @@ class Actions(_Exchange):
     def leave(self, client: Client) -> None:
         """Cancel the goals that a disconnected client sent, and abort those that it executed."""
         super().leave(client)
-        # Nobody hears of these results any more, so their servers may stop.
+        # Nobody receives these results any more, so their servers may stop.
         for key in list(client.goals.values()):
             self._send_cancel(self._take(key))
         for key in list(client.tasks):

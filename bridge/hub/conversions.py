@@ -61,7 +61,7 @@ class Builder:
             raise TypeError(f"{place or 'the message'} is not an object")
         _constants, fields = self._store.fielddefs[name]
         self._count(len(fields))
-        # What is left at the end has no field.
+        # Values that are left at the end have no field.
         given = dict(message)
         values = {}
         for field, (kind, content) in fields:

@@ -12,7 +12,7 @@ from bridge.hub.outbox import Lane
 
 SMALLEST_FRAGMENT: Final = 256
 """Minimum size of a fragment in bytes; smaller ones would consist mostly of framing."""
-# Maximum of status messages queued for a client.
+# Maximum number of status messages queued for a client.
 _STATUS_QUEUE: Final = 20
 
 

@@ -97,7 +97,7 @@ class OutgoingMessage:
             seconds, nanoseconds = divmod(self._time_ns, 10**9)
             serialised = self._definitions.serialise(self._type, self._parsed, self._max_size)
             msg = cbor2.dumps({"secs": seconds, "nsecs": nanoseconds, "bytes": serialised})
-        # A message of an unknown type, or one that does not fit its type: only floats show what they are.
+        # A message of an unknown type, or one that does not fit its type: only floats reveal their type.
         elif (typed := self._definitions.typed(self._type, self._parsed)) is not None:
             msg = cbor2.dumps(typed)  # of JSON, typed arrays and bytes, so it needs no check
         else:

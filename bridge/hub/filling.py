@@ -51,8 +51,8 @@ class Filler:
         self._defaults = defaults
         self._varying = varying
         self.parts = parts
-        # By the present fields. A publisher repeats the same few, so most messages are filled without a look at
-        # single fields.
+        # What a message lacks, by its present fields. A publisher repeats the same few combinations, so most messages
+        # are filled without checking single fields.
         self._known: dict[tuple[str, ...], _Absent] = {}
         # A message with as many fields as its type is complete. If it has unknown fields in place of absent ones,
         # the reference server refuses it; here its subscribers see what is wrong. Only the fields of a time may

@@ -255,7 +255,7 @@ class Outbox:
         self.size -= len(entry.payload or b"")
         entry.payload = None
         self._gaps += 1
-        # Packing costs as much as the queue is long, so it waits for as many gaps as messages.
+        # Packing takes time in proportion to the queue, so it waits until there are as many gaps as messages.
         if self._gaps > _GAPS + len(self):
             self._entries = deque(entry for entry in self._entries if entry.payload is not None)
             self._droppable = deque(entry for entry in self._droppable if entry.payload is not None)

@@ -27,7 +27,7 @@ _MEDIUM: Final = 126
 _LONG: Final = 1 << 16
 _MEDIUM_HEADER: Final = Struct("!BBH").pack
 _LONG_HEADER: Final = Struct("!BBQ").pack
-# Length in bytes of the longest header that `only_message` reads; shorter data is left to the others.
+# Length in bytes of the longest header that `only_message` reads; shorter data is left to the other functions.
 _LONGEST_HEADER: Final = 8
 # First bytes of valid frames: with or without FIN, no reserved bit, a defined opcode.
 _SOUND: Final = frozenset(end | opcode for end in (0, 0x80) for opcode in (0, 1, 2, 8, 9, 10))

@@ -47,7 +47,7 @@ class RtlBoard:
         # While there is no simulation, this one answers.
         self._blank = EmulatedBoard()
 
-        # The hardware of the loaded image, which goes with it; it is replaced when the board is programmed again.
+        # The simulated hardware and its image, which are replaced together when the board is programmed again.
         self._simulation: Simulation | None = None
         self._image: Image | None = None
         self._image_hash = self._blank.image_hash

@@ -256,7 +256,7 @@ class BoardServer:
     def _is_held(self) -> bool:
         """Return whether a host holds the board, after handling the last frames of one that has disconnected."""
         host = self._host
-        # its end may have arrived, and not been served yet
+        # the end of its connection may have arrived, and not been handled yet
         if host is not None and _has_left(host, self._access):
             self._drop_host(host)
         return self._host is not None

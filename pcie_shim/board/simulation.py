@@ -60,7 +60,8 @@ class Simulation:
 
         # The beginning of an answer whose end has not arrived.
         self._received = bytearray()
-        # What the child writes on standard error, for the sentence of an error. A file, because nobody reads it meanwhile.
+        # What the child writes on standard error, for the sentence of an error; a file, because nobody reads it while
+        # the child runs.
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
         try:
             self._child = subprocess.Popen(

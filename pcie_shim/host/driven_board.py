@@ -79,7 +79,7 @@ class DrivenBoard:
 
     def _forget(self) -> None:
         """Forget the contents of the registers, which another host may have written."""
-        # What the board has: a frame writes only what differs. Empty: unknown.
+        # Known contents of the board's blocks, empty if unknown: a frame writes only blocks that differ.
         self.settings = b""
         self._blocks: dict[str, bytes] = {}
 

@@ -109,7 +109,7 @@ def _reasons(fault: Fault, topology: Topology) -> set[str]:
         reasons |= _REASONS.get(fault.target, set())
     has_boards = fault.target == "pcie-app" or (fault.target == "master" and topology.fused)
     if has_boards and fault.what in {"stop", "memory"}:
-        reasons |= {FAILED}  # time for the boards goes by while it does not run
+        reasons |= {FAILED}  # the boards' deadlines pass while it does not run
     return reasons
 
 

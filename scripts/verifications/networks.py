@@ -264,7 +264,7 @@ def check(tally: Tally, pyagrum: Any, path: Path) -> None:
 def verify(only: list[str]) -> int:
     """Install the library, and check all networks."""
     packages = cached("networks", (LOCK,), install) / "packages"
-    sys.path.append(str(packages))  # last, so that everything else is this environment's
+    sys.path.append(str(packages))  # last, so that all other packages come from this environment
     import pyagrum
 
     tally, began = Tally(), time.monotonic()

@@ -545,7 +545,7 @@ async def robot(stand: Stand, received: Received, sent: list[Sent]) -> AsyncIter
             publishing.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
                 await publishing
-            await asyncio.sleep(2 * EVERY)  # nothing is in flight then, and a result too many has come
+            await asyncio.sleep(2 * EVERY)  # then a surplus result would have arrived
             received.extend(listener.received)
             expect(not publisher.refused, f"the server refused a reading: {publisher.refused[-1:]}")
 

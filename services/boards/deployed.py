@@ -114,7 +114,7 @@ class DeployedBoards:
 
     def find_lost_boards(self, error: BoardError) -> None:
         """Find all boards that are gone after a failure, so that several deaths at once fail one frame."""
-        # that of a board which is already known to be gone
+        # the error of a board that is already known to be gone
         if self._cluster is None or isinstance(error, BoardAwayError):
             return
         # a board that only refused an access is still open

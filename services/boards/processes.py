@@ -125,7 +125,7 @@ class BoardProcesses:
         # False under a master, which watches its boards itself
         self._reports = PARENT_VARIABLE not in os.environ
 
-        # here, because a service manager hears only its own child
+        # here, because a service manager accepts messages only from its own child
         self._manager = ServiceManager()
 
         # Boards write their number into this pipe: plus _LISTENS when their sockets listen, and every second while they
@@ -221,7 +221,7 @@ class BoardProcesses:
 
     def _report(self) -> None:
         """Tell the service manager how many boards listen, and that none of them is stuck."""
-        # a board that has not been heard yet counts from its start
+        # a board without a sign so far counts from its start
         count, now = len(self._endpoints), time.monotonic()
         self._manager.report(
             f"{len(self._listening)} of {count} boards listen",

@@ -33,7 +33,7 @@ def status(
         raise SettingsError(
             f"{named} is not a folder; name that of the processes (their --run-directory or BM_RUN_DIRECTORY)"
         )
-    # a hub alone is nobody's stack, unless its user has named its directory
+    # a hub alone is not a stack, unless the user has named its directory
     directory = named or default_run_directory()
     return run_async(show(directory, needs_master=named is None, watch=watch, json=json))
 

@@ -46,7 +46,7 @@ def subscriber(
     insecure: options.Insecure = False,
 ) -> int:
     """Extract variables from a ROS topic over rosbridge."""
-    # a deployment has all of these; to ignore a flag would read something else than the user named
+    # a deployment defines all of these, so with an ignored flag it would read something other than the user named
     if settings.deployment is not None and (value := topic or type_ or variables):
         flag = "--topic" if topic else "--type" if type_ else "--variables"
         raise SettingsError(
@@ -64,7 +64,7 @@ def subscriber(
         raise SettingsError(
             "give --uri, --topic and --type, or --deployment DIR (subscriber --help shows examples)"
         )
-    # checked as a source of a deployment is, so that the same mistakes have the same errors
+    # checked like a source of a deployment, so that the same mistakes have the same errors
     names = [name.strip() for name in variables.split(",") if name.strip()]
     try:
         source = Source(uri=settings.uri, topic=topic, type=type_)

@@ -95,15 +95,15 @@ class FrameFlow:
         self._readings: WaitingFrames[WaitingReading] = WaitingFrames(settings.queue or deployment.queue)
         self._computing: _Computing | None = None
         self._at_publisher: dict[int, Publish] = {}
-        # From here on the publisher's time counts (monotonic, s): since the first of the results that are there, or its
-        # last outcome.
+        # Start of the publisher's time limit (monotonic, s): when the first of these results was sent to it, or its
+        # last outcome arrived.
         self._published_at = 0.0
         # Number of the last frame sent to the boards; it also chooses the bank of the generators.
         self._number = 0
         # For the status: complete readings so far, and the number of the last published frame with its time (ns).
         self._received = 0
         self._last = (0, 0)
-        # Without those that `_readings` has passed over, which `losses` adds.
+        # Without the readings that `_readings` has dropped, which `losses` adds.
         self._losses: Counter[LossReason] = Counter()
         # Causes of unusable messages of which the user has been warned: one warning each.
         self._reported_causes: set[str] = set()
@@ -233,7 +233,7 @@ class FrameFlow:
         if len(self._at_publisher) >= MOST_AT_PUBLISHER or not self._peers.publisher.ready:
             return
         if self._count is not None and self.published + len(self._at_publisher) >= self._count:
-            # until it is known whether the results at the publisher are enough
+            # wait until it is known whether the results at the publisher are enough
             return
         waiting = self._readings.get()
         if waiting is None:

@@ -87,7 +87,7 @@ def fused_services(
 
         return make
 
-    # as when each were a process of its own
+    # as if each were a process of its own
     def settings_of(role: str) -> Settings:
         return settings.model_copy(update={"metrics": shifted(settings.metrics, METRICS_PORTS[role])})
 

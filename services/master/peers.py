@@ -76,7 +76,7 @@ class Peer:
         self.away = False
         """True while it has no connection to its rosbridge servers."""
         # Set at the end of the connection, with its error if it had one: that of a service of another version or
-        # deployment ends the run, any other end is mended.
+        # deployment ends the run; after any other, the connection is restored.
         self.closed = asyncio.Event()
         self.reason: Exception | None = None
         # When its time to greet or to get ready began (monotonic, s).

@@ -80,7 +80,7 @@ class Master:
             await self._prepare_peers()
             run_directory = peers.directory or settings.run_directory
             more: dict[str, Any] = {}
-            # with --connect alone, the run has no folder, and its services are watched by who started them
+            # with --connect alone, the run has no folder, and its services are watched by whoever started them
             if run_directory is not None:
                 watch = ChildrenWatch(peers, run_directory)
                 self._begin_task(watch.run())
@@ -119,7 +119,7 @@ class Master:
             # before the children end, because the private folder that contains the socket goes with them
             await sockets.aclose()
             await peers.end()
-            # an error before the first reading could come needs no summary
+            # a run that ended before a reading could arrive needs no summary
             if not self._once and self._peers.begun.is_set():
                 say(self.summary())
         return ExitCode.DONE
@@ -167,7 +167,7 @@ class Master:
         elapsed = 0.0 if began is None else time.monotonic() - began
         published = self._flow.published
         text = f"{published} result{'s' if published != 1 else ''} published in {elapsed:.1f} s"
-        # results that were published, on fewer topics than they should
+        # results that were published, but not on all of their topics
         if missed := losses.pop(LossReason.SOME_TOPICS, 0):
             text += f", {missed} of them {LossReason.SOME_TOPICS}"
         lost = ", ".join(f"{count} {reason}" for reason, count in losses.items() if count)
@@ -187,7 +187,7 @@ class Master:
 
     async def _expect_data(self) -> None:
         """End the run if no message arrives in time after its start."""
-        # before, nobody listens, and each phase of the start has its own limit
+        # not earlier, because nobody listens until then, and each phase of the start has its own limit
         await self._peers.begun.wait()
         limit = self._settings.first_data_timeout
         await asyncio.sleep(limit + _GRACE_PERIOD)

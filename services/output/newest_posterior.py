@@ -14,7 +14,7 @@ def posterior_of(publish: Publish, deployment: Deployment) -> Posterior | None:
     if inference.posterior is None:
         return None
     dimensions = deployment.result_dimensions
-    # the way back to the robot is still ahead, so its time is 0
+    # the result has not been sent to the robot yet, so the time of that stage is 0
     now = time.time_ns(), time.monotonic_ns()
     return Posterior(
         probabilities=tuple(inference.posterior.tolist()),

@@ -32,7 +32,7 @@ def line(frame: FrameOutcome, axes: list[Axis]) -> str:
     number = "-" if frame.number is None else str(frame.number)
     if not isinstance(frame, Posterior):
         return f"frame {number}: {frame.outcome if frame.outcome.isprintable() else repr(frame.outcome)}"
-    # replicas answer for themselves, so a mean over all of them says nothing
+    # replicas are separate posteriors, so a mean over all of them is meaningless
     if frame.replicas > 1:
         parts = [f"frame {number}: {frame.replicas} replicas"]
         parts += [_of_replica(frame, at, axes[1:]) for at in range(min(frame.replicas, _REPLICAS))]
@@ -90,7 +90,7 @@ def drawing() -> Iterator[Show]:
         return Group(words, picture(frame, axes, width=console.width, rows=rows, colour=colour))
 
     if not console.is_terminal:
-        # rows of a picture that were wrapped would be no picture
+        # a picture with wrapped rows could not be recognised
         yield lambda frame, axes: console.print(drawn(frame, axes), soft_wrap=True)
         return
     # The last frame, drawn at the end even if its turn had not come; and the time of the last picture (monotonic, s).

@@ -127,7 +127,7 @@ class FrameAssembler:
             [reader.needed for reader in self._readers], self._tolerance_ns
         )
         # For each topic: the newest stamp and whether a header had it, and the messages since the last frame. They
-        # tell when messages come on all topics and their stamps never meet.
+        # show when messages arrive on all topics, but their stamps never match.
         self._newest: list[tuple[int, bool]] = [(0, True)] * count
         self._since_pair = [0] * count
         self.absent: Counter[str] = Counter()
@@ -228,7 +228,7 @@ class WaitingFrames(Generic[Item]):
     def put(self, frame: Item) -> None:
         """Add a frame, or raise an OverflowedQueueError if the queue is full (only with `queue = all`)."""
         if self._keep_all:
-            # an error instead of a loss, because who keeps all readings wants every result
+            # an error instead of a loss, because a user who keeps all readings wants every result
             if len(self._waiting) >= QUEUE_ALL_DEPTH:
                 raise OverflowedQueueError(
                     f"{QUEUE_ALL_DEPTH} frames wait for the boards and more come in: the boards (pcie-app) are the slow part; "

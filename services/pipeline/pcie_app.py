@@ -38,7 +38,7 @@ class PcieApp:
         self._link = link(self._take)
         self._logs_frames = settings.log_level == "debug"
         self._log = get_logger(ROLE, settings.log_level)
-        # Number of the frame on the boards, and of the master that sent it: the result is for no later master.
+        # Number of the frame on the boards, and of the master that sent it: a later master must not get the result.
         self._posted: tuple[int, int] | None = None
         # A frame that came while the boards were busy. A master waits for its result before it sends another one,
         # so the busy frame is that of a former master, or boards are being searched.

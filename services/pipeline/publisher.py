@@ -161,7 +161,7 @@ class Publisher:
     async def _publish_waiting(self) -> NoReturn:
         while True:
             publish = await self._waiting.get()
-            # before the only result, because afterwards nothing would tell why nobody has received it
+            # before the only result, because afterwards nothing would show why nobody has received it
             if self._once:
                 await self._check_delivery(settled=False)
             published = await self._topics.publish(publish, look=self._once)

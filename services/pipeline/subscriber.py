@@ -82,13 +82,15 @@ class Subscriber:
         # Connections by URI, from their first attempt on, and the subscriptions of this run.
         self._rosbridges: dict[str, Ros] = {}
         self._subscriptions: list[Subscription] = []
-        # Counts since the start. Of those ending in `_sent`, the master has heard so far: each reading brings it the rest.
+        # Counts since the start. Those ending in `_sent` are what the master knows so far; each reading reports the
+        # difference.
         self._received = self._completed = self._unusable = 0
         self._passed_over = self._passed_over_sent = 0
         self._unpaired_sent = 0
         # Receipt of the last complete reading (monotonic, ns); 0 before the first one.
         self._last_tick = 0
-        # What was reported already: a gap of stamps until the next reading, and topics without which frames go on.
+        # What was reported already: a gap between stamps (until the next reading), and topics without which frames
+        # are formed.
         self._gap_reported = False
         self._absent_reported: set[str] = set()
 
@@ -208,7 +210,8 @@ class Subscriber:
         )
         self._subscriptions.append(subscription)
         timeout = self._settings.first_data_timeout
-        # Before the first message, silence is an error of the deployment or of the robot; later it is waited out.
+        # Before the first message, silence is an error of the deployment or of the robot; later, the subscriber waits
+        # until it ends.
         first, silent = True, False
         # Number of the connection whose backlog was skipped, and messages lost in the queue that were counted.
         connection: int | None = None
@@ -300,4 +303,4 @@ class Subscriber:
             self._passed_over_sent, self._unpaired_sent = passed_over, unpaired
             self._once = False  # the reading has been sent: a later failure must not end the service
         else:
-            self._passed_over += 1  # without a master: the next one hears of it with its first reading
+            self._passed_over += 1  # without a master: the next one learns of it with its first reading

@@ -91,7 +91,7 @@ class Synchroniser(Generic[Item]):
         self.absent: list[int] = []
         self._topics: list[_Topic[Item]] = [_Topic(each) for each in needed]
         self._tolerance = tolerance_ns
-        # Receipt of the first message of all: a topic that has not spoken since counts as silent from then on.
+        # Receipt of the first message of all: a topic that has had no message counts as silent from then on.
         self._begun: int | None = None
         # If no topic is needed: the stamp up to which messages are too late for a set of their own.
         self._done = -1
@@ -118,8 +118,8 @@ class Synchroniser(Generic[Item]):
         self.deadline = None
         while (found := self._pivot()) is not None:
             at, pivot = found
-            # what is older than the pivot's reach can be in no later set either; without a needed message, the next
-            # pivot is another one
+            # messages older than the pivot by more than the tolerance do not fit into any later set either; if a
+            # needed message is missing after their removal, the pivot changes
             needed_are_there = True
             for topic in self._topics:
                 stale = sum(each.stamp < pivot.stamp - self._tolerance for each in topic.waiting)
@@ -148,7 +148,7 @@ class Synchroniser(Generic[Item]):
         if not all(topic.waiting for topic in needed):
             return None
         if not needed:
-            # the rest of an instant whose set is out
+            # the remaining messages of an instant whose set was returned
             for topic in self._topics:
                 self._drop(topic, sum(each.stamp <= self._done for each in topic.waiting))
         heads = [

@@ -50,7 +50,7 @@ def result_from_line(
     expected = f"a result of pcie-app or an array of {count} probabilities"
     value = decoded(line, number, _Line, expected)
     found = len(value) if isinstance(value, list) else sum(len(board.counts) for board in value.boards)
-    # a model with as many results as another one cannot be told from it: a line has no deployment
+    # results of another model with as many lines cannot be detected, because they do not name their deployment
     if found != count:
         raise InputLineError(f"{where} has {found} values; expected {expected}")
     if isinstance(value, list):

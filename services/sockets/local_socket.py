@@ -40,7 +40,7 @@ class RecordSplitter:
 
     def __init__(self, peer: str) -> None:
         self._peer = peer
-        # The begin of a record whose end has not arrived; bounded, because a long one is refused by its length.
+        # The beginning of an incomplete record; bounded, because a long one is refused by its length.
         self._pending = bytearray()
 
     def feed(self, data: bytes) -> list[AnyRecord]:
@@ -121,7 +121,7 @@ class RecordProtocol(asyncio.Protocol):
         """Handle the opened socket (asyncio)."""
         # uvloop's transports are not subclasses of asyncio's, but behave alike
         self._transport = cast("asyncio.Transport", transport)
-        # a record waits for no other one to fill a packet
+        # a record must not wait for others to fill a packet
         sock = transport.get_extra_info("socket")
         if sock is not None:
             no_delay(sock)

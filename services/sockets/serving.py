@@ -158,14 +158,14 @@ class MasterLink(Link):
                 check_hello(record, "master", self._deployment.hash, f"{self._role} at {self._endpoint}")
             except OtherPeerError as error:
                 protocol.send(Trouble(error.exit_code, str(error)))
-                # a restart, by who started this service, gives it the deployment that the master has
+                # after a restart, by whoever started this service, it has the deployment of the master
                 self._outdated = outdated(self._deployment, record)
                 if self._outdated is not None and self._service is not None:
                     self._service.cancel()
                 raise
             self._greeted = True
             self.masters += 1
-            # first what was said on the way to the states that last
+            # first the notices, which led to the lasting states
             for each in (*self._unsaid, *self._last.values()):
                 protocol.send(each)
             self._unsaid.clear()

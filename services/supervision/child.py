@@ -69,10 +69,10 @@ class _Pipe:
 
     def __init__(self, take: Callable[[str], None]) -> None:
         self._take = take
-        # The writing end is the child's; its parent closes it after the start, otherwise the end would never come.
+        # The writing end is the child's; its parent closes it after the start; otherwise the pipe would never end.
         self._reader, self.writer = os.pipe()
         self._is_open = True
-        # The begin of a line whose end has not arrived; bounded.
+        # The beginning of an incomplete line; bounded.
         self._pending = b""
         os.set_blocking(self._reader, False)
         asyncio.get_running_loop().add_reader(self._reader, self.read)
@@ -97,7 +97,7 @@ class _Pipe:
             self._pending = b""
 
     def _pass_on(self, lines: list[bytes]) -> None:
-        # a child may print anything, also bytes that are no text
+        # a child may print anything, also bytes that are not text
         for line in lines:
             if text := line.decode("utf-8", "replace").rstrip():
                 self._take(text)
@@ -130,7 +130,7 @@ class Child:
         self._process: asyncio.subprocess.Process | _Forked | None = None
         self._pipes: list[_Pipe] = []
         self._error = ""
-        # Times of the last ends (monotonic, s), whose number within a window is limited, and the number of restarts.
+        # Times of the last exits (monotonic, s), whose number within a window is limited, and the number of restarts.
         self._ends: deque[float] = deque(maxlen=RESTARTS + 1) if ends is None else ends
         self.restarts = 0
 

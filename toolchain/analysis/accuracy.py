@@ -300,7 +300,7 @@ def _line_probabilities(machine: BM1Machine, addresses: Inputs, prior_address: i
 def _difference(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> tuple[float, float, float]:
     variation = 0.5 * float(np.abs(ours - theirs).sum())
     held = ours > 0
-    # A code above 0 never stands for a probability of 0; only the smallest of doubles can have become one.
+    # A code above 0 never stands for a probability of 0; such a 0 can only be an underflow of doubles.
     ratio = ours[held] / np.maximum(theirs[held], np.finfo(np.float64).tiny)
     divergence = max(0.0, float(ours[held] @ np.log2(ratio)))
     same = (theirs >= theirs.max() * (1 - _TIE)) & (ours >= ours.max() * (1 - _TIE))

@@ -108,8 +108,8 @@ class Cost:
     alms: float
 
 
-# Least squares of the relative errors of 37 boards (GHDL 2.0, yosys 0.70, synth_intel_alm, Cyclone V: the same ALM as a
-# Stratix V's), 2 to 100 lines, up to 32 replicas. ALMs of these are 0.8 % off in the median, 5.1 % at worst.
+# Least squares of the relative errors of 37 boards (GHDL 2.0, yosys 0.70, synth_intel_alm, Cyclone V: the same ALM as
+# a Stratix V's), 2 to 100 lines, up to 32 replicas. Their ALMs deviate by 0.8 % in the median, and by 5.1 % at most.
 COSTS: Final[Mapping[Of, Cost]] = {
     Of.BOARD: Cost(1683, 943.7),
     Of.CODE_BIT: Cost(1.816, 0.9962),

@@ -261,7 +261,7 @@ def _related(words: NDArray[np.uint64]) -> tuple[int, ...] | None:
     sums = sums[by_sum]
     fourth = np.flatnonzero(sums[1:] == sums[:-1])
     if fourth.size:
-        # two pairs with the same XOR have no word in common: the other two would be equal
+        # two pairs with the same XOR do not share a word, because then their other words would be equal
         one, other = by_sum[fourth[0]], by_sum[fourth[0] + 1]
         return tuple(sorted(int(index) for pair in (one, other) for index in (first[pair], second[pair])))
     return None

@@ -47,7 +47,7 @@ class _Pending:
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
-        # Bounded. An answer with another id is late or stray, and is ignored.
+        # Bounded. An answer with another id is late or unexpected, and is ignored.
         self._names: dict[str, str] = {}
 
     def __len__(self) -> int:
@@ -148,7 +148,7 @@ class PendingGoals(_Pending):
 class _Served:
     """Services or actions that this client serves: their types, by name."""
 
-    # Field of operations with the name, and the end of the names of operations.
+    # Field of operations that contains the name, and last word of the operations, as in `advertise_service`.
     kind: ClassVar[str]
 
     def __init__(self, wire: Wire) -> None:

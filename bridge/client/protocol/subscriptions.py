@@ -100,7 +100,7 @@ class _Subscribed:
     envelopes_tried: int = 0
 
     # These outlive a connection, because the messages stay the same.
-    # Whether the subscription requests JSON instead of CBOR, because CBOR brought nothing.
+    # Whether the subscription requests JSON instead of CBOR, because no message arrived as CBOR.
     as_json: bool = False
     # Size of its largest message so far, at most `max_size`: only a larger one is compared with the limits.
     largest: int = 0

@@ -308,7 +308,8 @@ def check_processor(stack: Stack) -> None:
         "import llvmlite.binding as llvm; llvm.get_host_cpu_name = lambda: 'goldmont-plus'\n"
         "from machines import warm_up; warm_up()"
     )
-    # the second time with the image's kernels but without their names, to show that the check can fail
+    # the second time without the variables that name the processor of the image's kernels, to show that the check can
+    # fail
     for words in ([], ["env", "--unset=NUMBA_CPU_NAME", "--unset=NUMBA_CPU_FEATURES"]):
         said = stack.docker("run", "--rm", *settings, "rosbayes", *words, "python", "-c", program)
         loaded, compiled = (said.count(f"] data {word} ") for word in ("loaded from", "saved to"))

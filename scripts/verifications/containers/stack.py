@@ -207,7 +207,7 @@ class Stack:
         """Kill the processes of services, and wait until the engine has restarted them."""
         before = self.restarts()
         for service in services:
-            # after `docker kill` the engine would not restart it; with its process ends this shell
+            # after `docker kill` the engine would not restart it; this shell ends together with its process
             kill = ("sh", "-c", "kill -KILL -1")
             self.docker("exec", self.container(service), *kill, codes=(0, KILLED))
 
