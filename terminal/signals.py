@@ -36,8 +36,8 @@ def raise_on_signals() -> None:
 
     A second signal is ignored, because the duration of the clean-up is bounded. Python drops an exception
     that is raised while the thread runs a callback from C code, forks, or runs a finaliser. So code must call
-    `check_signals` before it blocks. C code may also print it, and raise another one in its place, as numba does
-    while it is imported.
+    `check_signals` before it blocks. C code may also print the exception and raise another
+    one in its place, as numba does while it is imported.
     """
     sys.unraisablehook = _report_dropped
     sys.excepthook = _report_printed

@@ -160,7 +160,7 @@ class Goal:
             self._forget()
 
     def _forget(self) -> None:
-        """Ignore further events of this goal, and end what still waits for them."""
+        """Ignore further events of this goal, and end all waits for them."""
         self._session.goals.pop(self._identity, None)
         self._session.core.goals.forget(self._identity)
         self._fail(GoalError("it was cancelled at the end of its block", self._place))

@@ -487,7 +487,7 @@ def connect(
         headers: Additional headers of the handshake.
         ca_file: Certificate authorities (PEM) for the server, instead of those of the system.
         client_certificate: Certificate and key (PEM) of this client, in one file or in two.
-        tls: An SSL context, instead of these two.
+        tls: An SSL context, instead of `ca_file` and `client_certificate`.
         proxy: `http://proxy:3128`, `https://` or `socks5h://` (with the package python-socks), or
             `environment` for the proxy in HTTPS_PROXY etc.; None for a direct connection.
         max_size: Maximum size of a message in bytes, in both directions. A larger inbound message ends the

@@ -316,7 +316,7 @@ async def open_websocket(
 def _connect_error(
     error: Exception, uri: str, heard: bytes, seconds: float, *, answered: bool
 ) -> UnreachableError | NotRosbridgeError | AccessRefusedError:
-    """Return the error for a connection that was not opened."""
+    """Return the error for a connection that could not be opened."""
     # From the most specific to the least: an answer in HTTP, other bytes, TLS, the network.
     if isinstance(error, InvalidStatus):
         response = error.response

@@ -60,7 +60,7 @@ class EmulatedBoard:
         """Create a blank board; `make` returns the kernel of a machine instead of its kind."""
         self._make = make
         self.turned = 0.0
-        """Monotonic time at which its server last looked for requests; 0 before the first time."""
+        """Monotonic time at which its server last polled for requests; 0 before the first time."""
         self.programmed = 0
         """Number of images loaded so far."""
         self.done = 0

@@ -47,7 +47,7 @@ class Board(Protocol):
     """Registers and a machine, without sockets: blank until an image is loaded (docs/reference/registers.md)."""
 
     turned: float
-    """Monotonic time at which its server last looked for requests; 0 before the first time."""
+    """Monotonic time at which its server last polled for requests; 0 before the first time."""
     programmed: int
     """Number of images loaded so far."""
     done: int

@@ -46,7 +46,7 @@ class FrameOutput:
     Attributes:
         boards: One result per board, in the order of the partition.
         register_writes_ns: Time for posting settings, sensors, starts and resumes.
-        compute_ns: Time of waiting for the boards, which compute and transfer in it.
+        compute_ns: Time of waiting for the boards: their computing, and the transport.
         reads_ns: Time for copying the results.
         boards_compute_ns: Computing time of the slowest board, summed over the slices. The rest of
             `compute_ns` is transport, or other boards on the same core.

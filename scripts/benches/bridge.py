@@ -1,4 +1,4 @@
-"""Comparison of this client with roslibpy on one hub, and of the hub with a server of the reference server's design.
+"""Comparison of this client with roslibpy on one hub, and of the hub with a model of the reference server.
 
 The peer of each measured client or server is a bare socket, which does not encode or decode:
 published:  client -> hub -> bare socket

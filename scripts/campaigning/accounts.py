@@ -44,8 +44,8 @@ class Excuses:
             killed subscriber or master, a cut connection).
         results: Whether results may be lost in the same way after the publisher.
         most: Maximum number of each; higher only if a process or connection was held before.
-        until: Time of publication of the first reading that has a result again. Because nothing overtakes, earlier
-            readings are judged by then or lost, and later ones have no excuse.
+        until: Time of publication of the first reading that has a result again. Because everything keeps its order,
+            earlier readings are judged by then or lost, and later ones have no excuse.
     """
 
     reasons: frozenset[str] = frozenset()

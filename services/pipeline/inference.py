@@ -8,7 +8,7 @@ from toolchain.deployment import Deployment
 
 
 def infer(result: FrameResult, deployment: Deployment) -> Inference:
-    """Return the posterior for the results of all boards, as the kind of their machines infers it."""
+    """Return the posterior for the results of all boards, computed by the kind of their machines."""
     return deployment.machine.kind.infer(decode_boards(result))
 
 

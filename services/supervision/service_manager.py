@@ -43,7 +43,7 @@ class ServiceManager:
             self._ready, self._status = self._ready or ready, status
 
     def stopping(self) -> None:
-        """Send that this process is about to end."""
+        """Report that this process is about to end."""
         self._send("STOPPING=1")
 
     def _send(self, *assignments: str) -> bool:

@@ -138,7 +138,7 @@ class LogicPart:
 
     @property
     def alms(self) -> float:
-        """ALMs that hold those."""
+        """ALMs that hold these look-up tables."""
         return sum(count * COSTS[of].alms for of, count in self.counts.items())
 
 
@@ -155,7 +155,7 @@ class Logic:
 
     @property
     def alms(self) -> float:
-        """ALMs that hold those."""
+        """ALMs that hold these look-up tables."""
         return sum(part.alms for part in self.parts)
 
     @property

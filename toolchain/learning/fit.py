@@ -59,7 +59,7 @@ class Support:
     name: str
     """The variable."""
     readings: int
-    """Number of its readings in rows with a truth."""
+    """Number of its readings in rows with a true position."""
     cells: int
     """Number of lines with at least one of them."""
     median: float
@@ -94,7 +94,7 @@ def fit_model(
     recordings: Sequence[FittedRecording],
     options: FitOptions,
 ) -> tuple[Fit, tuple[Support, ...]]:
-    """Learn from rows with a truth; return the fit, and the amount of data behind each table."""
+    """Learn from the rows with a true position; return the fit, and the amount of data behind each table."""
     if not len(truth.rows):
         raise ModelError(
             "no row has a true value inside the searched dimensions: is --truth right, and in the model's unit?"

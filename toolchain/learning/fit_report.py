@@ -146,7 +146,7 @@ def _comparison(
 def _posteriors(
     model: Model, truth: TrueCells, readings: Mapping[str, Sequence[object]]
 ) -> list[NDArray[np.float64] | None]:
-    """Return the exact posterior of each row with a truth; None if its readings are impossible in the model."""
+    """Return the exact posterior of each row with a true position; None if its readings are impossible in the model."""
     found: list[NDArray[np.float64] | None] = []
     for row in truth.rows.tolist():
         try:

@@ -116,7 +116,7 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
 
 
 def _lines(path: Path, file: TextIO) -> Iterator[str]:
-    """Yield the lines of a file, with bounded length."""
+    """Yield the lines of a file, each of bounded length."""
     while line := file.readline(_LONGEST_LINE + 1):
         if len(line) > _LONGEST_LINE:
             raise ModelError(f"{path} is not a CSV file: a line has more than {_LONGEST_LINE} characters")

@@ -320,9 +320,9 @@ class Subscriptions:
     def renew(self, topic: str) -> bool:
         """Renew the subscription of a topic that is silent although published; return whether it stops asking for CBOR.
 
-        rosbridge for ROS 2 fixes the quality of service when it subscribes, so it does not hear a best-effort
-        publisher that starts later. Servers fail to write some types as CBOR, so the second and later renewals
-        request JSON.
+        rosbridge for ROS 2 fixes the quality of service when it subscribes, so it gets nothing from a best-effort
+        publisher that starts later. Servers fail to write some types as CBOR, so the second and later renewals request
+        JSON.
         """
         subscribed = self._subscribed.get(absolute(topic))
         if subscribed is None or subscribed.has_messages:

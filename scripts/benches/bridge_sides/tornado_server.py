@@ -1,4 +1,4 @@
-"""A server of the reference server's design, for scripts/bench bridge: Tornado, threads, message classes.
+"""A model of the reference server, for scripts/bench bridge: Tornado, threads, message classes.
 
 It is not rosbridge_suite, which needs ROS, but does the same work for a message of one type: Tornado reads
 it. A queue passes it to the connection's thread, which parses it, checks every field against its type, and
