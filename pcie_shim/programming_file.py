@@ -186,13 +186,13 @@ class _Manifest(_Checked, Generic[_Parameters]):
 
 
 class _Named(BaseModel):
-    """The part of an identity that names its parameters."""
+    """The field of `_Identity` that names the kind of machine."""
 
     machine: str
 
 
 class _Kind(BaseModel):
-    """The part of a manifest that names the kind of machine."""
+    """The part of `_Manifest` that is read before the kind of machine is known."""
 
     identity: _Named
 

@@ -27,7 +27,7 @@ def say(text: str) -> None:
 
 
 def warn(sentence: str, *, name: str = "") -> None:
-    """Print a warning in one line on standard error; `name` is that of the process, if a text line shall contain it."""
+    """Print a warning in one line on standard error; `name` is the name of the process, for text lines."""
     write_line(formatted("warning", one_line(sentence), name=name))
 
 

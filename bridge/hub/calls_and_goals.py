@@ -81,7 +81,7 @@ class Caller:
         )
 
     def operation(self, op: str, kind: str, **fields: object) -> bytes:
-        """Return an operation for this client; `kind` (service or action) is the key of the name in its request."""
+        """Return an operation for this client, with the name in its request under the key `kind` (service or action)."""
         identity = {} if self.id is None else {"id": self.id}
         return orjson.dumps({"op": op, kind: self.name, **fields, **identity})
 
