@@ -1,4 +1,4 @@
-"""Settings of all services: flags override `BM_*` variables, the deployment and the defaults, in this order."""
+"""Settings of all services: a flag applies before a `BM_*` variable, then the deployment, then the default."""
 
 import difflib
 import os

@@ -75,7 +75,7 @@ def pip(folder: Path) -> tuple[str | Path, ...]:
 
 
 def install_roslibpy() -> Path:
-    """Return the folder with roslibpy's environment (venv) and its source package (source)."""
+    """Return the folder with roslibpy's environment (venv) and its source package (source), after installing them once."""
 
     def make(folder: Path) -> None:
         make_environment(folder, ROSLIBPY)
@@ -94,7 +94,7 @@ def install_roslibpy() -> Path:
 
 
 def install_roslib() -> Path:
-    """Return the module of roslib.
+    """Return the path of roslib's module, after installing it once.
 
     Raises:
         SettingsError: Node is missing or too old.

@@ -141,7 +141,7 @@ async def serve_status(
 ) -> AsyncIterator[None]:
     """Report in the running loop within the context; `more` is passed to `Report`.
 
-    Without a directory, which must exist, there is no status socket; without `metrics` there is no HTTP
+    The directory must exist; without one there is no status socket, and without `metrics` there is no HTTP
     server. A socket that cannot be opened only causes a warning, because it must not end a robot's run.
     """
     _check(directory)

@@ -211,7 +211,7 @@ def measure(
 
 @dataclass(slots=True)
 class _Results:
-    """Results of the readings so far; `lengths` by frame and replica."""
+    """Results of the readings so far; `lengths` are cycles with each bank, by frame and replica."""
 
     boards: EmulatedBoards
     readings: Readings
