@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolchain.errors import NetworkFileError
-from toolchain.networks.builder import MAX_PARENTS, MAX_STATES, NetworkBuilder
+from toolchain.networks.builder import NetworkBuilder
 
 _MAX_DEPTH: Final = 16
+_MAX_ELEMENTS: Final = 1 << 19
 _DECIMAL: Final = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
@@ -49,70 +50,78 @@ def _decimals(words: Sequence[str], child: str, line: XmlLine) -> NDArray[np.flo
     return np.array([float(word) for word in words])
 
 
-class XmlFile:
-    """A parser that calls `started(name, attributes)` and `ended(name, text)` for every element.
+@dataclass(slots=True)
+class Element:
+    """An element of an XML file; its text is that after its last child, so all of it if there are none."""
 
-    The text is that between the last start tag and the end tag, so it is complete for elements without children.
-    `open` are the names of the open elements; `ended` is called after its element was removed.
-    """
+    name: str
+    attributes: dict[str, str]
+    start: XmlLine
+    end: XmlLine
+    children: list[Element] = field(default_factory=list)
+    text: str = ""
 
-    def __init__(
-        self,
-        path: Path,
-        root: str,
-        *,
-        started: Callable[[str, dict[str, str]], None],
-        ended: Callable[[str, str], None],
-    ) -> None:
-        self._path = path
-        self._root = root
-        self._started = started
-        self._ended = ended
-        self.open: list[str] = []
-        self._text: list[str] = []
-        self._parser = expat.ParserCreate()
-        self._parser.buffer_text = True
-        self._parser.StartElementHandler = self._start
-        self._parser.EndElementHandler = self._end
-        self._parser.CharacterDataHandler = self._characters
-        self._parser.EntityDeclHandler = self._entity
-        self._parser.SkippedEntityHandler = self._entity
+    def named(self, *names: str) -> list[Element]:
+        """Return the children with one of these names."""
+        return [child for child in self.children if child.name in names]
 
-    @property
-    def here(self) -> XmlLine:
-        """The line that is being parsed."""
-        return XmlLine(self._path, self._parser.CurrentLineNumber)
+    def texts(self, name: str) -> list[str]:
+        """Return the texts of the children with this name."""
+        return [child.text for child in self.named(name)]
 
-    def parse(self, data: bytes) -> None:
-        """Parse a whole file, or raise a NetworkFileError with the line."""
-        try:
-            self._parser.Parse(data, True)
-        except expat.ExpatError as reason:
-            raise XmlLine(self._path, reason.lineno).error(expat.ErrorString(reason.code)) from None
-        except (LookupError, ValueError):
-            raise self.here.error("its encoding is not known") from None
+    def only(self, name: str) -> str:
+        """Return the text of the only child with this name, or raise a NetworkFileError."""
+        found = self.texts(name)
+        if len(found) != 1:
+            raise self.end.error(f"there are {len(found)} elements {name}, expected one")
+        return found[0]
 
-    def _entity(self, name: str, *_rest: object) -> None:
-        raise self.here.error(
+
+def read_xml(data: bytes, path: Path, root: str) -> Element:
+    """Return the root of an XML file without entities; errors are NetworkFileErrors with the line."""
+    parser = expat.ParserCreate()
+    parser.buffer_text = True
+    top = Element("", {}, XmlLine(path, 1), XmlLine(path, 1))
+    opened, count = [top], 0
+    # the text since the last tag
+    pieces: list[str] = []
+
+    def here() -> XmlLine:
+        return XmlLine(path, parser.CurrentLineNumber)
+
+    def refuse(name: str, *_rest: object) -> None:
+        raise here().error(
             f"the entity {name[:40]!r}: a network does not need entities, and they are refused"
         )
 
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
-        if len(self.open) == _MAX_DEPTH:
-            raise self.here.error(f"elements are nested more than {_MAX_DEPTH} deep")
-        if not self.open and name != self._root:
-            raise self.here.error(f"the file is {name[:40]!r}, expected {self._root}")
-        self.open.append(name)
-        self._text = []
-        self._started(name, attributes)
+    def start(name: str, attributes: dict[str, str]) -> None:
+        nonlocal count
+        count += 1
+        if count > _MAX_ELEMENTS or len(opened) > _MAX_DEPTH:
+            raise here().error(f"more than {_MAX_ELEMENTS} elements, or nested more than {_MAX_DEPTH} deep")
+        if len(opened) == 1 and name != root:
+            raise here().error(f"the file is {name[:40]!r}, expected {root}")
+        element = Element(name, attributes, here(), here())
+        opened[-1].children.append(element)
+        opened.append(element)
+        pieces.clear()
 
-    def _characters(self, text: str) -> None:
-        self._text.append(text)
+    def end(_name: str) -> None:
+        element = opened.pop()
+        element.text, element.end = "".join(pieces).strip(), here()
+        pieces.clear()
 
-    def _end(self, name: str) -> None:
-        self.open.pop()
-        self._ended(name, "".join(self._text).strip())
-        self._text = []
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.CharacterDataHandler = pieces.append
+    parser.EntityDeclHandler = parser.SkippedEntityHandler = refuse
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as reason:
+        raise XmlLine(path, reason.lineno).error(expat.ErrorString(reason.code)) from None
+    except (LookupError, ValueError):
+        raise here().error("its encoding is not known") from None
+    return top.children[0]
 
 
 # XDSL, the format of GeNIe: chance and deterministic nodes
@@ -121,148 +130,68 @@ _XDSL_NODES: Final = {"cpt": "probabilities", "deterministic": "resultingstates"
 """The kinds of nodes that can be read, and the element with the table of each."""
 
 
-@dataclass(slots=True)
-class _XdslNode:
-    """A node while it is read; its table is processed after the last node, because its parents may come later."""
-
-    kind: str
-    name: str
-    line: XmlLine
-    states: list[str] = field(default_factory=list)
-    parents: list[str] = field(default_factory=list)
-    table: str = ""
-
-
 def read_xdsl(data: bytes, builder: NetworkBuilder) -> None:
     """Read an XDSL file; in `probabilities`, the first parent varies slowest and the child fastest.
 
     `resultingstates` of a deterministic node has one state for each combination of its parents.
     """
-    _XdslReader(builder).read(data)
+    smile = read_xml(data, builder.path, "smile")
+    builder.name(smile.attributes.get("id", ""))
+    nodes = [node for group in smile.named("nodes") for node in group.children]
+    for node in nodes:
+        if node.name not in _XDSL_NODES:
+            raise node.start.error(
+                f"a {node.name[:40]} node: only nodes with tables (cpt) and deterministic ones can be read; in "
+                "GeNIe, change its type to General"
+            )
+        if "dynamic" in node.attributes:
+            raise node.start.error("a dynamic node: only static networks can be read")
+        states = [state.attributes.get("id", "") for state in node.named("state")]
+        builder.variable(node.attributes.get("id", ""), states, node.start)
+    # after the last node, because the parents of a node may come later
+    for node in nodes:
+        _xdsl_table(builder, node)
 
 
-class _XdslReader:
-    def __init__(self, builder: NetworkBuilder) -> None:
-        self._builder = builder
-        self._file = XmlFile(builder.path, "smile", started=self._started, ended=self._ended)
-        self._nodes: list[_XdslNode] = []
-
-    def read(self, data: bytes) -> None:
-        self._file.parse(data)
-        for node in self._nodes:
-            self._builder.variable(node.name, node.states, node.line)
-        for node in self._nodes:
-            self._define(node)
-
-    def _started(self, name: str, attributes: dict[str, str]) -> None:
-        here = self._file.here
-        match self._file.open:
-            case ["smile"]:
-                self._builder.name(attributes.get("id", ""))
-            case ["smile", "nodes", _]:
-                if name not in _XDSL_NODES:
-                    raise here.error(
-                        f"a {name[:40]} node: only nodes with tables (cpt) and deterministic ones can be read; in "
-                        "GeNIe, change its type to General"
-                    )
-                if "dynamic" in attributes:
-                    raise here.error("a dynamic node: only static networks can be read")
-                self._nodes.append(_XdslNode(name, attributes.get("id", ""), here))
-            case ["smile", "nodes", _, "state"]:
-                states = self._nodes[-1].states
-                if len(states) == MAX_STATES:
-                    raise here.error(f"{self._nodes[-1].name[:40]} has more than {MAX_STATES} states")
-                states.append(attributes.get("id", ""))
-
-    def _ended(self, name: str, text: str) -> None:
-        if len(self._file.open) != 3 or self._file.open[:2] != ["smile", "nodes"]:
-            return
-        node, here = self._nodes[-1], self._file.here
-        if name == "parents":
-            node.parents = text.split(maxsplit=MAX_PARENTS)
-            if len(node.parents) > MAX_PARENTS:
-                raise here.error(f"{node.name[:40]} has more than {MAX_PARENTS} parents")
-        elif name == _XDSL_NODES[node.kind]:
-            if node.table:
-                raise here.error(f"{node.name[:40]} has two tables")
-            node.table, node.line = text, here
-
-    def _define(self, node: _XdslNode) -> None:
-        shape = self._builder.shape((*node.parents, node.name), node.line)
-        size, entries = shape[-1], math.prod(shape)
-        wanted = entries if node.kind == "cpt" else entries // size
-        words = _entries(node.table, wanted, node.name, node.line)
-        if node.kind == "cpt":
-            values = _decimals(words, node.name, node.line)
-        else:
-            chosen = [self._builder.state(node.name, word, node.line) for word in words]
-            values = (np.arange(size) == np.array(chosen)[:, np.newaxis]).astype(np.float64)
-        table = np.moveaxis(values.reshape(shape), -1, 0)
-        self._builder.distribution(node.name, node.parents, table, node.line)
+def _xdsl_table(builder: NetworkBuilder, node: Element) -> None:
+    child = node.attributes["id"]
+    parents = " ".join(node.texts("parents")).split()
+    tables = node.named(_XDSL_NODES[node.name])
+    if len(tables) > 1:
+        raise tables[1].end.error(f"{child[:40]} has two tables")
+    line = tables[0].end if tables else node.start
+    shape = builder.shape((*parents, child), line)
+    wanted = math.prod(shape) if node.name == "cpt" else math.prod(shape[:-1])
+    words = _entries(tables[0].text if tables else "", wanted, child, line)
+    if node.name == "cpt":
+        values = _decimals(words, child, line)
+    else:
+        chosen = [builder.state(child, word, line) for word in words]
+        values = (np.arange(shape[-1]) == np.array(chosen)[:, np.newaxis]).astype(np.float64)
+    builder.distribution(child, parents, np.moveaxis(values.reshape(shape), -1, 0), line)
 
 
 # XMLBIF (version 0.3)
 
-_XMLBIF_TEXTS: Final = {"NAME", "OUTCOME", "FOR", "GIVEN", "TABLE"}
-
 
 def read_xmlbif(data: bytes, builder: NetworkBuilder) -> None:
     """Read an XMLBIF file without entities; in a TABLE, the GIVENs are in order and the FOR varies fastest."""
-    _XmlbifReader(builder).read(data)
-
-
-class _XmlbifReader:
-    """A reader of elements; definitions are processed at the end, because their variables may come later."""
-
-    def __init__(self, builder: NetworkBuilder) -> None:
-        self._builder = builder
-        self._file = XmlFile(builder.path, "BIF", started=self._started, ended=self._ended)
-        self._fields: dict[str, list[str]] = {}
-        self._definitions: list[tuple[dict[str, list[str]], XmlLine]] = []
-
-    def read(self, data: bytes) -> None:
-        self._file.parse(data)
-        for fields, line in self._definitions:
-            self._definition(fields, line)
-
-    def _started(self, name: str, attributes: dict[str, str]) -> None:
-        if name in {"VARIABLE", "DEFINITION"}:
-            self._fields = {}
-            kind = attributes.get("TYPE", "nature")
-            if name == "VARIABLE" and kind != "nature":
-                raise self._file.here.error(
-                    f"a variable of the type {kind[:40]!r}: only 'nature' can be read"
-                )
-
-    def _ended(self, name: str, text: str) -> None:
-        inside, here = self._file.open, self._file.here
-        if name in _XMLBIF_TEXTS and inside:
-            if inside[-1] in {"VARIABLE", "DEFINITION"}:
-                self._fields.setdefault(name, []).append(text)
-            elif name == "NAME" and inside[-1] == "NETWORK":
-                self._builder.name(text)
-        elif name == "VARIABLE":
-            variable = self._one("NAME", self._fields, here)
-            states = self._fields.get("OUTCOME", [])
-            if len(states) > MAX_STATES:
-                raise here.error(f"{variable[:40]} has more than {MAX_STATES} states")
-            self._builder.variable(variable, states, here)
-        elif name == "DEFINITION":
-            self._definitions.append((self._fields, here))
-
-    def _one(self, key: str, fields: dict[str, list[str]], line: XmlLine) -> str:
-        found = fields.get(key, [])
-        if len(found) != 1:
-            raise line.error(f"there are {len(found)} elements {key}, expected one")
-        return found[0]
-
-    def _definition(self, fields: dict[str, list[str]], line: XmlLine) -> None:
-        child = self._one("FOR", fields, line)
-        text = self._one("TABLE", fields, line)
-        parents = fields.get("GIVEN", [])
-        if len(parents) > MAX_PARENTS:
-            raise line.error(f"{child[:40]} has more than {MAX_PARENTS} parents")
-        shape = self._builder.shape((*parents, child), line)
-        words = _entries(text, math.prod(shape), child, line)
-        values = _decimals(words, child, line).reshape(shape)
-        self._builder.distribution(child, parents, np.moveaxis(values, -1, 0), line)
+    parts = [
+        part for network in read_xml(data, builder.path, "BIF").named("NETWORK") for part in network.children
+    ]
+    for part in parts:
+        if part.name == "NAME":
+            builder.name(part.text)
+        elif part.name == "VARIABLE":
+            kind = part.attributes.get("TYPE", "nature")
+            if kind != "nature":
+                raise part.start.error(f"a variable of the type {kind[:40]!r}: only 'nature' can be read")
+            builder.variable(part.only("NAME"), part.texts("OUTCOME"), part.end)
+    # after the last variable, because that of a definition may come later
+    for part in parts:
+        if part.name == "DEFINITION":
+            child, table, parents = part.only("FOR"), part.only("TABLE"), part.texts("GIVEN")
+            shape = builder.shape((*parents, child), part.end)
+            words = _entries(table, math.prod(shape), child, part.end)
+            values = _decimals(words, child, part.end).reshape(shape)
+            builder.distribution(child, parents, np.moveaxis(values, -1, 0), part.end)

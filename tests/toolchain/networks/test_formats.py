@@ -238,7 +238,7 @@ ENTITIES = (
     '<!ENTITY % p SYSTEM "http://127.0.0.1/x"> %p;',
 )
 MISTAKES = [
-    (*changed("dog.xdsl", '<cpt id="light_on">', '<noisymax id="light_on">'), 9),
+    (*changed("dog.xdsl", '<cpt id="light_on">', '<noisymax id="x"/><cpt id="light_on">'), 9),
     (*changed("dog.xdsl", "0.6 0.4 0.05", "0.6 0.4"), 10),
     (*changed("dog.xdsl", "0.6 0.4 0.05", "0.6 0.4 0.0_5"), 10),
     (*changed("dog.xdsl", "0.6 0.4 0.05", "0.6 0.3 0.05"), 10),
@@ -246,7 +246,7 @@ MISTAKES = [
     (*changed("dog.xdsl", "</smile>", ""), 16),
     (*changed("dog.xdsl", '<cpt id="light_on">', '<cpt dynamic="plate" id="light_on">'), 9),
     (*changed("dog.xdsl", "0.05 0.95</probabilities>", "0.05 0.95</probabilities><probabilities/>"), 10),
-    (*changed("dog.xdsl", "<parents>family_out", f"<parents>{'p ' * 31}family_out"), 9),
+    (*changed("dog.xdsl", "<parents>family_out", f"<parents>{'p ' * 31}family_out"), 10),
     ("dog.xdsl", "<smile><cpt id='a'><state id='b'/><parents>c</parents></cpt></smile>", None),
     (*changed("dog.xdsl", "<smile", '<!DOCTYPE smile [<!ENTITY a "b">]><smile'), 2),
     *((*changed("dog.bif", "table 0.15, 0.85", f"table {new}"), 8) for new in PROBABILITIES),
