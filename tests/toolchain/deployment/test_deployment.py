@@ -46,27 +46,24 @@ def edit(folder, old, new, *, count=1):
     path.write_text(text.replace(old, new, count))
 
 
-def refused(folder, error=DeploymentError):
+def refused(folder, error=DeploymentError, place=..., line=...):
     with pytest.raises(error) as caught:
         load_deployment(folder, images=False)
     assert caught.value.exit_code == 2
-    sentence = str(caught.value)
+    assert line in {..., caught.value.line}
+    assert place in {..., caught.value.place}
+    sentence, path = str(caught.value), str(folder / "deployment.toml")
     assert "\n" not in sentence
-    assert str(folder / "deployment.toml") in sentence
-    return sentence.removeprefix(str(folder / "deployment.toml"))
+    assert path in sentence
+    return sentence.removeprefix(path)
 
 
-def test_what_is_written_is_read_back(folder):
+def test_what_a_deployment_says_of_itself(folder):
     written = load_deployment(folder, images=False)
-    assert written.directory == folder
-    assert written.image_path(1) == folder / "boards" / "board1.bm"
-    assert written.variables[1].period == 360
-    assert written.variables[0].period is None
-    assert written.outputs == (Output(),)
-    assert written.output_uri(written.outputs[0]) == "ws://a:9090"
-    assert written.machine.stop is Stop.SLICES
-    assert (written.machine.interface_sensors, written.machine.interface_results) == (20, 1200)
     assert written == boat(hash=deployment_hash(boat()), directory=folder)
+    assert written.image_path(1) == folder / "boards" / "board1.bm"
+    assert written.output_uri(Output()) == "ws://a:9090"
+    assert (written.machine.interface_sensors, written.machine.interface_results) == (20, 1200)
     assert [written.searched[0].value(i) for i in (0, 3)] == [-3.0, 3.0]
 
 
@@ -138,11 +135,8 @@ def test_uris_and_endpoints_may_be_edited(folder):
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ('name = "D1"', 'name = "D2"'),
         ("offset = 0.0", "offset = 0.5"),
-        ("target_count = 255", "target_count = 254"),
         ('topic = "/boat/sensors"', 'topic = "/boat/sensor"'),
-        ('on_range = "clamp"', 'on_range = "error"'),
         ('image_hash = "0', 'image_hash = "1'),
         ("hash = ", "# hash = "),
     ],
@@ -157,11 +151,7 @@ def test_any_other_edit_is_found(folder, old, new):
 @pytest.mark.parametrize("key", ["integrity", "integrity_frames"])
 def test_a_key_of_an_earlier_version_is_to_be_deleted(folder, key):
     edit(folder, "tolerance_s", f'{key} = "off"\ntolerance_s')
-    with pytest.raises(DeploymentError) as caught:
-        load_deployment(folder, images=False)
-    line = (folder / "deployment.toml").read_text().splitlines().index(f'{key} = "off"') + 1
-    assert (caught.value.exit_code, caught.value.line, caught.value.place) == (2, line, (key,))
-    assert "delete this line" in refused(folder)
+    assert "delete this line" in refused(folder, place=(key,), line=7)
 
 
 @pytest.mark.parametrize("new", ["format = true", "format = 7\nwarp = true", ""])
@@ -177,16 +167,13 @@ def test_another_format_is_reported_before_anything_else(folder, new):
         ("\nname =", "\nnmae =", 4, ("nmae",)),
         ("[machine]", "[mahcine]", 51, ("mahcine",)),
         ("[[source]]", "[[sources]]", 9, ("sources",)),
-        ("prob_bits", "zzzz", 55, ("machine", "zzzz")),
         ('"clamp"', '"clmp"', 23, ("variable", 0, "on_range")),
-        ('"lfsr32"', '"lfsr64"', 59, ("machine", "rng")),
         ("bits = 9", 'bits = "9"', 31, ("variable", 1, "bits")),
         ("bits = 9", "bits = 17", 31, ("variable", 1, "bits")),
         ("bits = 9\n", "", 26, ("variable", 1, "bits")),
         ('path = "bearings[0]"', 'path = "bearings[0"', 29, ("variable", 1, "path")),
         ("values = 360", "values = 512", 26, ("variable", 1)),
         ("ws://a:9090", "http://a:9090", 10, ("source", 0, "uri")),
-        ("ws://a:9090", "robot:9090", 10, ("source", 0, "uri")),
         ("ws://a:9090", "ws://[::1", 10, ("source", 0, "uri")),
         ("max_cycles = 131072", f"max_cycles = {2**63}", 65, ("machine", "max_cycles")),
         ("boat_msgs/Sensors", "Sensors", 12, ("source", 0, "type")),
@@ -200,13 +187,7 @@ def test_another_format_is_reported_before_anything_else(folder, new):
 )
 def test_a_wrong_key_or_value_has_its_line(folder, old, new, line, place):
     edit(folder, old, new)
-    with pytest.raises(DeploymentError) as caught:
-        load_deployment(folder, images=False)
-    assert (caught.value.path, caught.value.line, caught.value.place) == (
-        folder / "deployment.toml",
-        line,
-        place,
-    )
+    refused(folder, place=place, line=line)
 
 
 @pytest.mark.parametrize(
