@@ -3,17 +3,10 @@
 import pytest
 
 CORRIDOR = """
-import numpy as np
-from toolchain.models.conditional import normal
-from toolchain.models.model import Known, Model, cell_centres, interval
+from tests.toolchain.corridor import corridor
 
 def model(cells: int = 12):
-    place = interval("x", 0.0, 10.0, cells=cells)
-    (x,) = cell_centres(place)
-    loud = 0.05 + 0.9 * np.exp(-x / 3)
-    return Model(name="corridor", searched=(place,), known=(
-        normal("range", mean=x, sigma=1.0, values=21, step=0.5, on_missing="missing"),
-        Known(name="loud", table=np.array([1 - loud, loud]))))
+    return corridor(cells, missing=True)
 """
 
 

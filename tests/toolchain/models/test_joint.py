@@ -196,7 +196,6 @@ def test_a_line_that_is_impossible_changes_no_code():
     )
     model = joint.ask(["s"], ["k"]).model()
     assert model.prior_distribution.tolist() == [0.5, 0.5, 0]
-    assert model.known[0].table[1].max() == 0.2 or model.prior_distribution[2] == 0
     assert exact_posterior(model, [1]) == pytest.approx([1 / 3, 2 / 3, 0])
 
 
@@ -288,21 +287,17 @@ def test_it_is_the_sum(seed, both_orders):
 
 def test_min_fill_answers_what_smallest_tables_would_refuse(monkeypatch):
     terms, names, sizes = random_terms(2964)  # the largest tables have 1600 and 480 entries
-    monkeypatch.setattr(inference, "MAX_ENTRIES", 1000)
-    monkeypatch.setattr(inference, "_CHEAP", 10**9)
-    with pytest.raises(ModelError, match="summing over"):
-        summed(terms, names, sizes, [names[0], names[-1]])
-    monkeypatch.setattr(inference, "_CHEAP", 100)
-    found, whole = summed(terms, names, sizes, [names[0], names[-1]])
+
+    def answer(most, cheap):
+        monkeypatch.setattr(inference, "MAX_ENTRIES", most)
+        monkeypatch.setattr(inference, "_CHEAP", cheap)
+        return summed(terms, names, sizes, [names[0], names[-1]])
+
+    for most, cheap in ((1000, 10**9), (100, 0)):
+        with pytest.raises(ModelError, match=r"summing over v\d+ needs a table of \d+ entries"):
+            answer(most, cheap)
+    found, whole = answer(1000, 100)
     assert found == pytest.approx(whole)
-
-
-def test_if_both_orders_are_too_large_the_table_is_named(monkeypatch):
-    terms, names, sizes = random_terms(2964)
-    monkeypatch.setattr(inference, "MAX_ENTRIES", 100)
-    monkeypatch.setattr(inference, "_CHEAP", 0)
-    with pytest.raises(ModelError, match=r"summing over v\d+ needs a table of \d+ entries"):
-        summed(terms, names, sizes, [names[0], names[-1]])
 
 
 def test_a_name_with_thousands_of_neighbours():

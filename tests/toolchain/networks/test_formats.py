@@ -171,7 +171,6 @@ def test_the_same_network_in_every_format(tmp_path, file):
         ("dog.net", "class Dogs {\ninheritance = ();\n" + NET.split("\n", 2)[2] + "}\n", "Dogs"),
         ("dog.bif", BIF.replace('"dog problem"', "unknown"), "dog"),
         ("dog.bif.gz", gzip.compress(BIF.replace('"dog problem"', "unknown").encode()), "dog"),
-        ("dog.UAI.GZ", gzip.compress(UAI.encode()), "dog"),
         ("dog.xdsl", XDSL, "Network1"),
         ("dog.bif", BIF.replace("/* no commas", "/* */ /* no commas"), "dog problem"),
         ("dog.bif", BIF.replace("0.15, 0.85", "0.15, 0.849"), "dog problem"),
