@@ -1,4 +1,4 @@
-"""Readiness of a case study's process, and publications that a server refuses."""
+"""Readiness of a case study's process, publications that a server refuses, and a robot's name as `--uri`."""
 
 import asyncio
 import json
@@ -6,10 +6,15 @@ import re
 
 import pytest
 
+from bridge.discovery import UnknownRobotError
 from casestudies import publishing
-from casestudies import publishing as module
+from casestudies.boat.normaliser import app as normaliser
+from casestudies.boat.simulator import app as simulator
+from casestudies.boat.viewer import app as viewer
+from casestudies.mrclam.player import app as player
 from casestudies.publishing import Readiness, serve_readiness
 from terminal.health import is_ready, read_status, status_socket
+from tests.command_runner import invoke
 from tests.patience import PATIENCE
 
 WORK = "a result was shown"
@@ -28,7 +33,7 @@ async def asked(directory):
 
 
 async def test_ready_once_it_has_worked(tmp_path, readiness, monkeypatch):
-    monkeypatch.setattr(module, "RECENT_S", PATIENCE)
+    monkeypatch.setattr(publishing, "RECENT_S", PATIENCE)
     ready, why = await asked(tmp_path)
     assert not ready
     assert why.endswith(WORK)
@@ -39,7 +44,7 @@ async def test_ready_once_it_has_worked(tmp_path, readiness, monkeypatch):
 
 
 async def test_not_ready_when_its_work_stopped(tmp_path, readiness, monkeypatch):
-    monkeypatch.setattr(module, "RECENT_S", 0.0)
+    monkeypatch.setattr(publishing, "RECENT_S", 0.0)
     readiness.record()
     await asyncio.sleep(0.01)
     assert not (await asked(tmp_path))[0]
@@ -70,3 +75,37 @@ async def test_a_refused_topic_is_reported_as_far_as_rosapi_tells(known, warning
     monkeypatch.setattr(publishing, "SETTLED_S", 0)
     await publishing.report_refused(Server(known), "/boat/raw", TYPE)
     assert capsys.readouterr().err.count("warning: ") == warnings
+
+
+@pytest.fixture
+def looked_up(monkeypatch):
+    """The names that are looked up; only `Zoë` is announced, at a port where nothing listens."""
+
+    async def resolve(name):
+        names.append(name)
+        if name != "Zoë":
+            raise UnknownRobotError(f"no robot called {name}")
+        return "ws://127.0.0.1:1"
+
+    names = []
+    monkeypatch.setattr("bridge.discovery.resolve", resolve)
+    monkeypatch.setattr("bridge.client.session.FIRST_DELAY", 3600)  # the first attempt is the last
+    return names
+
+
+@pytest.mark.parametrize("command", [simulator, normaliser, viewer])
+def test_a_robots_name_stands_for_its_uri(command, looked_up, monkeypatch):
+    found = invoke(command, ["--uri", "robot:Zoë"])
+    assert (found.exit_code, looked_up) == (3, ["Zoë"])
+    assert found.stderr.splitlines()[-1].startswith("error: ")
+    assert "ws://127.0.0.1:1" in found.stderr
+    assert "Traceback" not in found.stderr
+    monkeypatch.setenv("BM_URI", "robot:Adam")
+    unknown = invoke(command, [])
+    assert (unknown.exit_code, looked_up) == (3, ["Zoë", "Adam"])
+    assert unknown.stderr.splitlines() == ["error: no robot called Adam"]
+
+
+def test_a_player_looks_it_up_too(looked_up):
+    assert invoke(player, ["nowhere.csv", "--uri", "robot:Adam"]).exit_code == 3
+    assert looked_up == ["Adam"]

@@ -3,7 +3,7 @@
 import pytest
 
 CORRIDOR = """
-from tests.toolchain.corridor import corridor
+from tests.toolchain.builders import corridor
 
 def model(cells: int = 12):
     return corridor(cells, missing=True)

@@ -61,12 +61,10 @@ def test_a_file_is_read_up_to_its_bound(tmp_path):
 KEY = "a" + ".a" * 20_000
 DEEP_KEYS = {
     "a dotted key": f"{KEY} = 1",
-    "a header": f"[{KEY}]",
     "an array's header": f"[[{KEY}]]",
     "a quoted key": r'"\""' + KEY[1:] + " = 1",
     "a key with spaces": "  'a' " + KEY[1:].replace(".", " . ") + " = 1",
     "an inline table": f"c = {{a = 1, {KEY} = 1}}",
-    "a table in an array": f"c = [{{{KEY} = 1}}]",
 }
 
 

@@ -6,7 +6,7 @@ import pytest
 from machines.bm1 import BM1Machine, Start, StopReason, first_slice
 from machines.parameters import BM1Parameters
 from machines.reference import ReferenceBM1
-from tests.toolchain.corridor import corridor, machine_of
+from tests.toolchain.builders import corridor, machine_of
 from toolchain.analysis.accuracy import _difference, _line_probabilities, bootstrap, measure, share_of_frames
 from toolchain.analysis.emulation import EmulatedBoards, joined
 from toolchain.analysis.readings import (

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.toolchain.corridor import corridor
+from tests.toolchain.builders import corridor
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis import Sweep
 from toolchain.analysis.logic import DEVICES

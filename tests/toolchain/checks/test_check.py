@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from machines.bm1 import Start, StopReason
 from machines.parameters import PriorMode, RngKind, RngReset
 from machines.reference import ReferenceBM1
-from tests.toolchain.deployments import boat
+from tests.toolchain.builders import boat
 from tests.toolchain.running import OPTIONS, TINY, build_model, toolchain
 from toolchain.building.build import assemble, build_deployment
 from toolchain.building.machine import plan_machine

@@ -13,8 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from tests.toolchain.corridor import corridor
-from tests.toolchain.deployments import boat
+from tests.toolchain.builders import boat, corridor
 from tests.toolchain.running import build_model
 from toolchain.deployment import (
     BoardSection,

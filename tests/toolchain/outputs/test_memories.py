@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from machines.parameters import PriorMode, RngKind, RngReset
 from machines.rng import POLYNOMIALS, random_numbers
 from pcie_shim.programming_file import read_image
 from tests.patience import PROCESS_PATIENCE
-from tests.toolchain.running import build_model, contents
+from tests.toolchain.running import TARGET, TINY, build_model, contents
 from toolchain.deployment import load_deployment
 from toolchain.models.conditional import normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
@@ -221,26 +222,15 @@ def test_generators_that_exist_emulated_only_have_no_seeds_and_no_project(tmp_pa
     ]
 
 
-ELSEWHERE = """
-import sys
-from dataclasses import replace
-from pathlib import Path
-from tests.toolchain.outputs.test_memories import model
-from tests.toolchain.running import OPTIONS
-from toolchain.building.build import build_deployment
-from toolchain.building.machine import plan_machine
-options = replace(OPTIONS, partitions=2, build_date="2020-02-02T02:02:02Z")
-build_deployment(plan_machine(model(), options), Path(sys.argv[1]))
-"""
-
-
 @pytest.mark.thorough
-def test_the_same_bytes_in_another_folder_locale_and_hash_seed(tmp_path):
+def test_the_same_bytes_in_another_folder_locale_and_hash_seed(tmp_path, case):
+    (case / "model.py").write_text(TINY.replace('"tiny"', '"tïny"'), "utf-8")
+    os.utime(case / "model.py", (1_580_608_922, 1_580_608_922))
     found = []
     for number, language in enumerate(["C", "C.UTF-8"]):
         folder = tmp_path / f"number {number}"
         place = {"PYTHONHASHSEED": str(number), "LC_ALL": language, "TZ": ["UTC", "Asia/Tokyo"][number]}
-        command = [sys.executable, "-c", ELSEWHERE, folder]
+        command = [Path(sys.executable).with_name("toolchain"), "build", case, "-o", folder, *TARGET]
         subprocess.run(command, check=True, timeout=PROCESS_PATIENCE, env=os.environ | place)
         found.append(contents(folder))
     assert found[0] == found[1]
