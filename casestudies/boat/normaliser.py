@@ -9,6 +9,7 @@ import typer
 from casestudies import DEFAULT_URI, Uri
 from casestudies.boat.sensors import (
     ARRAY_TYPE,
+    DISTANCE_NAMES,
     LONGEST_DISTANCE,
     RAW_MSG,
     RAW_TOPIC,
@@ -18,7 +19,6 @@ from casestudies.boat.sensors import (
     SENSORS_TOPIC,
     SENSORS_TYPE,
     BadReadingError,
-    is_distance,
     read_raw,
     readings_message,
 )
@@ -41,7 +41,7 @@ def normalise_bearing(raw: float) -> int:
 def normalise(raw: tuple[float, ...]) -> tuple[int, ...]:
     """Return the machine's readings for raw readings, both in the order of `SENSOR_NAMES`."""
     return tuple(
-        normalise_distance(value) if is_distance(name) else normalise_bearing(value)
+        normalise_distance(value) if name in DISTANCE_NAMES else normalise_bearing(value)
         for name, value in zip(SENSOR_NAMES, raw, strict=True)
     )
 
@@ -55,7 +55,7 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
         BridgeError: No rosbridge server answers at the URI.
     """
     from bridge.client import connect
-    from casestudies.publishing import LossyPublication, Readiness, report_refused, serve_readiness
+    from casestudies.topics import LossyPublication, Readiness, report_refused, serve_readiness
 
     reported: set[str] = set()
     readiness = Readiness("a reading was normalised")

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from casestudies.boat.sensors import BEACONS, map_grid
 from casestudies.grid import Grid
-from casestudies.listening import Instance, Truth
+from casestudies.topics import Instance, Truth
 from posteriors.posterior import Posterior
 from terminal.errors import OutputError
 
@@ -194,7 +194,7 @@ def posterior_grid(posterior: Posterior) -> Grid:
 
 
 def _draw_map(axes: Any, grid: Grid, instance: Instance, route: Sequence[Truth], number: int) -> None:
-    _map_axes(axes, grid, f"({_letter(number)}a) true position")
+    _map_axes(axes, grid, f"({number + 1}a) true position")
     axes.set_facecolor("#eaf2f8")
     _draw_beacons(axes)
     axes.plot([t.x for t in route], [t.y for t in route], color="#9fb8cc", linewidth=0.8, zorder=1)
@@ -233,7 +233,7 @@ def _draw_posterior(axes: Any, grid: Grid, instance: Instance, scale: float, num
 
     posterior = _posterior_of(instance)
     height, width = posterior.sizes
-    title = f"({_letter(number)}b) posterior"
+    title = f"({number + 1}b) posterior"
     if instance.report is not None and instance.report.number is not None:
         title += f", frame {instance.report.number}"
     _map_axes(axes, grid, title)
@@ -295,10 +295,6 @@ def _draw_beacons(axes: Any) -> None:
     axes.scatter(
         xs, ys, marker="^", s=46, color="#ffd24d", edgecolors="black", zorder=5, clip_on=False, label="beacon"
     )
-
-
-def _letter(number: int) -> str:
-    return str(number + 1)
 
 
 def _posterior_of(instance: Instance) -> Posterior:

@@ -138,8 +138,3 @@ def read_raw(
             raise BadReadingError(f"the raw reading {name} must be a finite number, not {value!r}")
         values.append(float(value))
     return tuple(values), head if isinstance(head, Mapping) else None
-
-
-def is_distance(name: str) -> bool:
-    """Return whether a sensor measures a distance; the others measure bearings."""
-    return name in DISTANCE_NAMES

@@ -99,7 +99,7 @@ async def simulate(
     """
     from bridge.client import connect
     from bridge.stamps import header
-    from casestudies.publishing import LossyPublication, Readiness, report_refused, serve_readiness
+    from casestudies.topics import LossyPublication, Readiness, report_refused, serve_readiness
 
     readiness = Readiness("a reading was published")
     async with (

@@ -19,8 +19,7 @@ from terminal.output import check_writable, say, warn, write_json
 from terminal.signals import run_async
 
 if TYPE_CHECKING:
-    from casestudies.boat.pictures import StageShare
-    from casestudies.listening import Instance, Truth
+    from casestudies.topics import Instance, Truth
 
 POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
@@ -136,8 +135,7 @@ class Viewer:
             BridgeError: No rosbridge server answers at the URI.
         """
         from bridge.client import connect
-        from casestudies.listening import listen
-        from casestudies.publishing import Readiness, serve_readiness
+        from casestudies.topics import Readiness, listen, serve_readiness
 
         readiness = Readiness("a result was shown")
         async with (
@@ -189,7 +187,10 @@ class Viewer:
             "frames_without_posterior": self.frames - self.results,
             "median_distance_cells": distance,
             "median_time_ms": time,
-            "stages": [_stage_numbers(stage) for stage in stage_shares(self.instances)],
+            "stages": [
+                {"stage": each.name, "part": each.part.value, "mean_us": each.mean_us, "share": each.share}
+                for each in stage_shares(self.instances)
+            ],
             "frames": [
                 _frame_numbers(line, instance)
                 for line, instance in zip(self.lines, self.instances, strict=True)
@@ -224,11 +225,6 @@ def _frame_numbers(line: Line, instance: "Instance") -> dict[str, object]:
 
 def _by_label(pair: tuple[float, float] | None) -> dict[str, float] | None:
     return None if pair is None else dict(zip(("y", "x"), pair, strict=True))
-
-
-def _stage_numbers(stage: "StageShare") -> dict[str, object]:
-    """Return a stage as a JSON object."""
-    return {"stage": stage.name, "part": stage.part.value, "mean_us": stage.mean_us, "share": stage.share}
 
 
 def _results(number: int) -> str:

@@ -224,15 +224,6 @@ def _wrapped(angle: float) -> float:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-def write_landmarks(path: Path, positions: dict[int, tuple[float, float]]) -> None:
-    """Write `landmarks.csv`, or raise an OutputError."""
-    _write(
-        path,
-        ["landmark", "x_m", "y_m"],
-        [[str(number), f"{x:.4f}", f"{y:.4f}"] for number, (x, y) in sorted(positions.items())],
-    )
-
-
 def write_recording(path: Path, kept: Sequence[Window], landmarks: Sequence[int]) -> None:
     """Write a file that `casestudies.mrclam.player` reads, or raise an OutputError."""
     heading = ["time_s", "ref_x_m", "ref_y_m", "ref_std_m", "heading_rad"]
@@ -275,12 +266,6 @@ def robots_in(folder: Path) -> list[int]:
     return found
 
 
-def prefix_of(folder: Path) -> str:
-    """Return the prefix of the recordings' names: `ds1` for a folder whose name ends in 1."""
-    number = re.search(r"(\d+)$", folder.resolve().name)
-    return f"ds{number[1]}" if number else "ds"
-
-
 app = CommandLine()
 
 
@@ -310,8 +295,10 @@ def convert(
     subjects, positions = read_barcodes(folder), read_positions(folder)
     robots = robot or robots_in(folder)
     check_writable(output)
-    write_landmarks(output / "landmarks.csv", positions)
-    print(f"wrote {output / 'landmarks.csv'}: {len(positions)} landmarks", flush=True)
+    places = [[str(number), f"{x:.4f}", f"{y:.4f}"] for number, (x, y) in sorted(positions.items())]
+    _write(output / "landmarks.csv", ["landmark", "x_m", "y_m"], places)
+    print(f"wrote {output / 'landmarks.csv'}: {len(places)} landmarks", flush=True)
+    data_set = "".join(re.findall(r"\d+$", folder.resolve().name))
     for number in robots:
         measured, misread = read_measured(folder, number, subjects)
         kept, left_out = windows(read_track(folder, number), measured)
@@ -322,7 +309,7 @@ def convert(
         if not kept:
             warn(f"robot {number}: nothing to write, {said}")
             continue
-        path = output / f"{prefix_of(folder)}_robot{number}.csv"
+        path = output / f"ds{data_set}_robot{number}.csv"
         write_recording(path, kept, sorted(positions))
         print(f"wrote {path}: {said}", flush=True)
 

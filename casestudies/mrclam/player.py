@@ -12,24 +12,22 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 import typer
 
-from bridge.client import Publication
+from bridge.client import Publication, connect
 from bridge.client.protocol import RosVersion
+from bridge.stamps import header
 from casestudies import DEFAULT_URI, DataFileError, Uri
 from casestudies.grid import Grid
+from casestudies.topics import Instance, Listener, listen
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.posterior import Posterior
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import check_writable, say, write_json
 from terminal.signals import run_async
-
-if TYPE_CHECKING:
-    from casestudies.listening import Instance, Listener
-
 
 SIGHTINGS_TOPIC: Final = "/mrclam/sightings"
 SIGHTINGS_TYPE: Final = "mrclam_msgs/Sightings"
@@ -172,7 +170,7 @@ class PlayedFrame:
     """A recorded frame and its result: the published posterior, or None and the reason."""
 
     frame: RecordedFrame
-    posterior: "Posterior | None"
+    posterior: Posterior | None
     cycles: int | None
     outcome: str
 
@@ -219,9 +217,6 @@ async def play(
         BadResultError: A message was not a result.
         BridgeError: No rosbridge server answers at the URI, or it was lost.
     """
-    from bridge.client import connect
-    from casestudies.listening import listen
-
     played: list[PlayedFrame] = []
     async with connect(uri, retry=True, on_state=report_connection(uri)) as ros, listen(ros) as listener:
         version = await ros.detect_ros_version()
@@ -248,16 +243,14 @@ async def play(
 
 async def _take_turn(
     frame: RecordedFrame,
-    publication: "Publication",
-    listener: "Listener",
-    version: "RosVersion | None",
+    publication: Publication,
+    listener: Listener,
+    version: RosVersion | None,
     *,
     limit_s: float,
     repeat_s: float,
-) -> "Instance | None":
+) -> Instance | None:
     """Publish a frame until its result arrives, and return the result, or None after the limit; skip late results of other frames."""
-    from bridge.stamps import header
-
     stamps: set[int] = set()
     end = time.monotonic() + limit_s
     while (now := time.monotonic()) < end:
@@ -273,7 +266,7 @@ async def _take_turn(
     return None
 
 
-def _played(frame: RecordedFrame, instance: "Instance | None", timeout_s: float) -> PlayedFrame:
+def _played(frame: RecordedFrame, instance: Instance | None, timeout_s: float) -> PlayedFrame:
     if instance is None or instance.report is None:
         return PlayedFrame(
             frame=frame, posterior=None, cycles=None, outcome=f"no result within {timeout_s:g} s"
@@ -299,17 +292,6 @@ def _line(played: PlayedFrame) -> str:
 
 
 _HEADING: Final = "frame  seen  reference (m)       estimate (m)      distance (m)   cycles"
-
-
-def _write_numbers(path: Path, played: Sequence[PlayedFrame]) -> None:
-    numbers = {
-        "frames": len(played),
-        "without_result": sum(frame.posterior is None for frame in played),
-        "median_distance_m": median_distance(played),
-        "distances_m": [frame.distance() for frame in played],
-        "cycles": [frame.cycles for frame in played],
-    }
-    write_json(path, numbers)
 
 
 app = CommandLine()
@@ -365,7 +347,14 @@ def player(
         flush=True,
     )
     if numbers is not None:
-        _write_numbers(numbers, played)
+        figures = {
+            "frames": len(played),
+            "without_result": without,
+            "median_distance_m": median_distance(played),
+            "distances_m": [frame.distance() for frame in played],
+            "cycles": [frame.cycles for frame in played],
+        }
+        write_json(numbers, figures)
 
 
 if __name__ == "__main__":

@@ -19,8 +19,7 @@ from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.programming_file import Image, Partition, image_bytes
 from pcie_shim.register_layout import next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode
-from toolchain.hardware.sources import HDL, PARAMETERS, SOURCES, in_order, verilog
-from toolchain.hardware.tools import HardwareToolError, run_tool
+from toolchain.hardware import HDL, PARAMETERS, SOURCES, HardwareToolError, in_order, run_tool, verilog
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -97,6 +96,6 @@ def image_of_parameters(parameters: BM1Parameters) -> Image:
 def write_hardware_files(image: Image, folder: Path) -> None:
     """Write the files of an image's hardware, as a build does: the package of parameters and all memories."""
     # imported here, because benches do not need it and dozens of simulations are started
-    from toolchain.hardware.board_files import write_board_files
+    from toolchain.hardware import write_board_files
 
     write_board_files(image, folder)

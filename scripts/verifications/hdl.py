@@ -35,7 +35,7 @@ from scripts.running.flags import ROOT, ScriptParser
 from scripts.verifications.checks import Tally
 from scripts.verifications.installation import install_programs
 from services.errors import SettingsError
-from toolchain.hardware.simulation import Simulator
+from toolchain.hardware import Simulator
 
 SESSIONS: Final = 60
 """Number of random machines in the matrix."""

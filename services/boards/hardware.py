@@ -10,8 +10,7 @@ from pcie_shim.errors import SimulationError
 from pcie_shim.programming_file import Image
 from services.errors import SettingsError
 from terminal.output import say, warn
-from toolchain.hardware.simulation import Compiled, Simulator, check_tools, compiled
-from toolchain.hardware.tools import HardwareToolError, missing
+from toolchain.hardware import Compiled, HardwareToolError, Simulator, check_tools, compiled, missing
 
 
 class Engine(StrEnum):

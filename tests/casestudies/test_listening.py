@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.client import connect
-from casestudies.listening import Truth, Truths, listen, read_truth
+from casestudies.topics import Truth, Truths, listen, read_truth
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.frame_report import FrameReport
 from posteriors.posterior import Posterior
@@ -119,7 +119,7 @@ async def test_frames_come_with_their_posterior_and_truth(heard):
 
 
 async def test_a_truth_that_is_a_little_late_is_waited_for(heard, monkeypatch):
-    monkeypatch.setattr("casestudies.listening._PATIENCE_S", PATIENCE)
+    monkeypatch.setattr("casestudies.topics._PATIENCE_S", PATIENCE)
     fake, listener = heard
     await fake.publish(TRUTH, pose(1))
     await say_frame(fake, 2)

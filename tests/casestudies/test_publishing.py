@@ -7,12 +7,12 @@ import re
 import pytest
 
 from bridge.discovery import UnknownRobotError
-from casestudies import publishing
+from casestudies import topics
 from casestudies.boat.normaliser import app as normaliser
 from casestudies.boat.simulator import app as simulator
 from casestudies.boat.viewer import app as viewer
 from casestudies.mrclam.player import app as player
-from casestudies.publishing import Readiness, serve_readiness
+from casestudies.topics import Readiness, serve_readiness
 from terminal.health import is_ready, read_status, status_socket
 from tests.command_runner import invoke
 from tests.patience import PATIENCE
@@ -33,7 +33,7 @@ async def asked(directory):
 
 
 async def test_ready_once_it_has_worked(tmp_path, readiness, monkeypatch):
-    monkeypatch.setattr(publishing, "RECENT_S", PATIENCE)
+    monkeypatch.setattr(topics, "RECENT_S", PATIENCE)
     ready, why = await asked(tmp_path)
     assert not ready
     assert why.endswith(WORK)
@@ -44,7 +44,7 @@ async def test_ready_once_it_has_worked(tmp_path, readiness, monkeypatch):
 
 
 async def test_not_ready_when_its_work_stopped(tmp_path, readiness, monkeypatch):
-    monkeypatch.setattr(publishing, "RECENT_S", 0.0)
+    monkeypatch.setattr(topics, "RECENT_S", 0.0)
     readiness.record()
     await asyncio.sleep(0.01)
     assert not (await asked(tmp_path))[0]
@@ -72,8 +72,8 @@ class Server:
     ("known", "warnings"), [(None, 0), ("", 1), ("boat_msgs/msg/Raw", 0), ("std_msgs/String", 1)]
 )
 async def test_a_refused_topic_is_reported_as_far_as_rosapi_tells(known, warnings, capsys, monkeypatch):
-    monkeypatch.setattr(publishing, "SETTLED_S", 0)
-    await publishing.report_refused(Server(known), "/boat/raw", TYPE)
+    monkeypatch.setattr(topics, "SETTLED_S", 0)
+    await topics.report_refused(Server(known), "/boat/raw", TYPE)
     assert capsys.readouterr().err.count("warning: ") == warnings
 
 

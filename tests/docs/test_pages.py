@@ -20,7 +20,7 @@ from rosbayes.__main__ import app
 from services.settings import ENV_PREFIX, Settings
 from terminal.flags import default_of, field_flag
 from tests.bridge.hub.broker_harness import Harness
-from toolchain.checks.finding import Check
+from toolchain.checks.findings import Check
 from toolchain.deployment import DeploymentFile
 
 ROOT = Path(__file__).parents[2]

@@ -35,7 +35,7 @@ from services.commands.board import app
 from tests.command_runner import invoke
 from tests.patience import PROCESS_PATIENCE
 from tests.pcie_shim.boards import expected, image, images, machine, never_stopping
-from toolchain.hardware import simulation
+from toolchain import hardware
 
 needs_ghdl = pytest.mark.skipif(
     shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
@@ -301,7 +301,7 @@ def test_a_full_disk_is_an_error_of_the_board(tmp_path, monkeypatch):
     def write(*_):
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr(simulation, "write_board_files", write)
+    monkeypatch.setattr(hardware, "write_board_files", write)
     with pytest.raises(SimulationError) as raised:
         SimulatedHardware(Engine.GHDL, tmp_path / "hardware", {0: image(machine(1))})
     assert str(tmp_path) in str(raised.value)

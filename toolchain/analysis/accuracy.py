@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from machines.bm1 import BM1Machine, Start, addressed_codes
 from machines.encode import decode_code
 from machines.parameters import RngReset
-from toolchain.analysis.emulation import EmulatedBoards, Inputs, inputs_of_boards
-from toolchain.analysis.readings import Readings
+from toolchain.analysis.emulation import EmulatedBoards, Inputs, Readings, inputs_of_boards
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.model import Model, exact_posterior, fuse
 
@@ -239,7 +238,8 @@ class _Results:
                 )
             ]
         )
-        ran = [boards.run(inputs, prior_row, _bank(boards, frame, run, banks)) for run in range(banks)]
+        numbers = [(frame * banks + run) % boards.parameters.rng_banks for run in range(banks)]
+        ran = [boards.run(inputs, prior_row, bank) for bank in numbers]
         posteriors = [posterior for each in ran if (posterior := each.posterior) is not None]
         self.posteriors += 1
         self.without += banks - len(posteriors)
@@ -283,10 +283,6 @@ class _Results:
                 worst=int(lengths.max()),
             ),
         )
-
-
-def _bank(boards: EmulatedBoards, frame: int, run: int, banks: int) -> int:
-    return (frame * banks + run) % boards.parameters.rng_banks
 
 
 def _line_probabilities(machine: BM1Machine, addresses: Inputs, prior_address: int) -> NDArray[np.float64]:

@@ -18,9 +18,8 @@ from machines.encode import decode_code
 from machines.parameters import BM1Parameters
 from machines.rng import random_numbers
 from toolchain.analysis.accuracy import Interval, bootstrap
-from toolchain.analysis.emulation import EmulatedBoards
-from toolchain.analysis.readings import sample_readings
-from toolchain.analysis.results import COLOURS, MARKERS, new_figure, save_figure
+from toolchain.analysis.emulation import EmulatedBoards, sample_readings
+from toolchain.analysis.sweep import COLOURS, MARKERS, new_figure, save_figure
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Stop
 from toolchain.models.conditional import normal

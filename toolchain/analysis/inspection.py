@@ -12,22 +12,23 @@ import numpy as np
 from machines.bm1 import BM1Machine
 from machines.parameters import SensorMode
 from toolchain.analysis import InspectOptions
-from toolchain.analysis.accuracy import Accuracy, Difference, Interval, measure
-from toolchain.analysis.emulation import EmulatedBoards, joined, one_replica
-from toolchain.analysis.logic import device_named
-from toolchain.analysis.readings import (
+from toolchain.analysis.accuracy import Accuracy, Interval, measure
+from toolchain.analysis.emulation import (
+    EmulatedBoards,
     Readings,
     check_columns,
     check_frames,
+    joined,
     model_of_codes,
+    one_replica,
     readings_of_lines,
     recorded_readings,
     sample_readings,
 )
+from toolchain.analysis.logic import device_named
 from toolchain.analysis.resources import ASSUMPTIONS, Energy, Estimate, energy, estimate
-from toolchain.building.build import read_images
+from toolchain.building.build import loss_heading, many_sentence, read_images
 from toolchain.building.quantise import ColumnLoss, quantise
-from toolchain.building.report import loss_heading, many_sentence
 from toolchain.deployment import Deployment, Scale
 from toolchain.errors import BuildError
 from toolchain.models.model import Model
@@ -264,7 +265,11 @@ def _accuracy_part(found: Inspection) -> str:
         ("the machine against its codes", accuracy.sampling),
     ):
         if difference is not None:
-            rows.append(f"  {name:34}{_shown_difference(difference)}")
+            rows.append(
+                f"  {name:34}{_shown_interval(difference.total_variation, '.4f'):>21}"
+                f"  {_shown_interval(difference.kl_bits, '.4f'):>21}"
+                f"  {_shown_interval(difference.map_agreement, '.0%'):>19}"
+            )
     if accuracy.machine is None:
         rows.append("  Give the model with --model for the quantisation loss.")
     if accuracy.z is not None:
@@ -275,13 +280,6 @@ def _accuracy_part(found: Inspection) -> str:
             "(0.27 % is normal)."
         )
     return "\n".join(rows)
-
-
-def _shown_difference(difference: Difference) -> str:
-    return (
-        f"{_shown_interval(difference.total_variation, '.4f'):>21}  {_shown_interval(difference.kl_bits, '.4f'):>21}"
-        f"  {_shown_interval(difference.map_agreement, '.0%'):>19}"
-    )
 
 
 def _shown_interval(interval: Interval, form: str) -> str:

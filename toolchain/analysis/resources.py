@@ -8,6 +8,7 @@ assumed constants are listed.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -25,12 +26,12 @@ from toolchain.errors import BuildError
 from toolchain.outputs.mif import LENGTH, table_length
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from machines.bm1 import BM1Machine
     from machines.parameters import BM1Parameters
+    from toolchain.analysis.emulation import Readings
     from toolchain.analysis.logic import Device
-    from toolchain.analysis.readings import Readings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,11 +59,6 @@ class Estimate:
         return self.memories.blocks / self.device.blocks
 
     @property
-    def mlab_share(self) -> float:
-        """Share of the device's memory LABs."""
-        return self.memories.mlabs * MLAB_ALMS / (self.device.alms * MLAB_SHARE)
-
-    @property
     def fits(self) -> bool:
         """True if the machine can be placed and routed."""
         return self.why_not == ""
@@ -75,8 +71,8 @@ class Estimate:
             return f"it takes {self.memories.blocks:,} memory blocks, and there are {self.device.blocks:,}"
         if self.alm_share > usable:
             return f"it takes {self.alms:,.0f} ALMs, and {usable * self.device.alms:,.0f} of {self.device.alms:,} can be used"
-        if self.mlab_share > 1:
-            mlabs = self.device.alms * MLAB_SHARE / MLAB_ALMS
+        mlabs = self.device.alms * MLAB_SHARE / MLAB_ALMS
+        if self.memories.mlabs > mlabs:
             return f"its tables take {self.memories.mlabs:,} memory LABs, and there are {mlabs:,.0f}"
         return ""
 
@@ -102,7 +98,8 @@ def boards_needed(
     largest_lines = min(largest_lines, room[1] // parameters.replicas)
     if parameters.sensor_mode is not SensorMode.COLUMN and parameters.sensors:
         largest_lines = min(largest_lines, room[0] // (parameters.replicas * parameters.sensors))
-    most = _most_lines(lambda lines: on(lines).fits, min(parameters.lines, largest_lines))
+    possible = range(1, min(parameters.lines, largest_lines) + 1)
+    most = bisect_left(possible, True, key=lambda lines: not on(lines).fits)
     if most == 0 and largest_lines == 0:
         raise BuildError(
             f"not even one line of {parameters.replicas} replicas fits the register map: it has room for {room[0]} inputs "
@@ -127,18 +124,6 @@ def boards_needed(
         f"{parameters.lines} lines need {boards}: {reason}; {largest} lines per board take {share}. An estimate, not a "
         "compilation."
     )
-
-
-def _most_lines(fits: Callable[[int], bool], highest: int) -> int:
-    """Return the maximum number of lines that fit, 0 to `highest`, by bisection."""
-    low, high = 0, highest + 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if fits(middle):
-            low = middle
-        else:
-            high = middle
-    return low
 
 
 CORE_VOLTAGE: Final = 0.9

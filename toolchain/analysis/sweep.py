@@ -1,18 +1,24 @@
-"""Sweeps over the possible machines of a model: accuracy, cycles and ALMs, stored point by point in a file."""
+"""Sweeps over the possible machines of a model: points, stored one by one in a file, their Pareto front, table and picture."""
 
 import hashlib
 import json
+import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from machines.parameters import RngKind
 from toolchain.analysis import Sweep
 from toolchain.analysis.accuracy import measure
-from toolchain.analysis.emulation import EmulatedBoards
+from toolchain.analysis.emulation import EmulatedBoards, Readings
 from toolchain.analysis.logic import Device
-from toolchain.analysis.readings import Readings
 from toolchain.analysis.resources import estimate
-from toolchain.analysis.results import Point
+from toolchain.bounded_files import read_bounded
 from toolchain.building.machine import (
     MachinePlan,
     board_layout,
@@ -24,6 +30,257 @@ from toolchain.building.machine import (
 from toolchain.building.quantise import quantise
 from toolchain.errors import BuildError
 from toolchain.models.model import Model
+
+MAX_FILE_BYTES: Final = 1 << 28
+
+_BEGIN: Final = b'{"key":"'
+"""The first bytes of every line of results."""
+
+
+class Point(BaseModel):
+    """The measurement of one machine in a sweep: a line of the results file.
+
+    Attributes:
+        key: SHA-256 of everything on which the results depend.
+        total_variation: Compared with the model, mean over frames; None if no frame had a posterior.
+        total_variation_low: Lower end of its 95 % interval.
+        total_variation_high: Upper end of its 95 % interval.
+        quantising: The same for exact inference on the codes.
+        kl_bits: KL(machine || model).
+        map_agreement: Share of frames with the same most probable line.
+        z_rms: Root mean square of z-scores; 1 is ideal.
+        without: Share of runs without a posterior.
+        cycles_median: Cycles of a frame.
+        cycles_95: Their 95th percentile.
+        alms: ALMs of the largest board; None for generators that FPGAs do not have.
+        blocks: Memory blocks of the largest board.
+        fits: Whether these fit the device.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    key: str = Field(pattern="[0-9a-f]{64}")
+    scale: Literal["address", "column", "none"]
+    rng: Literal["lfsr8", "lfsr16", "lfsr24", "lfsr32", "table", "ideal"]
+    steps_per_clock: int
+    prob_bits: int
+    target_count: int
+    counter_bits: int
+    partitions: int
+    frames: int
+    total_variation: float | None
+    total_variation_low: float | None
+    total_variation_high: float | None
+    quantising: float | None
+    kl_bits: float | None
+    map_agreement: float | None
+    z_rms: float | None
+    without: float
+    cycles_median: float
+    cycles_95: float
+    alms: float | None
+    blocks: int | None
+    fits: bool | None
+
+
+class Results:
+    """The results file with one JSON object per line, from which an interrupted sweep can be resumed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.points: dict[str, Point] = {}
+        content = b""
+        if path.exists():
+            content = read_bounded(path, MAX_FILE_BYTES, BuildError)
+        lines = content.split(b"\n")
+        # A power failure may leave an incomplete last line: that point is measured again.
+        torn = lines.pop()
+        if torn and not torn.startswith(_BEGIN[: len(torn)]):
+            lines.append(torn)
+        self._torn_at = len(content) - len(torn) if torn else None
+        for number, line in enumerate(lines, start=1):
+            try:
+                point = Point.model_validate_json(line)
+            except ValidationError:
+                raise BuildError(
+                    f"{path}, line {number}, is not a result of a sweep; name another file with -o"
+                ) from None
+            self.points[point.key] = point
+
+    def check_writable(self) -> None:
+        """Create the file if it is missing; raise a BuildError before a long run if it cannot be written."""
+        try:
+            os.close(self._opened())
+        except OSError as reason:
+            raise self._not_writable(reason) from None
+
+    def append(self, point: Point) -> None:
+        """Append a point with one write, and wait until it is on the disk."""
+        line = point.model_dump_json() + "\n"
+        try:
+            if self._torn_at is not None:
+                os.truncate(self.path, self._torn_at)
+                self._torn_at = None
+            descriptor = self._opened()
+            try:
+                written = os.write(descriptor, line.encode())
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        except OSError as reason:
+            raise self._not_writable(reason) from None
+        if written != len(line):
+            raise BuildError(f"{self.path} cannot be written: the disk is full")
+
+    def _opened(self) -> int:
+        return os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+
+    def _not_writable(self, reason: OSError) -> BuildError:
+        return BuildError(f"{self.path} cannot be written: {reason.strerror or reason}")
+
+
+def pareto(points: Sequence[Point]) -> list[Point]:
+    """Return the Pareto front of total variation, cycles, ALMs and runs without a posterior."""
+    judged = [(point, figures) for point in points if (figures := _figures(point)) is not None]
+    return [
+        point
+        for point, own in judged
+        if not any(
+            other != own and all(a <= b for a, b in zip(other, own, strict=True)) for _, other in judged
+        )
+    ]
+
+
+def _figures(point: Point) -> tuple[float, ...] | None:
+    if point.total_variation is None:
+        return None
+    alms = math.inf if point.alms is None else point.alms
+    return (point.total_variation, point.cycles_median, alms, point.without)
+
+
+def table(points: Sequence[Point], front: Sequence[Point]) -> str:
+    """Return the sweep as text; points on the Pareto front have a star."""
+    keys = {point.key for point in front}
+    rows = [
+        (
+            "  scale    rng     steps  codes  target  total variation (95 %)     by codes    KL bits  same MAP   z rms  without   cycles"
+            "      95 %     ALMs  blocks  fits"
+        )
+    ]
+    for point in sorted(points, key=lambda each: (each.cycles_median, each.total_variation or 1.0)):
+        variation = (
+            f"{point.total_variation:7.4f} ({point.total_variation_low:.4f}..{point.total_variation_high:.4f})"
+            if point.total_variation is not None
+            else "-"
+        )
+        rows.append(
+            ("* " if point.key in keys else "  ")
+            + f"{point.scale:8} {point.rng:7} {point.steps_per_clock:5d}  {point.prob_bits:5d}  "
+            f"{point.target_count:6d}  {variation:>24}  {_cell(point.quantising, '.4f'):>9}  {_cell(point.kl_bits, '.4f'):>9}  "
+            f"{_cell(point.map_agreement, '.0%'):>8}  {_cell(point.z_rms, '.2f'):>6}  {point.without:7.1%}  "
+            f"{point.cycles_median:7,.0f}  {point.cycles_95:8,.0f}  {_cell(point.alms, ',.0f'):>7}  {_cell(point.blocks, ','):>6}  "
+            f"{'-' if point.fits is None else 'yes' if point.fits else 'no':>4}"
+        )
+    rows.append(
+        "* no other machine is better in one of total variation, cycles, ALMs and frames without a posterior, and as good "
+        "in the others"
+    )
+    return "\n".join(rows) + "\n"
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None else f"{value:{form}}"
+
+
+_DPI: Final = 75
+COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
+MARKERS: Final = "osD^v<>P"
+_SUFFIXES: Final = (".png", ".svg", ".pdf")
+_KINDS_INSIDE: Final = 5
+"""Maximum length of a legend inside the picture, because a longer one would cover points."""
+
+
+def check_pictures_possible(path: Path | None = None) -> None:
+    """Raise a BuildError before a long run if its picture cannot be drawn or written."""
+    if find_spec("matplotlib") is None:
+        raise BuildError(
+            "a plot needs matplotlib, which is not installed: run pip install matplotlib, or omit --plot"
+        )
+    if path is None:
+        return
+    if path.suffix not in _SUFFIXES:
+        raise BuildError(
+            f"{path} is not the name of a picture; expected a name that ends in {', '.join(_SUFFIXES)}"
+        )
+    there = path.exists()
+    try:
+        with path.open("ab"):
+            pass
+        if not there:
+            path.unlink()
+    except OSError as reason:
+        raise BuildError(
+            f"{path} cannot be written: {reason.strerror or reason}; name another file"
+        ) from None
+
+
+def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[Point]) -> None:
+    """Draw accuracy against cycles, with ALMs as the size of points, and the Pareto front."""
+    shown = [point for point in points if point.total_variation is not None]
+    largest = max((point.alms or 0.0 for point in shown), default=0.0) or 1.0
+    kinds = sorted({(point.scale, point.rng) for point in shown})
+    beside = len(kinds) > _KINDS_INSIDE
+    figure = new_figure((10.2 if beside else 7.2, 4.8))
+    axes = figure.subplots()
+    for at, (scale, rng) in enumerate(kinds):
+        of_kind = [point for point in shown if (point.scale, point.rng) == (scale, rng)]
+        axes.scatter(
+            [point.cycles_median for point in of_kind],
+            [point.total_variation for point in of_kind],
+            s=[20 + 120 * (point.alms or 0.0) / largest for point in of_kind],
+            color=COLOURS[at % len(COLOURS)],
+            marker=MARKERS[at % len(MARKERS)],
+            alpha=0.6,
+            label=f"{rng}, scale {scale}",
+        )
+    axes.scatter(
+        [point.cycles_median for point in front],
+        [point.total_variation for point in front],
+        s=220,
+        facecolors="none",
+        edgecolors="black",
+        linewidths=0.8,
+        label="Pareto front",
+    )
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="cycles of a frame (median)",
+        ylabel="total variation to exact inference (mean)",
+        title=f"{name}: accuracy against cycles; the larger, the more ALMs",
+    )
+    axes.grid(alpha=0.3, which="both")
+    if beside:
+        figure.legend(loc="outside right center", fontsize="small", frameon=False)
+    else:
+        axes.legend(fontsize="small", frameon=False)
+    save_figure(figure, path)
+
+
+def new_figure(size: tuple[float, float]) -> Any:
+    """Return a matplotlib figure of a size in inches, or raise a BuildError."""
+    check_pictures_possible()
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=size, layout="constrained")
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    """Write a picture without matplotlib's version, so that the file changes only with the drawing."""
+    try:
+        figure.savefig(path, dpi=_DPI, metadata={"Software": None} if path.suffix == ".png" else None)
+    except (OSError, ValueError) as reason:
+        raise BuildError(f"{path} cannot be written: {getattr(reason, 'strerror', None) or reason}") from None
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,9 @@ from pydantic import ValidationError
 
 from machines.parameters import SensorMode
 from pcie_shim.programming_file import Image
-from toolchain.building.build import assemble, check_agreement, read_images
+from toolchain.building.build import REPORT_NAME, assemble, build_report, check_agreement, read_images
 from toolchain.building.machine import board_layout, machine_options, plan_machine
 from toolchain.building.options import BuildOptions, DeploymentEdits, refused_option
-from toolchain.building.report import REPORT_NAME, build_report
 from toolchain.deployment import FILE_NAME, Deployment, Variable, deployment_text, load_deployment
 from toolchain.deployment.deployment import with_hash
 from toolchain.errors import BuildError, ModelError

@@ -14,8 +14,17 @@ from toolchain.analysis.emulation import joined
 from toolchain.building.build import assemble, check_agreement, read_images
 from toolchain.building.machine import MachinePlan, partition_lines, plan_machine
 from toolchain.building.options import BuildOptions
-from toolchain.checks.codes import code_findings, loss_findings
-from toolchain.checks.finding import Check, CheckedMachine, Finding, Severity, error, note, warning
+from toolchain.checks.findings import (
+    Check,
+    CheckedMachine,
+    Finding,
+    Severity,
+    code_findings,
+    error,
+    loss_findings,
+    note,
+    warning,
+)
 from toolchain.checks.generators import generator_findings
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
@@ -66,7 +75,8 @@ def _machine(deployment: Deployment, images: Sequence[Image], model: Model | Non
 
 def _check(machine: CheckedMachine) -> Iterator[Finding]:
     yield from code_findings(machine)
-    yield from variable_findings(machine.deployment)
+    yield from _same_readings(machine.deployment)
+    yield from _ranges(machine.deployment)
     yield from source_findings(machine.deployment)
     yield from generator_findings(machine)
 
@@ -100,13 +110,8 @@ def _sorted(findings: Iterable[Finding]) -> list[Finding]:
     return sorted(findings, key=lambda finding: order.index(finding.severity))
 
 
-def variable_findings(deployment: Deployment) -> Iterator[Finding]:
-    """Find variables with mistakes, and variables with the same path."""
-    yield from _same_readings(deployment)
-    yield from _ranges(deployment)
-
-
 def _same_readings(deployment: Deployment) -> Iterator[Finding]:
+    """Find variables with the same path."""
     readers: dict[tuple[int, str], list[str]] = {}
     for variable in deployment.variables:
         # A bare name as a path is searched for like the name itself.

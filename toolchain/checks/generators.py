@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from machines.bm1 import BM1Machine
 from machines.parameters import RngKind, RngReset
 from machines.rng import LFSR
-from toolchain.checks.finding import Check, CheckedMachine, Finding, Severity, error, note, warning
+from toolchain.checks.findings import Check, CheckedMachine, Finding, Severity, error, note, warning
 from toolchain.outputs.memories import seed_words
 
 _RANDOM_SIGMAS: Final = 5
@@ -85,10 +85,10 @@ def _relations(machine: CheckedMachine) -> Iterator[Finding]:
     """Find columns whose bits are related by XOR in a bank or, with one generator per cell, in a line."""
     parameters, names = machine.parameters, machine.names
     seeds = seed_words(machine.board).reshape(-1, parameters.columns)
-    found = relations(parameters.rng, seeds, parameters.prob_bits)
+    found, groups = relations(parameters.rng, seeds, parameters.prob_bits)
     what_groups = "banks" if parameters.shared else "lines in a bank"
     for count in (2, 3, 4):
-        related = [relation for relation in found.found if len(relation.bits) == count]
+        related = [relation for relation in found if len(relation.bits) == count]
         if not related:
             continue
         first = related[0]
@@ -106,18 +106,18 @@ def _relations(machine: CheckedMachine) -> Iterator[Finding]:
             Check.RNG_RELATION,
             f"rng = {parameters.rng}",
             (
-                f"in {len(related)} of {found.groups} {what_groups} {count} random bits of {'different' if apart else 'several'} columns "
+                f"in {len(related)} of {groups} {what_groups} {count} random bits of {'different' if apart else 'several'} columns "
                 f"{'are the same' if count == 2 else 'XOR to 0'} in every cycle ({where}: {bits}), so these columns are not "
                 "independent"
             ),
             "use a wider --rng or fewer --prob-bits"
             + (f", or --rng-banks {clean}, which excludes these banks" if clean > 1 else ""),
         )
-    if found.groups < len(seeds):
+    if groups < len(seeds):
         yield note(
             Check.RNG_RELATION,
             f"rng = {parameters.rng}",
-            f"relations were searched in {found.groups} of {len(seeds)} {what_groups}, to save time",
+            f"relations were searched in {groups} of {len(seeds)} {what_groups}, to save time",
         )
 
 
@@ -201,17 +201,10 @@ class Relation:
     bits: tuple[Bit, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Relations:
-    """The relations found, at most one per group and with the fewest bits, and the number of groups that were searched."""
-
-    found: tuple[Relation, ...]
-    groups: int
-
-
-def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> Relations:
+def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> tuple[list[Relation], int]:
     """Search for relations of 2, 3 or 4 bits between columns, in as many groups as a few seconds permit.
 
+    Returns at most one relation of the fewest bits for each group, and the number of groups that were searched.
     `seeds` are uint64[groups, columns]; the columns of a group are those whose bits are ANDed. The low
     `prob_bits` bits of a state are compared with a code.
     """
@@ -225,7 +218,7 @@ def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> Relat
         for group, row in enumerate(words)
         if (related := _related(row)) is not None
     ]
-    return Relations(tuple(found), groups)
+    return found, groups
 
 
 def _bit_words(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> NDArray[np.uint64]:

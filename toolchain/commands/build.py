@@ -2,7 +2,7 @@
 
 import json as json_text
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,14 +16,13 @@ from toolchain.commands.request import (
     fit_to_device,
     model_file,
     read_model,
-    read_named,
 )
 from toolchain.errors import BuildError, ToolchainError
 from toolchain.networks import is_network
 
 if TYPE_CHECKING:
     from toolchain.building.machine import MachinePlan
-    from toolchain.checks.finding import Finding
+    from toolchain.checks.findings import Finding
 
 _NO_ROBOT = TargetOptions(uri="ws://127.0.0.1:9090", topic="/readings", type="std_msgs/Float64MultiArray")
 """A placeholder for a check, which needs no topics, although the options of a build do."""
@@ -54,12 +53,11 @@ def build(
     `toolchain build asia.bif --searched bronc --known smoke,dysp -o build/asia --uri ws://localhost:9090
     --topic /patient --type clinic_msgs/Patient`
     """
-    from toolchain.building.build import build_date, build_deployment
+    from toolchain.building.build import REPORT_NAME, build_date, build_deployment
     from toolchain.building.machine import plan_machine
-    from toolchain.building.report import REPORT_NAME
 
     file = model_file(model)
-    options = read_named(build_options(flags, target, sources), flags)
+    options = build_options(flags, target, sources)
     typer.echo(f"Reading {file}", err=True)
     read = read_model(model, flags, flags.bits)
     dated = replace(options, build_date=build_date(file))
@@ -87,7 +85,7 @@ def check(
     code is 2 if there is an error among the findings, otherwise 0.
     """
     from toolchain.checks.check import check_deployment
-    from toolchain.checks.finding import Severity
+    from toolchain.checks.findings import Severity
     from toolchain.deployment import FILE_NAME
     from toolchain.models import case_study
 
@@ -103,7 +101,7 @@ def check(
             raise BuildError(f"{flag} is for a model; {path} is a deployment, which was built with its own")
         findings = check_deployment(path)
     for finding in findings:
-        typer.echo(json_text.dumps(finding.as_dict()) if json else finding.sentence)
+        typer.echo(json_text.dumps(asdict(finding)) if json else finding.sentence)
     counts = Counter(finding.severity for finding in findings)
     if not json:
         summary = ", ".join(
@@ -125,9 +123,8 @@ def _model_flags(context: typer.Context) -> list[str]:
 def _of_model(path: Path, flags: BuildFlags) -> "list[Finding]":
     from toolchain.checks.check import check_model, refusal
 
-    options = build_options(flags, _NO_ROBOT)
     try:
-        options = read_named(options, flags)
+        options = build_options(flags, _NO_ROBOT)
         model = read_model(path, flags, flags.bits)
     except ToolchainError as reason:
         return [refusal(reason, "the model")]

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -12,9 +12,6 @@ from toolchain.analysis import InspectOptions, ReadingOptions, Sweep
 from toolchain.commands.request import ModelFlags, read_model
 from toolchain.errors import BuildError
 from toolchain.flags import Bits
-
-if TYPE_CHECKING:
-    from toolchain.analysis.results import Point
 
 
 @contextmanager
@@ -107,10 +104,19 @@ def explore(
         raise BuildError(
             "name a model to explore, such as 'toolchain explore casestudies/boat', or --claims DIR"
         )
+    from toolchain.analysis.emulation import check_columns, recorded_readings, sample_readings
     from toolchain.analysis.logic import device_named
-    from toolchain.analysis.readings import check_columns, recorded_readings, sample_readings
-    from toolchain.analysis.results import Results, check_pictures_possible, draw_sweep, pareto, table
-    from toolchain.analysis.sweep import run_sweep, run_task, tasks, with_resources
+    from toolchain.analysis.sweep import (
+        Results,
+        check_pictures_possible,
+        draw_sweep,
+        pareto,
+        run_sweep,
+        run_task,
+        table,
+        tasks,
+        with_resources,
+    )
 
     if plot is not None:
         check_pictures_possible(plot)
@@ -137,7 +143,9 @@ def explore(
                 kept.points,
                 lambda task: run_task(task, drawn, device, sweep.banks),
                 kept.append,
-                lambda point: advance(_name_of(point)),
+                lambda point: advance(
+                    f"{point.rng}, codes of {point.prob_bits} bits, target {point.target_count}, scale {point.scale}"
+                ),
             )
     finally:
         # Ctrl-C may arrive between the write of a point and its return, so read the file.
@@ -154,14 +162,10 @@ def explore(
                 typer.echo(f"Wrote {plot}", err=True)
 
 
-def _name_of(point: "Point") -> str:
-    return f"{point.rng}, codes of {point.prob_bits} bits, target {point.target_count}, scale {point.scale}"
-
-
 def _run_claims(directory: Path, *, frames: int, seed: int) -> None:
     from toolchain.analysis.claims import draw_claims, experiments, run_claims
-    from toolchain.analysis.readings import check_frames
-    from toolchain.analysis.results import check_pictures_possible
+    from toolchain.analysis.emulation import check_frames
+    from toolchain.analysis.sweep import check_pictures_possible
 
     figures, picture = directory / "claims.json", directory / "claims.png"
     check_pictures_possible()

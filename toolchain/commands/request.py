@@ -152,10 +152,9 @@ def _case_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Mod
 
 
 def build_options(flags: BuildFlags, target: TargetOptions, sources: Path | None = None) -> BuildOptions:
-    """Return the options of a build, without the interface and the table of random numbers.
+    """Return the options of a build; `sources` is a file that assigns variables to topics, instead of one topic."""
+    from toolchain.outputs.mif import read_table
 
-    `sources` is a file that assigns variables to topics; without it, the target must name a topic.
-    """
     place = {"--uri": target.uri, "--topic": target.topic, "--type": target.type}
     missing = [flag for flag, value in place.items() if not value]
     if sources is None and missing:
@@ -169,17 +168,11 @@ def build_options(flags: BuildFlags, target: TargetOptions, sources: Path | None
                 raise BuildError(
                     f"{flag} {value}: the file of --sources sets that for each topic; omit the flag"
                 )
-    return BuildOptions(
+    options = BuildOptions(
         sources=None if sources is None else read_sources(sources, target.uri or None),
         **{each.name: getattr(target, each.name) for each in fields(TargetOptions)},
         **{each.name: getattr(flags, each.name) for each in fields(MachineOptions)},
     )
-
-
-def read_named(options: BuildOptions, flags: BuildFlags) -> BuildOptions:
-    """Return the options with the interface and the table of random numbers given by flags."""
-    from toolchain.outputs.mif import read_table
-
     if flags.interface is not None:
         try:
             options = replace(options, interface=parse_interface(flags.interface))

@@ -208,17 +208,14 @@ def _residuals(
     if known.normal is None:  # mean_slopes has checked it
         raise AssertionError
     expected = known.normal.mean[truth.lines] + (slopes[:, truth.lines] * truth.within).sum(axis=0)
-    numbers = np.array([_number(values[row]) for row in truth.rows])
+    given = [values[row] for row in truth.rows]
+    numbers = np.array([float(each) if isinstance(each, int | float) else math.nan for each in given])
     there = np.isfinite(numbers)
     away = numbers[there] - expected[there]
     if known.period is not None:
         away = wrapped(away, known.period * abs(known.step))
     refused = sum(values[row] is not None for row in truth.rows) - int(there.sum())
     return away, _support(known.name, truth.lines[there], refused)
-
-
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, int | float) else math.nan
 
 
 def _counted(

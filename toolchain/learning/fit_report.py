@@ -79,7 +79,10 @@ def run_fit(
         + ".",
         _table(fit, supports, model.lines),
         *compared,
-        f"Wrote {output}. {_how_to_load(output)}",
+        (
+            f"Wrote {output}. To use it, return toolchain.learning.fitted.with_fit(model, fit) from model(), where fit is a "
+            f"parameter of type Path | None, and build with --set {shlex.quote(f'fit={output}')}."
+        ),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -256,13 +259,6 @@ def _table(fit: Fit, supports: Sequence[Support], lines: int) -> str:
         notes.append(f"  The prior was counted too, from {fit.file.prior_rows} rows.")
     heading = "Data behind each table (readings; cells that have some, share that has none, median in those that have):"
     return "\n".join([heading, *rows, *notes])
-
-
-def _how_to_load(output: Path) -> str:
-    return (
-        "To use it, return toolchain.learning.fitted.with_fit(model, fit) from model(), where fit is a parameter "
-        f"of type Path | None, and build with --set {shlex.quote(f'fit={output}')}."
-    )
 
 
 def _sha256(path: Path) -> str:

@@ -229,7 +229,7 @@ def _read_tables(path: Path) -> Fit:
                 variable.name: _array(archive, f"table{number}.npy")
                 for number, variable in enumerate(counted)
             }
-            prior = _prior(archive) if file.prior_rows else None
+            (prior,) = _array(archive, _PRIOR) if file.prior_rows else (None,)
     except OSError as reason:
         raise ModelError(f"{path} cannot be read: {reason.strerror or reason}") from None
     except (
@@ -257,14 +257,6 @@ def _member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
     if len(data) > most:
         raise ValueError(name)
     return data
-
-
-def _prior(archive: zipfile.ZipFile) -> NDArray[np.float64]:
-    rows = _array(archive, _PRIOR)
-    if len(rows) != 1:
-        raise ValueError(_PRIOR)
-    prior: NDArray[np.float64] = rows[0]
-    return prior
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> NDArray[np.float64]:

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from toolchain.models.conditional import normal, wrapped_normal
-    from toolchain.models.distribution import conditional_normal, function, potential, table, uniform
+    from toolchain.models.distribution import (
+        IntegerType,
+        IntervalType,
+        LabelType,
+        Symbol,
+        conditional_normal,
+        function,
+        potential,
+        table,
+        uniform,
+    )
     from toolchain.models.joint import JointDistribution, Question
     from toolchain.models.model import (
         Known,
@@ -20,7 +30,6 @@ if TYPE_CHECKING:
         exact_posterior,
         interval,
     )
-    from toolchain.models.symbol import IntegerType, IntervalType, LabelType, Symbol
 
 __all__ = [
     "IntegerType",
@@ -45,21 +54,16 @@ __all__ = [
     "wrapped_normal",
 ]
 
-_HOMES: Final = {
-    "conditional": ("normal", "wrapped_normal"),
-    "distribution": ("conditional_normal", "function", "potential", "table", "uniform"),
-    "joint": ("JointDistribution", "Question"),
-    "model": ("Known", "Model", "PriorSelect", "cell_centres", "dimension", "exact_posterior", "interval"),
-    "symbol": ("IntegerType", "IntervalType", "LabelType", "Symbol"),
-}
-_HOME_OF: Final = {name: module for module, names in _HOMES.items() for name in names}
+_MODULES: Final = ("model", "conditional", "distribution", "joint")
 
 
 def __getattr__(name: str) -> object:
     """Return a name from one of the modules of this package (PEP 562)."""
-    if name not in _HOME_OF:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    if name in __all__:
+        for module in _MODULES:
+            if hasattr(found := import_module(f"{__name__}.{module}"), name):
+                return getattr(found, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

@@ -4,12 +4,12 @@ import importlib.util
 import inspect
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
 from enum import Enum
 from pathlib import Path
 from types import ModuleType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from toolchain.bounded_files import nearest_name
 from toolchain.errors import ModelError, ToolchainError
@@ -18,6 +18,8 @@ from toolchain.models.model import Model
 
 FILE_NAME = "model.py"
 _TOOLCHAIN = Path(__file__).parent.parent
+
+_Result = TypeVar("_Result")
 
 
 def load_model(case: Path, settings: Mapping[str, str]) -> Model:
@@ -34,11 +36,15 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
             contains an error, or the result is not a Model.
     """
     path = existing_model_path(case)
-    # standard output belongs to the command, which may print JSON
-    with _importing_from(path.parent.resolve()), redirect_stdout(sys.stderr):
-        function = _model_function(path)
-        arguments = _arguments(path, function, settings)
-        model = _guarded(path, "model()", lambda: function(**arguments))
+    folder = str(path.parent.resolve())
+    sys.path.append(folder)  # last, so that modules of the folder do not hide others
+    try:
+        with redirect_stdout(sys.stderr):  # standard output belongs to the command, which may print JSON
+            function = _model_function(path)
+            arguments = _arguments(path, function, settings)
+            model = _guarded(path, "model()", lambda: function(**arguments))
+    finally:
+        sys.path.remove(folder)
     if isinstance(model, Question):
         return model.model()
     if not isinstance(model, Model):
@@ -71,16 +77,6 @@ def existing_model_path(case: Path) -> Path:
     return path
 
 
-@contextmanager
-def _importing_from(folder: Path) -> Iterator[None]:
-    """Let `model.py` import modules in its folder, which is last on the path so that they do not hide others."""
-    sys.path.append(str(folder))
-    try:
-        yield
-    finally:
-        sys.path.remove(str(folder))
-
-
 def _model_function(path: Path) -> Callable[..., object]:
     spec = importlib.util.spec_from_file_location("rosbayes_case_study_model", path)
     if spec is None or spec.loader is None:
@@ -100,7 +96,7 @@ def _model_function(path: Path) -> Callable[..., object]:
     return function
 
 
-def _guarded(path: Path, what: str, call: Callable[[], object]) -> object:
+def _guarded(path: Path, what: str, call: Callable[[], _Result]) -> _Result:
     """Call a function of the user's file; an exception becomes one sentence with its line.
 
     An error raised by the file keeps its text; an error of the toolchain also gets the line of the file.
@@ -139,12 +135,14 @@ def _arguments(path: Path, function: Callable[..., object], settings: Mapping[st
         if parameter.kind not in {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
     }
     hints = _guarded(path, "an annotation", lambda: get_type_hints(function))
-    if not isinstance(hints, dict):  # never: get_type_hints returns one
-        raise TypeError
     arguments: dict[str, Any] = {}
     for key, text in settings.items():
         if key not in parameters:
-            raise ModelError(f"{path}: {_unknown(key, list(parameters))}")
+            if not parameters:
+                raise ModelError(f"{path}: the model has no parameters, so --set {key} has no meaning")
+            raise ModelError(
+                f"{path}: the model has no parameter '{key}'; {nearest_name(key, list(parameters))}"
+            )
         default = parameters[key].default
         fallback = str if default in {inspect.Parameter.empty, None} else type(default)
         arguments[key] = _value(key, text, hints.get(key, fallback))
@@ -152,12 +150,6 @@ def _arguments(path: Path, function: Callable[..., object], settings: Mapping[st
         if parameter.default is inspect.Parameter.empty and key not in arguments:
             raise ModelError(f"{path}: the model needs {key}: add --set {key}=VALUE")
     return arguments
-
-
-def _unknown(key: str, known: list[str]) -> str:
-    if not known:
-        return f"the model has no parameters, so --set {key} has no meaning"
-    return f"the model has no parameter '{key}'; {nearest_name(key, known)}"
 
 
 def _value(key: str, text: str, wanted: Any) -> object:

@@ -74,7 +74,7 @@ def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, i
         touched = [left.pop(each) for each in sorted(holding.pop(name))]
         if not touched:
             continue
-        scope = _union(touched)
+        scope = tuple(dict.fromkeys(name for term in touched for name in term.scope))
         summed = product(touched, scope, sizes).sum(axis=scope.index(name))
         largest = summed.max()
         made = Term(
@@ -95,10 +95,6 @@ class _Plan:
     largest: int
     scope: tuple[str, ...]
 
-    @property
-    def cost(self) -> tuple[int, int]:
-        return self.largest, self.entries
-
 
 def _order(terms: Iterable[Term], names: set[str], sizes: Mapping[str, int]) -> tuple[str, ...]:
     """Return the cheaper order of two rules, or raise a ModelError."""
@@ -110,7 +106,8 @@ def _order(terms: Iterable[Term], names: set[str], sizes: Mapping[str, int]) -> 
         neighbours.discard(name)
     plan = _planned(graph, names, sizes, lambda at, name: _entries(at, name, sizes))
     if plan.entries > _CHEAP:
-        plan = min(plan, _planned(graph, names, sizes, _fill), key=lambda each: each.cost)
+        other = _planned(graph, names, sizes, _fill)
+        plan = min(plan, other, key=lambda each: (each.largest, each.entries))
     if plan.largest > MAX_ENTRIES:
         _check_size(plan.scope, sizes, f"summing over {plan.scope[0]}")
     return plan.order
@@ -174,10 +171,6 @@ def _fill(graph: _Graph, name: str) -> int:
     if len(neighbours) > _MOST_COUNTED:
         return len(neighbours) ** 2
     return sum(other not in graph[one] for one, other in combinations(neighbours, 2))
-
-
-def _union(terms: Iterable[Term]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(name for term in terms for name in term.scope))
 
 
 def _check_size(scope: Sequence[str], sizes: Mapping[str, int], what: str) -> None:

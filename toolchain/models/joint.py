@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolchain.errors import ModelError
-from toolchain.models.distribution import Distribution, Factor
+from toolchain.models.distribution import Distribution, Factor, Symbol
 from toolchain.models.inference import Links, Term, eliminate, product, reduced, relevant, without_idle
 from toolchain.models.model import (
     MAX_ENTRIES,
@@ -30,7 +30,6 @@ from toolchain.models.model import (
     check_size,
     dimension,
 )
-from toolchain.models.symbol import Symbol
 
 Named: TypeAlias = Symbol | str
 
@@ -68,8 +67,11 @@ class JointDistribution:
             raise ModelError(
                 f"{self.name}: {min(bare)} has no distribution; give it one, such as uniform({min(bare)})"
             )
-        if cycle := _cycle(children):
-            raise ModelError(f"{self.name}: {' -> '.join(cycle)} is a cycle; a joint distribution has none")
+        try:
+            TopologicalSorter(children).prepare()
+        except CycleError as error:
+            cycle = " -> ".join(error.args[1])  # the first one is again at the end
+            raise ModelError(f"{self.name}: {cycle} is a cycle; a joint distribution has none") from None
         object.__setattr__(self, "symbols", tuple(symbols.values()))
 
     def symbol(self, name: Named) -> Symbol:
@@ -342,12 +344,3 @@ def _rule(symbol: Symbol) -> dict[str, Any]:
         "path": symbol.path,
         "states": symbol.type.labels,
     }
-
-
-def _cycle(parents: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return the names on a directed cycle, with the first one again at the end; empty if there is none."""
-    try:
-        TopologicalSorter(parents).prepare()
-    except CycleError as error:
-        return list(error.args[1])
-    return []

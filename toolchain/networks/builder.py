@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolchain.errors import ModelError, NetworkFileError
-from toolchain.models.distribution import Factor, potential, table
+from toolchain.models.distribution import Factor, IntegerType, LabelType, Symbol, potential, table
 from toolchain.models.joint import JointDistribution
 from toolchain.models.model import MAX_ENTRIES
-from toolchain.models.symbol import IntegerType, LabelType, Symbol
 
 MAX_VARIABLES: Final = 20_000
 MAX_STATES: Final = 65_535
@@ -54,15 +53,6 @@ class NetworkBuilder:
         """Set the name of the network; the file name replaces `unknown` and similar names."""
         if name.lower() not in {"unknown", "network", "unnamed", "default", ""}:
             self._name = "".join(each for each in name if each.isprintable())[:MAX_NAME]
-
-    def _file_name(self) -> str:
-        path = self.path.with_suffix("") if self.path.suffix.lower() == ".gz" else self.path
-        return path.stem
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The variables so far, in the order of the file."""
-        return tuple(self._symbols)
 
     def size(self, name: str, place: Place) -> int:
         """Return the number of states of a variable."""
@@ -159,4 +149,5 @@ class NetworkBuilder:
         for name in self._symbols:
             if name not in used:
                 raise ModelError(f"{name} has no table")
-        return JointDistribution(self._name or self._file_name(), tuple(self._factors))
+        path = self.path.with_suffix("") if self.path.suffix.lower() == ".gz" else self.path
+        return JointDistribution(self._name or path.stem, tuple(self._factors))

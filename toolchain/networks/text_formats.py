@@ -211,21 +211,17 @@ def read_bif(data: bytes, builder: NetworkBuilder) -> None:
         match block:
             case "network":
                 builder.name(text.word("the network's name"))
-                _bif_properties(text)
+                text.sign("{")
+                while text.peek() != "}":
+                    text.sign("property")
+                    text.skip(";")
+                text.sign("}")
             case "variable":
                 _bif_variable(text, builder)
             case "probability":
                 _bif_probability(text, builder)
             case _:
                 raise text.error(f"expected network, variable or probability, found {block[:40]!r}")
-
-
-def _bif_properties(text: Scanner) -> None:
-    text.sign("{")
-    while text.peek() != "}":
-        text.sign("property")
-        text.skip(";")
-    text.sign("}")
 
 
 def _bif_variable(text: Scanner, builder: NetworkBuilder) -> None:

@@ -62,11 +62,6 @@ def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, .
     return tuple(found)
 
 
-def prior_name(board: int) -> str:
-    """Return the file name of a board's prior."""
-    return f"board{board}_prior.mif"
-
-
 def column_name(board: int, column: int, sensors: int) -> str:
     """Return the file name of a board's column, 1 to `sensors`; all have the same length, for sorting."""
     return f"board{board}_column{column:0{len(str(sensors))}d}.mif"
@@ -108,33 +103,27 @@ def packed_words(codes: NDArray[np.uint16], prob_bits: int) -> Iterator[int]:
 
 
 def _prior(deployment: Deployment, board: int, image: Image) -> Memory:
-    parameters, select = image.machine.parameters, deployment.prior_select
+    name, part, select = f"board{board}_prior.mif", image.partition, deployment.prior_select
+    parameters = image.machine.parameters
+    if (
+        parameters.prior_mode is PriorMode.WRITTEN
+    ):  # the initial contents of the words that the host may write
+        return Memory(
+            name=name,
+            width=parameters.prob_bits,
+            depth=parameters.lines,
+            words=lambda: (int(code) for code in image.machine.prior[0]),
+            comments=(
+                "prior elements, P(S), until the host writes another",
+                f"address = the line of the board, from line {part.line_offset} of the model on",
+            ),
+        )
+    what = "P(S)"
     if select is not None:
         what = (
             f"P(S | {select.name}): address = the value of {select.name}; the top one is the prior without it"
         )
-    elif parameters.prior_mode is PriorMode.WRITTEN:
-        what = "P(S), until the host writes another"
-    else:
-        what = "P(S)"
-    if parameters.prior_mode is PriorMode.WRITTEN:
-        return _written_prior(prior_name(board), what, image)
-    return _codes(prior_name(board), f"prior elements, {what}", image, image.machine.prior)
-
-
-def _written_prior(name: str, what: str, image: Image) -> Memory:
-    """Return the initial contents of the words that the host may write: one word per line."""
-    part = image.partition
-    return Memory(
-        name=name,
-        width=image.machine.parameters.prob_bits,
-        depth=image.machine.parameters.lines,
-        words=lambda: (int(code) for code in image.machine.prior[0]),
-        comments=(
-            f"prior elements, {what}",
-            f"address = the line of the board, from line {part.line_offset} of the model on",
-        ),
-    )
+    return _codes(name, f"prior elements, {what}", image, image.machine.prior)
 
 
 def _columns(deployment: Deployment, board: int, image: Image) -> Iterator[Memory]:

@@ -47,13 +47,6 @@ class Mif:
     words: tuple[int, ...]
     """All words, from address 0; omitted addresses are 0, as in Quartus."""
 
-    def __post_init__(self) -> None:
-        if not self.words or self.width < 1:
-            raise MifError(f"a memory of {len(self.words)} words of {self.width} bits is empty")
-        for address, word in enumerate(self.words):
-            if word < 0 or word.bit_length() > self.width:
-                raise MifError(f"the word at address {address} doesn't fit {self.width} bits")
-
 
 def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[str] = ()) -> Iterator[str]:
     """Yield the lines of a file in canonical form: hexadecimal, with one entry per line.

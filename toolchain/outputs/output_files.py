@@ -2,13 +2,13 @@
 
 import filecmp
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
 
 from machines.parameters import RngKind
 from pcie_shim.programming_file import Image, image_bytes
@@ -34,33 +34,9 @@ _UNVERIFIED: Final = """\
 """
 
 
-def project_files(deployment: Deployment, mifs: Sequence[str]) -> dict[str, str]:
-    """Return the project's files by name: `bm1.qpf`, a `.qsf` per board, `bm1.tcl`; `mifs` are its memories."""
-    boards = range(len(deployment.boards))
-    head = (
-        f"# The Bayesian machine of the model {printable(deployment.name)}, written by 'toolchain build'.\n"
-    )
-    files = {f"{PROJECT}.qpf": head + _UNVERIFIED + _revisions(boards)}
-    for board in boards:
-        own = [path for path in mifs if _belongs_to(path, board)]
-        files[f"{PROJECT}_board{board}.qsf"] = head + _UNVERIFIED + _settings(deployment, board, own)
-    files[f"{PROJECT}.tcl"] = head + _UNVERIFIED + _script(boards)
-    return files
-
-
-def _belongs_to(path: str, board: int) -> bool:
-    name = path.rpartition("/")[2]
-    return not name.startswith("board") or name.startswith(f"board{board}_")
-
-
-def _revisions(boards: range) -> str:
-    lines = "".join(f'PROJECT_REVISION = "{PROJECT}_board{board}"\n' for board in boards)
-    return f'\nQUARTUS_VERSION = "18.1"\n{lines}'
-
-
 def _settings(deployment: Deployment, board: int, mifs: Sequence[str]) -> str:
     lines = deployment.boards[board]
-    memories = "".join(f'set_global_assignment -name MIF_FILE "{path}"\n' for path in mifs)
+    assignments = "".join(f'set_global_assignment -name MIF_FILE "{path}"\n' for path in mifs)
     return f"""
 # Board {board}: lines {lines.line_offset} to {lines.line_offset + lines.lines - 1}.
 set_global_assignment -name FAMILY "{FAMILY}"
@@ -74,11 +50,10 @@ set_global_assignment -name NUM_PARALLEL_PROCESSORS ALL
 set_parameter -name BOARD {board}
 
 set_global_assignment -name VHDL_FILE "{PARAMETERS_FILE}"
-{memories}"""
+{assignments}"""
 
 
-def _script(boards: range) -> str:
-    names = " ".join(f"{PROJECT}_board{board}" for board in boards)
+def _script(revisions: Sequence[str]) -> str:
     return f"""#
 # Compiles a programming file for every board, in the project's folder:
 #     quartus_sh -t {PROJECT}.tcl FOLDER
@@ -94,7 +69,7 @@ if {{[llength $sources] == 0}} {{
     puts stderr "error: no .vhd file in '$folder'; name the folder that holds the machine's VHDL"
     exit 2
 }}
-foreach revision {{{names}}} {{
+foreach revision {{{" ".join(revisions)}}} {{
     project_open {PROJECT} -revision $revision
     foreach source $sources {{
         set_global_assignment -name VHDL_FILE $source
@@ -119,15 +94,12 @@ class Change(StrEnum):
     REMOVED = "removed"
 
 
-Pieces: TypeAlias = Callable[[], Iterable[bytes]]
-
-
 @dataclass(frozen=True, slots=True)
 class OutputFiles:
     """A part of a deployment: its files, and a pattern for files of earlier builds."""
 
-    contents: dict[str, Pieces]
-    """Functions that return the content in pieces, by the path in the deployment's folder."""
+    contents: dict[str, Iterable[bytes]]
+    """The content in pieces, to be consumed once, by the path in the deployment's folder."""
     own: re.Pattern[str]
     """Paths of this part; files that are not in `contents` are removed."""
 
@@ -143,81 +115,94 @@ _PROJECT: Final = re.compile(rf"{PROJECT}\.(qpf|tcl)|{PROJECT}_board\d+\.qsf")
 
 def memory_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
     """Return `bm1_parameters.vhd` and the MIFs (thesis 3.2)."""
-    contents: dict[str, Pieces] = {PARAMETERS_FILE: lambda: [parameters_vhd(deployment, images).encode()]}
+    contents: dict[str, Iterable[bytes]] = {PARAMETERS_FILE: [parameters_vhd(deployment, images).encode()]}
     for memory in memories(deployment, images):
-        contents[f"{MEMORIES_FOLDER}/{memory.name}"] = partial(_encoded, memory)
+        contents[f"{MEMORIES_FOLDER}/{memory.name}"] = _encoded(memory)
     return OutputFiles(contents, _MEMORIES)
 
 
+def _encoded(memory: Memory) -> Iterator[bytes]:
+    for line in memory.lines():  # computed when it is written, because all memories together are large
+        yield line.encode()
+
+
 def quartus_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
-    """Return the Quartus project; none for generators that exist only in emulation."""
+    """Return the Quartus project: `bm1.qpf`, a `.qsf` per board, `bm1.tcl`; none for emulated generators."""
     if deployment.machine.rng is RngKind.IDEAL:
         return OutputFiles({}, _PROJECT)
-    mifs = [f"{MEMORIES_FOLDER}/{memory.name}" for memory in memories(deployment, images)]
-    texts = project_files(deployment, mifs)
-    return OutputFiles({name: partial(iter, [text.encode()]) for name, text in texts.items()}, _PROJECT)
+    names = [memory.name for memory in memories(deployment, images)]
+    revisions = [f"{PROJECT}_board{board}" for board in range(len(deployment.boards))]
+    texts = {f"{PROJECT}.qpf": '\nQUARTUS_VERSION = "18.1"\n'}
+    for board, revision in enumerate(revisions):
+        texts[f"{PROJECT}.qpf"] += f'PROJECT_REVISION = "{revision}"\n'
+        own = [
+            f"{MEMORIES_FOLDER}/{name}"
+            for name in names
+            if not name.startswith("board") or name.startswith(f"board{board}_")
+        ]
+        texts[f"{revision}.qsf"] = _settings(deployment, board, own)
+    texts[f"{PROJECT}.tcl"] = _script(revisions)
+    head = (
+        f"# The Bayesian machine of the model {printable(deployment.name)}, written by 'toolchain build'.\n"
+    )
+    return OutputFiles(
+        {name: [(head + _UNVERIFIED + text).encode()] for name, text in texts.items()}, _PROJECT
+    )
 
 
 def image_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
     """Return the programming files."""
     pairs = zip(deployment.boards, images, strict=True)
-    return OutputFiles({board.image: partial(_image, image) for board, image in pairs}, _IMAGES)
+    return OutputFiles({board.image: map(image_bytes, [image]) for board, image in pairs}, _IMAGES)
 
 
 def text_file(name: str, text: str) -> OutputFiles:
     """Return one text file."""
-    return OutputFiles({name: partial(iter, [text.encode()])}, re.compile(re.escape(name)))
+    return OutputFiles({name: [text.encode()]}, re.compile(re.escape(name)))
 
 
 def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
     """Write the files of a part atomically; return every path, sorted, and its change."""
-    return _changes(directory, files, _write, _remove)
+    changes = {name: _write(directory / name, pieces) for name, pieces in files.contents.items()}
+    for name in _stale(directory, files):
+        try:
+            (directory / name).unlink()
+        except OSError as reason:
+            raise BuildError(f"{directory / name} cannot be written: {reason.strerror or reason}") from None
+        changes[name] = Change.REMOVED
+    return sorted(changes.items())
 
 
 def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
     """Return the changes that `write_files` would make; files that differ only in comments are unchanged."""
-    return _changes(directory, files, _compare, lambda _: None)
-
-
-def _changes(
-    directory: Path,
-    files: OutputFiles,
-    of_file: Callable[[Path, Pieces], Change],
-    remove: Callable[[Path], None],
-) -> list[tuple[str, Change]]:
-    changes = {name: of_file(directory / name, pieces) for name, pieces in files.contents.items()}
-    for folder in ("", "boards", PARAMETERS_FILE.partition("/")[0], MEMORIES_FOLDER):
-        for path in sorted((directory / folder).glob("*")):
-            name = path.relative_to(directory).as_posix()
-            if files.own.fullmatch(name) and name not in files.contents:
-                remove(path)
-                changes[name] = Change.REMOVED
+    changes = dict.fromkeys(_stale(directory, files), Change.REMOVED)
+    for name, pieces in files.contents.items():
+        if not (directory / name).is_file():
+            changes[name] = Change.NEW
+        else:
+            same = _has_same_lines(directory / name, pieces)
+            changes[name] = Change.UNCHANGED if same else Change.CHANGED
     return sorted(changes.items())
 
 
-def _compare(path: Path, pieces: Pieces) -> Change:
-    if not path.is_file():
-        return Change.NEW
-    return Change.UNCHANGED if _has_same_lines(path, pieces()) else Change.CHANGED
+def _stale(directory: Path, files: OutputFiles) -> list[str]:
+    """Return the paths of this part that an earlier build wrote, and that it no longer has."""
+    folders = ("", "boards", PARAMETERS_FILE.partition("/")[0], MEMORIES_FOLDER)
+    paths = [path for folder in folders for path in (directory / folder).glob("*")]
+    names = [path.relative_to(directory).as_posix() for path in paths]
+    return [name for name in names if files.own.fullmatch(name) and name not in files.contents]
 
 
-def _write(path: Path, pieces: Pieces) -> Change:
-    with whole_file(path, BuildError) as partial:
+def _write(path: Path, pieces: Iterable[bytes]) -> Change:
+    with whole_file(path, BuildError) as part:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as file:
-            file.writelines(pieces())
+        with part.open("wb") as file:
+            file.writelines(pieces)
         existed = path.is_file()
-        if existed and filecmp.cmp(path, partial, shallow=False):
-            partial.unlink()
+        if existed and filecmp.cmp(path, part, shallow=False):
+            part.unlink()
             return Change.UNCHANGED
     return Change.CHANGED if existed else Change.NEW
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink()
-    except OSError as reason:
-        raise BuildError(f"{path} cannot be written: {reason.strerror or reason}") from None
 
 
 def _has_same_lines(path: Path, pieces: Iterable[bytes]) -> bool:
@@ -235,11 +220,3 @@ def _has_same_lines(path: Path, pieces: Iterable[bytes]) -> bool:
 
 def _plain(line: bytes) -> bytes:
     return _COMMENT.sub(b"", line).strip()
-
-
-def _encoded(memory: Memory) -> Iterator[bytes]:
-    return (line.encode() for line in memory.lines())
-
-
-def _image(image: Image) -> Iterator[bytes]:
-    yield image_bytes(image)

@@ -34,9 +34,12 @@ def parameters_vhd(deployment: Deployment, images: Sequence[Image]) -> str:
     """Return the text of the package: VHDL-2008, printable ASCII, the same bytes for the same machine."""
     image = images[0]
     parameters = image.machine.parameters
+    searched = ", ".join(f"{dimension.label} ({dimension.size})" for dimension in deployment.searched)
     return "".join(
         [
-            _head(deployment),
+            f"-- Parameters of the Bayesian machine of the model {printable(deployment.name)}, VHDL-2008.\n",
+            f"-- It searches {printable(searched)}; the first is the slowest in the lines' order.\n",
+            "-- Written by 'toolchain build', and again by 'toolchain regenerate memories'; not to be edited.\n\n",
             "library ieee;\nuse ieee.std_logic_1164.all;\n\npackage bm1_parameters is\n\n",
             _TYPES,
             _section("The matrix: column 0 is the prior, columns 1 to SENSORS the known variables"),
@@ -73,15 +76,6 @@ def parameters_vhd(deployment: Deployment, images: Sequence[Image]) -> str:
             _memory_files(images),
             "\nend package bm1_parameters;\n",
         ]
-    )
-
-
-def _head(deployment: Deployment) -> str:
-    searched = ", ".join(f"{dimension.label} ({dimension.size})" for dimension in deployment.searched)
-    return (
-        f"-- Parameters of the Bayesian machine of the model {printable(deployment.name)}, VHDL-2008.\n"
-        f"-- It searches {printable(searched)}; the first is the slowest in the lines' order.\n"
-        "-- Written by 'toolchain build', and again by 'toolchain regenerate memories'; not to be edited.\n\n"
     )
 
 

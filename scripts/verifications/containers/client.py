@@ -17,7 +17,7 @@ from bridge.client import Ros, connect
 from bridge.errors import BridgeError
 from bridge.stamps import stamp_ns
 from casestudies.boat.sensors import SENSOR_NAMES, SENSORS_TOPIC, SENSORS_TYPE
-from casestudies.listening import Instance, listen
+from casestudies.topics import Instance, listen
 from machines.bm1 import Start
 from machines.posterior import joint_posterior
 from machines.reference import ReferenceBM1

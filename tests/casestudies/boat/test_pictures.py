@@ -12,7 +12,7 @@ from casestudies.boat.pictures import (
     posterior_grid,
     stage_shares,
 )
-from casestudies.listening import Instance, Truth
+from casestudies.topics import Instance, Truth
 from posteriors.frame_report import FrameReport, StageTimes
 from posteriors.posterior import Posterior
 from terminal.errors import OutputError

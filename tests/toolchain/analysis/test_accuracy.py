@@ -8,10 +8,11 @@ from machines.parameters import BM1Parameters
 from machines.reference import ReferenceBM1
 from tests.toolchain.builders import corridor, machine_of
 from toolchain.analysis.accuracy import _difference, _line_probabilities, bootstrap, measure, share_of_frames
-from toolchain.analysis.emulation import EmulatedBoards, joined
-from toolchain.analysis.readings import (
+from toolchain.analysis.emulation import (
     MISSING,
+    EmulatedBoards,
     Readings,
+    joined,
     model_of_codes,
     reading_columns,
     recorded_readings,

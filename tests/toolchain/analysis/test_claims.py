@@ -9,7 +9,7 @@ from machines.bm1 import Start, addressed_codes
 from machines.reference import ReferenceBM1
 from toolchain.analysis import claims
 from toolchain.analysis.claims import Faults, beacons, draw_claims, draw_frames, machine_of, run_claims
-from toolchain.analysis.readings import sample_readings
+from toolchain.analysis.emulation import sample_readings
 
 
 @pytest.fixture

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 from tests.toolchain.builders import corridor
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis import Sweep
+from toolchain.analysis.emulation import sample_readings
 from toolchain.analysis.logic import DEVICES
-from toolchain.analysis.readings import sample_readings
-from toolchain.analysis.results import Point, Results, pareto
-from toolchain.analysis.sweep import run_sweep, run_task, tasks
+from toolchain.analysis.sweep import Point, Results, pareto, run_sweep, run_task, tasks
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 
@@ -203,6 +202,6 @@ def test_ctrl_c_keeps_what_is_done(case, monkeypatch):
 
 
 def test_a_file_of_results_that_does_not_end_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("toolchain.analysis.results.MAX_FILE_BYTES", 1000)
+    monkeypatch.setattr("toolchain.analysis.sweep.MAX_FILE_BYTES", 1000)
     with pytest.raises(BuildError, match="not a regular file"):
         Results(Path("/dev/zero"))

@@ -20,10 +20,9 @@ from toolchain.deployment import Scale, Variable, WrittenPrior, load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.deployment.address_array import written_prior
 from toolchain.errors import BuildError, DeploymentError, ModelError, ReadingError
-from toolchain.models.distribution import table
+from toolchain.models.distribution import IntegerType, LabelType, Symbol, table
 from toolchain.models.joint import JointDistribution
 from toolchain.models.model import Known, Model, PriorSelect, dimension, exact_posterior, fuse
-from toolchain.models.symbol import IntegerType, LabelType, Symbol
 
 FINE = {"prob_bits": 14, "counter_bits": 16, "target_count": 20000}
 PRIORS = np.array([[0.7, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, 0.7], [0.0, 0.5, 0.5, 0.0]])

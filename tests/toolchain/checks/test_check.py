@@ -18,8 +18,7 @@ from tests.toolchain.running import OPTIONS, TINY, build_model, toolchain
 from toolchain.building.build import assemble, build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.checks.check import check_deployment, check_model, source_findings
-from toolchain.checks.codes import line_name, reading
-from toolchain.checks.finding import Check, Severity
+from toolchain.checks.findings import Check, Severity, line_name, reading
 from toolchain.deployment import Scale, Source, Variable
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval

@@ -9,8 +9,18 @@ from hypothesis import strategies as st
 
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal, wrapped_normal
-from toolchain.models.distribution import MAX_ENTRIES, conditional_normal, function, potential, table, uniform
-from toolchain.models.symbol import IntegerType, IntervalType, LabelType, Symbol
+from toolchain.models.distribution import (
+    MAX_ENTRIES,
+    IntegerType,
+    IntervalType,
+    LabelType,
+    Symbol,
+    conditional_normal,
+    function,
+    potential,
+    table,
+    uniform,
+)
 
 MEANS = st.lists(st.floats(-200, 200), min_size=1, max_size=4).map(np.array)
 SIGMAS = st.floats(0.05, 100)

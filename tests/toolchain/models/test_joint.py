@@ -11,11 +11,19 @@ from hypothesis import strategies as st
 from toolchain.errors import ModelError
 from toolchain.models import inference
 from toolchain.models.conditional import normal, wrapped_normal
-from toolchain.models.distribution import conditional_normal, potential, table, uniform
+from toolchain.models.distribution import (
+    IntegerType,
+    IntervalType,
+    LabelType,
+    Symbol,
+    conditional_normal,
+    potential,
+    table,
+    uniform,
+)
 from toolchain.models.inference import Term, eliminate, product
 from toolchain.models.joint import JointDistribution, Question
 from toolchain.models.model import cell_centres, exact_posterior, interval
-from toolchain.models.symbol import IntegerType, IntervalType, LabelType, Symbol
 
 YES_NO = LabelType("no", "yes")
 R, S, G = (Symbol(name, YES_NO) for name in ("R", "S", "G"))

@@ -9,7 +9,15 @@ from tests.toolchain.running import OPTIONS, refused_within
 from toolchain.building.machine import partition_lines, plan_machine
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.conditional import normal, wrapped_normal
-from toolchain.models.distribution import conditional_normal, potential, table
+from toolchain.models.distribution import (
+    IntegerType,
+    IntervalType,
+    LabelType,
+    Symbol,
+    conditional_normal,
+    potential,
+    table,
+)
 from toolchain.models.joint import JointDistribution
 from toolchain.models.model import (
     Known,
@@ -21,7 +29,6 @@ from toolchain.models.model import (
     fuse,
     interval,
 )
-from toolchain.models.symbol import IntegerType, IntervalType, LabelType, Symbol
 
 
 def known(name="K", values=3, lines=4, **fields):

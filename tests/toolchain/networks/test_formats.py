@@ -13,9 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from toolchain.errors import NetworkFileError
-from toolchain.models.distribution import Potential
+from toolchain.models.distribution import IntegerType, LabelType, Potential
 from toolchain.models.model import exact_posterior
-from toolchain.models.symbol import IntegerType, LabelType
 from toolchain.networks import MAX_BYTES, is_network, read_network
 
 BIF = """\

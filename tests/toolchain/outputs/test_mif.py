@@ -117,12 +117,6 @@ def test_noise_is_refused_or_read_but_never_fails_otherwise(noise):
         parse_mif(HEAD + noise)
 
 
-@pytest.mark.parametrize(("width", "words"), [(3, (8,)), (3, (-1,)), (0, (0,)), (3, ())])
-def test_no_memory_holds_it(width, words):
-    with pytest.raises(MifError):
-        Mif(width, words)
-
-
 def test_a_file(tmp_path):
     (tmp_path / "a.mif").write_bytes(b"-- \xe9\xff\n" + mif_text(Mif(4, (1, 2))).encode())
     assert read_mif(tmp_path / "a.mif") == Mif(4, (1, 2))

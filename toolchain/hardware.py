@@ -1,11 +1,12 @@
-"""Simulations of a board's hardware, compiled once for each image into a folder that the user names."""
+"""The VHDL of a board: the tools that read it, its generated files for one image, and its compiled simulations."""
 
 import hashlib
 import os
 import re
 import shutil
+import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -13,9 +14,168 @@ from typing import Final
 
 from machines.parameters import RngKind
 from pcie_shim.programming_file import Image
-from toolchain.hardware.board_files import MEMORY_FOLDER, board_memories, write_board_files
-from toolchain.hardware.sources import HDL, SOURCES, in_order, verilog
-from toolchain.hardware.tools import HardwareToolError, missing, run_tool
+from toolchain.building.machine import MACHINE_KEYS
+from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source, Variable
+from toolchain.errors import ToolchainError
+from toolchain.outputs.memories import Memory, memories
+from toolchain.outputs.vhdl_parameters import parameters_vhd
+
+_LIMIT_S: Final = 1200.0
+_LAST_OUTPUT: Final = 1500  # characters
+
+
+class HardwareToolError(ToolchainError):
+    """A tool is missing or failed; the sentence names it and ends with its output."""
+
+
+def missing(tools: Iterable[str]) -> list[str]:
+    """Return the tools that are not installed."""
+    return [tool for tool in tools if shutil.which(tool) is None]
+
+
+def run_tool(
+    command: Sequence[str],
+    folder: Path,
+    environment: Mapping[str, str] | None = None,
+    *,
+    separate: bool = False,
+) -> str:
+    """Run a tool in a folder and return its output, without its warnings if `separate` is True.
+
+    Raises:
+        HardwareToolError: It is not installed, failed, or did not end in time.
+    """
+    if missing(command[:1]):
+        raise HardwareToolError(f"{command[0]} is not installed (Debian: apt-get install {command[0]})")
+    try:
+        done = subprocess.run(
+            command, check=True, cwd=folder, env=environment, capture_output=True, text=True, timeout=_LIMIT_S
+        )
+    except subprocess.TimeoutExpired:
+        raise HardwareToolError(f"{command[0]} did not end within {_LIMIT_S:.0f} s") from None
+    except subprocess.CalledProcessError as error:
+        output = (error.stdout + error.stderr).strip()[-_LAST_OUTPUT:]
+        raise HardwareToolError(f"{command[0]} failed: {output}") from None
+    return done.stdout if separate else done.stdout + done.stderr
+
+
+HDL: Final = Path(__file__).resolve().parents[1] / "hdl"
+
+SOURCES: Final = (
+    "bm_register_map.vhd",
+    "bm1_utilities.vhd",
+    "bm_register_block.vhd",
+    "bm1_table.vhd",
+    "bm1_stochastic_bitstream_generator.vhd",
+    "bm1_prior_element.vhd",
+    "bm1_tile_element.vhd",
+    "bm1_counter.vhd",
+    "bm1_lfsr.vhd",
+    "bm1_table_player.vhd",
+    "bm1_generators.vhd",
+    "bm1_control.vhd",
+    "bm1_matrix.vhd",
+    "bm1_core.vhd",
+    "bm1_words.vhd",
+    "bm1_readout.vhd",
+    "bm1_guard.vhd",
+    "bm1_registers.vhd",
+    "bm1_axi.vhd",
+    "bm1.vhd",
+)
+"""The hardware's files in the order of analysis; the generated package of parameters comes after the first."""
+
+PARAMETERS: Final = "bm1_parameters.vhd"
+
+
+def in_order(sources: Sequence[Path | str], parameters: Path | str = PARAMETERS) -> list[str]:
+    """Return the files in the order of analysis, with the package of parameters in its place."""
+    return [str(sources[0]), str(parameters), *map(str, sources[1:])]
+
+
+def verilog(
+    folder: Path,
+    top: str = "bm1",
+    *,
+    table: str,
+    hdl: Path = HDL,
+    more_sources: Sequence[str] = (),
+    generics: Mapping[str, int | str] | None = None,
+) -> str:
+    """Return a board's hardware as Verilog, from the package of parameters in a folder.
+
+    Args:
+        folder: Working folder of GHDL.
+        top: Top-level entity.
+        table: Verilog of `bm1_table`.
+        hdl: Folder of the VHDL.
+        more_sources: Further VHDL files, relative to `hdl`.
+        generics: Generics of the top-level entity.
+
+    Raises:
+        HardwareToolError: GHDL is not installed or failed.
+    """
+    # without its entity, the table's component remains unbound: a black box
+    names = [name for name in SOURCES if name != "bm1_table.vhd"]
+    sources = in_order([hdl / name for name in [*names, *more_sources]], folder / PARAMETERS)
+    run_tool(["ghdl", "-a", "--std=08", "-Wno-binding", *sources], folder)
+    options = [f"-g{name}={value}" for name, value in (generics or {}).items()]
+    text = run_tool(["ghdl", "--synth", "--std=08", "--out=verilog", *options, top], folder, separate=True)
+    return re.sub(r"^module bm1_table\n.*?^endmodule\n", "", text, flags=re.DOTALL | re.MULTILINE) + table
+
+
+MEMORY_FOLDER: Final = "Memory_MIFs"
+
+
+def write_board_files(image: Image, folder: Path) -> None:
+    """Write the files of an image's hardware, as a build does; its generic BOARD is the partition's index."""
+    images = [image] * image.partition.count  # a board uses its own entry only
+    (folder / PARAMETERS).write_text(parameters_vhd(_deployment(image), images), "ascii")
+    (folder / MEMORY_FOLDER).mkdir(exist_ok=True)
+    for memory in board_memories(image):
+        (folder / MEMORY_FOLDER / memory.name).write_text("".join(memory.lines()), "ascii")
+
+
+def board_memories(image: Image) -> list[Memory]:
+    """Return the memories of one board."""
+    part = image.partition
+    return [
+        memory
+        for memory in memories(_deployment(image), [image] * part.count)
+        if not memory.name.startswith("board") or memory.name.startswith(f"board{part.index}_")
+    ]
+
+
+def _deployment(image: Image) -> Deployment:
+    """Return a deployment of this image's model; an image has no names, only their numbers."""
+    parameters = image.machine.parameters
+    widths = [*parameters.sensor_bits, *([parameters.prior_bits] if parameters.prior_bits else [])]
+    total = image.partition.total_lines
+    return Deployment(
+        name=f"of image {image.image_hash[:12]}",
+        sources=(Source(uri="ws://localhost:9090", topic="/readings", type="std_msgs/Float64MultiArray"),),
+        variables=tuple(
+            Variable(
+                name=f"variable {at}",
+                path=f"data[{at}]",
+                kind="sensor" if at < parameters.sensors else "prior_select",
+                bits=bits,
+                values=2**bits - 1,
+            )
+            for at, bits in enumerate(widths)
+        ),
+        searched=(Dimension(label="line", size=total),),
+        machine=MachineSection(
+            lines=total,
+            interface=f"{image.interface_sensors}x{image.interface_results}",
+            target_count=min(255, parameters.target_count_max),
+            **{key: getattr(parameters, key) for key in MACHINE_KEYS},
+        ),
+        boards=(
+            BoardSection(image="boards/board0.bm", image_hash=image.image_hash, line_offset=0, lines=total),
+        ),
+    )
+
 
 _BUILDING: Final = "building-"
 _TABLE_VHDL: Final = "simulation/bm1_table_textio.vhd"
@@ -157,6 +317,6 @@ def _key(image: Image, simulator: Simulator) -> str:
     parts += [run_tool([tool, "--version"], Path("/")) for tool in simulator.tools]
     names = [*SOURCES, _TABLE_VHDL, _BENCH_VHDL, _TABLE_VERILOG, _BENCH_CPP]
     # the code that writes the generated files and calls the tools
-    own = [Path(__file__), *sorted((Path(__file__).parents[1] / "outputs").glob("*.py"))]
+    own = [Path(__file__), *sorted((Path(__file__).parent / "outputs").glob("*.py"))]
     parts += [path.read_text("utf-8") for path in [*(HDL / name for name in names), *own]]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
