@@ -34,16 +34,11 @@ def test_each_stage_has_its_exit_code_and_names_what_failed(tmp_path):
 
     def run(fails: str = "", code: int = 1) -> tuple[int, str]:
         calls.write_text("")
-        environment = os.environ | {
-            "PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}",
-            "FAILS": fails,
-            "WITH": str(code),
-        }
-        command = ["bash", ".ci/run"]
+        path = f"{tmp_path / 'bin'}:{os.environ['PATH']}"
         done = subprocess.run(
-            command,
+            ["bash", ".ci/run"],
             cwd=tmp_path,
-            env=environment,
+            env=os.environ | {"PATH": path, "FAILS": fails, "WITH": str(code)},
             capture_output=True,
             text=True,
             timeout=PROCESS_PATIENCE,
@@ -51,18 +46,7 @@ def test_each_stage_has_its_exit_code_and_names_what_failed(tmp_path):
         )
         return done.returncode, done.stdout
 
-    code, said = run()
-    assert code == 0
-    for name in (
-        "environment and downloads",
-        "format, lint, types, imports",
-        "docs",
-        "tests",
-        "containers",
-        "campaign",
-    ):
-        assert f"== {name}\n" in said
-        assert f"== {name}: " in said
+    assert run()[0] == 0
     for fails, expected in {
         "environment": 10,
         "container-engine install": 10,
@@ -78,12 +62,9 @@ def test_each_stage_has_its_exit_code_and_names_what_failed(tmp_path):
     }.items():
         code, said = run(fails)
         assert code == expected, said
-        if expected != 10:
-            assert any("FAILED this::one" in line for line in said.splitlines()[-20:-1])
+        assert expected == 10 or any("FAILED this::one" in line for line in said.splitlines()[-20:-1])
     run("container-engine install")
     assert calls.read_text().count("container-engine install") == 3
     assert run("verify containers --short", 3)[0] == 10  # a download within a later stage
     code, said = run("container-engine able", 4)
-    assert code == 0
-    assert "containers: skipped" in said
-    assert "verify" not in calls.read_text()
+    assert (code, "containers: skipped" in said, "verify" in calls.read_text()) == (0, True, False)

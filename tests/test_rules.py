@@ -1,15 +1,11 @@
 """The rules of tests/conftest.py: a test says that it starts processes, and leaves nothing behind."""
 
-import contextlib
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
-import psutil
 import pytest
 
 from tests.patience import PROCESS_PATIENCE
@@ -112,36 +108,3 @@ def test_who_breaks_a_rule_fails_and_is_told_which(tmp_path):
     }, ran.stdout
     for name, sentence in told.items():
         assert ("is not marked process or thorough" if "starts" in name else f"leaves {name[9:]}") in sentence
-
-
-STARTS_A_HUB = """
-import subprocess, time
-from pathlib import Path
-import pytest
-
-@pytest.mark.thorough
-def test_something():
-    hub = subprocess.Popen(["{hub}", "--port", "0"], start_new_session=True)
-    Path("{pid}.new").write_text(str(hub.pid))
-    Path("{pid}.new").rename("{pid}")
-    time.sleep(300)
-"""
-
-
-@pytest.mark.process
-def test_a_run_that_is_ended_leaves_nothing(tmp_path):
-    pid = tmp_path / "pid"
-    test = tmp_path / "test_hub.py"
-    test.write_text(STARTS_A_HUB.format(hub=Path(sys.executable).with_name("hub"), pid=pid))
-    command = [sys.executable, "-m", "pytest", "-p", "tests.conftest", "-n", "0", str(test)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen(command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL) as run:
-        deadline = time.monotonic() + PROCESS_PATIENCE
-        while not pid.exists():
-            assert run.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        run.send_signal(signal.SIGTERM)
-        assert run.wait(PROCESS_PATIENCE) == -signal.SIGTERM
-    with contextlib.suppress(psutil.NoSuchProcess):
-        psutil.Process(int(pid.read_text())).wait(PROCESS_PATIENCE)

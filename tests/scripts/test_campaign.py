@@ -81,9 +81,17 @@ class Recording:
         """The message of a reading, to be changed in its place."""
         return self.events[3 * index + ("reading", "report", "result").index(kind)][1]
 
-    def value(self, index, key, value, *, status=0):
-        pairs = self.message("report", index)["status"][status]["values"]
-        next(pair for pair in pairs if pair["key"] == key)["value"] = value
+    def values(self, index, *, status):
+        """The values of a report's status, to be changed."""
+        return self.message("report", index)["status"][status]["values"]
+
+    def replace(self, first, last, *events):
+        self.events[first:last] = events
+
+    def end(self, completed, lost=None):
+        """Let the last reading have no result, and the counters be these."""
+        self.replace(3 * 7 + 1, None)
+        self.counters = Counters(completed, lost or {})
 
     def play(self):
         observer = Observer(outcome)
@@ -99,90 +107,50 @@ class Recording:
         return {finding.flaw for finding in observer.findings}
 
 
-def last_bit(run):
-    run.message("result", 4)["data"][3] += 2**-54
+def both(index, number, **more):
+    return ("report", report(index, number, **more)), ("result", result(index, number, **more))
 
 
-def result_of_another_reading(run):
-    """As without sequence numbers on the link."""
-    run.events[3 * 4 + 2] = ("result", result(5, 5))
-
-
-def other_tables(run):
-    run.events[13:15] = [("report", report(4, 5, tables=1)), ("result", result(4, 5, tables=1))]
-
-
-def other_deployment(run):
-    run.message("report", 4)["status"][0]["hardware_id"] = "other"
-
-
-def slice_too_early(run):
-    run.value(4, "cycles", "128", status=2)
-
-
-def duplicated(run):
-    run.events += [("report", report(7, 9)), ("result", result(7, 9))]
-
-
-def out_of_order(run):
-    run.events[10:12] = []
-    run.events[13:13] = [("report", report(3, 6)), ("result", result(3, 6))]
-
-
-def lost_uncounted(run):
-    del run.events[3 * 7 + 1 :]
-    run.counters = Counters(7)
-
-
-def lost_after_counting(run):
-    """The publisher counts a result that never arrives."""
-    del run.events[3 * 7 + 1 :]
-
-
-def counted_twice(run):
-    run.counters = Counters(8, {PASSED_OVER: 1})
-
-
-def lost_without_a_fault(run):
-    del run.events[3 * 7 + 1 :]
-    run.counters = Counters(7, {FAILED: 1})
-
-
-def passed_over_alone(run):
-    """The last reading is not followed by another one."""
-    del run.events[3 * 7 + 1 :]
-    run.counters = Counters(7, {PASSED_OVER: 1})
-
-
-def not_a_number(run):
-    run.message("result", 4)["data"][3] = float("nan")
-
-
-def unknown_stamp(run):
+def shift(run):
     run.message("report", 4)["header"]["stamp"]["nsecs"] += 1000
 
 
-def without_result(run):
-    run.events[3 * 7 + 1 :] = []
+def lose_result(run):
+    run.replace(3 * 7 + 1, None)
     del run.events[3 * 4 + 2]
 
 
+def reorder(run):
+    run.replace(10, 12)
+    run.replace(13, 13, *both(3, 6))
+
+
+def data(run):
+    return run.message("result", 4)["data"]
+
+
 BUGS = {
-    last_bit: Flaw.WRONG,
-    result_of_another_reading: Flaw.WRONG,
-    other_tables: Flaw.WRONG,
-    other_deployment: Flaw.WRONG,
-    slice_too_early: Flaw.WRONG,
-    duplicated: Flaw.DUPLICATE,
-    out_of_order: Flaw.OUT_OF_ORDER,
-    lost_uncounted: Flaw.UNCOUNTED,
-    lost_after_counting: Flaw.UNCOUNTED,
-    counted_twice: Flaw.MISCOUNTED,
-    lost_without_a_fault: Flaw.UNEXPLAINED,
-    passed_over_alone: Flaw.UNEXPLAINED,
-    not_a_number: Flaw.MALFORMED,
-    unknown_stamp: Flaw.UNKNOWN,
-    without_result: Flaw.WITHOUT_RESULT,
+    "last bit": (Flaw.WRONG, lambda run: data(run).__setitem__(3, data(run)[3] + 2**-54)),
+    # as without sequence numbers on the link
+    "result of another reading": (Flaw.WRONG, lambda run: run.replace(14, 15, ("result", result(5, 5)))),
+    "other tables": (Flaw.WRONG, lambda run: run.replace(13, 15, *both(4, 5, tables=1))),
+    "other deployment": (
+        Flaw.WRONG,
+        lambda run: run.message("report", 4)["status"][0].update(hardware_id="other"),
+    ),
+    "slice too early": (Flaw.WRONG, lambda run: run.values(4, status=2)[0].update(value="128")),
+    "duplicated": (Flaw.DUPLICATE, lambda run: run.replace(99, 99, *both(7, 9))),
+    "out of order": (Flaw.OUT_OF_ORDER, reorder),
+    "lost uncounted": (Flaw.UNCOUNTED, lambda run: run.end(7)),
+    # the publisher counts a result that never arrives
+    "lost after counting": (Flaw.UNCOUNTED, lambda run: run.end(8)),
+    "counted twice": (Flaw.MISCOUNTED, lambda run: setattr(run, "counters", Counters(8, {PASSED_OVER: 1}))),
+    "lost without a fault": (Flaw.UNEXPLAINED, lambda run: run.end(7, {FAILED: 1})),
+    # the last reading is not followed by another one
+    "passed over alone": (Flaw.UNEXPLAINED, lambda run: run.end(7, {PASSED_OVER: 1})),
+    "not a number": (Flaw.MALFORMED, lambda run: data(run).__setitem__(3, float("nan"))),
+    "unknown stamp": (Flaw.UNKNOWN, shift),
+    "without result": (Flaw.WITHOUT_RESULT, lose_result),
 }
 
 
@@ -190,11 +158,11 @@ def test_a_right_run_has_no_findings():
     assert Recording().play() == set()
 
 
-@pytest.mark.parametrize("plant", BUGS, ids=lambda plant: plant.__name__)
-def test_a_planted_bug_is_found(plant):
+@pytest.mark.parametrize(("flaw", "plant"), BUGS.values(), ids=BUGS)
+def test_a_planted_bug_is_found(flaw, plant):
     run = Recording()
     plant(run)
-    assert BUGS[plant] in run.play()
+    assert flaw in run.play()
 
 
 @pytest.mark.parametrize(("until", "flaws"), [(0.8, set()), (0.55, {Flaw.UNCOUNTED})])
