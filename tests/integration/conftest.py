@@ -178,13 +178,13 @@ class Stage:
         # process numbers begin again from below now and then
         return sorted(found.values(), key=lambda each: (each.pid - first.pid) % PID_MAX)
 
-    async def loop(self, boat, *options, robot=None, rate=20, reading=READING, environment=None):
+    async def loop(self, boat, *options, environment=None):
         """Start a hub, a robot that publishes and a master in --loop, and wait for the first results."""
         hub, uri = await self.hub()
-        publishing = (robot or Robot)(uri)
+        publishing = Robot(uri)
         self.robots.append(publishing)
         await publishing.connect()
-        await publishing.keep_publishing(rate=rate, **reading)
+        await publishing.keep_publishing()
         command = (*LOOP, "-d", str(boat), "--uri", uri, *options)
         master = self.start(*command, environment={"BM_RUN_DIRECTORY": str(self.runs)} | (environment or {}))
         await publishing.have(3)
@@ -265,7 +265,6 @@ class Robot:
         self._tasks = []
         self._collecting = None
         self._publishing = None
-        self._values = {}
         self._socket = None
 
     async def __aenter__(self):
@@ -327,43 +326,24 @@ class Robot:
         await self._socket.send(json.dumps({"op": "publish", "topic": "/boat/sensors", "msg": msg}))
         return stamp_ns
 
-    async def keep_publishing(self, rate=20, **values):
+    async def keep_publishing(self, **values):
         """Publish in the background until the test is over; a lost server is waited for."""
-
-        self._values = values or READING
 
         async def publish():
             while True:
                 try:
-                    await self.publish(**self._values)
+                    await self.publish(**values or READING)
                 except (websockets.ConnectionClosed, OSError):
                     with contextlib.suppress(OSError, websockets.WebSocketException):
                         await self.connect()
-                await asyncio.sleep(1 / rate)
+                await asyncio.sleep(0.05)
 
         self._publishing = asyncio.ensure_future(publish())
         self._tasks.append(self._publishing)
 
-    async def stop_publishing(self):
-        """Publish no more in the background, and hear the results of what was published: nothing is under way then."""
+    def stop_publishing(self):
+        """Publish no more in the background."""
         self._publishing.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await self._publishing
-        await self.answer(await self.publish(**self._values))
-
-    async def answer(self, stamp_ns):
-        """Wait for what comes of the reading with a stamp: its frame's report, and the result unless there is none."""
-
-        def answered():
-            before = 0
-            for frame in self.frames:
-                published = frame["status"][0]["level"] == 0
-                if stamp_of(frame) == stamp_ns and len(self.results) >= before + published:
-                    return frame, self.results[before] if published else None
-                before += published
-            return None
-
-        return await until(answered, lambda: "nothing came of the reading")
 
     async def have(self, count):
         """Wait until so many results have come."""

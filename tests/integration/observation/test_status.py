@@ -60,7 +60,7 @@ async def test_the_status_of_a_run(stage, boat):
     assert {"rosbayes_ready{", "rosbayes_stage_seconds_sum{"} <= set(
         re.findall(r"^\w+{", await asyncio.to_thread(scraped), re.MULTILINE)
     )
-    await robot.stop_publishing()
+    robot.stop_publishing()
     code, stack, _ = await ask_until(
         stage, lambda stack: any(why.startswith("master: no result for") for why in stack["why"])
     )
