@@ -117,6 +117,7 @@ async def test_boards_that_compile_give_services_more_time(peers, events, own_bo
     peer = Peer("pcie-app", endpoint_from("unix:/x", ""), None)
     peer.since = 7.0
     peers._boards = Process() if own_boards else None
+    assert peers._service_settings.peer_timeout == pytest.approx(ready - 10.6)  # for the boards
     events.pending = Awaited("answer frame 3", 1.0, 0.2)
     for limit in (0.2, ready):
         awaited = peers._awaited(peer)
