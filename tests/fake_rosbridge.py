@@ -17,9 +17,6 @@ It behaves as real servers do (A: rosbridge_suite on ROS 1, B: on ROS 2, R: rosb
 * errors are not reported (A, B), unless `statuses` (R: `{"op": "status", "level": "error", ...}`);
 * a client that subscribes to a topic by two ids gets its first message twice (B);
 * NaN and infinities leave as null (A, B, R);
-* null where a published message may hold a number is refused (A, B, R), with `refuses_null`;
-* after a message that is JSON but not an object the connection is open and dead (A, B), with `zombies`;
-* every `/` leaves as `\\/` (A, B), with `escapes`;
 * type names of the ROS 2 form are refused (A), with `ros=1`; rosapi, if present, answers as in that ROS version;
 * a subscription made before a best-effort publisher started never hears it (B: `MultiSubscriber.__init__` in
   rosbridge_library/internal/subscribers.py chooses the reliability once), for topics of `start_best_effort`;
@@ -52,20 +49,16 @@ SERVER = "FakeRosbridge, a test double"
 class Received:
     """One operation that a client sent; `op` is None if it was not a JSON object."""
 
-    client: int
     op: dict[str, Any] | None
     raw: str
-    at: float
 
 
 @dataclass(eq=False)
 class _Client:
-    number: int
     connection: ServerConnection
-    dead: bool = False
     advertised: dict[str, set[Any]] = field(default_factory=dict)
     subscribed: dict[str, dict[Any, dict[str, Any]]] = field(default_factory=dict)
-    heard: dict[str, float] = field(default_factory=dict)
+    heard: set[str] = field(default_factory=set)
     services: set[str] = field(default_factory=set)
 
 
@@ -90,9 +83,6 @@ class FakeRosbridge:
     ros: int = 2
     rosapi: bool = False
     statuses: bool = False
-    refuses_null: bool = False
-    zombies: bool = False
-    escapes: bool = False
     silent: bool = False
     delay: float = 0.0
     refuses: int | None = None
@@ -102,7 +92,6 @@ class FakeRosbridge:
         self.received = []
         self.connections = 0
         self.types = {}
-        self.latched = {}
         self.services = {}
         self.fails_as_cbor = set()
         self.refused_topics = set()
@@ -141,7 +130,6 @@ class FakeRosbridge:
             self._place.bind(("127.0.0.1", self.port))
             self.port = self._place.getsockname()[1]
         self.types.clear()
-        self.latched.clear()
         self._server = await serve(
             self._talk,
             "127.0.0.1",
@@ -233,7 +221,13 @@ class FakeRosbridge:
 
     async def publish(self, topic, msg):
         """Publish as a ROS node would, and return the number of clients that got it."""
-        return await self._publish(_slashed(topic), msg)
+        reached, topic = 0, _slashed(topic)
+        for client in list(self._clients):
+            times = self._times(client, topic)
+            reached += times > 0
+            for _ in range(times):
+                await self._say(client, {"op": "publish", "topic": topic, "msg": msg})
+        return reached
 
     def serve(self, service, handler):
         """Serve a service: the handler returns the values, or a str to refuse, or None never to answer."""
@@ -247,7 +241,7 @@ class FakeRosbridge:
     # The server
 
     async def _talk(self, connection):
-        client = _Client(next(self._numbers), connection)
+        client = _Client(connection)
         self._clients.add(client)
         self.connections += 1
         self._news.set()
@@ -267,14 +261,9 @@ class FakeRosbridge:
             reason = "no JSON"
         else:
             reason = "" if isinstance(op, dict) else "no object"
-        self.received.append(
-            Received(client.number, op if isinstance(op, dict) else None, raw, time.monotonic())
-        )
+        self.received.append(Received(op if isinstance(op, dict) else None, raw))
         self._news.set()
-        if client.dead:
-            return
         if not isinstance(op, dict):
-            client.dead = self.zombies and reason == "no object"
             await self._complain(client, reason)
             return
         method = getattr(self, f"_op_{op.get('op')}", None)
@@ -290,8 +279,6 @@ class FakeRosbridge:
     async def _say(self, client, data):
         if isinstance(data, dict):
             data = json.dumps(_without_nan(data))
-            if self.escapes:
-                data = data.replace("/", "\\/")
         if self.delay:
             task = asyncio.create_task(self._say_late(client, data))
             self._late.add(task)
@@ -304,10 +291,9 @@ class FakeRosbridge:
         await self._send(client, data)
 
     async def _send(self, client, data):
-        if self.silent or client.dead:
-            return
-        with contextlib.suppress(ConnectionClosed):
-            await client.connection.send(data)
+        if not self.silent:
+            with contextlib.suppress(ConnectionClosed):
+                await client.connection.send(data)
 
     def _is_type(self, type_name):
         parts = type_name.split("/") if isinstance(type_name, str) else []
@@ -324,8 +310,6 @@ class FakeRosbridge:
             await self._complain(client, "topic type mismatch")
             return
         client.advertised.setdefault(topic, set()).add(op.get("id"))
-        if op.get("latch"):
-            self.latched.setdefault(topic, {})
 
     async def _op_unadvertise(self, client, op):
         client.advertised.pop(_slashed(op.get("topic")), None)
@@ -336,21 +320,8 @@ class FakeRosbridge:
             await self._complain(client, "no message")
         elif topic not in self.types:
             await self._complain(client, f"{topic} is not advertised")
-        elif self.refuses_null and _has_null(msg):
-            await self._complain(client, f"null in a message of {topic}")
         else:
-            if topic in self.latched:
-                self.latched[topic] = msg
-            await self._publish(topic, msg)
-
-    async def _publish(self, topic, msg):
-        reached = 0
-        for client in list(self._clients):
-            times = self._times(client, topic)
-            reached += times > 0
-            for _ in range(times):
-                await self._say(client, {"op": "publish", "topic": topic, "msg": msg})
-        return reached
+            await self.publish(topic, msg)
 
     def _times(self, client, topic):
         """Return how often a client gets a message: mostly once or never."""
@@ -362,11 +333,7 @@ class FakeRosbridge:
         ):
             return 0
         first = topic not in client.heard
-        now = time.monotonic()
-        throttle = min(subscription.get("throttle_rate", 0) for subscription in subscriptions.values()) / 1000
-        if not first and now - client.heard[topic] < throttle:
-            return 0
-        client.heard[topic] = now
+        client.heard.add(topic)
         return 2 if first and len(subscriptions) > 1 else 1
 
     async def _op_subscribe(self, client, op):
@@ -385,8 +352,6 @@ class FakeRosbridge:
             if not any(each.subscribed.get(topic) for each in self._clients):
                 self._begun[topic] = time.monotonic()
             client.subscribed.setdefault(topic, {})[op.get("id")] = op
-            if self.latched.get(topic):
-                await self._say(client, {"op": "publish", "topic": topic, "msg": self.latched[topic]})
 
     async def _op_unsubscribe(self, client, op):
         topic = _slashed(op.get("topic"))
@@ -394,7 +359,7 @@ class FakeRosbridge:
         if op.get("id") is None:
             subscriptions.clear()
         subscriptions.pop(op.get("id"), None)
-        client.heard.pop(topic, None)
+        client.heard.discard(topic)
 
     async def _op_advertise_service(self, client, op):
         client.services.add(_slashed(op.get("service")))
@@ -455,15 +420,6 @@ class FakeRosbridge:
             "/rosapi/topics": lambda _args: {"topics": list(topics), "types": list(topics.values())},
             "/rosapi/topic_type": lambda args: {"type": topics.get(_slashed(args.get("topic")), "")},
             "/rosapi/publishers": publishers,
-            "/rosapi/topics_for_type": lambda args: {
-                "topics": [
-                    topic for topic, its in topics.items() if _bare(its) == _bare(args.get("type", ""))
-                ]
-            },
-            "/rosapi/nodes": lambda _args: {"nodes": ["/fake"]},
-            "/rosapi/services": lambda _args: {
-                "services": [*self.services, *(s for c in self._clients for s in c.services)]
-            },
         }
         if self.ros == 2:
             known["/rosapi/get_ros_version"] = lambda _args: {"version": 2, "distro": "fake"}
@@ -483,11 +439,3 @@ def _without_nan(value):
     if isinstance(value, list):
         return [_without_nan(part) for part in value]
     return value
-
-
-def _has_null(value):
-    if isinstance(value, dict):
-        return any(map(_has_null, value.values()))
-    if isinstance(value, list):
-        return any(map(_has_null, value))
-    return value is None
