@@ -405,13 +405,26 @@ _ENVELOPES = (
     b'{"op":"publish","topic":"/a","topic":"/b","msg":',
     b'{"op":"publish","topic":"/a","msg":"',
     b"",
+    b'{"op":"publish","msg":',
 )
 _DEEP = b'{"a":[[[[[]]]]]}'
 _LONG = b'{"long":"' + b"x" * 600 + b'"}'
 _PARTS = (
     *(b"{}", b'{"a":1}', b'{"data":[1.5,-0.0,1e15,123456789012345678901234567890]}', b'{"a":{"b":{"c":[]}}}'),
     *(_DEEP, b'{"a":NaN}', b'{"a":1e999}', b'{"a":"\xff"}', b'{"a":"\\ud800"}', b'{"a":"\\u00e9\xc3\xa9"}'),
-    *(b'{"a":1,"a":2}', b',"topic":"/b"', b',"msg":{"z":1}', b"}", b"{", b'"', b" ", b"null", b"[1]", _LONG),
+    *(
+        b'{"a":1,"a":2}',
+        b',"topic":"/a"',
+        b',"topic":"/b"',
+        b',"msg":{"z":1}',
+        b"}",
+        b"{",
+        b'"',
+        b" ",
+        b"null",
+        b"[1]",
+        _LONG,
+    ),
 )
 _right = st.tuples(
     st.sampled_from((_ENVELOPES[0], _ENVELOPES[3])), st.sampled_from(_PARTS[:4]), st.just(b"}")
@@ -419,14 +432,17 @@ _right = st.tuples(
 _any = st.tuples(
     st.sampled_from(_ENVELOPES),
     st.lists(st.sampled_from(_PARTS) | st.binary(max_size=5), max_size=3).map(b"".join),
-    st.sampled_from((b"}", b"}", b"}", b"", b"} ", b"}}")),
+    st.sampled_from((b"}", b"}", b"}", b"", b"} ", b"}}", b"]")),
 )
 published = (_right | _any).map(b"".join)
 
 
 @settings(max_examples=200)
 @example([_ENVELOPES[0] + b"{}}", _ENVELOPES[0] + b"null}"], Delivery())
-@given(st.lists(published, max_size=8), st.sampled_from((Delivery(), Delivery(arrays="numpy"))))
+@example(
+    [_ENVELOPES[0] + b"{}}"] * 3 + [None] + [_ENVELOPES[0] + b"{}}", b"\xff" * 20 + b"}"] * 2, Delivery()
+)
+@given(st.lists(published | st.none(), max_size=8), st.sampled_from((Delivery(), Delivery(arrays="numpy"))))
 @example(
     [
         _ENVELOPES[2] + _PARTS[2] + b"} ",
@@ -440,13 +456,23 @@ published = (_right | _any).map(b"".join)
 )
 def test_a_client_that_knows_an_envelope_reads_what_one_does_that_parses_all(messages, delivery):
     cores = [ClientCore(max_size=200, max_depth=3), ClientCore(max_size=200, max_depth=3)]
+    wanted = 0
     for core in cores:
         core.restore()
-        core.subscriptions.subscribe("/a", delivery=delivery)
         core.subscriptions.subscribe("/b")
-    for received in messages:
+        core.subscriptions.subscribe("/b", throttle_rate=1000)
+    for number, received in enumerate([None, *messages]):
+        if received is None:  # the topic is wanted, or not wanted any more
+            for core in cores:
+                if wanted:
+                    core.subscriptions.unsubscribe(wanted)
+            again = (
+                [] if wanted else [core.subscriptions.subscribe("/a", delivery=delivery) for core in cores]
+            )
+            wanted = max(again, default=0)
+            continue
         cores[1].subscriptions.forget_envelopes()  # so that it parses everything
-        events = [repr(core.receive(received, 0.0)) for core in cores]
+        events = [repr(core.receive(received, number / 3)) for core in cores]
         assert events[0] == events[1]
         assert len(cores[0].subscriptions.envelopes) <= 16
 
@@ -457,11 +483,15 @@ def _content(payload):
 
 
 _AGAIN = [b'{"op":"unadvertise","topic":"/a"}', b'{"op":"advertise","topic":"/a","type":"p/T"}']
+_ENDED = [b'{"op":"unadvertise","topic":"/b"}']  # nobody is subscribed to it
 
 
 @settings(max_examples=200)
-@given(st.lists(st.lists(published, max_size=3) | st.just(_AGAIN), max_size=8))
+@given(st.lists(st.lists(published, max_size=3) | st.sampled_from((_AGAIN, _ENDED)), max_size=8))
 @example([[_ENVELOPES[0] + b"{}}", _ENVELOPES[0] + b"null}"]])
+@example([[_ENVELOPES[3] + b"{}}"], _ENDED, [_ENVELOPES[3] + b"{}}"]])
+@example([[_ENVELOPES[0] + b"{}}"], [_ENVELOPES[0] + b'{"a":1}]', _ENVELOPES[0] + b'{"a":1}} ']])
+@example([[_ENVELOPES[12] + b'{"n":1},"topic":"/a"}', _ENVELOPES[12] + b'{"n":2}}']])
 @example([[_ENVELOPES[0] + b"{}}", _ENVELOPES[1] + _LONG + b"}"], [_ENVELOPES[1] + _LONG + b"}"] * 2])
 @example(
     [[_ENVELOPES[4] + _DEEP + b"}"]] * 3 + [[_ENVELOPES[4] + b'{"a":1}}'], [_ENVELOPES[6] + _DEEP + b"}"]]

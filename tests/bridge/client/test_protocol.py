@@ -313,26 +313,6 @@ def test_what_is_unusable_says_so(data):
     assert 10 < len(event.reason) < 300
 
 
-def test_nonsense_after_the_known_envelopes_were_forgotten():
-    core = connected()
-    core.subscriptions.subscribe("/a")
-    core.receive(b'{"op":"publish","topic":"/a","msg":{}}', 0.0)
-    assert core.subscriptions.envelopes
-    for nonsense in (b"\xff", b"\xff" * 20 + b"}"):
-        assert isinstance(core.receive(nonsense, 0.0), UnusableReceived)
-
-
-def test_a_known_envelope_around_nonsense():
-    core = connected()
-    number = core.subscriptions.subscribe("/a")
-    envelope = b'{"op":"publish","topic":"/a","msg":'
-    for body, msg in ((b'{"n":1}}', {"n": 1}), (b'{"n":NaN}}', {"n": None}), (b'{"n":2} }', {"n": 2})):
-        assert core.receive(envelope + body, 0.0) == MessageReceived("/a", msg, (number,))
-        assert core.subscriptions.envelopes
-    for body in (b"3}", b"{}", b"{}}}", b'{"a":' * 64 + b"1" + b"}" * 65):
-        assert isinstance(core.receive(envelope + body, 0.0), UnusableReceived)
-
-
 # Any sequence of wishes, losses and messages
 
 TOPICS = ["/a", "a", "/b", "c"]

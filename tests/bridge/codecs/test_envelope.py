@@ -1,12 +1,10 @@
-"""A known envelope gives the same message as parsing the whole text; other envelopes are parsed."""
+"""The bytes before a message, which tell its topic or are no envelope."""
 
 import orjson
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from bridge.client.protocol import ClientCore
-from bridge.client.protocol.events import MessageReceived
 from bridge.codecs.json_codec import LONGEST, envelope_of, topic_of
 
 CANONICAL = b'{"op":"publish","topic":"/t","msg":'
@@ -57,30 +55,3 @@ def test_a_proven_envelope_says_the_same_around_any_message(middle):
         for message in (b"{}", b'{"a":1}', b'{"op":"x","topic":"y","msg":{}}', b' {"}":"{"} '):
             whole = orjson.loads(envelope + message + b"}")
             assert whole == {"op": "publish", "topic": topic, "msg": orjson.loads(message)}
-
-
-def core_that_knows():
-    core = ClientCore(max_size=2000, max_depth=5)
-    core.restore()
-    core.subscriptions.subscribe("/t")
-    for _ in range(2):
-        assert core.receive(CANONICAL + b'{"a":1}}', 0.0) == MessageReceived("/t", {"a": 1}, (1,))
-    assert core.subscriptions._known.topic == "/t"
-    return core
-
-
-def test_a_known_envelope_is_ignored_after_unsubscribing():
-    core = core_that_knows()
-    core.subscriptions.unsubscribe(1)
-    assert core.receive(CANONICAL + b'{"a":1}}', 0.0) is None
-    number = core.subscriptions.subscribe("/t")
-    again = core.subscriptions.subscribe("/t")
-    for _ in range(3):
-        assert core.receive(CANONICAL + b'{"a":1}}', 0.0) == MessageReceived("/t", {"a": 1}, (number, again))
-
-
-def test_throttles_apply_with_a_known_envelope():
-    core = core_that_knows()
-    slow = core.subscriptions.subscribe("/t", throttle_rate=1000)
-    heard = [core.receive(CANONICAL + b"{}}", now) for now in (10.0, 10.1, 10.2, 11.1)]
-    assert [event.subscriptions for event in heard] == [(1, slow), (1,), (1,), (1, slow)]

@@ -1,8 +1,11 @@
 """Calls of services and goals of actions: client -> hub -> serving client -> hub -> client, each ended exactly once."""
 
+import json
+
 import pytest
 
 from bridge.client.protocol.events import GoalStatus
+from bridge.codecs import png
 from tests.bridge.hub.broker_harness import Harness
 
 ASKS = {"service": "call_service", "action": "send_action_goal"}
@@ -341,6 +344,26 @@ def test_actions_are_described_also_those_of_actionlibs_topics(action):
     assert action.client.rosapi("action_servers") == {"action_servers": [DOCK]}
     action.client.subscribe("/undock/goal", type="a/B")
     assert set(action.client.rosapi("action_servers")["action_servers"]) == {"/undock", DOCK}
+
+
+def test_one_goal_at_a_time_may_have_no_id(action):
+    key = action.asked(None)
+    action.ask(None)
+    assert (refusal := action.answer())["result"] is False
+    assert "id" not in refusal
+    action.client.send(op="cancel_action_goal", action=DOCK)
+    assert action.server.read() == [{"op": "cancel_action_goal", "id": key, "action": DOCK}]
+    action.end(key, values={}, status=GoalStatus.CANCELED, result=True)
+    status = {"status": GoalStatus.CANCELED}
+    assert action.answer() == {"op": "action_result", "action": DOCK, "values": {}, "result": True} | status
+
+
+def test_feedback_and_result_as_png(action):
+    key = action.asked("g", compression="png", feedback=True)
+    action.server.send(op="action_feedback", id=key, action=DOCK, values={"a": 1})
+    action.end(key, values={"b": 1}, status=GoalStatus.SUCCEEDED, result=True)
+    operations = [json.loads(png.decode(operation["data"])) for operation in action.client.read()]
+    assert [operation["values"] for operation in operations] == [{"a": 1}, {"b": 1}]
 
 
 # --- absent fields

@@ -231,10 +231,14 @@ def test_a_dropped_message_is_not_encoded(monkeypatch):
 # --- what goes wrong is told to who wants it
 
 
-def test_status_messages_are_sent_on_request_and_do_not_pile_up():
+@pytest.mark.parametrize("level", ["info", "warning", "error"])
+def test_status_messages_are_sent_on_request_and_do_not_pile_up(level):
     peer = Harness().connect()
     peer.send_raw(b"42")
-    peer.send(op="set_level", level="warning")
+    peer.send(op="set_level", level=level, id="i")
+    peer.advertise("/s", "std_msgs/String", queue_size=1, png="png")  # further fields are ignored
+    peer.publish("/s")  # a subset of its type
+    assert peer.read() == []
     peer.send(op="fly", id="f1")
     peer.send(op="publish", topic="/t", id=7, msg=1)
     first, second = peer.read()

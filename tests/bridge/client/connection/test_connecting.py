@@ -7,6 +7,8 @@ import socket
 from types import SimpleNamespace
 
 import pytest
+from websockets.frames import Frame, Opcode
+from websockets.utils import accept_key
 
 from bridge.client import State, connect
 from bridge.client.websocket import WebSocket
@@ -149,6 +151,22 @@ async def test_a_service_that_greets_before_it_is_asked(monkeypatch):
     async with tcp_service(lambda _reader, writer: writer.write(b"220 mail ready\r\n")) as port:
         uri = f"ws://127.0.0.1:{port}"
         assert "220 mail ready" in await fails(uri, NotRosbridgeError)
+
+
+async def test_what_comes_in_one_piece_with_the_handshake_is_heard():
+    async def serve(reader, writer):
+        head = (await reader.readuntil(b"\r\n\r\n")).decode()
+        key = accept_key(re.search(r"Sec-WebSocket-Key: (\S+)", head)[1]).encode()
+        frames = Frame(Opcode.TEXT, b'{"op":"status","level":"error","msg":"welcome"}').serialize(mask=False)
+        frames += Frame(Opcode.TEXT, b'{"op":"st', fin=False).serialize(mask=False)
+        frames += Frame(Opcode.CONT, b'atus","msg":"again"}').serialize(mask=False)
+        accepting = b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: "
+        writer.write(SWITCHING + accepting + key + b"\r\n\r\n" + frames)
+        await reader.readexactly(8)
+        writer.write(b"\x88\x02\x03\xe8")  # closed as it wishes
+
+    async with tcp_service(serve) as port, connect(f"ws://127.0.0.1:{port}") as ros:
+        assert [said.text for said in ros.statuses] == ["welcome", "again"]
 
 
 SWITCHING = b"HTTP/1.1 101 Switching Protocols\r\n"
