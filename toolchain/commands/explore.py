@@ -10,7 +10,6 @@ import typer
 
 from toolchain.analysis import InspectOptions, ReadingOptions, Sweep
 from toolchain.commands.request import ModelFlags, read_model
-from toolchain.errors import BuildError
 from toolchain.flags import Bits
 
 
@@ -60,17 +59,16 @@ def inspect(
 
 
 def explore(
+    model: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net, .xdsl (.gz)."
+        ),
+    ],
     flags: ModelFlags,
     sweep: Sweep,
     readings: ReadingOptions,
     bits: Bits = None,
-    model: Annotated[
-        Path | None,
-        typer.Argument(
-            help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net, .xdsl (.gz).",
-            metavar="[MODEL]",
-        ),
-    ] = None,
     frames: Annotated[int, typer.Option(help="Maximum number of frames.")] = 50,
     results: Annotated[
         Path,
@@ -81,29 +79,12 @@ def explore(
     plot: Annotated[
         Path | None, typer.Option(help="Picture of accuracy against cycles.", metavar="PNG")
     ] = None,
-    claims: Annotated[
-        Path | None,
-        typer.Option(
-            help="Instead of a sweep: the thesis's claims as experiments, with numbers and a picture in this folder.",
-            metavar="DIR",
-        ),
-    ] = None,
 ) -> None:
     """Sweep over machines for a model: accuracy against cycles and ALMs, with the Pareto front.
 
     For example `toolchain explore casestudies/boat --partitions 4 --prob-bits 6,8 --plot boat.png`; after
-    Ctrl-C, the same command resumes the sweep, whose points are in the results file. `toolchain explore
-    --claims out/claims` tests the thesis's claims.
+    Ctrl-C, the same command resumes the sweep, whose points are in the results file.
     """
-    if claims is not None:
-        if model is not None:
-            raise BuildError(f"--claims has its own model: omit {model}")
-        _run_claims(claims, frames=frames, seed=readings.seed)
-        return
-    if model is None:
-        raise BuildError(
-            "name a model to explore, such as 'toolchain explore casestudies/boat', or --claims DIR"
-        )
     from toolchain.analysis.emulation import check_columns, recorded_readings, sample_readings
     from toolchain.analysis.logic import device_named
     from toolchain.analysis.sweep import (
@@ -160,24 +141,3 @@ def explore(
             if plot is not None:
                 draw_sweep(plot, read.name, points, front)
                 typer.echo(f"Wrote {plot}", err=True)
-
-
-def _run_claims(directory: Path, *, frames: int, seed: int) -> None:
-    from toolchain.analysis.claims import draw_claims, experiments, run_claims
-    from toolchain.analysis.emulation import check_frames
-    from toolchain.analysis.sweep import check_pictures_possible
-
-    figures, picture = directory / "claims.json", directory / "claims.png"
-    check_pictures_possible()
-    check_frames(frames)
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        check_pictures_possible(picture)
-        with progress(experiments()) as advance:
-            claims = run_claims(frames=frames, seed=seed, advance=advance)
-        typer.echo(claims.as_text(), nl=False)
-        figures.write_text(claims.as_json(), encoding="utf-8")
-    except OSError as reason:
-        raise BuildError(f"{figures} cannot be written: {reason.strerror or reason}") from None
-    draw_claims(picture, claims)
-    typer.echo(f"Wrote {figures} and {picture}", err=True)

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from docs.experiments import claims
+from docs.experiments.claims import Faults, beacons, draw_claims, draw_frames, machine_of, run_claims
 from machines.bm1 import Start, addressed_codes
 from machines.reference import ReferenceBM1
-from toolchain.analysis import claims
-from toolchain.analysis.claims import Faults, beacons, draw_claims, draw_frames, machine_of, run_claims
 from toolchain.analysis.emulation import sample_readings
 
 

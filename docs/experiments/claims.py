@@ -1,9 +1,12 @@
 """The thesis's claims as experiments: the number of cycles (2.1.2, 4.3), and flipped bits (2.1.1).
 
+    python docs/experiments/claims.py out/claims --frames 100
+
 The model is a boat among any number of beacons, so that lines, sensors and counters vary one at a time. Bits
 are flipped in a machine of this module, which runs like the reference; the kernels do not support faults.
 """
 
+import argparse
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -18,9 +21,10 @@ from machines.encode import decode_code
 from machines.parameters import BM1Parameters
 from machines.rng import random_numbers
 from toolchain.analysis.accuracy import Interval, bootstrap
-from toolchain.analysis.emulation import EmulatedBoards, sample_readings
+from toolchain.analysis.emulation import EmulatedBoards, check_frames, sample_readings
 from toolchain.analysis.sweep import COLOURS, MARKERS, new_figure, save_figure
 from toolchain.building.quantise import quantise
+from toolchain.commands.explore import progress
 from toolchain.deployment import Scale, Stop
 from toolchain.models.conditional import normal
 from toolchain.models.model import Model, cell_centres, exact_posterior, interval
@@ -344,3 +348,26 @@ def draw_claims(path: Path, claims: Claims) -> None:
 def _bounds(intervals: Sequence[Interval]) -> tuple[_Floats, _Floats, _Floats]:
     values = np.array([(each.value, each.low, each.high) for each in intervals])
     return values[:, 0], values[:, 1], values[:, 2]
+
+
+def main() -> None:
+    """Run all experiments, print tables, and write `claims.json` and `claims.png`."""
+    parser = argparse.ArgumentParser(description="Test the thesis's claims with a model of its own.")
+    parser.add_argument("directory", type=Path, help="folder for the numbers and the picture")
+    parser.add_argument("--frames", type=int, default=50, help="frames for each point (50)")
+    parser.add_argument(
+        "--seed", type=int, default=1, help="seed of the readings and of the flipped bits (1)"
+    )
+    options = parser.parse_args()
+    check_frames(options.frames)
+    options.directory.mkdir(parents=True, exist_ok=True)
+    with progress(experiments()) as advance:
+        claims = run_claims(frames=options.frames, seed=options.seed, advance=advance)
+    print(claims.as_text(), end="")
+    (options.directory / "claims.json").write_text(claims.as_json(), encoding="utf-8")
+    draw_claims(options.directory / "claims.png", claims)
+    print(f"Wrote claims.json and claims.png to {options.directory}")
+
+
+if __name__ == "__main__":
+    main()
