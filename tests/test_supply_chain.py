@@ -64,50 +64,23 @@ def test_a_wheel_built_twice_is_the_same_bytes(tmp_path):
         assert not any(name.startswith(("tests", "scripts", "hdl")) for name in archive.namelist())
 
 
-@pytest.fixture(scope="module")
-def elsewhere(tmp_path_factory):
-    """An environment with the wheel installed; other packages are those of this one."""
-    folder = tmp_path_factory.mktemp("elsewhere")
-    run(ROOT / "scripts" / "wheel", folder / "dist", cwd=folder)
-    run(sys.executable, "-m", "venv", "--without-pip", folder / "venv", cwd=folder)
-    python = folder / "venv" / "bin" / "python"
-    (wheel,) = (folder / "dist").glob("rosbayes-*.whl")
-    run(
-        sys.executable,
-        "-m",
-        "pip",
-        "--python",
-        python,
-        "install",
-        "--no-index",
-        "--no-deps",
-        wheel,
-        cwd=folder,
-    )
-    (packages,) = (folder / "venv" / "lib").glob("python*/site-packages")
+def test_an_installed_wheel_has_commands_and_packages(tmp_path):
+    """In an environment with the wheel; other packages are those of this one."""
+    run(ROOT / "scripts" / "wheel", tmp_path / "dist", cwd=tmp_path)
+    run(sys.executable, "-m", "venv", "--without-pip", tmp_path / "venv", cwd=tmp_path)
+    scripts = tmp_path / "venv" / "bin"
+    (wheel,) = (tmp_path / "dist").glob("rosbayes-*.whl")
+    install = ("-m", "pip", "--python", scripts / "python", "install", "--no-index", "--no-deps", wheel)
+    run(sys.executable, *install, cwd=tmp_path)
+    (packages,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
     # a folder that a .pth file names has its own .pth files ignored: this tree, installed editable, stays out
     (packages / "dependencies.pth").write_text("\n".join(site.getsitepackages()) + "\n")
-    return folder
-
-
-def test_its_commands_answer(elsewhere):
-    scripts = elsewhere / "venv" / "bin"
-    assert "--plot" in run(scripts / "listen", "--help", cwd=elsewhere)
-    assert "listen" in run(scripts / "rosbayes", "--help", cwd=elsewhere)
-    run(scripts / "toolchain", "new", "corridor", cwd=elsewhere)
-    target = [
-        "--uri",
-        "ws://127.0.0.1:9090",
-        "--topic",
-        "/corridor/readings",
-        "--type",
-        "std_msgs/Float64MultiArray",
-    ]
-    run(scripts / "toolchain", "build", "corridor", "-o", "built", *target, cwd=elsewhere)
-    assert (elsewhere / "built" / "deployment.toml").is_file()
-
-
-def test_its_packages_are_importable(elsewhere):
-    code = "import json, bridge.client, posteriors; print(json.dumps([bridge.client.__file__, posteriors.__file__]))"
-    files = json.loads(run(elsewhere / "venv" / "bin" / "python", "-c", code, cwd=elsewhere))
-    assert all(Path(each).is_relative_to(elsewhere / "venv") for each in files)
+    assert "--plot" in run(scripts / "listen", "--help", cwd=tmp_path)
+    assert "listen" in run(scripts / "rosbayes", "--help", cwd=tmp_path)
+    run(scripts / "toolchain", "new", "corridor", cwd=tmp_path)
+    target = ("--uri", "ws://127.0.0.1:9090", "--topic", "/corridor/readings", "--type", "a/B")
+    run(scripts / "toolchain", "build", "corridor", "-o", "built", *target, cwd=tmp_path)
+    assert (tmp_path / "built" / "deployment.toml").is_file()
+    code = "import bridge.client, posteriors; print(bridge.client.__file__, posteriors.__file__, sep='\\n')"
+    files = run(scripts / "python", "-c", code, cwd=tmp_path).split()
+    assert all(Path(each).is_relative_to(tmp_path / "venv") for each in files)

@@ -71,11 +71,12 @@ async def test_a_reading_becomes_a_result(run, monkeypatch):
 
 async def test_the_newest_reading_wins_unless_all_are_kept(boat):
     run = Run(boat)
-    run.read(5, passed_over=2, unpaired=3)
+    for at in range(5):
+        run.read(passed_over=2, unpaired=3, addresses=[at])
     assert run.lost == {LossReason.PASSED_OVER: 13, LossReason.UNPAIRED: 15}
     computed(run)
     computed(run)
-    assert run.app.frames == [1, 2]  # no other reading was kept
+    assert [each.addresses for each in run.app.records] == [[0], [4]]  # no other reading was kept
 
 
 async def test_a_publisher_that_takes_nothing_costs_its_results_and_no_more(run):
@@ -160,10 +161,16 @@ async def test_frames_wait_for_peers_that_are_not_ready(run):
 
 
 async def test_too_many_readings_end_the_run(run):
-    run.read(1 + QUEUE_ALL_DEPTH)  # one is on the boards
+    for at in range(1 + QUEUE_ALL_DEPTH):  # one is on the boards
+        run.read(addresses=[at])
     assert run.error is None
-    run.read()
+    for _ in range(3):
+        computed(run)
+    assert [each.addresses for each in run.app.records] == [[0], [1], [2], [3]]
+    run.read(4)
     assert isinstance(run.error, OverflowedQueueError)
+    assert run.error.exit_code == 6
+    assert run.lost == {}
 
 
 async def test_a_run_publishes_the_requested_number_of_results(boat):

@@ -18,9 +18,11 @@ from posteriors.posterior import Posterior
 from services.errors import SettingsError
 from services.output import posterior_file
 from services.output.axes import Axis, axes_of
+from services.output.master_output import print_json, sentence
 from services.output.posterior_file import open_result_file, record
 from services.output.posterior_lines import drawing, line
 from services.output.posterior_picture import ROWS, picture
+from services.sockets.records import Outcome, Published
 from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source
 
 HASH = "0" * 64
@@ -308,3 +310,28 @@ class TestFiles:
         with contextlib.closing(open_result_file(tmp_path / name)) as file:
             file.add(posterior, axes_of(posterior, None))
         assert len((tmp_path / name).read_bytes().splitlines()) == len(whole.splitlines()) + 1
+
+
+class TestMaster:
+    """Results as `master` prints them: the words and the keys of `listen`."""
+
+    deployment = deployment(
+        Dimension(label="y", size=2, offset=0.5, step=2.0, unit="m"),
+        Dimension(label="size", size=3, states=("small", "medium", "large")),
+    )
+    posterior = made([[0, 0, 2], [1, 0, 1]], "y", "size")
+    published = Published(7, Outcome.PUBLISHED, True, 2, 0.5, 812, 3_210_000)
+
+    def test_the_line_of_a_master_begins_with_the_words_of_listen(self):
+        said = sentence(self.published, self.deployment)
+        assert said == "frame 7: y 0.5 m, size large with 0.5; 812 cycles; 3.21 ms"
+        heard = line(self.posterior, axes_of(self.posterior, self.deployment))
+        assert heard == said.replace("with 0.5;", "with 0.5; mean y 1.5 m;")
+
+    def test_best_means_the_same_in_both_objects(self, capfdbinary):
+        print_json(self.published, self.deployment)
+        said = json.loads(capfdbinary.readouterr().out)
+        heard = record(self.posterior, axes_of(self.posterior, self.deployment))
+        assert list(said["best"].items()) == [("y", 0), ("size", 2)]
+        for key in ("best", "best_value", "probability"):
+            assert said[key] == heard[key]

@@ -5,14 +5,8 @@ from contextlib import nullcontext
 
 import pytest
 
-from services.errors import OverflowedQueueError, VariableError
-from services.pipeline.frames import (
-    QUEUE_ALL_DEPTH,
-    UNPAIRED_WARNING,
-    FrameAssembler,
-    StampGap,
-    WaitingFrames,
-)
+from services.errors import VariableError
+from services.pipeline.frames import UNPAIRED_WARNING, FrameAssembler, StampGap
 from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source, Variable
 from toolchain.deployment.sections import WrittenPrior
 
@@ -129,23 +123,3 @@ def test_stamps_that_never_meet_are_reported():
     assert far_apart(0, header={}).stamp_gap().without_header == ("/t1",)
     assert frames.take(1, stamped(10 * UNPAIRED_WARNING - 10, D2=1), 1, 1) != []
     assert frames.stamp_gap() is None
-
-
-def test_latest_keeps_the_newest_and_counts_the_rest():
-    waiting = WaitingFrames("latest")
-    for frame in range(5):
-        waiting.put(frame)
-    assert waiting.get() == 4
-    assert waiting.get() is None
-    assert waiting.passed_over == 4
-
-
-def test_all_keeps_order_and_names_the_slow_part_when_full():
-    waiting = WaitingFrames("all")
-    for frame in range(QUEUE_ALL_DEPTH):
-        waiting.put(frame)
-    with pytest.raises(OverflowedQueueError) as caught:
-        waiting.put(256)
-    assert caught.value.exit_code == 6
-    assert [waiting.get() for _ in range(QUEUE_ALL_DEPTH)] == list(range(QUEUE_ALL_DEPTH))
-    assert waiting.passed_over == 0

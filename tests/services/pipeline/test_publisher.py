@@ -121,14 +121,6 @@ async def test_the_master_learns_that_no_server_is_there_and_that_one_is_back(bo
             assert [each.level for each in link.of(Notice)] == ["warning", "info"]
 
 
-@pytest.mark.parametrize(("level", "logged"), [("debug", 1), ("info", 0)])
-def test_each_result_is_logged_for_debugging(boat, link, level, logged):
-    publisher = Publisher(Settings(log_level=level), boat, link.make)
-    publisher._log = Mock()
-    publisher._report(Published(7, Outcome.PUBLISHED, None, 0, 1.0, 9, 9))
-    assert [each.kwargs["frame"] for each in publisher._log.debug.mock_calls] == [7] * logged
-
-
 @pytest.mark.parametrize(
     ("refused", "outcome", "missed"), [("/a", Outcome.PUBLISHED, 1), ("/a /b", Outcome.REFUSED, 0)]
 )

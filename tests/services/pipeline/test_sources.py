@@ -5,6 +5,7 @@ robot two: /scan (LaserScan, CBOR), /imu (Imu)                          ->  serv
 """
 
 import asyncio
+import contextlib
 import json
 import time
 from contextlib import asynccontextmanager
@@ -12,15 +13,22 @@ from contextlib import asynccontextmanager
 import pytest
 
 from bridge.client import State
+from bridge.errors import AccessRefusedError, UnreachableError
+from bridge.hub.access import AccessPolicy, tls_context
 from bridge.stamps import header
+from services.pipeline.connections import connect_all
 from services.pipeline.frames import UNPAIRED_WARNING
 from services.pipeline.subscriber import Subscriber
 from services.pipes.subscriber import print_addresses
 from services.settings import Settings
 from services.sockets.records import Begin, LossReason, Notice, Reading, Unusable
+from services.sockets.status import why_not_connected
+from tests.bridge.hub.sockets import running_hub
+from tests.certificates import issue
 from tests.fake_rosbridge import FakeRosbridge
 from tests.integration.conftest import build_corridor
 from tests.patience import PATIENCE
+from tests.services.conftest import until
 from tests.services.pipeline.conftest import running
 from toolchain.deployment import load_deployment
 
@@ -147,3 +155,44 @@ async def test_readings_go_on_beside_a_camera_with_large_pictures(
             assert link.of(Reading)[0].addresses == [4, None]
             lost = subscriber.status().frames.lost
             assert lost == ({} if is_left_out else {LossReason.TOO_LARGE: 1})
+
+
+# --- connections ---
+
+
+async def test_a_certificate_that_only_the_settings_know(tmp_path):
+    certificate, key = issue(tmp_path, "localhost")
+    async with running_hub(access=AccessPolicy(tls=tls_context(certificate, key))) as port:
+        uris = [f"wss://localhost:{port}"]
+        async with contextlib.AsyncExitStack() as stack:
+            by_uri = await connect_all(stack, Settings(ca=certificate), uris)
+            assert by_uri[uris[0]].state == "connected"
+        async with contextlib.AsyncExitStack() as stack:
+            with pytest.raises((AccessRefusedError, UnreachableError)):
+                await connect_all(stack, Settings(connect_timeout=0.5), uris)
+
+
+async def test_a_robot_of_the_deployment_is_looked_up(monkeypatch):
+    async with running_hub() as port:
+
+        async def resolve(name):
+            assert name == "Robot 7"
+            return f"ws://127.0.0.1:{port}"
+
+        monkeypatch.setattr("bridge.discovery.resolve", resolve)
+        async with contextlib.AsyncExitStack() as stack:
+            by_uri = await connect_all(stack, Settings(), ["robot:Robot 7"])
+            assert by_uri["robot:Robot 7"].state == "connected"
+
+
+async def test_a_server_that_is_waited_for_is_named(unused_tcp_port):
+    uri, by_uri = f"ws://127.0.0.1:{unused_tcp_port}", {}
+    async with contextlib.AsyncExitStack() as stack:
+        connecting = asyncio.create_task(
+            connect_all(stack, Settings(connect_timeout=PATIENCE), [uri], by_uri)
+        )
+        await until(lambda: by_uri and by_uri[uri].last_error)
+        assert uri in why_not_connected(by_uri)
+        async with running_hub(port=unused_tcp_port):
+            await connecting
+            assert not why_not_connected(by_uri)

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import time
 from contextlib import nullcontext
-from unittest.mock import Mock, call
+from unittest.mock import Mock
 
 import pytest
 
@@ -78,14 +78,6 @@ def test_an_unusable_message_is_reported_by_its_cause(boat, link):
     assert isinstance(first, Unusable)
     assert first.cause == second.cause
     assert subscriber.status().frames.lost == {LossReason.UNUSABLE: 2}
-
-
-@pytest.mark.parametrize(("level", "logged"), [("debug", 1), ("info", 0)])
-def test_the_number_of_a_reading_is_logged_for_debugging(boat, link, level, logged):
-    subscriber = Subscriber(Settings(log_level=level), boat, link.make)
-    subscriber._log = Mock()
-    link.take(Notice("debug", "complete frame=1"))
-    assert subscriber._log.debug.mock_calls == [call("complete frame=1")] * logged
 
 
 @pytest.mark.parametrize(("existing", "hinted"), [("/boat/sensors2", True), ("/elsewhere", False)])
