@@ -171,18 +171,14 @@ CELL = {"sensor_mode": SensorMode.CELL}
         ({}, 3, {}),
         ({}, [0], {}),
         ({}, [0, 3], {}),  # the address of a missing reading, which is None here
-        ({}, [0, 4], {}),
         ({}, [0, 0.5], {}),
         ({}, [0, 0], {"target_count": 256}),
-        ({}, [0, 0], {"bank": 16}),
         ({"replicas": 2}, [(0, 0)], {}),
         ({"replicas": 2}, [(0, 0), (0,)], {}),
         ({"replicas": 2}, [(0, 0), (0, 3)], {}),
-        ({"replicas": 2}, [(0, 0), (0, 4)], {}),
         (CELL, [0, 0], {}),
         (CELL, [[0, 0, 0], [0, [1], 2]], {}),
         (CELL, [[0, 0, 0], [0, 3, 0]], {}),
-        (CELL, [[0, 0, 0], [0, 9, 0]], {}),
     ],
 )
 def test_readings_that_do_not_fit_are_refused(machine, change, readings, options):

@@ -40,23 +40,11 @@ def file(tmp_path, *lines):
 
 
 def test_frames_are_read_with_what_was_seen(tmp_path):
-    frames = read_recording(file(tmp_path, HEADING, FIRST, SECOND))
-    assert frames == (
-        RecordedFrame(
-            number=1,
-            time_s=1248272277.018,
-            x=4.392,
-            y=2.407,
-            sightings=(Sighting(landmark=20, range_m=6.712, bearing_rad=-1.8623),),
-        ),
-        RecordedFrame(
-            number=2,
-            time_s=1248272278.018,
-            x=-1.5,
-            y=-6.25,
-            sightings=(Sighting(landmark=6, range_m=6.794, bearing_rad=-2.2450),),
-        ),
-    )
+    first, second = read_recording(file(tmp_path, HEADING, FIRST, SECOND))
+    seen = (Sighting(landmark=20, range_m=6.712, bearing_rad=-1.8623),)
+    assert first == RecordedFrame(number=1, time_s=1248272277.018, x=4.392, y=2.407, sightings=seen)
+    seen = (Sighting(landmark=6, range_m=6.794, bearing_rad=-2.2450),)
+    assert second == RecordedFrame(number=2, time_s=1248272278.018, x=-1.5, y=-6.25, sightings=seen)
 
 
 def test_what_was_not_seen_is_absent_from_the_message(tmp_path):

@@ -96,11 +96,9 @@ def test_a_prior_of_one_of_them(tmp_path, written):
     [
         ("", "", 2),
         ("near = ", "naer = ", 4),
-        ("near = ", "q = ", 4),
         ("left = ", "near = ", 11),
         ("ranges[3]", "ranges[-3]", 11),
         ("/scan", "scan me", 8),
-        ("ws://two:9090", "two:9090", 7),
         ('topic = "/imu"', 'topic = "/scan"', 15),
         ('{ left = "ranges[3]" }', "{}", 11),
         ('variables = { left = "ranges[3]" }\n', "", 14),

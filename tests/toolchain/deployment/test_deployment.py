@@ -165,7 +165,6 @@ def test_another_format_is_reported_before_anything_else(folder, new):
         ("on_range", "on_rnage", 23, ("variable", 0, "on_rnage")),
         ("\nname =", "\nnmae =", 4, ("nmae",)),
         ("[machine]", "[mahcine]", 51, ("mahcine",)),
-        ("[[source]]", "[[sources]]", 9, ("sources",)),
         ('"clamp"', '"clmp"', 23, ("variable", 0, "on_range")),
         ("bits = 9", 'bits = "9"', 31, ("variable", 1, "bits")),
         ("bits = 9", "bits = 17", 31, ("variable", 1, "bits")),

@@ -90,7 +90,6 @@ def test_what_is_left_out_is_zero_hexadecimal_is_the_default_and_words_of_a_rang
         ("WIDTH=8; DEPTH=8;\nCONTENT\nBEGUN", 3),
         (HEAD + "0 : 1;\n", 4),
         (HEAD + "0 : 100;", 3),
-        (HEAD + "0 : -1;", 3),
         (HEAD + "0 : 1_0;", 3),
         (HEAD + "0 : G;", 3),
         (HEAD + "8 : 1;", 3),
