@@ -47,6 +47,7 @@ def test_a_build(case):
         (["--interface", "20"], ["--interface", "'20'"]),
         (["--bits", "L=3"], ["--bits L=3", "it has K"]),
         (["--bits", "K=17"], ["--bits K=17", "1 to 16"]),
+        (["--bits", "K=x"], ["--bits K=x", "1 to 16"]),
         (["--rng-table", "a.mif"], ["--rng-table", "--rng lfsr32"]),
         (["--rng", "table", "--rng-table", "/no.mif"], ["/no.mif", "No such file"]),
         (["--searched", "s"], ["--searched"]),

@@ -84,7 +84,7 @@ def test_what_is_left_out_is_zero_hexadecimal_is_the_default_and_words_of_a_rang
         ("WIDTH=8;\nCONTENT BEGIN", 2),
         ("WIDTH=8;\nWIDTH=8;", 2),
         ("WIDTH=0;", 1),
-        ("WIDTH=99999999999;", 1),
+        ("WIDTH=99999999999; DEPTH=1; CONTENT BEGIN END;", 1),
         ("DEPTH=" + "9" * 5000, 1),
         ("DATA_RADIX=ROMAN;", 1),
         ("WIDTH=8; DEPTH=8;\nCONTENT\nBEGUN", 3),
