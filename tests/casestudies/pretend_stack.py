@@ -9,6 +9,7 @@ import itertools
 import time
 
 from tests.patience import PROCESS_PATIENCE
+from tests.posteriors.messages import posterior_message, report_message
 
 
 def certain(line):
@@ -25,28 +26,11 @@ def frame_message(stamp, number, *, published):
         "cycles": 800 + number,
         "counts_total": 4000,
         "published": str(published).lower(),
-        "rosbridge_in_us": 100,
-        "local_hops_us": 200,
-        "register_writes_us": 50,
-        "compute_us": 600,
-        "reads_us": 50,
-        "received_ns": now - 1_000_000,
-        "sent_ns": now,
     }
-    pairs = [{"key": key, "value": str(value)} for key, value in values.items()]
-    outcome = "overflow" if published else "impossible on every board"
-    return {
-        "header": {"stamp": stamp, "frame_id": "bm"},
-        "status": [
-            {"level": 0, "name": f"rosbayes: {name}", "message": outcome, "hardware_id": on, "values": told}
-            for name, on, told in (("frame", "boat", pairs), ("board 0", "board0", []))
-        ],
-    }
-
-
-def posterior_message(values):
-    dims = [{"label": "y", "size": 32, "stride": 1024}, {"label": "x", "size": 32, "stride": 32}]
-    return {"layout": {"dim": dims, "data_offset": 0}, "data": values}
+    stages = {"rosbridge_in": 100, "local_hops": 200, "register_writes": 50, "compute": 600, "reads": 50}
+    values |= {f"{stage}_us": time for stage, time in stages.items()}
+    values |= {"received_ns": now - 1_000_000, "sent_ns": now}
+    return report_message(stamp, "overflow" if published else "impossible on every board", **values)
 
 
 class PretendStack:
@@ -78,4 +62,4 @@ class PretendStack:
             stamp = header["stamp"] if header else {"sec": now // 10**9, "nanosec": now % 10**9}
             await self.fake.publish("/bm/frame", frame_message(stamp, number, published=answer is not None))
             if answer is not None:
-                await self.fake.publish("/BMresults", posterior_message(answer))
+                await self.fake.publish("/BMresults", posterior_message(answer, 32, 32))

@@ -11,9 +11,10 @@ from casestudies.topics import Truth, Truths, listen, read_truth
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.frame_report import FrameReport
 from posteriors.posterior import Posterior
-from tests.casestudies.pretend_stack import certain, frame_message, posterior_message
+from tests.casestudies.pretend_stack import certain, frame_message
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
+from tests.posteriors.messages import posterior_message
 
 
 def test_a_truth():
@@ -95,7 +96,7 @@ def pose(seconds):
 async def say_frame(fake, number, *, published=True):
     await fake.publish("/bm/frame", frame_message({"sec": number, "nanosec": 0}, number, published=published))
     if published:
-        await fake.publish("/BMresults", posterior_message(certain(number)))
+        await fake.publish("/BMresults", posterior_message(certain(number), 32, 32))
 
 
 @pytest.fixture
@@ -146,7 +147,7 @@ async def test_a_truth_that_never_comes_is_not_waited_for_to_the_limit(heard):
 async def test_a_result_without_a_report_is_handed_out_too(heard):
     fake, listener = heard
     await fake.publish(TRUTH, pose(1))
-    await fake.publish("/BMresults", posterior_message(certain(7)))
+    await fake.publish("/BMresults", posterior_message(certain(7), 32, 32))
     async with asyncio.timeout(PATIENCE):
         instance = await listener.next(1000)
     assert (instance.report, instance.truth) == (None, None)

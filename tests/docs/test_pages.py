@@ -1,18 +1,26 @@
-"""The pages name what exists, and everything that a user can set: paths, commands, flags, keys, limits, errors."""
+"""The pages name what exists and what a user can set, and their examples run and give what is printed below them."""
 
+import asyncio
+import contextlib
 import dataclasses
+import doctest
 import importlib
 import inspect
-import os
+import io
+import json
 import re
 import shlex
 import tomllib
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import BaseModel
 from typer.main import get_command
 
+from bridge.client import connect
 from bridge.hub.limits import HubLimits
 from machines.parameters import BM1Parameters
 from pcie_shim import errors, framing
@@ -20,8 +28,13 @@ from rosbayes.__main__ import app
 from services.settings import ENV_PREFIX, Settings
 from terminal.flags import default_of, field_flag
 from tests.bridge.hub.broker_harness import Harness
+from tests.bridge.hub.sockets import running_hub
+from tests.patience import PATIENCE
+from tests.toolchain.running import TARGET, assert_refused, toolchain
+from toolchain.building.options import read_sources
 from toolchain.checks.findings import Check
-from toolchain.deployment import DeploymentFile
+from toolchain.deployment import DeploymentFile, Variable
+from toolchain.models.case_study import load_model
 
 ROOT = Path(__file__).parents[2]
 PAGES = {path.relative_to(ROOT).as_posix(): path.read_text() for path in (ROOT / "docs").rglob("*.md")}
@@ -43,15 +56,6 @@ def test_paths_functions_and_rooms_of_the_house_exist():
     assert len(names) > 20
     sources = "\n".join(path.read_text() for room in ROOMS for path in (ROOT / room).rglob("*.py"))
     assert not [name for name in names if not re.search(rf"\b(def|class) {name}\b", sources)]
-
-
-def test_every_script_has_a_row():
-    page = PAGES["docs/reference/commands.md"]
-    scripts = {
-        path.name for path in (ROOT / "scripts").iterdir() if path.is_file() and os.access(path, os.X_OK)
-    }
-    # the image's entry point is described on the page about containers
-    assert not [name for name in scripts - {"with-kernels"} if f"\n| `scripts/{name}" not in page]
 
 
 # Printed commands
@@ -193,3 +197,195 @@ def row(name):
 @pytest.mark.parametrize("name", Settings.model_fields)
 def test_a_setting_has_the_row_of_its_declaration(name):
     assert row(name) in PAGES["docs/reference/commands.md"].splitlines()
+
+
+GUIDE = "\n".join(text for name, text in sorted(PAGES.items()) if name.startswith("docs/how-to/bridge"))
+EXAMPLES = dict(
+    re.findall(r"^###? ([^\n]+)\n(?:(?!^##).)*?^```python\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
+)
+STARTS = re.findall(r"(?:^    |with\s`)hub(?: --ros-version (\d))?(?:`|$)", GUIDE, re.MULTILINE)
+"""ROS versions of the hubs that the pages start for their examples."""
+(ROS_VERSION,) = {int(number) for number in STARTS}
+
+Company = Callable[[str], Awaitable[None]]
+
+
+async def run(example: str, uri: str, company: Company | None = None) -> str:
+    """Return the output of an example, run in a thread while `company` acts as the robot."""
+    program = compile(example.replace("ws://127.0.0.1:9090", uri), "example.py", "exec")
+    said = io.StringIO()
+
+    def play() -> None:
+        with contextlib.redirect_stdout(said):
+            exec(program, {"__name__": "__main__"})  # noqa: S102  # the pages of this repository
+
+    robot = asyncio.create_task(company(uri)) if company is not None else None
+    with ThreadPoolExecutor(1) as thread:
+        try:
+            await asyncio.get_running_loop().run_in_executor(thread, play)
+        finally:
+            if robot is not None:
+                robot.cancel()
+                with contextlib.suppress(asyncio.CancelledError):
+                    await robot
+    return said.getvalue()
+
+
+def publishes(topic: str, type_name: str, *messages: dict[str, Any]) -> Company:
+    """Publishes these again and again, until the example has had enough."""
+
+    async def play(uri: str) -> None:
+        async with connect(uri) as ros:
+            publication = await ros.advertise(topic, type_name)
+            while True:
+                for message in messages:
+                    await publication.publish(message)
+                    await asyncio.sleep(0.05)
+
+    return play
+
+
+poses = publishes("/pose", "geometry_msgs/PointStamped", {"point": {"x": 0.8}}, {"point": {"x": 0.9}})
+
+#: By heading: who plays the robot, and what is printed.
+PLAYED: dict[str, tuple[Company | None, str]] = {
+    "Subscribe": (poses, "/pose {'x': 0.9,"),
+    "A misspelt field": (None, "has no field lineer; did you mean linear"),
+    "Long arrays": (None, "0.5 float64"),
+    "Large messages": (None, "{'data': 'short'} discarded: 1\na message of /notes cannot be published"),
+    "Serialised messages": (None, "laser [0.5 1.5]"),
+    "Actions": (None, "no result: action /fibonacci"),
+    "Services": (None, "{'sum': 3}\nservice /add at ws://"),
+    "Serve an action": (None, "SUCCEEDED {'sequence': [0, 1, 1, 2, 3, 5]}"),
+    "Parameters, topics and nodes": (None, "15 1.0\nparameter /camera:gain at ws://"),
+    "Threads": (None, "{'data': 'from a thread'}"),
+    "Transforms between frames": (None, "[2. 1. 0.] [1.5 1.  0. ] (4, 4)\nframe gripper is not known"),
+    "Find a variable in messages": (
+        None,
+        "D1 (True, 7)\ny (True, 2.5)\npose.position.x (True, 1.5)\nranges[1] (True, 0.5)\ndata[2] (True, 3)\n",
+    ),
+    "Several robots": (poses, "two {'x': 0.9,"),
+    "Quality of service (ROS 2)": (None, "{'data': 'here be dragons'}"),
+}
+ELSEWHERE = {"Publish", "TLS, tokens, proxies", "roslibpy"}
+"""Examples that have a test of their own, or need a certificate or a process."""
+
+
+@pytest.mark.parametrize("heading", PLAYED)
+async def test_an_example_runs(heading):
+    company, printed = PLAYED[heading]
+    async with running_hub(ros_version=ROS_VERSION) as port:
+        assert printed in await run(EXAMPLES[heading], f"ws://127.0.0.1:{port}", company)
+
+
+async def test_what_is_published_is_heard():
+    async with running_hub(ros_version=ROS_VERSION) as port, connect(f"ws://127.0.0.1:{port}") as ros:
+        poses = ros.subscribe("/pose", "geometry_msgs/PointStamped")
+        await ros.call("/rosapi/get_time", timeout=PATIENCE)
+        await run(EXAMPLES["Publish"], ros.uri)
+        heard = [(await poses.next(PATIENCE)).msg["point"]["x"] for _ in range(10)]
+        assert heard == [0.1 * step for step in range(10)]
+
+
+def test_no_example_is_left_out():
+    assert set(EXAMPLES) == set(PLAYED) | ELSEWHERE
+    assert len(EXAMPLES) == GUIDE.count("```python")
+
+
+# README and the page about machines
+
+
+def test_the_notebook_of_readme_runs(tmp_path, monkeypatch, capsys):
+    (text,) = [
+        each
+        for each in re.findall(r"^```python\n(.*?)^```", PAGES["README.md"], re.MULTILINE | re.DOTALL)
+        if "build/boat" in each
+    ]
+    (line,) = [
+        each for each in printed(PAGES["README.md"]) if each.startswith("toolchain build casestudies/boat")
+    ]
+    words = [str(ROOT / word) if word.startswith("casestudies") else word for word in shlex.split(line)[1:]]
+    monkeypatch.chdir(tmp_path)
+    command = get_command(app).resolve_command(None, ["toolchain"])[1]
+    command.main(words, standalone_mode=False)
+    capsys.readouterr()
+    exec(text, {})  # noqa: S102 - the page's own program
+    assert capsys.readouterr().out.startswith("('y', 'x') (32, 32)")
+
+
+def test_the_examples_of_machines():
+    # Fences would be taken for output.
+    text = PAGES["docs/reference/machines.md"].replace("```python\n", "\n").replace("```\n", "\n")
+    test = doctest.DocTestParser().get_doctest(text, {}, "machines.md", "machines.md", 0)
+    assert len(test.examples) > 8
+    report = []
+    doctest.DocTestRunner(verbose=False).run(test, out=report.append)
+    assert not report, "".join(report)
+
+
+# The toolchain's pages
+
+DEPLOYMENT, MODELS, TOOLCHAIN = (
+    PAGES[f"docs/{name}.md"] for name in ("reference/deployment", "how-to/models", "reference/toolchain")
+)
+
+
+def test_the_example_is_a_model(tmp_path):
+    example = re.search(r"```python\n(.*?)```", TOOLCHAIN, re.DOTALL)[1]
+    (tmp_path / "model.py").write_text(example)
+    model = load_model(tmp_path, {"cells": "7"})
+    assert model.lines == 7
+    assert [known.name for known in model.known] == ["range", "door"]
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", MODELS, re.DOTALL)
+
+
+def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    models = tmp_path / "models"
+    for name in ("mymodel", "boiler"):
+        (models / name).mkdir(parents=True)
+    for name, language in (("garden.bif", "bif"), ("mymodel/walks.csv", "csv")):
+        (text,) = blocks(language)
+        (models / name).write_text(text)
+    boiler, _ = blocks("python")
+    (models / "boiler" / "model.py").write_text(boiler)
+    commands = re.findall(r"^    (toolchain .*)$", MODELS, re.MULTILINE)
+    assert len(commands) == 8
+    for command in commands:
+        if "fit=" in command:  # of a model that the reader has changed
+            continue
+        result = toolchain(*shlex.split(command)[1:])
+        assert result.exit_code == 0, f"{command}\n{result.stderr}"
+
+
+def test_the_sources_of_the_deployment_page(tmp_path):
+    (example,) = re.findall(r"^```toml\n(.*?)^```", DEPLOYMENT, re.MULTILINE | re.DOTALL)
+    (tmp_path / "sources.toml").write_text(example)
+    file = read_sources(tmp_path / "sources.toml", "ws://robot:9090")
+    names = ("ahead", "colour", "left", "near", "turn")
+    placed = file.place(tuple(Variable(name=name, bits=3, values=4) for name in names))
+    assert [each.source for each in placed] == [1, 3, 1, 0, 2]
+
+
+@pytest.mark.parametrize("mode", ["cell", "threshold"])
+def test_inspect_explains_the_disparity_model(tmp_path, mode):
+    (example,) = re.findall(r"```python\n(# disparity/model\.py.*?)```", TOOLCHAIN, re.DOTALL)
+    model, out = tmp_path / "disparity", tmp_path / "out"
+    model.mkdir()
+    (model / "model.py").write_text(example)
+    built = toolchain("build", model, "-o", out, *TARGET, "--sensor-mode", mode, "--replicas", 3)
+    assert built.exit_code == 0, built.output
+    looked = toolchain("inspect", out, "--frames", 5)
+    if mode == "threshold":
+        assert_refused(looked, "--model")
+    else:
+        assert looked.exit_code == 0, looked.output
+        assert "5 frames of readings for 3 replicas, drawn from" in looked.stdout
+    named = toolchain("inspect", out, "--frames", 5, "--model", model, "--json")
+    assert named.exit_code == 0, named.output
+    # lines that all read the same would have nothing to be wrong about
+    assert 0.001 < json.loads(named.stdout)["accuracy"]["machine"]["total_variation"]["value"] < 0.1
+    assert_refused(toolchain("inspect", out, "--readings", tmp_path / "r.csv"), "r.csv")

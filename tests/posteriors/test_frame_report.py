@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from posteriors import BadResultError, BoardReport, FrameReport, Posterior, StageTimes
 from posteriors.frame_report import read_frame_report, write_frame_report
 from posteriors.pairing import WAITING, Pairing
-from tests.posteriors.hostile import JSON
+from tests.posteriors.messages import JSON, report_message, status
 
 REPORT = FrameReport(
     stamp_ns=12_000_000_034,
@@ -69,25 +69,8 @@ def test_a_report_that_is_written_is_read_back_whole(ros_version):
     ]
 
 
-def status(name, message="", hardware="", **values):
-    return {
-        "level": 0,
-        "name": name,
-        "message": message,
-        "hardware_id": hardware,
-        "values": [{"key": key, "value": str(value)} for key, value in values.items()],
-    }
-
-
-def frame_message(*, stamp=None, **values):
-    return {
-        "header": {"stamp": stamp or {"sec": 12, "nanosec": 34}, "frame_id": "bm"},
-        "status": [
-            status("rosbayes: frame", "overflow", "boat", **values),
-            status("rosbayes: board 0", "overflow", "board0", cycles=812, counts_total=900, reason=1),
-            status("rosbayes: board 1", "impossible", "board1", cycles=0, counts_total=0, reason=4),
-        ],
-    }
+def frame_message(**values):
+    return report_message({"sec": 12, "nanosec": 34}, **values)
 
 
 def test_keys_may_be_absent_or_new():
@@ -194,6 +177,8 @@ def test_a_server_that_swaps_a_report_and_its_result():
     pairing.add_report(report(5, 50))
     assert pairs(pairing.add_posterior(result(5, 55))) == [(5, 5)]
     assert pairing.announced_only == 1
+    pairing.add_posterior(result(6, 60))  # its report is lost
+    assert pairs(pairing.add_report(report(7, 66))) == [(None, 6)]
 
 
 @pytest.mark.parametrize(("heard", "number"), [(12, 1), (15, 1), (16, 2)])

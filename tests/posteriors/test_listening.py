@@ -18,25 +18,17 @@ from posteriors import BadResultError, NoResultError, listen, posteriors
 from posteriors.frame_report import FrameReport
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE, PROCESS_PATIENCE
+from tests.posteriors.messages import posterior_message, report_message
 
 
 def report(number, *, published=True, deployment="boat"):
+    outcome = "posterior" if published else "no posterior: impossible"
     values = {"number": number, "cycles": 800, "published": str(published).lower(), "compute_us": 12.5}
-    return {
-        "header": {"stamp": {"sec": number, "nanosec": 0}},
-        "status": [
-            {
-                "message": "posterior" if published else "no posterior: impossible",
-                "hardware_id": deployment,
-                "values": [{"key": key, "value": str(value)} for key, value in values.items()],
-            }
-        ],
-    }
+    return report_message({"sec": number, "nanosec": 0}, outcome, deployment, **values)
 
 
 def result(*data):
-    dims = [{"label": "y", "size": 2, "stride": 4}, {"label": "x", "size": 2, "stride": 2}]
-    return {"layout": {"dim": dims, "data_offset": 0}, "data": [value / sum(data) for value in data]}
+    return posterior_message([value / sum(data) for value in data], 2, 2)
 
 
 async def say(fake, number, *data, **about):

@@ -8,12 +8,7 @@ from hypothesis.extra import numpy as arrays
 
 from posteriors import BadResultError, FrameReport, LabelError, Posterior, StageTimes
 from posteriors.posterior import read_posterior
-from tests.posteriors.hostile import JSON
-
-
-def posterior_message(data, *sizes, offset=0):
-    dims = [{"label": label, "size": size, "stride": 1} for label, size in zip("yx", sizes, strict=False)]
-    return {"layout": {"dim": dims, "data_offset": offset}, "data": data}
+from tests.posteriors.messages import JSON, posterior_message
 
 
 class TestReading:

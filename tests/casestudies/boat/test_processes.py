@@ -17,10 +17,11 @@ from matplotlib.image import imread
 
 from casestudies.boat import viewer
 from casestudies.boat.sensors import map_grid
-from tests.casestudies.pretend_stack import PretendStack, certain, frame_message, posterior_message
+from tests.casestudies.pretend_stack import PretendStack, certain, frame_message
 from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PROCESS_PATIENCE
+from tests.posteriors.messages import posterior_message
 
 GRID = map_grid()
 
@@ -74,7 +75,7 @@ def where_the_boat_is(fake):
 async def say_result(fake, number):
     """Return the publisher's message about one frame."""
     await fake.publish("/bm/frame", frame_message({"sec": number, "nanosec": 0}, number, published=True))
-    await fake.publish("/BMresults", posterior_message(certain(500)))
+    await fake.publish("/BMresults", posterior_message(certain(500), 32, 32))
 
 
 @pytest.mark.process

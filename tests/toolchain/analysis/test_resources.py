@@ -63,11 +63,9 @@ def test_registers_are_counted_exactly():
     "more",
     [
         {"lines": 2048},
-        {"sensor_bits": (7, 7, 7, 9, 9, 9, 9)},
         {"shared": False},
         {"rng": RngKind.TABLE, "steps_per_clock": 1},
         {"prior_mode": PriorMode.WRITTEN},
-        {"rng_banks": 256},
         {"replicas": 2},
         {"sensor_mode": SensorMode.CELL},
     ],

@@ -22,7 +22,7 @@ from toolchain.analysis.logic import DEVICES, logic_of
 from toolchain.analysis.resources import estimate
 from toolchain.building.build import BuildError, assemble, build_deployment
 from toolchain.building.machine import plan_machine
-from toolchain.checks.check import check_deployment, check_model
+from toolchain.checks.check import check_deployment
 from toolchain.deployment import REPLICA, Scale, Stop, load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.deployment.address_array import MISSING, to_addresses, written_prior
@@ -197,7 +197,6 @@ def test_a_build_of_each_kind(tmp_path, options):
     assert f"SENSOR_{options.sensor_mode.upper()};" in package
     findings = check_deployment(tmp_path)
     assert [finding for finding in findings if finding.severity.name != "NOTE"] == []
-    assert check_model(model(select=True), options) is not None
 
 
 CALLED_REPLICA = replace(model(), searched=(dimension(REPLICA, size=6),))
