@@ -80,6 +80,19 @@ def ignore_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
+async def until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
+    """Run coroutines until one of them ends, cancel the others, and raise its error if it has failed."""
+    tasks = [asyncio.ensure_future(each) for each in work]
+    try:
+        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in ended:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
 def run_async(main: Coroutine[Any, Any, int | None]) -> int:
     """Run a coroutine on uvloop until it ends or a signal cancels it.
 

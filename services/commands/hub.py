@@ -22,7 +22,7 @@ from terminal.logs import log_libraries
 from terminal.one_line import shown
 from terminal.output import say
 from terminal.run_directory import status_directory
-from terminal.signals import run_async
+from terminal.signals import run_async, until_one_ends
 
 app = CommandLine(
     help="Serve rosbridge without ROS: topics, services, actions, parameters and rosapi.\n\n`hub --port 9090`\n\n"
@@ -180,15 +180,6 @@ async def _serve(
     )
     directory = status_directory(settings.run_directory, "hub")
     async with serve_status(directory, "hub", status, metrics=settings.metrics):
-        announcing = None if announce is None else asyncio.ensure_future(announce_once_ready(announce))
-        tasks = [asyncio.ensure_future(hub), *([announcing] if announcing else [])]
-        try:
-            # an announcement that fails ends the hub, since its users would wait in vain
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+        # an announcement that fails ends the hub, since its users would wait in vain
+        await until_one_ends(hub, *([announce_once_ready(announce)] if announce is not None else []))
     return 0

@@ -10,8 +10,7 @@ from services.pipeline.pcie_app import ROLE, PcieApp
 from services.pipes.lines import require_pipe
 from services.pipes.pcie_app import compute_lines
 from services.settings import Settings
-from services.sockets.reporting import check_metrics
-from services.sockets.serving import board_endpoints, deployment_for, listening, own_endpoint
+from services.sockets.serving import board_endpoints, deployment_for, listening
 from terminal.command_line import CommandLine
 from terminal.signals import run_async
 
@@ -45,8 +44,7 @@ def pcie_app(
     deployed = DeployedBoards(settings, loaded, board_endpoints(settings, loaded), reprogram=reprogram)
     # the status is served from a thread, because the main one blocks while boards compute
     if listen is not None:
-        check_metrics(settings.metrics, insecure=insecure)
-        link = listening(own_endpoint(listen, insecure=insecure), ROLE, loaded)
+        link = listening(listen, ROLE, settings, loaded, insecure=insecure)
         return run_async(PcieApp(settings, deployed, link).run())
     require_pipe(ROLE, "readings")
     return compute_lines(deployed, loaded.machine.rng_banks)

@@ -6,8 +6,7 @@ from services.pipeline.result_topics import ROLE
 from services.pipes.lines import require_pipe
 from services.pipes.publisher import publish_lines
 from services.settings import Settings
-from services.sockets.reporting import check_metrics
-from services.sockets.serving import deployment_for, listening, own_endpoint
+from services.sockets.serving import deployment_for, listening
 from terminal.command_line import CommandLine
 from terminal.signals import run_async
 
@@ -29,8 +28,7 @@ def publisher(settings: Settings, listen: options.Listen = None, insecure: optio
     loaded = deployment_for(settings)
     # under a master the results come over the socket, alone over standard input
     if listen is not None:
-        check_metrics(settings.metrics, insecure=insecure)
-        link = listening(own_endpoint(listen, insecure=insecure), ROLE, loaded)
+        link = listening(listen, ROLE, settings, loaded, insecure=insecure)
         return run_async(Publisher(settings, loaded, link).run())
     require_pipe(ROLE, "results")
     return run_async(publish_lines(settings, loaded))

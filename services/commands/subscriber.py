@@ -10,8 +10,7 @@ from services.errors import SettingsError
 from services.pipeline.subscriber import ROLE, Subscriber
 from services.pipes.subscriber import print_addresses, print_variables
 from services.settings import Settings
-from services.sockets.reporting import check_metrics
-from services.sockets.serving import deployment_for, listening, own_endpoint
+from services.sockets.serving import deployment_for, listening
 from terminal.command_line import CommandLine
 from terminal.signals import run_async
 from toolchain.deployment import Source
@@ -53,9 +52,8 @@ def subscriber(
             f"{flag} {value} cannot be combined with a deployment; {settings.deployment} has its own: omit one of them"
         )
     if listen is not None:
-        check_metrics(settings.metrics, insecure=insecure)
         loaded = deployment_for(settings)
-        link = listening(own_endpoint(listen, insecure=insecure), ROLE, loaded)
+        link = listening(listen, ROLE, settings, loaded, insecure=insecure)
         return run_async(Subscriber(settings, loaded, link).run())
     if settings.deployment is not None:
         loaded = deployment_for(settings)

@@ -36,7 +36,7 @@ from services.sockets.records import (
     Reading,
     Unusable,
 )
-from services.sockets.status import FrameCounts, reasons, seconds_since
+from services.sockets.status import FrameCounts
 from services.supervision.child import RESTARTS
 from toolchain.deployment import Deployment
 
@@ -129,14 +129,7 @@ class FrameFlow:
 
     def counts(self) -> FrameCounts:
         """Return the counts for the status."""
-        number, tick = self._last
-        return FrameCounts(
-            received=self._received,
-            completed=self.published,
-            lost=reasons(self.losses),
-            last_number=number or None,
-            last_age_s=seconds_since(tick),
-        )
+        return FrameCounts.of(self._received, self.published, self.losses, self._last)
 
     @property
     def losses(self) -> Counter[LossReason]:

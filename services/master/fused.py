@@ -12,16 +12,13 @@ from typing import Any, cast
 
 from services.boards.deployed import DeployedBoards
 from services.master.command_lines import METRICS_PORTS
-from services.pipeline.pcie_app import ROLE as PCIE_APP
 from services.pipeline.pcie_app import PcieApp
 from services.pipeline.publisher import Publisher
-from services.pipeline.result_topics import ROLE as PUBLISHER
-from services.pipeline.subscriber import ROLE as SUBSCRIBER
 from services.pipeline.subscriber import Subscriber
 from services.settings import Settings
 from services.sockets.records import AnyRecord, Record
 from services.sockets.reporting import shifted
-from services.sockets.serving import Link, MakeLink, board_endpoints
+from services.sockets.serving import Link, MakeLink, Service, board_endpoints
 from toolchain.deployment import Deployment
 
 TakeRecord = Callable[[AnyRecord], None]
@@ -92,9 +89,9 @@ def fused_services(
         return settings.model_copy(update={"metrics": shifted(settings.metrics, METRICS_PORTS[role])})
 
     boards = DeployedBoards(settings, deployment, board_endpoints(settings, deployment))
-    running = {
-        SUBSCRIBER: Subscriber(settings_of(SUBSCRIBER), deployment, link_of(SUBSCRIBER)).run(),
-        PUBLISHER: Publisher(settings_of(PUBLISHER), deployment, link_of(PUBLISHER)).run(),
-        PCIE_APP: PcieApp(settings_of(PCIE_APP), boards, link_of(PCIE_APP)).run(),
-    }
-    return {role: (ends[role], coroutine) for role, coroutine in running.items()}
+    services: list[Service] = [
+        Subscriber(settings_of(Subscriber.role), deployment, link_of(Subscriber.role)),
+        Publisher(settings_of(Publisher.role), deployment, link_of(Publisher.role)),
+        PcieApp(settings_of(PcieApp.role), boards, link_of(PcieApp.role)),
+    ]
+    return {service.role: (ends[service.role], service.run()) for service in services}

@@ -20,24 +20,21 @@ from services.boards.deployed import TICK, DeployedBoards
 from services.boards.frames import frame_failed, result_record
 from services.settings import Settings
 from services.sockets.records import AnyRecord, FrameRequest, LossReason, Notice, Ready, Record
-from services.sockets.reporting import serve_status
-from services.sockets.serving import MakeLink, report_failure
-from services.sockets.status import FrameCounts, ProcessStatus, reasons, seconds_since
-from terminal.logs import get_logger
+from services.sockets.serving import MakeLink, Service
+from services.sockets.status import FrameCounts, ProcessStatus
 
 ROLE = "pcie-app"
 Result = TypeVar("Result")
 
 
-class PcieApp:
+class PcieApp(Service):
     """Service that computes the frames of a master."""
 
+    role = ROLE
+
     def __init__(self, settings: Settings, boards: DeployedBoards, link: MakeLink) -> None:
-        self._settings = settings
+        super().__init__(settings, link)
         self._boards = boards
-        self._link = link(self._take)
-        self._logs_frames = settings.log_level == "debug"
-        self._log = get_logger(ROLE, settings.log_level)
         # Number of the frame on the boards, and of the master that sent it: a later master must not get the result.
         self._posted: tuple[int, int] | None = None
         # A frame that came while the boards were busy. A master waits for its result before it sends another one,
@@ -54,36 +51,25 @@ class PcieApp:
         self._asked = self._computed = self._failed = 0
         self._last: tuple[int, int, FrameOutput] | None = None
 
-    async def run(self) -> int:
-        """Serve until cancelled.
-
-        Raises:
-            PcieShimError: The boards cannot be opened, or a board came back with another image.
-            OutdatedError: A master uses the current content of the folder, and this service an earlier one.
-        """
-        settings = self._settings
-        status = serve_status(settings.run_directory, ROLE, self.status, metrics=settings.metrics)
-        async with self._link, status:
-            try:
-                self._opened = await _in_thread(self._boards.open)
-                self._link.keep(Ready(self._opened))
-                while True:
-                    await asyncio.sleep(TICK)
-                    if self._error is not None:
-                        raise self._error
-                    if self._posted is not None and self._boards.is_late:
-                        self._collect()
-                    elif self._boards.gone and self._searching is None:
-                        for board in await _in_thread(self._boards.recover):
-                            self._link.send(Notice("info", f"board {board} is back, programmed"))
-            except PcieShimError as error:
-                await report_failure(self._link, error)
-                raise
-            finally:
-                self._unwatch()
-                if self._searching is not None:
-                    self._searching.cancel()
-                self._boards.close()
+    async def _serve(self) -> None:
+        """Keep the boards open, or raise a PcieShimError: one cannot be opened, or came back with another image."""
+        try:
+            self._opened = await _in_thread(self._boards.open)
+            self._link.keep(Ready(self._opened))
+            while True:
+                await asyncio.sleep(TICK)
+                if self._error is not None:
+                    raise self._error
+                if self._posted is not None and self._boards.is_late:
+                    self._collect()
+                elif self._boards.gone and self._searching is None:
+                    for board in await _in_thread(self._boards.recover):
+                        self._link.send(Notice("info", f"board {board} is back, programmed"))
+        finally:
+            self._unwatch()
+            if self._searching is not None:
+                self._searching.cancel()
+            self._boards.close()
 
     def status(self) -> ProcessStatus:
         """Return the status of this process."""
@@ -94,12 +80,8 @@ class PcieApp:
             why=gone or self._opened or "waiting for the boards to be opened and programmed",
             deployment=self._boards.deployment.hash,
             boards=self._boards.status(output),
-            frames=FrameCounts(
-                received=self._asked,
-                completed=self._computed,
-                lost=reasons({LossReason.FAILED: self._failed}),
-                last_number=number or None,
-                last_age_s=seconds_since(tick),
+            frames=FrameCounts.of(
+                self._asked, self._computed, {LossReason.FAILED: self._failed}, (number, tick)
             ),
         )
 

@@ -12,7 +12,6 @@ from typing import NoReturn
 import msgspec
 
 from bridge.client import State
-from bridge.errors import BridgeError
 from services.pipeline.connections import (
     CHECK_INTERVAL,
     SETTLED_TIME,
@@ -23,24 +22,19 @@ from services.pipeline.connections import (
 from services.pipeline.result_topics import RESULTS_DEPTH, ROLE, ResultTopics
 from services.settings import Settings
 from services.sockets.records import AnyRecord, Begin, Outcome, Publish, Published, Ready, Rosbridge
-from services.sockets.reporting import serve_status
-from services.sockets.serving import MakeLink, report_failure
-from services.sockets.status import (
-    FrameCounts,
-    ProcessStatus,
-    connections,
-    reasons,
-    seconds_since,
-    why_not_connected,
-)
-from terminal.logs import get_logger
+from services.sockets.serving import MakeLink, Service
+from services.sockets.status import FrameCounts, ProcessStatus, connections, why_not_connected
+from terminal.signals import until_one_ends
 from toolchain.deployment import Deployment
 
 
-class Publisher:
+class Publisher(Service):
     """Service that publishes the results of a master."""
 
+    role = ROLE
+
     def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
+        super().__init__(settings, link)
         self._topics = ResultTopics(settings, deployment)
         # Results that could not be published at once. While `_draining`, later ones join them, so that all stay in
         # order: until the topics are advertised, and then until the queue is empty.
@@ -48,11 +42,7 @@ class Publisher:
         self._draining = True
         # Set by the master's `Begin`: the only result must be seen on the wire, or be an error.
         self._once = False
-        self._link = link(self._take)
         self._deployment = deployment
-        self._logs_frames = settings.log_level == "debug"
-        self._log = get_logger(ROLE, settings.log_level)
-        self._settings = settings
         # The sentence about topics and servers once they are advertised; empty before.
         self._where = ""
         # For the status: outcomes so far, and the last published frame's number and time (monotonic, ns).
@@ -66,21 +56,17 @@ class Publisher:
         why = why_not_connected(self._topics.rosbridges)
         if not why and not self._where:
             why = "waiting for the topics to be advertised"
-        number, tick = self._last
         outcomes = self._outcomes
         return ProcessStatus(
             ready=not why,
             why=why or self._where,
             deployment=self._deployment.hash,
             connections=connections(self._topics.rosbridges),
-            frames=FrameCounts(
-                received=outcomes.total() + self._waiting.qsize(),
-                completed=outcomes[Outcome.PUBLISHED],
-                lost=reasons(
-                    {reason: count for reason, count in outcomes.items() if reason is not Outcome.PUBLISHED}
-                ),
-                last_number=number or None,
-                last_age_s=seconds_since(tick),
+            frames=FrameCounts.of(
+                outcomes.total() + self._waiting.qsize(),
+                outcomes[Outcome.PUBLISHED],
+                {reason: count for reason, count in outcomes.items() if reason is not Outcome.PUBLISHED},
+                self._last,
             ),
         )
 
@@ -170,27 +156,11 @@ class Publisher:
             self._report(published)
             self._draining = not self._waiting.empty()
 
-    async def run(self) -> int:
-        """Serve until a signal, or raise a BridgeError if a server is unreachable or not a rosbridge server."""
-        settings = self._settings
-        status = serve_status(settings.run_directory, ROLE, self.status, metrics=settings.metrics)
-        async with self._link, status:
-            try:
-                async with self._topics.opened(self._state_changed) as where:
-                    await self._check_delivery(settled=False)
-                    self._where = where
-                    self._link.keep(Ready(where))
-                    self._draining = False
-                    tasks = [
-                        asyncio.ensure_future(each)
-                        for each in (self._publish_waiting(), self._keep_checking())
-                    ]
-                    try:
-                        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-                        return ended.pop().result()
-                    finally:
-                        for task in tasks:
-                            task.cancel()
-            except BridgeError as error:
-                await report_failure(self._link, error)
-                raise
+    async def _serve(self) -> None:
+        """Publish, or raise a BridgeError if a server is unreachable or not a rosbridge server."""
+        async with self._topics.opened(self._state_changed) as where:
+            await self._check_delivery(settled=False)
+            self._where = where
+            self._link.keep(Ready(where))
+            self._draining = False
+            await until_one_ends(self._publish_waiting(), self._keep_checking())

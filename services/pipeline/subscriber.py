@@ -21,17 +21,8 @@ from services.pipeline.frames import FrameAssembler
 from services.settings import Settings
 from services.sockets.local_socket import MAX_RECORD
 from services.sockets.records import AnyRecord, Begin, LossReason, Notice, Reading, Ready, Rosbridge, Unusable
-from services.sockets.reporting import serve_status
-from services.sockets.serving import MakeLink, report_failure
-from services.sockets.status import (
-    FrameCounts,
-    ProcessStatus,
-    connections,
-    reasons,
-    seconds_since,
-    why_not_connected,
-)
-from terminal.logs import get_logger
+from services.sockets.serving import MakeLink, Service
+from services.sockets.status import FrameCounts, ProcessStatus, connections, seconds_since, why_not_connected
 from toolchain.deployment import Deployment, Source
 
 ROLE = "subscriber"
@@ -60,11 +51,13 @@ async def newest_message(subscription: Subscription, message: Message) -> tuple[
     return message, older
 
 
-class Subscriber:
+class Subscriber(Service):
     """Service that sends readings of a deployment's topics to a master, as addresses of columns."""
 
+    role = ROLE
+
     def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
-        self._settings = settings
+        super().__init__(settings, link)
         self._deployment = deployment
         self._assembler = FrameAssembler(deployment)
         # At the assembler's deadline (monotonic, ns), `_wake` forwards the readings that are due.
@@ -76,9 +69,6 @@ class Subscriber:
         self._begun = asyncio.Event()
         self._once = False
         self._lost: asyncio.Future[None] | None = None
-        self._logs_frames = settings.log_level == "debug"
-        self._log = get_logger(ROLE, settings.log_level)
-        self._link = link(self._take)
         # Connections by URI, from their first attempt on, and the subscriptions of this run.
         self._rosbridges: dict[str, Ros] = {}
         self._subscriptions: list[Subscription] = []
@@ -119,20 +109,17 @@ class Subscriber:
             why=why or f"connected to {', '.join(self._rosbridges)}",
             deployment=self._deployment.hash,
             connections=connections(self._rosbridges),
-            frames=FrameCounts(
-                received=self._received,
-                completed=self._completed,
-                lost=reasons(
-                    {
-                        LossReason.PASSED_OVER: self._passed_over,
-                        LossReason.TOO_LARGE: sum(each.discarded for each in self._subscriptions),
-                        LossReason.UNUSABLE: self._unusable,
-                        LossReason.UNPAIRED: self._assembler.unpaired,
-                    }
-                ),
-                without=dict(self._assembler.absent),
-                last_number=None,
-                last_age_s=age,
+            frames=FrameCounts.of(
+                self._received,
+                self._completed,
+                {
+                    LossReason.PASSED_OVER: self._passed_over,
+                    LossReason.TOO_LARGE: sum(each.discarded for each in self._subscriptions),
+                    LossReason.UNUSABLE: self._unusable,
+                    LossReason.UNPAIRED: self._assembler.unpaired,
+                },
+                (0, self._last_tick),
+                self._assembler.absent,
             ),
         )
 
@@ -150,54 +137,45 @@ class Subscriber:
         elif state is State.CONNECTED and self._begun.is_set():
             self._link.notice("info", f"rosbridge at {uri} is connected again")
 
-    async def run(self) -> int:
-        """Serve until a signal.
+    async def _serve(self) -> None:
+        """Send readings.
 
         Raises:
             BridgeError: A server is unreachable, or no message of a topic arrives in time.
             RosbridgeLostError: A run with `--once` lost its server.
         """
-        settings = self._settings
-        sources = self._deployment.sources
+        settings, sources = self._settings, self._deployment.sources
         self._lost = asyncio.get_running_loop().create_future()
-        status = serve_status(settings.run_directory, ROLE, self.status, metrics=settings.metrics)
-        async with self._link, status, contextlib.AsyncExitStack() as stack:
-            try:
-                uris = [source.uri for source in sources]
-                by_uri = await connect_all(
-                    stack,
-                    settings,
-                    uris,
-                    self._rosbridges,
-                    on_state=self._state_changed,
-                    max_size=settings.message_bytes,
-                )
-                self._link.keep(Ready(f"connected to {', '.join(by_uri)}"))
-                rosbridges = [by_uri[settings.uri or source.uri] for source in sources]
-                # not only when the boards are programmed, which may take much longer
-                hints = [
-                    asyncio.ensure_future(
-                        report_unpublished(ros, source.topic, partial(self._link.notice, "warning"))
-                    )
-                    for ros, source in zip(rosbridges, sources, strict=True)
-                ]
-                for hint in hints:
-                    stack.callback(hint.cancel)
-                await self._begun.wait()
-                tasks = [
-                    asyncio.ensure_future(self._follow(rosbridges[at], at, source, hints[at]))
-                    for at, source in enumerate(sources)
-                ]
-                for task in tasks:
-                    stack.callback(task.cancel)
-                # the first error ends the service; a topic that is left out ends without one
-                ended, _ = await asyncio.wait([*tasks, self._lost], return_when=asyncio.FIRST_EXCEPTION)
-                for each in ended:
-                    each.result()
-            except Exception as error:
-                await report_failure(self._link, error)
-                raise
-        return 0
+        async with contextlib.AsyncExitStack() as stack:
+            by_uri = await connect_all(
+                stack,
+                settings,
+                [source.uri for source in sources],
+                self._rosbridges,
+                on_state=self._state_changed,
+                max_size=settings.message_bytes,
+            )
+            self._link.keep(Ready(f"connected to {', '.join(by_uri)}"))
+            rosbridges = [by_uri[settings.uri or source.uri] for source in sources]
+            # not only when the boards are programmed, which may take much longer
+            warn = partial(self._link.notice, "warning")
+            hints = [
+                asyncio.ensure_future(report_unpublished(ros, source.topic, warn))
+                for ros, source in zip(rosbridges, sources, strict=True)
+            ]
+            for hint in hints:
+                stack.callback(hint.cancel)
+            await self._begun.wait()
+            tasks = [
+                asyncio.ensure_future(self._follow(rosbridges[at], at, source, hints[at]))
+                for at, source in enumerate(sources)
+            ]
+            for task in tasks:
+                stack.callback(task.cancel)
+            # the first error ends the service; a topic that is left out ends without one
+            ended, _ = await asyncio.wait([*tasks, self._lost], return_when=asyncio.FIRST_EXCEPTION)
+            for each in ended:
+                each.result()
 
     async def _follow(self, ros: Ros, at: int, source: Source, hint: asyncio.Future[None]) -> None:
         subscription = ros.subscribe(

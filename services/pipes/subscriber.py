@@ -14,6 +14,7 @@ from services.settings import Settings
 from services.sockets.records import Reading
 from terminal.connection import report_wait
 from terminal.output import print_json_line, say, warn
+from terminal.signals import until_one_ends
 from toolchain.deployment import Deployment, Source
 
 
@@ -130,14 +131,8 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
 
         for source in deployment.sources:
             say(f"listening on {source.topic} at {settings.uri or source.uri}")
-        work = [print_all(), *(follow(at, source) for at, source in enumerate(deployment.sources))]
-        tasks = [asyncio.ensure_future(each) for each in work]
-        try:
-            ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            # the printing has ended, or one of them has failed
-            for each in ended:
-                each.result()
-        finally:
-            for task in tasks:
-                task.cancel()
+        # the printing ends, or one of them fails
+        await until_one_ends(
+            print_all(), *(follow(at, source) for at, source in enumerate(deployment.sources))
+        )
     return 0

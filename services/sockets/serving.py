@@ -1,4 +1,4 @@
-"""The service side of a local socket, which listens and serves one master at a time.
+"""The services of a run, and their side of a local socket, which serves one master at a time.
 
 master ──connects──▶ service   a second one is refused with `Trouble`
 ◀───Hello────           role, version, deployment
@@ -12,7 +12,7 @@ import socket
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 from pcie_shim.credentials import read_key
 from pcie_shim.endpoint import Endpoint, listen, parse_endpoint, remove_listener
@@ -21,7 +21,10 @@ from services.errors import OtherPeerError, OutdatedError, SettingsError
 from services.settings import Settings
 from services.sockets.local_socket import RecordProtocol, check_hello, own_hello
 from services.sockets.records import AnyRecord, Hello, Notice, Record, Trouble
+from services.sockets.reporting import check_metrics, serve_status
+from services.sockets.status import ProcessStatus
 from terminal.errors import ExitCode, exit_code_of
+from terminal.logs import get_logger
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 
@@ -202,9 +205,63 @@ class MasterLink(Link):
             self._unsaid.append(record)
 
 
-def listening(endpoint: Endpoint, role: str, deployment: Deployment) -> MakeLink:
-    """Return the function that creates a link over a local socket at this endpoint."""
+def listening(
+    listen: str, role: str, settings: Settings, deployment: Deployment, *, insecure: bool
+) -> MakeLink:
+    """Return the function that creates a link over a local socket at the endpoint of `--listen`.
+
+    Raises:
+        SettingsError: It is not an endpoint, or other machines could reach it, or the metrics.
+    """
+    check_metrics(settings.metrics, insecure=insecure)
+    endpoint = endpoint_from(listen, "--listen")
+    if endpoint.host and not insecure and not endpoint.is_loopback:
+        raise SettingsError(
+            f"--listen {listen} lets everybody on that network compute frames and read results; "
+            "use unix:PATH or a loopback address, or give --insecure if that is intended"
+        )
     return lambda on_record: MasterLink(endpoint, role, deployment, on_record)
+
+
+class Service:
+    """A service of a run, which works for one master at a time through its link, and reports its status."""
+
+    role: ClassVar[str]
+
+    def __init__(self, settings: Settings, link: MakeLink) -> None:
+        self._settings = settings
+        self._link = link(self._take)
+        self._log = get_logger(self.role, settings.log_level)
+        # Whether each frame is logged, because its texts take time.
+        self._logs_frames = settings.log_level == "debug"
+
+    async def run(self) -> int:
+        """Serve until cancelled, or until an error, which the master is told.
+
+        Raises:
+            OutdatedError: A master uses the current content of the folder, and this service an earlier one.
+        """
+        settings = self._settings
+        status = serve_status(settings.run_directory, self.role, self.status, metrics=settings.metrics)
+        async with self._link, status:
+            try:
+                await self._serve()
+            except Exception as error:
+                await report_failure(self._link, error)
+                raise
+        return 0
+
+    def status(self) -> ProcessStatus:
+        """Return the status of this process."""
+        raise NotImplementedError
+
+    def _take(self, record: AnyRecord) -> None:
+        """Handle a record of the master."""
+        raise NotImplementedError
+
+    async def _serve(self) -> None:
+        """Do the work; the link is open."""
+        raise NotImplementedError
 
 
 async def report_failure(link: Link, error: BaseException) -> None:
@@ -296,18 +353,3 @@ def board_endpoint(text: str, where: str, settings: Settings) -> Endpoint:
     if not endpoint.host or settings.key_file is None:
         return endpoint
     return replace(endpoint, key=read_key(settings.key_file))
-
-
-def own_endpoint(text: str, *, insecure: bool) -> Endpoint:
-    """Return the endpoint at which a service serves its master.
-
-    Raises:
-        SettingsError: It is not an endpoint, or other machines could reach it.
-    """
-    endpoint = endpoint_from(text, "--listen")
-    if endpoint.host and not insecure and not endpoint.is_loopback:
-        raise SettingsError(
-            f"--listen {text} lets everybody on that network compute frames and read results; "
-            "use unix:PATH or a loopback address, or give --insecure if that is intended"
-        )
-    return endpoint

@@ -58,6 +58,26 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
     # Of the subscriber: readings without a topic that may be missing and was alive, by topic.
     without: dict[str, int] = msgspec.field(default_factory=dict)
 
+    @classmethod
+    def of(
+        cls,
+        received: int,
+        completed: int,
+        lost: Mapping[Reason, int],
+        last: tuple[int, int],
+        without: Mapping[str, int] | None = None,
+    ) -> FrameCounts:
+        """Return counts: `lost` without zeros; `last` is a number and a time (monotonic ns), each 0 if there is none."""
+        number, tick = last
+        return cls(
+            received=received,
+            completed=completed,
+            lost={str(reason): count for reason, count in lost.items() if count},
+            last_number=number or None,
+            last_age_s=seconds_since(tick),
+            without=dict(without or {}),
+        )
+
 
 class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
     """A board, as it reports itself, or as pcie-app sees it."""
@@ -178,11 +198,6 @@ def why_not_connected(rosbridges: Mapping[str, Ros]) -> str:
             reason = f" ({ros.last_error})" if ros.last_error else ""
             return f"waiting for the rosbridge server at {uri}{reason}"
     return ""
-
-
-def reasons(counts: Mapping[Reason, int]) -> dict[str, int]:
-    """Return the counts that are not 0."""
-    return {reason: count for reason, count in dict(counts).items() if count}
 
 
 # --- asking -----------------------------------------------------------------------------------------

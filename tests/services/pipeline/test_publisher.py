@@ -102,6 +102,7 @@ async def test_results_stay_in_order_while_the_queue_drains(boat, link):
     assert topics.published == [1, 2, 3, 4, 5]
     assert publisher.status().frames.completed == 5
     task.cancel()
+    await asyncio.wait([task])
 
 
 async def test_the_master_learns_that_no_server_is_there_and_that_one_is_back(boat, link):

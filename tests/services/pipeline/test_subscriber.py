@@ -131,7 +131,7 @@ def test_the_status_shows_the_time_without_readings(boat, link, monkeypatch):
 @pytest.mark.parametrize("once", [True, False])
 async def test_only_a_single_reading_needs_a_server_that_stays(boat, link, tmp_path, monkeypatch, once):
     serving = Mock(return_value=contextlib.nullcontext())
-    monkeypatch.setattr("services.pipeline.subscriber.serve_status", serving)
+    monkeypatch.setattr("services.sockets.serving.serve_status", serving)
     async with FakeRosbridge() as fake:
         subscriber = Subscriber(Settings(uri=fake.uri, run_directory=tmp_path), boat, link.make)
         async with running(subscriber, link) as task:
