@@ -13,9 +13,8 @@ from pathlib import Path
 
 from bridge.errors import BridgeError
 from casestudies import CaseStudyError
+from services.child import ask_for_end_with_parent, own_command
 from services.errors import StackError
-from services.supervision.child import own_command
-from services.supervision.parent import ask_for_end_with_parent
 from terminal.errors import ExitCode, StoppedError
 from terminal.signals import run_async
 from toolchain.errors import ToolchainError

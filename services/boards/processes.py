@@ -16,12 +16,11 @@ from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.board.server import Board, StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint, is_served
 from services.boards.hardware import SimulatedHardware
+from services.child import ForkedChild, end_all
 from services.errors import BoardFailedError, SettingsError
 from services.settings import Settings, endpoint_in
-from services.sockets.reporting import STUCK_S, serve_status_in_thread, shifted
+from services.sockets.reporting import STUCK_S, ServiceManager, serve_status_in_thread, shifted
 from services.sockets.status import BoardStatus, ProcessStatus
-from services.supervision.child import ForkedChild, end_all
-from services.supervision.service_manager import ServiceManager
 from terminal.logs import PARENT_VARIABLE, name_process
 from terminal.output import say
 from terminal.run_directory import remove_stale_sockets

@@ -15,12 +15,12 @@ from pcie_shim.endpoint import Endpoint
 from services.boards.deployed import images_of
 from services.boards.hardware import Engine, SimulatedHardware
 from services.boards.processes import BoardProcesses, serve_one
+from services.child import RESTARTS
 from services.commands import flags as options
 from services.errors import SettingsError
 from services.settings import Settings
 from services.sockets.reporting import check_metrics
 from services.sockets.serving import deployment_for, endpoint_from
-from services.supervision.child import RESTARTS
 from terminal.command_line import CommandLine
 from terminal.logs import PARENT_VARIABLE, name_process
 from terminal.output import say

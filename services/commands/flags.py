@@ -5,8 +5,8 @@ from typing import Annotated, Any, TypeAlias
 
 import typer
 
+from services.child import end_with_parent
 from services.settings import ENV_PREFIX, Settings, load_settings
-from services.supervision.parent import end_with_parent
 from terminal.flags import Group, expanded, flags_of
 
 

@@ -11,7 +11,7 @@ from services.commands import flags as options
 from services.errors import SettingsError
 from services.output.listener import show_frames
 from services.output.posterior_file import open_result_file
-from services.output.posterior_lines import drawing, print_json, print_line
+from services.output.posterior_output import drawing, print_json, print_line
 from services.settings import LONGEST_S, Settings
 from services.sockets.serving import deployment_for
 from terminal.command_line import CommandLine

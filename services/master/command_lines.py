@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from pcie_shim.endpoint import Endpoint
+from services.child import RESTARTS, own_command
 from services.settings import Settings
 from services.sockets.reporting import shifted
-from services.supervision.child import RESTARTS, own_command
 
 METRICS_PORTS = {"subscriber": 1, "publisher": 2, "pcie-app": 3, "board": 4}
 """Ports of the processes' metrics, counted from the master's; board N has the N-th after that of board 0."""

@@ -5,12 +5,15 @@ subscriber ─reading─▶ [waiting] ─frame─▶ pcie-app ─result─▶ pu
 
 import asyncio
 import time
+from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 from structlog.typing import FilteringBoundLogger
 
+from services.child import RESTARTS
 from services.errors import (
     BoardFailedError,
     OverflowedQueueError,
@@ -18,7 +21,6 @@ from services.errors import (
     RosbridgeLostError,
     VariableError,
 )
-from services.master.latencies import Latencies
 from services.master.peers import ANSWER_TIME, Awaited, Peer, Peers
 from services.pipeline.frames import WaitingFrames
 from services.settings import Settings
@@ -36,12 +38,20 @@ from services.sockets.records import (
     Reading,
     Unusable,
 )
-from services.sockets.status import FrameCounts
-from services.supervision.child import RESTARTS
+from services.sockets.status import BUCKETS_S, FrameCounts, StageLatency
 from toolchain.deployment import Deployment
 
 MOST_AT_PUBLISHER = 8
 """Maximum number of results that the publisher has not acknowledged; frames wait when it is reached."""
+
+REMEMBERED = 1000
+"""Number of frames over which quantiles are computed."""
+
+_STAGES = (
+    *("rosbridge_in", "waited", "register_writes", "compute", "reads", "rosbridge_out"),
+    *("local_hops", "frame"),
+)
+"""The stages in the order of a frame's path, the time between the processes, and the whole frame."""
 
 _LOSSES = {
     Outcome.NO_POSTERIOR: LossReason.NO_POSTERIOR,
@@ -65,6 +75,52 @@ class _Computing:
     number: int
     waiting: WaitingReading
     sent: int
+
+
+class Latencies:
+    """Quantiles over the last published frames, and counts over all of them."""
+
+    def __init__(self) -> None:
+        # A ring with a row for each of the last frames and a column for each stage, in ns.
+        self._times = np.zeros((REMEMBERED, len(_STAGES)), np.int64)
+        # Over all frames: their number, and for each stage the sum and the counts of the buckets.
+        self._frames = 0
+        self._sums_ns = [0] * len(_STAGES)
+        self._counts = [[0] * (len(BUCKETS_S) + 1) for _ in _STAGES]
+
+    def add(self, publish: Publish, published: Published) -> None:
+        """Add a published frame."""
+        result, total = publish.result, published.total_ns
+        stages = (
+            publish.reading_sent_tick - publish.received_tick,
+            publish.waited_ns,
+            *(result.register_writes_ns, result.compute_ns, result.reads_ns),
+            published.out_ns,
+        )
+        times = [max(0, spent) for spent in (*stages, total - sum(stages), total)]
+        self._times[self._frames % REMEMBERED] = times
+        self._frames += 1
+        for at, spent in enumerate(times):
+            self._sums_ns[at] += spent
+            self._counts[at][bisect_left(BUCKETS_S, spent / 1e9)] += 1
+
+    def summary(self) -> list[StageLatency]:
+        """Return the latencies of each stage; none before the first frame."""
+        known = min(self._frames, REMEMBERED)
+        if not known:
+            return []
+        p50, p99 = np.percentile(self._times[:known], (50, 99), axis=0, method="nearest") / 1e6
+        return [
+            StageLatency(
+                stage=stage,
+                p50_ms=round(float(p50[at]), 3),
+                p99_ms=round(float(p99[at]), 3),
+                frames=self._frames,
+                sum_s=self._sums_ns[at] / 1e9,
+                buckets=list(self._counts[at]),
+            )
+            for at, stage in enumerate(_STAGES)
+        ]
 
 
 class FrameFlow:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from structlog.typing import FilteringBoundLogger
 
 from pcie_shim.endpoint import Endpoint
+from services.child import RESTARTS, Child, end_all
 from services.errors import (
     BoardFailedError,
     ChildDiedError,
@@ -34,7 +35,6 @@ from services.sockets.local_socket import RecordProtocol, check_hello, open_conn
 from services.sockets.records import AnyRecord, Begin, Notice, Ready, Rosbridge, Trouble
 from services.sockets.serving import board_endpoints, endpoint_from
 from services.sockets.status import PeerStatus
-from services.supervision.child import RESTARTS, Child, end_all
 from terminal.errors import ExitCode
 from terminal.output import say
 from terminal.run_directory import LockedRunDirectory

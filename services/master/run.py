@@ -6,13 +6,14 @@ import sys
 import time
 from collections.abc import Coroutine, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from services.errors import NoDataError
 from services.master.flow import FrameFlow
 from services.master.peers import ROLE, Peer, Peers
 from services.output.axes import deployment_axes
-from services.output.master_output import print_json, sentence
+from services.output.master_output import posterior_of, print_json, sentence
+from services.output.posterior_output import Show, drawing
 from services.settings import Settings
 from services.sockets.records import LossReason, Publish, Published
 from services.sockets.reporting import STUCK_S, serve_status
@@ -23,9 +24,6 @@ from terminal.logs import get_logger
 from terminal.output import say, show_progress
 from terminal.run_directory import OccupiedError
 from toolchain.deployment import Deployment
-
-if TYPE_CHECKING:
-    from services.output.posterior_lines import Show
 
 ASK_EVERY = 5.0
 """Seconds between two checks whether all children make progress."""
@@ -99,18 +97,13 @@ class Master:
             if not self._once and sys.stderr.isatty() and not shown:
                 self._begin_task(self._show_progress())
             self._begin_task(self._expect_data())
-            if not self._plot:
+            with drawing() if self._plot else contextlib.nullcontext() as show:
+                if show is not None:
+                    self._begin_task(self._keep_drawing(show))
                 await peers.start(self._flow)
                 await self._flow.end
-            else:
-                # rich takes long to load
-                from services.output.posterior_lines import drawing
-
-                with drawing() as show:
-                    self._begin_task(self._keep_drawing(show))
-                    await peers.start(self._flow)
-                    await self._flow.end
-                    # the last one, which may be newer than the last picture
+                # the last one, which may be newer than the last picture
+                if show is not None:
                     self._draw(show)
         finally:
             for task in self._tasks:
@@ -209,15 +202,13 @@ class Master:
                 show_progress(f"{ROLE}: {published}{of} results, {rate:.0f} a second{newest}")
             before, count = now, published
 
-    async def _keep_drawing(self, show: "Show") -> None:
+    async def _keep_drawing(self, show: Show) -> None:
         while True:
             await asyncio.sleep(_DRAWN_EVERY)
             self._draw(show)
 
-    def _draw(self, show: "Show") -> None:
+    def _draw(self, show: Show) -> None:
         """Draw the newest posterior, unless it is drawn already."""
-        from services.output.newest_posterior import posterior_of
-
         newest = self._flow.newest
         if newest is None or newest is self._drawn:
             return

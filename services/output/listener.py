@@ -10,7 +10,7 @@ from posteriors.posterior import MAX_RESULT, Posterior
 from services.errors import SettingsError
 from services.output.axes import Axis, axes_of
 from services.output.posterior_file import ResultFile
-from services.output.posterior_lines import Show
+from services.output.posterior_output import Show
 from services.settings import Settings
 from terminal.connection import report_connection
 from terminal.output import say, warn

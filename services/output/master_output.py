@@ -1,10 +1,13 @@
-"""Output of results by `master`: one JSON object per line, or one sentence."""
+"""Output of results by `master`: one JSON object per line, one sentence, or the newest posterior to draw."""
 
+import time
 from collections.abc import Sequence
 
+from posteriors.posterior import Posterior
 from services.errors import StackError
 from services.output.axes import Axis, deployment_axes, in_words
-from services.sockets.records import Published
+from services.pipeline.inference import infer, report_of
+from services.sockets.records import Publish, Published
 from terminal.output import print_json_line
 from toolchain.deployment import Deployment
 
@@ -51,3 +54,20 @@ def _cell(axes: Sequence[Axis], line: int) -> dict[str, int]:
     for axis in reversed(axes):
         line, indices[axis.label] = divmod(line, axis.size)
     return {axis.label: indices[axis.label] for axis in axes}
+
+
+def posterior_of(publish: Publish, deployment: Deployment) -> Posterior | None:
+    """Return the posterior of a computed frame with its report, or None if all counts were 0."""
+    inference = infer(publish.result, deployment)
+    if inference.posterior is None:
+        return None
+    dimensions = deployment.result_dimensions
+    # the result has not been sent to the robot yet, so the time of that stage is 0
+    now = time.time_ns(), time.monotonic_ns()
+    return Posterior(
+        probabilities=tuple(inference.posterior.tolist()),
+        labels=tuple(dimension.label for dimension in dimensions),
+        sizes=tuple(dimension.size for dimension in dimensions),
+        heard_ns=now[0],
+        report=report_of(publish, inference, deployment, now=now, previous_out_ns=0),
+    )

@@ -1,14 +1,16 @@
 """The status of a stack on one screen: readiness, processes, connections and boards."""
 
-from __future__ import annotations
-
 import asyncio
+import contextlib
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
 
 from services.errors import SettingsError
 from services.sockets.status import (
@@ -20,10 +22,6 @@ from services.sockets.status import (
     ask_stack,
 )
 from terminal.errors import ExitCode
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
-    from rich.table import Table
 
 _WATCH_INTERVAL = 1.0
 _PLAIN_WIDTH = 140
@@ -43,9 +41,6 @@ def plain(text: str) -> str:
 
 def screen(stack: StackStatus) -> RenderableType:
     """Return one screen with the status of a stack."""
-    from rich.console import Group
-    from rich.text import Text
-
     # a table appears only if it has rows: a hub alone needs two lines
     parts: list[RenderableType] = [*_verdict(stack), _processes(stack)]
     if any(process.connections for process in stack.processes):
@@ -62,8 +57,6 @@ def screen(stack: StackStatus) -> RenderableType:
 
 
 def _verdict(stack: StackStatus) -> Iterator[RenderableType]:
-    from rich.text import Text
-
     if stack.ready:
         yield Text(f"{stack.directory}: all {len(stack.processes)} processes are ready", "green")
     else:
@@ -78,8 +71,6 @@ def _verdict(stack: StackStatus) -> Iterator[RenderableType]:
 
 
 def _processes(stack: StackStatus) -> Table:
-    from rich.text import Text
-
     # a process does not know how often it was restarted: the master does, or the parent of a board
     restarts = {peer.name: peer.restarts for process in stack.processes for peer in process.peers}
     table = _table("process", "ready")
@@ -120,8 +111,6 @@ def _stages(process: ProcessStatus) -> Table:
 
 
 def _connections(stack: StackStatus) -> Table:
-    from rich.text import Text
-
     table = _table("rosbridge of", "server", "state", "reconnections")
     for process in stack.processes:
         for connection in process.connections:
@@ -135,8 +124,6 @@ def _connections(stack: StackStatus) -> Table:
 
 
 def _boards(boards: list[BoardStatus]) -> Table:
-    from rich.text import Text
-
     table = _table("board", "state", "image", "restarts", "last cycles", "endpoint")
     for board in boards:
         table.add_row(
@@ -151,8 +138,6 @@ def _boards(boards: list[BoardStatus]) -> Table:
 
 
 def _table(*headings: str) -> Table:
-    from rich.table import Table
-
     table = Table(box=None, pad_edge=False)
     for heading in headings:
         table.add_column(heading)
@@ -210,9 +195,6 @@ async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) 
     Raises:
         SettingsError: No process answers, or a master is needed and does not answer, and `watch` is false.
     """
-    from rich.console import Console
-    from rich.live import Live
-
     # in a file or a pipe, lines are not wrapped to the width of a terminal, and nothing is overwritten
     terminal = sys.stdout.isatty()
     console = Console(width=None if terminal else _PLAIN_WIDTH, highlight=False)
@@ -228,9 +210,7 @@ async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) 
             # one screen after another, for a log
             console.print(screen(stack))
 
-    if live is not None:
-        live.start()
-    try:
+    with live or contextlib.nullcontext():
         while True:
             # with --watch, a stack that is gone may come back
             stack = await ask_stack(directory)
@@ -243,9 +223,6 @@ async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) 
             if not watch:
                 return ExitCode.DONE if stack.ready else ExitCode.CHILD
             await asyncio.sleep(_WATCH_INTERVAL)
-    finally:
-        if live is not None:
-            live.stop()
     raise SettingsError(
         f"no rosbayes process answers in {directory}{_silence(stack.silent)}; "
         "is the stack running, with this --run-directory?"

@@ -17,10 +17,10 @@ import pytest
 from pcie_shim.endpoint import Endpoint
 from services.boards import processes
 from services.boards.processes import BoardProcesses
+from services.child import ForkedChild
 from services.errors import BoardFailedError, SettingsError
 from services.settings import Settings
 from services.sockets.reporting import STUCK_S
-from services.supervision.child import ForkedChild
 from tests.patience import PROCESS_PATIENCE, PRODUCT_LIMITS
 
 BOARD = str(Path(sys.executable).parent / "board")

@@ -6,6 +6,7 @@ Run.read ──▶ FrameFlow ──▶ app.frames;  computed(), failed() ──�
 import msgspec
 import pytest
 
+from services.child import RESTARTS
 from services.errors import (
     BoardFailedError,
     OverflowedQueueError,
@@ -27,7 +28,6 @@ from services.sockets.records import (
     Rosbridge,
     Unusable,
 )
-from services.supervision.child import RESTARTS
 from tests.services.master.conftest import Run
 
 RAW = msgspec.Raw(b"\xc1")  # bytes that no decoder takes

@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from services.master.latencies import REMEMBERED, Latencies
+from services.master.flow import REMEMBERED, Latencies
 from services.sockets.records import FrameResult, Outcome, Publish, Published
 
 MS = 1_000_000

@@ -8,13 +8,13 @@ from unittest.mock import AsyncMock, Mock
 
 import pytest
 
+from services.child import RESTARTS, Child
 from services.errors import BoardFailedError, ChildDiedError, ReportedError, SettingsError
 from services.master.peers import Awaited, Peer, Peers
 from services.settings import Settings
 from services.sockets.local_socket import open_connection, own_hello
 from services.sockets.records import Begin, Ready, Trouble
 from services.sockets.serving import endpoint_from
-from services.supervision.child import RESTARTS, Child
 from terminal.logs import get_logger
 from tests.patience import PATIENCE, PROCESS_PATIENCE
 

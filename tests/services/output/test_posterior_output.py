@@ -20,8 +20,7 @@ from services.output import posterior_file
 from services.output.axes import Axis, axes_of
 from services.output.master_output import print_json, sentence
 from services.output.posterior_file import open_result_file, record
-from services.output.posterior_lines import drawing, line
-from services.output.posterior_picture import ROWS, picture
+from services.output.posterior_output import ROWS, drawing, line, picture
 from services.sockets.records import Outcome, Published
 from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source
 

@@ -10,9 +10,8 @@ import pytest
 from services.errors import SettingsError
 from services.sockets import reporting
 from services.sockets.records import VERSION
-from services.sockets.reporting import Report, serve_status, serve_status_in_thread
+from services.sockets.reporting import Report, ServiceManager, serve_status, serve_status_in_thread
 from services.sockets.status import FrameCounts, ProcessStatus, read_process_status, seconds_since
-from services.supervision.service_manager import ServiceManager
 from terminal.health import NoHealthError, in_thread, serve_health, status_socket
 from terminal.run_directory import remove_stale_sockets
 from tests.patience import PATIENCE

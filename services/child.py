@@ -1,4 +1,4 @@
-"""Child processes: starting, monitoring, restarting and stopping.
+"""Child processes: starting, monitoring, restarting and stopping them, and their end with their parent.
 
 parent ◀─ standard error ──────── child   lines for the user, which are passed on
        ◀─ ROSBAYES_ERROR_DESCRIPTOR       {"error": "the sentence that explains its end"}
@@ -6,6 +6,7 @@ parent ◀─ standard error ──────── child   lines for the user
 
 import asyncio
 import contextlib
+import ctypes
 import os
 import shutil
 import signal
@@ -19,12 +20,11 @@ from typing import Final, NoReturn
 import msgspec
 
 from services.errors import ReportedError, StackError
-from services.supervision.parent import end_with_parent
 from terminal.errors import ExitCode, StoppedError, exit_code_of
 from terminal.logs import PARENT_VARIABLE
 from terminal.output import ERROR_DESCRIPTOR, relay, say_error
 from terminal.run_directory import LockedRunDirectory
-from terminal.signals import ENDING_SIGNALS, raise_on_signals
+from terminal.signals import ENDING_SIGNALS, raise_on_signals, stopped_error
 
 RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 """Environment variable with the folder of status sockets (the setting `run_directory`)."""
@@ -322,3 +322,30 @@ async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
         await child.wait()
         child.close()
     return [child.name for child in stubborn]
+
+
+# --- in the child -----------------------------------------------------------------------------------
+
+_PR_SET_PDEATHSIG = 1
+
+
+def ask_for_end_with_parent() -> None:
+    """Make the kernel send SIGTERM to this process when its parent exits; this survives an exec."""
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+
+
+def end_with_parent() -> None:
+    """In a child: exit with the parent, even after SIGKILL.
+
+    Does nothing in a process without a rosbayes parent.
+
+    Raises:
+        StoppedError: The parent has already ended.
+    """
+    parent = os.environ.get(PARENT_VARIABLE)
+    if parent is None or not parent.isdigit():
+        return
+    ask_for_end_with_parent()
+    # the parent may have exited before the request to the kernel
+    if os.getppid() != int(parent):
+        raise stopped_error(signal.SIGTERM)

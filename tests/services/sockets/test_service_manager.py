@@ -8,9 +8,8 @@ import socket
 import pytest
 
 from services.sockets import reporting
-from services.sockets.reporting import serve_status
+from services.sockets.reporting import ServiceManager, serve_status
 from services.sockets.status import ProcessStatus
-from services.supervision.service_manager import ServiceManager
 from tests.patience import PATIENCE
 
 

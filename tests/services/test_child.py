@@ -11,8 +11,8 @@ import time
 import pytest
 import uvloop
 
+from services.child import LONGEST_LINE, RESTARTS, Child, _Pipe, end_all
 from services.errors import StackError
-from services.supervision.child import LONGEST_LINE, RESTARTS, Child, _Pipe, end_all
 from terminal.errors import ExitCode
 from tests.patience import PATIENCE, PROCESS_PATIENCE
 
@@ -146,7 +146,7 @@ def test_a_stubborn_child_is_killed_and_named(run, tmp_path, ignores, killed):
 
 def test_restarts_are_bounded(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("services.supervision.child.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("services.child.time.monotonic", lambda: now[0])
     one = child("")
     assert [one.may_restart(5.0) for _ in range(RESTARTS + 1)] == [True] * RESTARTS + [False]
     now[0] += 5.1
@@ -164,12 +164,12 @@ def test_a_command_that_is_not_there(run):
 @pytest.mark.process
 def test_a_child_ends_when_its_parent_is_killed(tmp_path):
     child_code = (
-        "import time; from services.supervision.parent import end_with_parent; end_with_parent();"
+        "import time; from services.child import end_with_parent; end_with_parent();"
         f"open({str(tmp_path / 'up')!r}, 'w').close(); time.sleep(1000)"
     )
     parent_code = f"""
 import asyncio, sys, time
-from services.supervision.child import Child
+from services.child import Child
 
 async def main():
     one = Child("tester", [sys.executable, "-c", {child_code!r}])

@@ -1,1 +1,0 @@
-"""Supervision of processes: starting, monitoring and stopping them together."""
