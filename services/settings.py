@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from pcie_shim.endpoint import Endpoint, parse_endpoint
@@ -145,25 +145,15 @@ class Settings(BaseSettings):
             )
         return value
 
-    @field_validator("metrics")
+    @field_validator("boards", "subscriber", "publisher", "pcie_app", "metrics")
     @classmethod
-    def _metrics(cls, value: str) -> str:
+    def _endpoints(cls, value: str | tuple[str, ...], field: ValidationInfo) -> str | tuple[str, ...]:
+        parse = metrics_endpoint if field.field_name == "metrics" else parse_endpoint
         try:
-            if value:
-                metrics_endpoint(value)
-        except SettingsError as error:
+            for text in filter(None, (value,) if isinstance(value, str) else value):
+                parse(text)
+        except (PcieShimError, SettingsError) as error:
             raise ValueError(str(error)) from error
-        return value
-
-    @field_validator("boards", "subscriber", "publisher", "pcie_app")
-    @classmethod
-    def _endpoints(cls, value: str | tuple[str, ...]) -> str | tuple[str, ...]:
-        for text in (value,) if isinstance(value, str) else value:
-            if text:
-                try:
-                    parse_endpoint(text)
-                except PcieShimError as error:
-                    raise ValueError(str(error)) from error
         return value
 
 

@@ -7,17 +7,16 @@ from terminal.logs import log_libraries
 from terminal.output import say, warn
 
 
-def report_wait(uri: str) -> Callable[[str, str], None]:
-    """Return a callback for a client's `on_state` that says at the start that the client waits for its server."""
-    is_missing = False
+def report_waits() -> Callable[[str, str, str], None]:
+    """Return a callback for the states of servers, by URI, that says at the start which of them are waited for."""
+    missing: set[str] = set()
 
-    def on_state(state: str, reason: str) -> None:
-        nonlocal is_missing
+    def on_state(uri: str, state: str, reason: str) -> None:
         if state == "connecting":
-            is_missing = True
+            missing.add(uri)
             say(f"waiting for rosbridge at {uri} ({reason})")
-        elif state == "connected" and is_missing:
-            is_missing = False
+        elif state == "connected" and uri in missing:
+            missing.discard(uri)
             say(f"rosbridge at {uri} is connected")
 
     return on_state

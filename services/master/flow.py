@@ -215,19 +215,16 @@ class FrameFlow:
             case Published():
                 self._take_outcome(record)
             case _:
-                where = peer.protocol.where if peer.protocol else peer.role
-                self._log.warning(
-                    f"{where} sent a {type(record).__name__}, which only another service may send"
-                )
+                where, what = peer.protocol.where if peer.protocol else peer.role, type(record).__name__
+                self._log.warning(f"{where} sent a {what}, which only another service may send")
 
     def lost(self, peer: Peer) -> None:
         """Count the frame or the results lost with a peer."""
         if peer is self._peers.app and self._computing is not None:
             self._losses[LossReason.WITH_APP] += 1
             if self._follows:
-                self._log.debug(
-                    LossReason.WITH_APP, frame=self._computing.number, _reason=LossReason.WITH_APP
-                )
+                number, reason = self._computing.number, LossReason.WITH_APP
+                self._log.debug(reason, frame=number, _reason=reason)
             self._computing = None
         if peer is self._peers.publisher and self._at_publisher:
             self._losses[LossReason.WITH_PUBLISHER] += len(self._at_publisher)
@@ -302,13 +299,8 @@ class FrameFlow:
         subscriber, reading = self._peers.subscriber.protocol, waiting.reading
         if subscriber is not None:
             taken = (reading.sent_tick - reading.received_tick) // 1000
-            subscriber.send(
-                Notice(
-                    "debug",
-                    f"complete frame={number} stamp_ns={reading.stamp_ns} received_ns={reading.received_ns} "
-                    f"taken_us={taken}",
-                )
-            )
+            times = f"stamp_ns={reading.stamp_ns} received_ns={reading.received_ns} taken_us={taken}"
+            subscriber.send(Notice("debug", f"complete frame={number} {times}"))
 
     def _take_result(self, result: FrameResult) -> None:
         computing = self._computing
@@ -329,9 +321,8 @@ class FrameFlow:
         if not self._at_publisher:
             self._published_at = time.monotonic()
         self.newest = record
-        self._at_publisher[result.number] = (
-            record  # before sending: a publisher in this process answers at once
-        )
+        # before sending: a publisher in this process answers at once
+        self._at_publisher[result.number] = record
         if publisher is None or not publisher.send(record):
             del self._at_publisher[result.number]
             self._losses[LossReason.WITH_PUBLISHER] += 1
@@ -349,11 +340,8 @@ class FrameFlow:
             self._failures.append(now)
             recent = sum(1 for each in self._failures if now - each <= window)
             if recent > RESTARTS:
-                self.fail(
-                    BoardFailedError(
-                        f"{record.sentence}; {recent} frames failed on boards within {window:g} s"
-                    )
-                )
+                often = f"{recent} frames failed on boards within {window:g} s"
+                self.fail(BoardFailedError(f"{record.sentence}; {often}"))
                 return
             self._log.warning(record.sentence, frame=record.number, _reason=LossReason.FAILED)
         elif self._follows:
@@ -371,16 +359,12 @@ class FrameFlow:
             self._losses[LossReason.SOME_TOPICS] += bool(record.missed)
             self._show(record)
         elif self._once and record.outcome is Outcome.NO_POSTERIOR:
-            self.fail(
-                VariableError(
-                    f"frame {record.number} has no posterior: all counts were 0; nothing was published"
-                )
-            )
+            why = f"frame {record.number} has no posterior: all counts were 0; nothing was published"
+            self.fail(VariableError(why))
             return
         elif self._once:
-            self.fail(
-                RosbridgeLostError("the rosbridge connection was lost before the result could be published")
-            )
+            why = "the rosbridge connection was lost before the result could be published"
+            self.fail(RosbridgeLostError(why))
             return
         else:
             self._losses[_LOSSES[record.outcome]] += 1

@@ -5,9 +5,10 @@ import csv
 import io
 import os
 import time
+from collections.abc import Iterable
 from itertools import product
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import orjson
 
@@ -25,23 +26,29 @@ _SHARE: Final = 20
 _NOT_KNOWN: Final = -1
 
 
-class ResultFile(Protocol):
+class ResultFile:
     """A file of posteriors."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
 
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
         """Save one frame, or raise a SettingsError for an unwritable file or one with another shape."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Write everything to the file."""
+        raise NotImplementedError
+
+    def _error(self, why: str | OSError) -> SettingsError:
+        if isinstance(why, OSError):
+            why = f"it cannot be written: {why.strerror or why}"
+        return SettingsError(f"--save {self._path}: {why}")
 
 
 def open_result_file(path: Path) -> ResultFile:
     """Open a file, or raise a SettingsError: `.jsonl` and `.csv` are appended to, `.npz` is overwritten."""
-    kinds: dict[str, type[_JsonLines | _CsvLines | _Archive]] = {
-        ".jsonl": _JsonLines,
-        ".csv": _CsvLines,
-        ".npz": _Archive,
-    }
+    kinds = {".jsonl": _JsonLines, ".csv": _CsvLines, ".npz": _Archive}
     kind = kinds.get(path.suffix)
     if kind is None:
         raise SettingsError(
@@ -78,11 +85,11 @@ def record(frame: FrameOutcome, axes: list[Axis]) -> dict[str, Any]:
     }
 
 
-class _Lines:
+class _Lines(ResultFile):
     """A file to which whole lines are appended, so that an interruption never leaves an incomplete line."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        super().__init__(path)
         # A descriptor instead of a file of Python, whose buffer would be written in parts. Readable, to look at what is
         # there already: the last byte, and the columns of a table.
         try:
@@ -90,11 +97,11 @@ class _Lines:
             size = os.fstat(self._file).st_size
             if size and os.pread(self._file, 1, size - 1) != b"\n":
                 os.close(self._file)
-                raise SettingsError(
-                    f"--save {path}: its last line is incomplete, so nothing can be appended; give another name"
+                raise self._error(
+                    "its last line is incomplete, so nothing can be appended; give another name"
                 )
         except OSError as error:
-            raise _not_writable(path, error) from error
+            raise self._error(error) from error
 
     def _write(self, line: bytes) -> None:
         written = 0
@@ -104,7 +111,7 @@ class _Lines:
                 written += os.write(self._file, line[written:])
         except OSError as error:
             self._take_back(written)
-            raise _not_writable(self._path, error) from error
+            raise self._error(error) from error
 
     def _take_back(self, written: int) -> None:
         """Remove an incomplete line, unless another process has written since."""
@@ -167,9 +174,7 @@ class _CsvLines(_Lines):
             with self._path.open(newline="", encoding="utf-8") as file:
                 there = next(csv.reader(file), [])
             if there != columns:
-                raise SettingsError(
-                    f"--save {self._path}: it has columns of another posterior; give another name"
-                )
+                raise self._error("it has columns of another posterior; give another name")
         self._columns = columns
 
     def _row(self, cells: list[Any]) -> None:
@@ -178,11 +183,11 @@ class _CsvLines(_Lines):
         self._write(row.getvalue().encode())
 
 
-class _Archive:
+class _Archive(ResultFile):
     """An archive for `numpy.load`, replaced by a complete new one every few seconds and at the end."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        super().__init__(path)
         # All posteriors so far, which have one shape and the axes of the first: an archive cannot be appended to.
         self._posteriors: list[Posterior] = []
         self._axes: list[Axis] = []
@@ -191,7 +196,7 @@ class _Archive:
         self._next = time.monotonic() + _EVERY
         # now, instead of after the first seconds of a run that may not come again
         if not os.access(path.parent, os.W_OK):
-            raise _not_writable(path, FileNotFoundError(2, "the folder is not writable"))
+            raise self._error("it cannot be written: the folder is not writable")
 
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
         """Add one posterior, except for a frame without one."""
@@ -200,12 +205,10 @@ class _Archive:
         if not self._axes:
             self._axes = axes
         elif axes != self._axes:
-            raise SettingsError(
-                f"--save {self._path}: a posterior of another shape arrived, which does not fit; .jsonl supports it"
-            )
+            raise self._error("a posterior of another shape arrived, which does not fit; .jsonl supports it")
         if (len(self._posteriors) + 1) * len(frame.probabilities) > MOST_NUMBERS:
-            raise SettingsError(
-                f"--save {self._path}: it is full with {len(self._posteriors)} posteriors, {MOST_NUMBERS} probabilities; .jsonl has no limit"
+            raise self._error(
+                f"it is full with {len(self._posteriors)} posteriors, {MOST_NUMBERS} probabilities; .jsonl has no limit"
             )
         self._posteriors.append(frame)
         if time.monotonic() >= self._next:
@@ -221,16 +224,16 @@ class _Archive:
             return
         import numpy as np
 
+        def numbers(of: Iterable[int | None]) -> Any:
+            return np.array([_NOT_KNOWN if number is None else number for number in of])
+
         posteriors = self._posteriors
+        values = np.array([each.probabilities for each in posteriors])
         arrays: dict[str, Any] = {
-            "probabilities": np.array([each.probabilities for each in posteriors]).reshape(
-                -1, *posteriors[0].sizes
-            ),
-            "frame": np.array([_NOT_KNOWN if each.number is None else each.number for each in posteriors]),
-            "stamp_ns": np.array(
-                [_NOT_KNOWN if each.stamp_ns is None else each.stamp_ns for each in posteriors]
-            ),
-            "cycles": np.array([_NOT_KNOWN if each.cycles is None else each.cycles for each in posteriors]),
+            "probabilities": values.reshape(-1, *posteriors[0].sizes),
+            "frame": numbers(each.number for each in posteriors),
+            "stamp_ns": numbers(each.stamp_ns for each in posteriors),
+            "cycles": numbers(each.cycles for each in posteriors),
             "latency_us": np.array([each.latency_us for each in posteriors], np.float64),
             "labels": np.array([axis.label for axis in self._axes]),
         }
@@ -245,9 +248,5 @@ class _Archive:
         except OSError as error:
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
-            raise _not_writable(self._path, error) from error
+            raise self._error(error) from error
         self._written = len(posteriors)
-
-
-def _not_writable(path: Path, error: OSError) -> SettingsError:
-    return SettingsError(f"--save {path}: it cannot be written: {error.strerror or error}")

@@ -3,31 +3,18 @@
 import asyncio
 import contextlib
 import time
-from collections.abc import Callable
 
-from bridge.client import Message, State, connect
+from bridge.client import Message
 from bridge.fields import Field, all_missing
-from services.pipeline.connections import OnState, connect_all, report_unpublished
+from services.pipeline.connections import connect_all, report_unpublished
 from services.pipeline.frames import FrameAssembler
 from services.pipeline.subscriber import RECEIVED_QUEUE
 from services.settings import Settings
 from services.sockets.records import Reading
-from terminal.connection import report_wait
+from terminal.connection import report_waits
 from terminal.output import print_json_line, say, warn
 from terminal.signals import until_one_ends
 from toolchain.deployment import Deployment, Source
-
-
-def _report_state() -> OnState:
-    # One for each server, because each remembers whether its server was missing.
-    reports: dict[str, Callable[[str, str], None]] = {}
-
-    def on_state(uri: str, state: State, reason: str) -> None:
-        if uri not in reports:
-            reports[uri] = report_wait(uri)
-        reports[uri](state, reason)
-
-    return on_state
 
 
 async def print_variables(settings: Settings, source: Source, names: list[str], count: int | None) -> int:
@@ -38,15 +25,10 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
         BridgeError: A message does not have a variable, or the server is unreachable.
     """
     fields = [Field(name) for name in names]
-    async with connect(
-        source.uri,
-        connect_timeout=settings.connect_timeout,
-        retry=True,
-        ca_file=settings.ca,
-        max_size=settings.message_bytes,
-        ros_version=settings.ros_version,
-        on_state=report_wait(source.uri),
-    ) as ros:
+    size, report = settings.message_bytes, report_waits()
+    async with contextlib.AsyncExitStack() as stack:
+        by_uri = await connect_all(stack, settings, [source.uri], on_state=report, max_size=size)
+        ros = by_uri[source.uri]
         subscription = ros.subscribe(
             source.topic, source.type, queue_size=RECEIVED_QUEUE, max_bytes=settings.topic_bytes
         )
@@ -105,14 +87,10 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
                 if printed == count:
                     return
 
+    size, report = settings.message_bytes, report_waits()
     async with contextlib.AsyncExitStack() as stack:
-        by_uri = await connect_all(
-            stack,
-            settings,
-            [source.uri for source in deployment.sources],
-            on_state=_report_state(),
-            max_size=settings.message_bytes,
-        )
+        uris = [source.uri for source in deployment.sources]
+        by_uri = await connect_all(stack, settings, uris, on_state=report, max_size=size)
 
         async def follow(at: int, source: Source) -> None:
             ros = by_uri[settings.uri or source.uri]

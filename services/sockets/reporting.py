@@ -157,10 +157,6 @@ class Report:
                 return round((completed - count) / (now - at), 1)
         return 0.0
 
-    def answer(self) -> bytes:
-        """Return the whole status as JSON."""
-        return msgspec.json.encode(self.status())
-
 
 def _check(directory: Path | None) -> None:
     if directory is not None and not directory.is_dir():
@@ -199,7 +195,9 @@ async def serve_status(
     _check(directory)
     report, manager = Report(name, get_status, **more), ServiceManager()
     async with contextlib.AsyncExitStack() as serving:
-        await serving.enter_async_context(serve_health(directory, name, report.answer))
+        await serving.enter_async_context(
+            serve_health(directory, name, lambda: msgspec.json.encode(report.status()))
+        )
         if metrics:
             from services.sockets.metrics import serve_metrics
 

@@ -4,7 +4,6 @@ import os
 import socket
 import time
 
-import msgspec
 import pytest
 
 from services.errors import SettingsError
@@ -93,7 +92,7 @@ def test_a_rate_is_of_the_last_seconds(monkeypatch, completed, rate):
         report.sample(ServiceManager())
         now[0] += 1
         done[0] += a_second
-    found = msgspec.json.decode(report.answer(), type=ProcessStatus)
+    found = report.status()
     assert (found.frames.rate, found.uptime_s) == (rate, len(completed))
 
 
