@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import asdict
 from typing import Annotated, Final
 
 import typer
@@ -61,16 +62,7 @@ def discover(
         print(f"{ROBOT}{_picked(robots).name}")
     elif as_json:
         for robot in robots:
-            print(
-                json.dumps(
-                    {
-                        "name": robot.name,
-                        "uri": robot.uri,
-                        "ros_version": robot.ros_version,
-                        "token": robot.token,
-                    }
-                )
-            )
+            print(json.dumps(asdict(robot)))
     else:
         Console().print(_table(robots))
     return 0
@@ -92,13 +84,8 @@ def _table(robots: list[Robot], *, numbered: bool = False) -> Table:
     for column in (*(("",) if numbered else ()), "name", "URI", "ROS", "token"):
         table.add_column(column, overflow="fold")
     for number, robot in enumerate(robots, start=1):
-        token = "wanted" if robot.token else ""
-        table.add_row(
-            *([str(number)] if numbered else []),
-            # anybody on the network may announce any name
-            escape(one_line(robot.name)),
-            escape(one_line(robot.uri)),
-            str(robot.ros_version or "?"),
-            token,
-        )
+        # anybody on the network may announce any name
+        name, uri = escape(one_line(robot.name)), escape(one_line(robot.uri))
+        ros, token = str(robot.ros_version or "?"), "wanted" if robot.token else ""
+        table.add_row(*([str(number)] if numbered else []), name, uri, ros, token)
     return table

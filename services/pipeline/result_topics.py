@@ -73,17 +73,11 @@ class ResultTopics:
             await connect_all(stack, settings, uris, by_uri, on_state=on_state, max_size=MAX_RESULT)
             for uri, output in zip(uris, deployment.outputs, strict=True):
                 self._outputs.append((by_uri[uri], await by_uri[uri].advertise(output.topic, output.type)))
+                self.advertised.append(AdvertisedTopic(by_uri[uri], uri, output.topic, output.type))
             # reports go to one server only, because a listener of several would get each twice
             first = by_uri[uris[0]]
             self._frames = await first.advertise(FRAME_TOPIC, FRAME_TYPE)
-            if settings.ros_version == "auto":
-                self._ros_version = await first.detect_ros_version() or 2
-            else:
-                self._ros_version = 1 if settings.ros_version == "1" else 2
-            self.advertised = [
-                AdvertisedTopic(by_uri[uri], uri, output.topic, output.type)
-                for uri, output in zip(uris, deployment.outputs, strict=True)
-            ]
+            self._ros_version = await first.detect_ros_version() or 2
             self.reports = AdvertisedTopic(first, uris[0], FRAME_TOPIC, FRAME_TYPE)
             topics = ", ".join(output.topic for output in deployment.outputs)
             yield f"publishing on {topics} at {', '.join(by_uri)}"
