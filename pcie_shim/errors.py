@@ -1,12 +1,10 @@
 """Errors of boards and of the link; the text of each is one sentence for the user."""
 
-from typing import ClassVar
-
 
 class PcieShimError(Exception):
     """Base class of this package's errors."""
 
-    exit_code: ClassVar[int] = 5
+    exit_code: int = 5
 
 
 class EndpointError(PcieShimError):
@@ -118,50 +116,13 @@ class StaleHandleError(AccessError):
 class BoardError(PcieShimError):
     """A board of the mini-cluster on which a frame failed, or that cannot be opened.
 
+    `__cause__` is the LinkError or ImageError, which also decides the exit code.
+
     Attributes:
         board: The board's number in the mini-cluster, from 0.
     """
 
-    def __init__(self, sentence: str, *, board: int) -> None:
+    def __init__(self, sentence: str, *, board: int, exit_code: int = 5) -> None:
         super().__init__(sentence)
         self.board = board
-
-
-class BoardUnreachableError(BoardError):
-    """Nothing listens at the board's endpoint, or the greeting is missing."""
-
-
-class BoardHeldError(BoardError):
-    """Another host or loader holds the board."""
-
-
-class BoardMismatchError(BoardError):
-    """The board has another register map or image than the deployment."""
-
-    exit_code = 2
-
-
-class BoardKeyError(BoardError):
-    """The board and this host do not have the same key."""
-
-    exit_code = 2
-
-
-class BoardSilentError(BoardError):
-    """The board did not answer or finish in time."""
-
-
-class BoardGoneError(BoardError):
-    """The board closed its link, or its registers read all ones."""
-
-
-class BoardLinkError(BoardError):
-    """The board violated the protocol: a short read, a wrong CRC, a wrong sequence number."""
-
-
-class BoardRefusedError(BoardError):
-    """The board answered an access of the driver with ERROR."""
-
-
-class BoardStaleError(BoardError):
-    """Another loader has programmed the board since it was opened."""
+        self.exit_code = exit_code

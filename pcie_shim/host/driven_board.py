@@ -11,31 +11,14 @@ from machines.kind import OUTCOME, Blocks, BoardResult, FrameSettings
 from pcie_shim import register_map as rm
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import (
-    AccessError,
     BoardError,
-    BoardGoneError,
-    BoardHeldError,
-    BoardKeyError,
-    BoardLinkError,
-    BoardMismatchError,
-    BoardRefusedError,
-    BoardSilentError,
-    BoardStaleError,
-    BoardUnreachableError,
-    DeviceGoneError,
     FramingError,
     GreetingMismatchError,
-    HeldError,
-    ImageError,
     ImageMismatchError,
-    KeyRefusedError,
     LinkClosedError,
-    LinkTimeoutError,
-    LinkUnreachableError,
     PcieShimError,
     SequenceError,
     ShortReadError,
-    StaleHandleError,
 )
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import Done, RegisterWrite, SocketLink
@@ -186,7 +169,9 @@ class DrivenBoard:
     def open_link(self) -> SocketLink:
         """The link of an open board; a LinkClosedError without one."""
         if self.link is None:
-            raise LinkClosedError(f"The link to the board at {self.endpoint} is closed: {self.broken}")
+            raise LinkClosedError(
+                f"The link to the board at {self.endpoint} is closed ({self.broken}): reopen the board"
+            )
         return self.link
 
     def close(self, reason: str) -> None:
@@ -291,20 +276,6 @@ class DrivenBoard:
         return BoardResult(words, self.done.cycles, joint, self._replica_cycles, self.reasons)
 
 
-_BOARD_ERRORS: Final[tuple[tuple[tuple[type[PcieShimError], ...], type[BoardError]], ...]] = (
-    ((LinkUnreachableError,), BoardUnreachableError),
-    ((HeldError,), BoardHeldError),
-    ((StaleHandleError,), BoardStaleError),
-    ((AccessError,), BoardRefusedError),
-    ((GreetingMismatchError, ImageError), BoardMismatchError),
-    ((KeyRefusedError,), BoardKeyError),
-    ((LinkTimeoutError,), BoardSilentError),
-    ((LinkClosedError, DeviceGoneError), BoardGoneError),
-    ((PcieShimError,), BoardLinkError),
-)
-
-
 def board_error(board: DrivenBoard, error: PcieShimError) -> BoardError:
-    """Return the error of a board for an error of its link or image."""
-    kind = next(kind for causes, kind in _BOARD_ERRORS if isinstance(error, causes))
-    return kind(f"Board {board.index}: {error}", board=board.index)
+    """Return the error of a board for an error of its link or image, to be raised from it."""
+    return BoardError(f"Board {board.index}: {error}", board=board.index, exit_code=error.exit_code)

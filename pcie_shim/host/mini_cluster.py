@@ -20,9 +20,9 @@ from machines.kind import BoardResult, FrameCourse, FrameInput
 from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import (
     AccessError,
-    BoardGoneError,
     FrameInputError,
     ImageMismatchError,
+    LinkClosedError,
     LinkError,
     PcieShimError,
     StaleHandleError,
@@ -330,11 +330,10 @@ class MiniCluster:
         while self._interrupted:
             self._open(self._interrupted.pop(), self._timeout)
         for board in self._boards:
-            if board.link is None:
-                raise BoardGoneError(
-                    f"Board {board.index} at {board.endpoint} is not open ({board.broken}): reopen it",
-                    board=board.index,
-                )
+            try:
+                _ = board.open_link
+            except LinkClosedError as error:
+                raise board_error(board, error) from error
 
     def _open(self, board: DrivenBoard, connect_timeout: float) -> None:
         # its link may be open still, if only another board has failed

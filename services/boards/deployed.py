@@ -4,13 +4,14 @@ from collections.abc import Sequence
 
 from machines.kind import FrameInput
 from pcie_shim.endpoint import Endpoint
-from pcie_shim.errors import BoardError, BoardMismatchError
+from pcie_shim.errors import BoardError
 from pcie_shim.host.mini_cluster import FrameOutput, MiniCluster
 from pcie_shim.programming_file import Image, read_image
 from services.boards.frames import BoardAwayError, driver_input
 from services.settings import Settings
 from services.sockets.records import FrameRequest
 from services.sockets.status import BoardStatus
+from terminal.errors import ExitCode
 from toolchain.deployment import Deployment
 
 TICK = 0.2
@@ -130,17 +131,17 @@ class DeployedBoards:
             self._times_gone[board] += 1
 
     def recover(self) -> list[int]:
-        """Try once to reopen the missing boards, and return the numbers of those that are back, or raise a BoardMismatchError."""
+        """Try once to reopen the missing boards, and return the numbers of those that are back, or raise a BoardError if none can be."""
         back: list[int] = []
         if self._cluster is None:
             return back
         for board in list(self.gone):
             try:
                 self._cluster.reopen(board, timeout=TICK)
-            except BoardMismatchError:
-                # another image: waiting would not help
-                raise
             except BoardError as error:
+                # with another image or key waiting would not help
+                if error.exit_code == ExitCode.USAGE:
+                    raise
                 self.gone[board] = str(error)
             else:
                 del self.gone[board]

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
+import pytest
 
 from machines import make_kernel
 from machines.bm1 import BM1Machine, Start, StopReason
@@ -18,6 +19,7 @@ from machines.kind import FrameInput
 from machines.parameters import BM1Parameters, RngKind, SensorMode
 from pcie_shim.board.server import StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint
+from pcie_shim.errors import BoardError, PcieShimError
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, Partition
 from tests.misbehaving_board import serve_misbehaving
@@ -112,6 +114,14 @@ class ServedBoard:
             self._stop.set()
         self._thread.join(PATIENCE)
         assert not self._thread.is_alive()
+
+
+@contextlib.contextmanager
+def board_fails(cause: type[PcieShimError]) -> Iterator[pytest.ExceptionInfo[BoardError]]:
+    """Expect the error of a board with such a cause."""
+    with pytest.raises(BoardError) as caught:
+        yield caught
+    assert isinstance(caught.value.__cause__, cause)
 
 
 def endpoints_of(boards: Sequence[ServedBoard]) -> list[str]:

@@ -14,13 +14,13 @@ from machines.parameters import PriorMode, SensorMode
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.endpoint import parse_endpoint
-from pcie_shim.errors import BoardGoneError, BoardMismatchError, FrameInputError
+from pcie_shim.errors import FrameInputError, ImageMismatchError, LinkClosedError
 from pcie_shim.host.driven_board import DrivenBoard
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, image_bytes
 from pcie_shim.register_map import ErrorCode
 from tests.patience import PATIENCE
-from tests.pcie_shim.boards import expected_of_replicas, image, images, machine, opened, words
+from tests.pcie_shim.boards import board_fails, expected_of_replicas, image, images, machine, opened, words
 
 JOINT_ORDER = (StopReason.OVERFLOW, StopReason.MAX_CYCLES, StopReason.IMPOSSIBLE, StopReason.SLICE)
 
@@ -153,7 +153,7 @@ def test_a_replaced_board_gets_the_prior_selects_again(start_board):
         # no other board decides about the replicas of the only one
         assert case.check(frame).slices == 1
         board.stop()
-        with pytest.raises(BoardGoneError):
+        with board_fails(LinkClosedError):
             cluster.run(frame)
         start_board(board.endpoint)
         cluster.reopen(0)
@@ -214,5 +214,5 @@ def test_a_board_of_other_capabilities_is_refused(start_board, monkeypatch, repl
     monkeypatch.setattr(Image, "image_hash", property(lambda _: known))
     registers = dataclasses.replace(other.registers, input_words=inputs)
     monkeypatch.setattr(Image, "registers", property(lambda _: registers))
-    with pytest.raises(BoardMismatchError):
+    with board_fails(ImageMismatchError):
         MiniCluster.open(endpoints, [other])

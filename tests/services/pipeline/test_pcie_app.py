@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from pcie_shim.errors import BoardError, BoardMismatchError, FrameInputError
+from pcie_shim.errors import BoardError, FrameInputError
 from services.boards.frames import BoardAwayError
 from services.pipeline import pcie_app
 from services.pipeline.pcie_app import PcieApp
@@ -160,7 +160,7 @@ async def test_a_board_that_is_late_fails_its_frame(stage):
 
 
 @pytest.mark.parametrize(
-    "error", [FrameInputError("too many addresses"), BoardMismatchError("another image", board=2)]
+    "error", [FrameInputError("too many addresses"), BoardError("another image", board=2, exit_code=2)]
 )
 async def test_an_error_that_no_wait_can_mend_ends_the_service(stage, error):
     if isinstance(error, FrameInputError):
