@@ -24,16 +24,23 @@ if TYPE_CHECKING:
 _PIECE: Final = 1 << 18
 
 
+@contextmanager
+def file_errors(path: Path, done: str, error: type[ToolchainError], advice: str = "") -> Iterator[None]:
+    """Convert an OSError of the block: the file cannot be `read` or `written`, whichever is `done` to it."""
+    try:
+        yield
+    except OSError as reason:
+        raise error(f"{path} cannot be {done}: {reason.strerror or reason}{advice}") from None
+
+
 def open_regular(path: Path, error: type[ToolchainError], most: int | None = None) -> BinaryIO:
     """Open a regular file for reading; others are refused, because a FIFO or a device could block or never end.
 
     Raises:
         error: The file is missing, cannot be read, is not a regular file, or has more than `most` bytes.
     """
-    try:
+    with file_errors(path, "read", error):
         number = os.open(path, os.O_RDONLY | os.O_NONBLOCK)  # otherwise, opening a FIFO waits for a writer
-    except OSError as reason:
-        raise error(f"{path} cannot be read: {reason.strerror or reason}") from None
     state = os.fstat(number)
     if stat.S_ISREG(state.st_mode) and (most is None or state.st_size <= most):
         return os.fdopen(number, "rb")
@@ -45,16 +52,11 @@ def open_regular(path: Path, error: type[ToolchainError], most: int | None = Non
 
 def read_bounded(path: Path, most: int, error: type[ToolchainError]) -> bytes:
     """Return the content of a regular file of at most `most` bytes, or raise the error."""
-    try:
-        with open_regular(path, error, most) as file:
-            pieces, size = [], 0
-            while size <= most and (
-                piece := file.read(_PIECE)
-            ):  # read(most) would allocate that much at once
-                pieces.append(piece)
-                size += len(piece)
-    except OSError as reason:
-        raise error(f"{path} cannot be read: {reason.strerror or reason}") from None
+    with file_errors(path, "read", error), open_regular(path, error, most) as file:
+        pieces, size = [], 0
+        while size <= most and (piece := file.read(_PIECE)):  # read(most) would allocate that much at once
+            pieces.append(piece)
+            size += len(piece)
     if size > most:  # it has grown, or is a file in /proc, which reports the size 0
         raise error(f"{path} has more than {most} bytes, the maximum")
     return b"".join(pieces)
@@ -68,11 +70,10 @@ def whole_file(path: Path, error: type[ToolchainError]) -> Iterator[Path]:
     """
     partial = path.with_name(path.name + ".part")
     try:
-        yield partial
-        if partial.exists():
-            partial.replace(path)
-    except OSError as reason:
-        raise error(f"{path} cannot be written: {reason.strerror or reason}") from None
+        with file_errors(path, "written", error):
+            yield partial
+            if partial.exists():
+                partial.replace(path)
     finally:
         with suppress(OSError):
             partial.unlink(missing_ok=True)

@@ -332,17 +332,11 @@ def _z_scores(
     table = np.array(list(drawn.values()))
     counts = int(table[:, 2].sum())
 
-    def root_mean_square(rows: NDArray[np.float64]) -> float:
-        return math.sqrt(rows[:, 0].sum() / rows[:, 2].sum())
-
-    def mean(rows: NDArray[np.float64]) -> float:
-        return float(rows[:, 1].sum() / rows[:, 2].sum())
-
     return ZScores(
         cycles=cycles,
         counts=counts,
         draws=len(table),
-        rms=bootstrap_rows(table, root_mean_square),
-        mean=bootstrap_rows(table, mean),
+        rms=bootstrap_rows(table, lambda rows: math.sqrt(rows[:, 0].sum() / rows[:, 2].sum())),
+        mean=bootstrap_rows(table, lambda rows: float(rows[:, 1].sum() / rows[:, 2].sum())),
         beyond_three=beyond / counts,
     )

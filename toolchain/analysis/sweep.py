@@ -18,7 +18,7 @@ from toolchain.analysis.accuracy import measure
 from toolchain.analysis.emulation import EmulatedBoards, Readings
 from toolchain.analysis.logic import Device
 from toolchain.analysis.resources import estimate
-from toolchain.bounded_files import read_bounded
+from toolchain.bounded_files import file_errors, read_bounded
 from toolchain.building.machine import (
     MachinePlan,
     board_layout,
@@ -109,34 +109,21 @@ class Results:
 
     def check_writable(self) -> None:
         """Create the file if it is missing; raise a BuildError before a long run if it cannot be written."""
-        try:
-            os.close(self._opened())
-        except OSError as reason:
-            raise self._not_writable(reason) from None
+        with file_errors(self.path, "written", BuildError), self.path.open("ab"):
+            pass
 
     def append(self, point: Point) -> None:
         """Append a point with one write, and wait until it is on the disk."""
-        line = point.model_dump_json() + "\n"
-        try:
+        line = point.model_dump_json().encode() + b"\n"
+        with file_errors(self.path, "written", BuildError):
             if self._torn_at is not None:
                 os.truncate(self.path, self._torn_at)
                 self._torn_at = None
-            descriptor = self._opened()
-            try:
-                written = os.write(descriptor, line.encode())
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-        except OSError as reason:
-            raise self._not_writable(reason) from None
+            with self.path.open("ab", buffering=0) as file:
+                written = file.write(line)
+                os.fsync(file.fileno())
         if written != len(line):
             raise BuildError(f"{self.path} cannot be written: the disk is full")
-
-    def _opened(self) -> int:
-        return os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-
-    def _not_writable(self, reason: OSError) -> BuildError:
-        return BuildError(f"{self.path} cannot be written: {reason.strerror or reason}")
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
@@ -213,15 +200,10 @@ def check_pictures_possible(path: Path | None = None) -> None:
             f"{path} is not the name of a picture; expected a name that ends in {', '.join(_SUFFIXES)}"
         )
     there = path.exists()
-    try:
-        with path.open("ab"):
-            pass
+    with file_errors(path, "written", BuildError, "; name another file"):
+        path.open("ab").close()
         if not there:
             path.unlink()
-    except OSError as reason:
-        raise BuildError(
-            f"{path} cannot be written: {reason.strerror or reason}; name another file"
-        ) from None
 
 
 def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[Point]) -> None:

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 from machines.bm1 import BM1Machine
 from machines.parameters import PriorMode, SensorMode
 from pcie_shim.programming_file import Image, Partition, read_image, tool_version
+from toolchain.bounded_files import file_errors
 from toolchain.building.machine import (
     MACHINE_KEYS,
     BoardLayout,
@@ -70,14 +71,10 @@ def build_deployment(plan: MachinePlan, directory: Path, *, remark: str = "") ->
     built = assemble(plan)
     if remark:
         built = replace(built, report=f"{built.report}\n{remark}\n")
-    try:
+    with file_errors(directory, "written", BuildError, "; choose another folder with -o"):
         directory.mkdir(parents=True, exist_ok=True)
         # a process that reads the folder meanwhile finds no deployment, instead of parts of two
         (directory / FILE_NAME).unlink(missing_ok=True)
-    except OSError as reason:
-        raise BuildError(
-            f"{directory} cannot be written: {reason.strerror or reason}; choose another folder with -o"
-        ) from None
     for part in (
         image_files(built.deployment, built.images),
         memory_files(built.deployment, built.images),

@@ -9,6 +9,7 @@ from typing import Annotated, Final
 import typer
 
 from terminal.command_line import CommandLine
+from toolchain.bounded_files import file_errors
 
 # NumPy and modules that need it are imported inside the functions of these modules, so that --help is fast.
 from toolchain.commands import regenerate
@@ -82,13 +83,11 @@ def new(
         raise BuildError(
             f"{name.parent} is not a folder, so {model} cannot be created in it; create it first, or correct the path"
         )
-    try:
+    with file_errors(name, "written", BuildError):
         name.mkdir(exist_ok=True)
         for file in _FILES:
             text = files("toolchain.commands").joinpath("template", file + ".txt").read_text(encoding="utf-8")
             (name / file).write_text(text.replace("NAME", model), encoding="utf-8")
-    except OSError as reason:
-        raise BuildError(f"{name} cannot be written: {reason.strerror or reason}") from None
     typer.echo(_next_steps(name), nl=False)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import zlib
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -12,15 +13,22 @@ from toolchain.bounded_files import read_bounded
 from toolchain.errors import ModelError, NetworkFileError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from toolchain.models.joint import JointDistribution
-    from toolchain.networks.builder import NetworkBuilder
 
 MAX_BYTES: Final = 32 << 20
 """Maximum size of a file in bytes, compressed or not."""
 
-SUFFIXES: Final = (".bif", ".xmlbif", ".bifxml", ".xml", ".uai", ".net", ".xdsl")
+_READERS: Final = {
+    ".bif": "text_formats.read_bif",
+    ".xmlbif": "xml_formats.read_xmlbif",
+    ".bifxml": "xml_formats.read_xmlbif",
+    ".xml": "xml_formats.read_xmlbif",
+    ".uai": "text_formats.read_uai",
+    ".net": "text_formats.read_net",
+    ".xdsl": "xml_formats.read_xdsl",
+}
+"""The reader of each suffix; it is imported when it is needed, because it needs NumPy."""
+SUFFIXES: Final = tuple(_READERS)
 """Suffixes of network files; `.gz` may follow."""
 
 
@@ -39,7 +47,12 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
     from toolchain.networks.builder import NetworkBuilder
 
     path = Path(path)
-    reader = _reader(path)
+    if not is_network(path):
+        raise NetworkFileError(
+            f"expected a name that ends in {', '.join(SUFFIXES)}, with or without .gz", path=path
+        )
+    module, _, function = _READERS[_suffix(path)].partition(".")
+    reader = getattr(import_module(f"{__name__}.{module}"), function)
     data = read_bounded(path, MAX_BYTES, NetworkFileError)
     if path.suffix.lower() == ".gz":
         data = _unpacked(path, data)
@@ -51,25 +64,6 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
         raise
     except ModelError as reason:
         raise NetworkFileError(str(reason), path=path) from None
-
-
-def _reader(path: Path) -> Callable[[bytes, NetworkBuilder], None]:
-    match _suffix(path):
-        case ".bif":
-            from toolchain.networks.text_formats import read_bif as reader
-        case ".xmlbif" | ".bifxml" | ".xml":
-            from toolchain.networks.xml_formats import read_xmlbif as reader
-        case ".uai":
-            from toolchain.networks.text_formats import read_uai as reader
-        case ".net":
-            from toolchain.networks.text_formats import read_net as reader
-        case ".xdsl":
-            from toolchain.networks.xml_formats import read_xdsl as reader
-        case _:
-            raise NetworkFileError(
-                f"expected a name that ends in {', '.join(SUFFIXES)}, with or without .gz", path=path
-            )
-    return reader
 
 
 def _suffix(path: Path) -> str:

@@ -12,7 +12,7 @@ from typing import Final
 
 from machines.parameters import RngKind
 from pcie_shim.programming_file import Image, image_bytes
-from toolchain.bounded_files import whole_file
+from toolchain.bounded_files import file_errors, whole_file
 from toolchain.deployment import Deployment
 from toolchain.errors import BuildError
 from toolchain.outputs.memories import FOLDER as MEMORIES_FOLDER
@@ -165,10 +165,8 @@ def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]
     """Write the files of a part atomically; return every path, sorted, and its change."""
     changes = {name: _write(directory / name, pieces) for name, pieces in files.contents.items()}
     for name in _stale(directory, files):
-        try:
+        with file_errors(directory / name, "written", BuildError):
             (directory / name).unlink()
-        except OSError as reason:
-            raise BuildError(f"{directory / name} cannot be written: {reason.strerror or reason}") from None
         changes[name] = Change.REMOVED
     return sorted(changes.items())
 
