@@ -7,6 +7,8 @@ from typing import Annotated, ClassVar
 
 import typer
 
+from bridge.discovery import find_uri
+
 
 class CaseStudyError(Exception):
     """Base class of the case studies' errors; `str()` is one sentence that says what to do."""
@@ -18,16 +20,10 @@ class DataFileError(CaseStudyError):
     """A file of recorded data is missing or is not valid."""
 
 
-def _find(uri: str) -> str:
-    from bridge.discovery import find_uri
-
-    return find_uri(uri)
-
-
 Uri = Annotated[
     str,
     typer.Option(
-        envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT|robot:NAME", callback=_find
+        envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT|robot:NAME", callback=find_uri
     ),
 ]
 DEFAULT_URI = "ws://127.0.0.1:9090"

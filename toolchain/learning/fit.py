@@ -24,7 +24,15 @@ from toolchain.deployment import Dimension
 from toolchain.deployment.address import to_address
 from toolchain.errors import ModelError, ReadingError
 from toolchain.learning import FitMethod, FitOptions, FitPrior
-from toolchain.learning.fitted import Fit, FitFile, FittedRecording, FittedVariable, mean_slopes, wrapped
+from toolchain.learning.fitted import (
+    Fit,
+    FitFile,
+    FittedRecording,
+    FittedVariable,
+    mean_slopes,
+    normal_of,
+    wrapped,
+)
 from toolchain.models.model import Known, Model
 
 LEAST_READINGS: Final = 10
@@ -205,9 +213,7 @@ def _residuals(
 ) -> tuple[NDArray[np.float64], Support]:
     """Return reading minus expectation at the true position, for every row with a reading."""
     slopes = mean_slopes(model, known)
-    if known.normal is None:  # mean_slopes has checked it
-        raise AssertionError
-    expected = known.normal.mean[truth.lines] + (slopes[:, truth.lines] * truth.within).sum(axis=0)
+    expected = normal_of(known).mean[truth.lines] + (slopes[:, truth.lines] * truth.within).sum(axis=0)
     given = [values[row] for row in truth.rows]
     numbers = np.array([float(each) if isinstance(each, int | float) else math.nan for each in given])
     there = np.isfinite(numbers)

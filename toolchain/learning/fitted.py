@@ -126,14 +126,19 @@ def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
     return spread
 
 
-def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
-    """Return the slopes of a variable's mean: float64[dimensions, lines], per cell."""
+def normal_of(known: Known) -> Normal:
+    """Return the normals behind a variable's table, or raise a ModelError if there are none."""
     if known.normal is None:
         raise ModelError(
             f"{known.name} is not normal around a mean in the model; fit it with --method counts"
         )
+    return known.normal
+
+
+def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
+    """Return the slopes of a variable's mean: float64[dimensions, lines], per cell."""
     sizes = tuple(dimension.size for dimension in model.searched)
-    mean = known.normal.mean.reshape(sizes)
+    mean = normal_of(known).mean.reshape(sizes)
     turn = None if known.period is None else known.period * abs(known.step)
     slopes = []
     for axis, size in enumerate(sizes):
@@ -158,18 +163,16 @@ def wrapped(away: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
 def _with_normal(model: Model, known: Known, fitted: FittedVariable, floor: float, where: str) -> Known:
     if not fitted.sigma > 0:
         raise ModelError(f"{where}: sigma of {known.name} is {fitted.sigma:g}, expected a positive number")
-    spread = cell_spread(model, known)
-    if known.normal is None:  # cell_spread has refused it
-        raise AssertionError
+    mean = normal_of(known).mean
     shape = Normal(
-        mean=known.normal.mean + fitted.bias,
-        sigma=np.hypot(fitted.sigma, spread),
+        mean=mean + fitted.bias,
+        sigma=np.hypot(fitted.sigma, cell_spread(model, known)),
         floor=floor,
         outliers=fitted.outliers,
     )
     make = normal_table if known.period is None else wrapped_normal_table
     table = make(known.name, shape, values=known.values, offset=known.offset, step=known.step)
-    return replace(known, table=table, floor=floor, normal=replace(shape, mean=known.normal.mean))
+    return replace(known, table=table, floor=floor, normal=replace(shape, mean=mean))
 
 
 def write_fit(path: Path, fit: Fit) -> None:

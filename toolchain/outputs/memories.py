@@ -19,7 +19,7 @@ from pcie_shim.programming_file import Image
 from toolchain.deployment import Deployment
 from toolchain.outputs.mif import mif_lines
 
-FOLDER: Final = "bm_arch/Memory_MIFs"
+MEMORIES_FOLDER: Final = "bm_arch/Memory_MIFs"
 
 _ROWS_AT_ONCE: Final = 64
 

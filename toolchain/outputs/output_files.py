@@ -15,11 +15,9 @@ from pcie_shim.programming_file import Image, image_bytes
 from toolchain.bounded_files import file_errors, whole_file
 from toolchain.deployment import Deployment
 from toolchain.errors import BuildError
-from toolchain.outputs.memories import FOLDER as MEMORIES_FOLDER
-from toolchain.outputs.memories import Memory, memories
+from toolchain.outputs.memories import MEMORIES_FOLDER, Memory, memories
 from toolchain.outputs.mif import printable
-from toolchain.outputs.vhdl_parameters import FILE as PARAMETERS_FILE
-from toolchain.outputs.vhdl_parameters import parameters_vhd
+from toolchain.outputs.vhdl_parameters import PARAMETERS_FILE, parameters_vhd
 
 FAMILY: Final = "Stratix V"
 DEVICE: Final = "5SGSMD8K2F40C2"

@@ -10,7 +10,7 @@ from toolchain.deployment import Deployment
 from toolchain.outputs.memories import column_name, generators, seed_width, seed_words
 from toolchain.outputs.mif import printable
 
-FILE: Final = "bm_arch/bm1_parameters.vhd"
+PARAMETERS_FILE: Final = "bm_arch/bm1_parameters.vhd"
 
 _MOST_SEEDS: Final = 4096
 """Maximum number of seeds in the package; more are only in the memory file."""
@@ -60,8 +60,8 @@ def parameters_vhd(deployment: Deployment, images: Sequence[Image]) -> str:
             _constant("COUNTER_BITS", "positive", parameters.counter_bits),
             _section("The prior"),
             _flag("PRIOR_WRITTEN", parameters.prior_mode is PriorMode.WRITTEN, "the host writes it"),
-            _generators(image),
-            _seeds(image),
+            _generator_constants(image),
+            _seed_constants(image),
             _section("When a machine stops: the registers hold 0 until the host writes these"),
             _constant("TARGET_COUNT", _vector(32), _hexadecimal(deployment.machine.target_count, 32)),
             _constant("MAX_CYCLES", _vector(64), _hexadecimal(deployment.machine.max_cycles, 64)),
@@ -132,7 +132,7 @@ def _sensor_widths(deployment: Deployment, parameters: BM1Parameters) -> str:
     return title + _array("SENSOR_BITS", "natural_array_t", rows, f"1 to {parameters.sensors}")
 
 
-def _generators(image: Image) -> str:
+def _generator_constants(image: Image) -> str:
     parameters, table = image.machine.parameters, image.machine.rng_table
     exponents = POLYNOMIALS.get(parameters.rng)
     text = _section("The random number generators") + _constant(
@@ -157,7 +157,7 @@ def _generators(image: Image) -> str:
     )
 
 
-def _seeds(image: Image) -> str:
+def _seed_constants(image: Image) -> str:
     parameters = image.machine.parameters
     if parameters.rng is RngKind.IDEAL:
         return "\n  -- RNG_IDEAL exists emulated only: there are no seeds.\n"
