@@ -19,15 +19,13 @@ MAP_LOW: Final = -50.0
 """Lowest coordinate of the map, the square [MAP_LOW, MAP_HIGH]^2."""
 MAP_HIGH: Final = 50.0
 BEACONS: Final = ((-50.0, -50.0), (-50.0, 0.0), (0.0, -50.0))
-"""Positions of the beacons: lower left corner, middle of the left side, middle of the lower side (4.1).
-"""
+"""Positions of the beacons: lower left corner, middle of the left side, middle of the lower side (4.1)."""
 DISTANCE_NAMES: Final = ("D1", "D2", "D3")
 BEARING_NAMES: Final = ("B1", "B2", "B3")
 SENSOR_NAMES: Final = DISTANCE_NAMES + BEARING_NAMES
 """Names of the sensors, in the order of the machine's columns and of the numbers in an array message."""
 LONGEST_DISTANCE: Final = 100
-"""Readings are whole numbers 0..100; longer distances, such as those to the map's far corners, are clamped.
-"""
+"""Readings are whole numbers 0..100; longer distances, such as those to the map's far corners, are clamped."""
 BEARING_SIGMA: Final = 10.0
 """Standard deviation of a bearing, in degrees."""
 

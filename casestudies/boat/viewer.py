@@ -110,11 +110,6 @@ class Viewer:
         self.frames = 0
         self.results = 0
 
-    @property
-    def done(self) -> bool:
-        """True if all requested results have arrived."""
-        return self.count is not None and self.results >= self.count
-
     def add(self, instance: "Instance") -> Line:
         """Add a frame and return its line."""
         line = line_of(instance)
@@ -146,7 +141,7 @@ class Viewer:
             say(f"boat-viewer: listening to {uri}")
             print(HEADING, flush=True)
             try:
-                while not self.done:
+                while self.count is None or self.results < self.count:
                     print(self.add(await listener.next(limit_s if self.lines else first_limit_s)), flush=True)
                     readiness.record()
             except NoResultError as error:

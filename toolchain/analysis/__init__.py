@@ -40,6 +40,10 @@ class ReadingOptions:
     seed: Annotated[int, typer.Option(help="Seed of drawn readings.", min=0)] = 1
     device: Annotated[str, typer.Option(help="FPGA of the boards.", metavar="proce-v-d8")] = "proce-v-d8"
 
+    def __post_init__(self) -> None:
+        if self.readings is None and self.reading:
+            raise BuildError(f"--reading {self.reading[0]} refers to a recording; add --readings FILE")
+
 
 @dataclass(frozen=True, kw_only=True)
 class InspectOptions(ReadingOptions):
@@ -67,6 +71,7 @@ class InspectOptions(ReadingOptions):
     ] = 100e6
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 1.0 <= self.clock_hz <= CLOCK_MAX_HZ:
             raise BuildError(
                 f"--clock is {self.clock_hz:g}, expected hertz from 1 to {CLOCK_MAX_HZ:g}, such as 100e6"

@@ -221,12 +221,6 @@ def check_frames(frames: int) -> None:
         raise BuildError(f"--frames is {frames}, expected 1 to {MOST_FRAMES}")
 
 
-def check_columns(recording: Path | None, columns: Sequence[str] | None) -> None:
-    """Refuse, with a BuildError, columns of a recording if there is no recording."""
-    if recording is None and columns:
-        raise BuildError(f"--reading {columns[0]} refers to a recording; add --readings FILE")
-
-
 def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -> Readings:
     """Draw a line from the prior, or from an equally probable selection, then its readings."""
     check_frames(frames)

@@ -16,7 +16,6 @@ from toolchain.analysis.accuracy import Accuracy, Interval, measure
 from toolchain.analysis.emulation import (
     EmulatedBoards,
     Readings,
-    check_columns,
     check_frames,
     joined,
     model_of_codes,
@@ -125,7 +124,6 @@ def _readings(
         frames = max(least, usual // replicas)
     check_frames(frames)
     mode = deployment.machine.sensor_mode
-    check_columns(options.readings, options.reading)
     if options.readings is not None:
         if mode is not SensorMode.COLUMN:
             raise BuildError(

@@ -128,7 +128,19 @@ class Results:
 
 def pareto(points: Sequence[Point]) -> list[Point]:
     """Return the Pareto front of total variation, cycles, ALMs and runs without a posterior."""
-    judged = [(point, figures) for point in points if (figures := _figures(point)) is not None]
+    judged = [
+        (
+            each,
+            (
+                each.total_variation,
+                each.cycles_median,
+                math.inf if each.alms is None else each.alms,
+                each.without,
+            ),
+        )
+        for each in points
+        if each.total_variation is not None
+    ]
     return [
         point
         for point, own in judged
@@ -136,13 +148,6 @@ def pareto(points: Sequence[Point]) -> list[Point]:
             other != own and all(a <= b for a, b in zip(other, own, strict=True)) for _, other in judged
         )
     ]
-
-
-def _figures(point: Point) -> tuple[float, ...] | None:
-    if point.total_variation is None:
-        return None
-    alms = math.inf if point.alms is None else point.alms
-    return (point.total_variation, point.cycles_median, alms, point.without)
 
 
 def table(points: Sequence[Point], front: Sequence[Point]) -> str:

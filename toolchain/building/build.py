@@ -63,10 +63,8 @@ class Built:
 def build_deployment(plan: MachinePlan, directory: Path, *, remark: str = "") -> Built:
     """Write a deployment: `deployment.toml`, an image per board, a report, and the hardware project.
 
-    The same plan gives the same bytes. A deployment in the folder is replaced; `remark` ends the report.
-
-    Raises:
-        BuildError: The options contradict the register map, or the folder cannot be written.
+    The same plan gives the same bytes. A deployment in the folder is replaced; `remark` ends the report. A
+    BuildError if the options contradict the register map, or the folder cannot be written.
     """
     built = assemble(plan)
     if remark:
@@ -112,10 +110,7 @@ def build_date(model_file: Path) -> str:
     """Return the build date for this model file, ISO 8601 in UTC.
 
     It is `SOURCE_DATE_EPOCH` if set, otherwise the modification time of the file, so the same input gives the
-    same bytes.
-
-    Raises:
-        BuildError: `SOURCE_DATE_EPOCH` is not a time.
+    same bytes. A BuildError if `SOURCE_DATE_EPOCH` is not a time.
     """
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
@@ -229,26 +224,22 @@ def check_agreement(deployment: Deployment, images: Sequence[Image]) -> None:
     machine = deployment.machine
     for index, (board, image) in enumerate(zip(deployment.boards, images, strict=True)):
         parameters = image.machine.parameters
-        found = {key: getattr(parameters, key) for key in MACHINE_KEYS}
-        expected = {key: getattr(machine, key) for key in MACHINE_KEYS}
+        pairs: dict[str, tuple[object, object]] = {
+            key: (getattr(machine, key), getattr(parameters, key)) for key in MACHINE_KEYS
+        }
         for variable, bits in zip(deployment.sensors, parameters.sensor_bits, strict=False):
-            found[f"bits of {variable.name}"], expected[f"bits of {variable.name}"] = bits, variable.bits
-        found |= {
-            "number of sensors": parameters.sensors,
-            "interface": f"{image.interface_sensors}x{image.interface_results}",
-            "lines of the board": parameters.lines,
-            "part of the model": image.partition,
+            pairs[f"bits of {variable.name}"] = variable.bits, bits
+        part = Partition(index, len(images), board.line_offset, machine.lines)
+        pairs |= {
+            "number of sensors": (len(deployment.sensors), parameters.sensors),
+            "interface": (machine.interface, f"{image.interface_sensors}x{image.interface_results}"),
+            "lines of the board": (board.lines, parameters.lines),
+            "part of the model": (part, image.partition),
         }
-        expected |= {
-            "number of sensors": len(deployment.sensors),
-            "interface": machine.interface,
-            "lines of the board": board.lines,
-            "part of the model": Partition(index, len(images), board.line_offset, machine.lines),
-        }
-        for key, value in found.items():
-            if value != expected[key]:
+        for key, (expected, found) in pairs.items():
+            if found != expected:
                 raise DeploymentError(
-                    f"{deployment.path} has {key} = {expected[key]}, but {board.image} was built with {value}: set it back, "
+                    f"{deployment.path} has {key} = {expected}, but {board.image} was built with {found}: set it back, "
                     "or build again with 'toolchain build'"
                 )
 

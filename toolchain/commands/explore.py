@@ -85,31 +85,20 @@ def explore(
     For example `toolchain explore casestudies/boat --partitions 4 --prob-bits 6,8 --plot boat.png`; after
     Ctrl-C, the same command resumes the sweep, whose points are in the results file.
     """
-    from toolchain.analysis.emulation import check_columns, recorded_readings, sample_readings
+    from toolchain.analysis import sweep as sweeps
+    from toolchain.analysis.emulation import recorded_readings, sample_readings
     from toolchain.analysis.logic import device_named
-    from toolchain.analysis.sweep import (
-        Results,
-        check_pictures_possible,
-        draw_sweep,
-        pareto,
-        run_sweep,
-        run_task,
-        table,
-        tasks,
-        with_resources,
-    )
 
     if plot is not None:
-        check_pictures_possible(plot)
+        sweeps.check_pictures_possible(plot)
     device = device_named(readings.device)
     read = read_model(model, flags, bits)
-    check_columns(readings.readings, readings.reading)
     if readings.readings is None:
         drawn = sample_readings(read, frames, seed=readings.seed)
     else:
         drawn = recorded_readings(readings.readings, read.variables, readings.reading or (), frames=frames)
-    kept = Results(results)
-    found = tasks(read, sweep, drawn, device)
+    kept = sweeps.Results(results)
+    found = sweeps.tasks(read, sweep, drawn, device)
     kept.check_writable()
     there = sum(task.key in kept.points for task in found)
     typer.echo(
@@ -119,10 +108,10 @@ def explore(
     )
     try:
         with progress(len(found)) as advance:
-            run_sweep(
+            sweeps.run_sweep(
                 found,
                 kept.points,
-                lambda task: run_task(task, drawn, device, sweep.banks),
+                lambda task: sweeps.run_task(task, drawn, device, sweep.banks),
                 kept.append,
                 lambda point: advance(
                     f"{point.rng}, codes of {point.prob_bits} bits, target {point.target_count}, scale {point.scale}"
@@ -130,14 +119,16 @@ def explore(
             )
     finally:
         # Ctrl-C may arrive between the write of a point and its return, so read the file.
-        kept = Results(results)
+        kept = sweeps.Results(results)
         points = [
-            with_resources(task, kept.points[task.key], device) for task in found if task.key in kept.points
+            sweeps.with_resources(task, kept.points[task.key], device)
+            for task in found
+            if task.key in kept.points
         ]
         if points:
-            front = pareto(points)
-            typer.echo(table(points, front), nl=False)
+            front = sweeps.pareto(points)
+            typer.echo(sweeps.table(points, front), nl=False)
             typer.echo(f"{len(points)} of {len(found)} machines are in {results}", err=True)
             if plot is not None:
-                draw_sweep(plot, read.name, points, front)
+                sweeps.draw_sweep(plot, read.name, points, front)
                 typer.echo(f"Wrote {plot}", err=True)

@@ -205,7 +205,8 @@ class Links:
                 beside = self._neighbours.setdefault(name, {})
                 for other in inside:
                     # an arc between the two is a better explanation than a common child
-                    if other != name and (other not in beside or _is_arc(factor, name, other)):
+                    arc = isinstance(factor, Distribution) and factor.symbol.name in {name, other}
+                    if other != name and (other not in beside or arc):
                         beside[other] = factor
 
     def components(self) -> list[set[str]]:
@@ -217,10 +218,6 @@ class Links:
                 found.append(set(self._reached(name)))
                 placed |= found[-1]
         return found
-
-    def joined(self, observed: Sequence[str]) -> bool:
-        """Return whether any two of these symbols are connected."""
-        return any(len(component.intersection(observed)) > 1 for component in self.components())
 
     def path(self, start: str, end: str) -> list[str]:
         """Return the shortest path between two symbols; empty if they are not connected."""
@@ -268,10 +265,6 @@ class Links:
         if factor.symbol.name == before:
             return f" <- {after}"
         return f" -> {factor.symbol.name} <- {after}"
-
-
-def _is_arc(factor: Factor, name: str, other: str) -> bool:
-    return isinstance(factor, Distribution) and factor.symbol.name in {name, other}
 
 
 def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:

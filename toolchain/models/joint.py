@@ -174,7 +174,7 @@ class Question:
             ": use fewer searched and known variables",
         )
         links = Links(terms, factors, {*searched, *self.given})
-        if links.joined(observed):
+        if any(len(component.intersection(observed)) > 1 for component in links.components()):
             raise self._refusal(active, observed)
         own: dict[str, list[Term]] = {symbol.name: [] for symbol in self.observed}
         common: list[Term] = []

@@ -154,9 +154,7 @@ class Model:
     known: tuple[Known, ...]
     """The known variables in the order of the machine's columns 1..N."""
     prior: NDArray[np.float64] | None = None
-    """P(S), float64[lines] summing to 1; None for a uniform one or, with a `prior_select`, for the mean of
-    its rows.
-    """
+    """P(S), float64[lines] summing to 1; None for a uniform one or, with a `prior_select`, for the mean of its rows."""
     prior_select: PriorSelect | None = None
     """The variable that selects the prior; then `prior` is the prior without a selection."""
 

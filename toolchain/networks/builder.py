@@ -18,16 +18,13 @@ MAX_VARIABLES: Final = 20_000
 MAX_STATES: Final = 65_535
 """Maximum number of states: that of a column, 2^16 - 1."""
 MAX_PARENTS: Final = 30
-"""Maximum number of parents: NumPy arrays have at most 64 axes, and no table of 2^24 entries needs as many.
-"""
+"""Maximum number of parents: NumPy arrays have at most 64 axes, and no table of 2^24 entries needs as many."""
 MAX_TOTAL: Final = 2 * MAX_ENTRIES
 """Maximum number of entries of all tables together."""
 MAX_NAME: Final = 200
 
 ROUNDING: Final = 0.02
-"""Maximum difference between the sum of a distribution and 1: published networks are rounded to two or three
-digits.
-"""
+"""Maximum difference between the sum of a distribution and 1: published networks are rounded to two or three digits."""
 
 
 class Place(Protocol):
