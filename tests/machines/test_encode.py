@@ -35,13 +35,6 @@ def test_every_code_is_the_nearest_to_what_it_makes(prob_bits):
     assert (encode_probability(made, prob_bits) == codes).all()
 
 
-def test_shapes_stay():
-    assert encode_probability(np.zeros((2, 3)), 8).shape == (2, 3)
-    assert encode_probability([0.1, 0.2], 8).dtype == np.uint16
-    assert decode_code(np.zeros((2, 3), dtype=np.uint16), 8).shape == (2, 3)
-    assert decode_code([0, 255], 8).tolist() == [0.0, 1.0]
-
-
 @pytest.mark.parametrize("p", [-0.01, 1.01, np.nan, np.inf])
 def test_a_number_that_is_not_a_probability_is_refused(p):
     with pytest.raises(ParameterError):

@@ -79,22 +79,6 @@ def test_streams_wrap_at_the_period(kind, reset):
     assert reason is StopReason.MAX_CYCLES
 
 
-def test_cycles_may_pass_the_periods_number_of_bits():
-    """The generators' state after far more cycles than an LFSR has states."""
-    machine = machine_of(lines=1, sensors=0, rng=RngKind.LFSR16, steps_per_clock=1)
-    quick = FastBM1(machine)
-    start = {"addresses": (), "target_count": 2**32 - 1}
-    quick.start(Start(**start, max_cycles=65535))
-    once, seeds = quick.counts, quick.rng_state
-    quick.reset()
-    assert (quick.rng_state == seeds).all()
-    quick.start(Start(**start, max_cycles=65535 * 100 + 1))
-    assert 0 <= int(quick.counts[0]) - 100 * int(once[0]) <= 1
-    reference = ReferenceBM1(machine)
-    reference.start(Start(**start, max_cycles=1))
-    assert (quick.rng_state == reference.rng_state).all()
-
-
 @pytest.mark.parametrize("replicas", [1, 16])
 def test_kept_words_are_shared_and_the_same_the_second_time(replicas):
     machine = machine_of(lines=30, rng_banks=3, replicas=replicas)

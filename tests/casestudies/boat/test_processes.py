@@ -72,12 +72,6 @@ def where_the_boat_is(fake):
     return answer
 
 
-async def say_result(fake, number):
-    """Return the publisher's message about one frame."""
-    await fake.publish("/bm/frame", frame_message({"sec": number, "nanosec": 0}, number, published=True))
-    await fake.publish("/BMresults", posterior_message(certain(500), 32, 32))
-
-
 @pytest.mark.process
 async def test_from_the_simulator_to_the_pictures(tmp_path):
     async with (
@@ -155,7 +149,9 @@ async def test_ctrl_c_ends_an_endless_viewer_with_its_pictures(tmp_path):
     ):
         await fake.wait_for_op("subscribe", topic="/boat/true_pose", timeout=PROCESS_PATIENCE)
         for number in (1, 2):
-            await say_result(fake, number)
+            report = frame_message({"sec": number, "nanosec": 0}, number, published=True)
+            await fake.publish("/bm/frame", report)
+            await fake.publish("/BMresults", posterior_message(certain(500), 32, 32))
         await viewer.line("    2 ")
         viewer.signal(signal.SIGINT)
         code, out, err = await viewer.ended()

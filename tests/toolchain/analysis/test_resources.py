@@ -72,11 +72,8 @@ def test_registers_are_counted_exactly():
 )
 def test_more_of_anything_takes_more(more):
     base, larger = on_d8(BOAT), on_d8(replace(BOAT, **more))
-    assert (larger.alms, larger.memories.blocks, larger.logic.registers) != (
-        base.alms,
-        base.memories.blocks,
-        base.logic.registers,
-    )
+    sizes = [(each.alms, each.memories.blocks, each.logic.registers) for each in (base, larger)]
+    assert sizes[0] != sizes[1]
     if "rng" not in more:
         assert larger.logic.aluts >= base.logic.aluts
         assert larger.logic.registers >= base.logic.registers
