@@ -22,7 +22,6 @@ from services.errors import (
     VariableError,
 )
 from services.master.peers import ANSWER_TIME, Awaited, Peer, Peers
-from services.pipeline.frames import WaitingFrames
 from services.settings import Settings
 from services.sockets.records import (
     AnyRecord,
@@ -41,6 +40,8 @@ from services.sockets.records import (
 from services.sockets.status import BUCKETS_S, FrameCounts, StageLatency
 from toolchain.deployment import Deployment
 
+QUEUE_ALL_DEPTH = 256
+"""Maximum number of frames that wait with `queue = all` before the run ends with an error."""
 MOST_AT_PUBLISHER = 8
 """Maximum number of results that the publisher has not acknowledged; frames wait when it is reached."""
 
@@ -61,7 +62,7 @@ _LOSSES = {
 
 
 @dataclass(frozen=True, slots=True)
-class WaitingReading:
+class _WaitingReading:
     """A reading that waits for the boards, and the time of its arrival (monotonic, ns)."""
 
     reading: Reading
@@ -73,7 +74,7 @@ class _Computing:
     """The frame on the boards, and the time when it was sent there (monotonic, ns)."""
 
     number: int
-    waiting: WaitingReading
+    waiting: _WaitingReading
     sent: int
 
 
@@ -148,7 +149,9 @@ class FrameFlow:
         self._show = show
         # A frame is in one of three places, in this order. `_send_next` moves the next one to the boards whenever
         # something changes that may have held it back: a reading, a result, an outcome, or a peer that is ready again.
-        self._readings: WaitingFrames[WaitingReading] = WaitingFrames(settings.queue or deployment.queue)
+        # Of the readings that wait, only the newest is kept, or all in order (`queue`).
+        self._readings: deque[_WaitingReading] = deque()
+        self._keeps_all = (settings.queue or deployment.queue) == "all"
         self._computing: _Computing | None = None
         self._at_publisher: dict[int, Publish] = {}
         # Start of the publisher's time limit (monotonic, s): when the first of these results was sent to it, or its
@@ -159,8 +162,8 @@ class FrameFlow:
         # For the status: complete readings so far, and the number of the last published frame with its time (ns).
         self._received = 0
         self._last = (0, 0)
-        # Without the readings that `_readings` has dropped, which `losses` adds.
-        self._losses: Counter[LossReason] = Counter()
+        self.losses: Counter[LossReason] = Counter()
+        """Readings and results lost so far, by reason."""
         # Causes of unusable messages of which the user has been warned: one warning each.
         self._reported_causes: set[str] = set()
         self.latencies = Latencies()
@@ -186,13 +189,6 @@ class FrameFlow:
     def counts(self) -> FrameCounts:
         """Return the counts for the status."""
         return FrameCounts.of(self._received, self.published, self.losses, self._last)
-
-    @property
-    def losses(self) -> Counter[LossReason]:
-        """Readings and results lost so far, by reason."""
-        losses = Counter(self._losses)
-        losses[LossReason.PASSED_OVER] += self._readings.passed_over
-        return losses
 
     # --- events at the peers -------------------------------------------------------------------
 
@@ -221,13 +217,13 @@ class FrameFlow:
     def lost(self, peer: Peer) -> None:
         """Count the frame or the results lost with a peer."""
         if peer is self._peers.app and self._computing is not None:
-            self._losses[LossReason.WITH_APP] += 1
+            self.losses[LossReason.WITH_APP] += 1
             if self._follows:
                 number, reason = self._computing.number, LossReason.WITH_APP
                 self._log.debug(reason, frame=number, _reason=reason)
             self._computing = None
         if peer is self._peers.publisher and self._at_publisher:
-            self._losses[LossReason.WITH_PUBLISHER] += len(self._at_publisher)
+            self.losses[LossReason.WITH_PUBLISHER] += len(self._at_publisher)
             self._at_publisher.clear()
 
     def awaited(self, peer: Peer) -> Awaited | None:
@@ -249,17 +245,25 @@ class FrameFlow:
         self._received += 1
         if self.first_reading_at is None:
             self.first_reading_at = time.monotonic()
-        self._losses[LossReason.PASSED_OVER] += reading.passed_over
-        self._losses[LossReason.UNPAIRED] += reading.unpaired
+        self.losses[LossReason.PASSED_OVER] += reading.passed_over
+        self.losses[LossReason.UNPAIRED] += reading.unpaired
         if self._peers.publisher.away and not self._once:
             # computing it would only delay a later one, whose result can be received
-            self._losses[LossReason.ROSBRIDGE_AWAY] += 1
+            self.losses[LossReason.ROSBRIDGE_AWAY] += 1
             return
-        try:
-            self._readings.put(WaitingReading(reading, time.monotonic_ns()))
-        except OverflowedQueueError as error:
-            self.fail(error)
+        if not self._keeps_all:
+            self.losses[LossReason.PASSED_OVER] += len(self._readings)
+            self._readings.clear()
+        # an error instead of a loss, because who keeps all readings wants every result
+        elif len(self._readings) >= QUEUE_ALL_DEPTH:
+            self.fail(
+                OverflowedQueueError(
+                    f"{QUEUE_ALL_DEPTH} frames wait for the boards and more come in: the boards (pcie-app) are the slow part; "
+                    "publish more slowly, lower the target count, or use queue = latest"
+                )
+            )
             return
+        self._readings.append(_WaitingReading(reading, time.monotonic_ns()))
         self._send_next()
 
     def _take_unusable(self, record: Unusable) -> None:
@@ -267,7 +271,7 @@ class FrameFlow:
         if self._once:
             self.fail(VariableError(record.sentence))
             return
-        self._losses[LossReason.UNUSABLE] += 1
+        self.losses[LossReason.UNUSABLE] += 1
         if record.cause not in self._reported_causes:
             self._reported_causes.add(record.cause)
             self._log.warning(f"{record.sentence}; such messages are skipped and counted")
@@ -281,9 +285,9 @@ class FrameFlow:
         if self._count is not None and self.published + len(self._at_publisher) >= self._count:
             # wait until it is known whether the results at the publisher are enough
             return
-        waiting = self._readings.get()
-        if waiting is None:
+        if not self._readings:
             return
+        waiting = self._readings.popleft()
         self._number += 1
         reading, number = waiting.reading, self._number
         bank = number % self._deployment.machine.rng_banks
@@ -292,7 +296,7 @@ class FrameFlow:
         if self._follows:
             self._follow(number, bank, waiting)
 
-    def _follow(self, number: int, bank: int, waiting: WaitingReading) -> None:
+    def _follow(self, number: int, bank: int, waiting: _WaitingReading) -> None:
         """Log a sent frame, and tell the subscriber its number, for its own log."""
         waited = (time.monotonic_ns() - waiting.arrived) // 1000
         self._log.debug("handed on to pcie-app", frame=number, bank=bank, waited_us=waited)
@@ -325,7 +329,7 @@ class FrameFlow:
         self._at_publisher[result.number] = record
         if publisher is None or not publisher.send(record):
             del self._at_publisher[result.number]
-            self._losses[LossReason.WITH_PUBLISHER] += 1
+            self.losses[LossReason.WITH_PUBLISHER] += 1
         self._send_next()
 
     def _take_failure(self, record: FrameFailed) -> None:
@@ -334,7 +338,7 @@ class FrameFlow:
         if self._once:
             self.fail(ReportedError(record.exit_code, record.sentence))
             return
-        self._losses[LossReason.FAILED] += 1
+        self.losses[LossReason.FAILED] += 1
         if record.reason is FailureReason.FAILED:
             now, window = time.monotonic(), self._settings.restart_window
             self._failures.append(now)
@@ -356,7 +360,7 @@ class FrameFlow:
                 self.latencies.add(publish, record)
             self.published += 1
             self._last = (record.number, time.monotonic_ns())
-            self._losses[LossReason.SOME_TOPICS] += bool(record.missed)
+            self.losses[LossReason.SOME_TOPICS] += bool(record.missed)
             self._show(record)
         elif self._once and record.outcome is Outcome.NO_POSTERIOR:
             why = f"frame {record.number} has no posterior: all counts were 0; nothing was published"
@@ -367,7 +371,7 @@ class FrameFlow:
             self.fail(RosbridgeLostError(why))
             return
         else:
-            self._losses[_LOSSES[record.outcome]] += 1
+            self.losses[_LOSSES[record.outcome]] += 1
         if self._count is not None and self.published >= self._count:
             if not self.end.done():
                 self.end.set_result(None)

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import sys
 import time
+from collections import Counter
 from collections.abc import Coroutine, Iterable
 from pathlib import Path
 from typing import Any
@@ -154,7 +155,7 @@ class Master:
 
     def summary(self) -> str:
         """Return a sentence about the results and losses of the run."""
-        losses = self._flow.losses
+        losses = Counter(self._flow.losses)
         # waiting for the robot does not count
         began = self._flow.first_reading_at
         elapsed = 0.0 if began is None else time.monotonic() - began

@@ -1,29 +1,24 @@
-"""Assembly of complete readings from the messages of one or several topics, and the queue before the boards.
+"""Assembly of complete readings from the messages of one or several topics.
 
 It has no sockets and no clock: messages go in, complete sets of addresses come out.
 """
 
-from collections import Counter, deque
+from collections import Counter
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from bridge.errors import BridgeError
 from bridge.fields import Field, all_missing
 from bridge.stamps import header_stamp_ns
-from services.errors import OverflowedQueueError, VariableError
+from services.errors import VariableError
 from services.pipeline.synchroniser import Synchroniser
 from services.sockets.records import Addresses, Reading
 from toolchain.deployment import Deployment, Variable
 from toolchain.deployment.address import to_address
 from toolchain.errors import ReadingError
 
-QUEUE_ALL_DEPTH = 256
-"""Maximum number of frames that wait with `queue = all` before the run ends with an error."""
-
 UNPAIRED_WARNING = 8
 """If every needed topic has this many unpaired messages, a gap between their stamps is reported."""
-
-Item = TypeVar("Item")
 
 
 class _SourceReader:
@@ -214,34 +209,3 @@ class FrameAssembler:
             self._tolerance_ns / 1e9,
             tuple(self._readers[source].topic for source in needed if not self._newest[source][1]),
         )
-
-
-class WaitingFrames(Generic[Item]):
-    """The queue of frames before the boards: the newest frame, or all in order up to a bound."""
-
-    def __init__(self, queue: str) -> None:
-        self._keep_all = queue == "all"
-        # At most one item unless all are kept.
-        self._waiting: deque[Item] = deque()
-        self.passed_over = 0
-
-    def put(self, frame: Item) -> None:
-        """Add a frame, or raise an OverflowedQueueError if the queue is full (only with `queue = all`)."""
-        if self._keep_all:
-            # an error instead of a loss, because a user who keeps all readings wants every result
-            if len(self._waiting) >= QUEUE_ALL_DEPTH:
-                raise OverflowedQueueError(
-                    f"{QUEUE_ALL_DEPTH} frames wait for the boards and more come in: the boards (pcie-app) are the slow part; "
-                    "publish more slowly, lower the target count, or use queue = latest"
-                )
-        elif self._waiting:
-            self._waiting.clear()
-            self.passed_over += 1
-        self._waiting.append(frame)
-
-    def get(self) -> Item | None:
-        """Return the next frame to compute, or None."""
-        return self._waiting.popleft() if self._waiting else None
-
-    def __len__(self) -> int:
-        return len(self._waiting)

@@ -14,8 +14,7 @@ from services.errors import (
     RosbridgeLostError,
     VariableError,
 )
-from services.master.flow import MOST_AT_PUBLISHER
-from services.pipeline.frames import QUEUE_ALL_DEPTH
+from services.master.flow import MOST_AT_PUBLISHER, QUEUE_ALL_DEPTH
 from services.sockets.records import (
     FailureReason,
     FrameFailed,

@@ -77,7 +77,7 @@ async def test_a_single_result_is_printed_as_a_sentence(boat, capsys, once, line
 async def test_the_summary_names_losses_only(run):
     publish_ = "0 results published in 0.0 s"
     assert run.master.summary() == publish_
-    run.flow._losses[LossReason.FAILED] = 2
+    run.flow.losses[LossReason.FAILED] = 2
     assert run.master.summary() == f"{publish_}; not published: 2 {LossReason.FAILED}"
 
 
