@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
+from bridge.discovery import ROBOT, find_uri
 from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import PcieShimError
 from services.errors import SettingsError
@@ -20,8 +21,6 @@ SHORTEST_S, LONGEST_S = 0.001, 86_400.0
 Seconds = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 ENV_PREFIX = "BM_"
 _DEPLOYMENTS = "the deployment's"
-ROBOT = "robot:"
-"""Prefix of a URI that names a robot instead of an address."""
 
 
 class Settings(BaseSettings):
@@ -192,9 +191,7 @@ def load_settings(**flags: Any) -> Settings:
     if "log_format" in given:
         use_log_format(settings.log_format)
     # looked up only where the server is used: a board would wait for a robot that it never contacts
-    if "uri" in flags and settings.uri is not None and settings.uri.startswith(ROBOT):
-        from bridge.discovery import find_uri
-
+    if "uri" in flags and settings.uri is not None:
         return settings.model_copy(update={"uri": find_uri(settings.uri)})
     return settings
 
