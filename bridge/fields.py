@@ -102,20 +102,16 @@ class Field:
             if isinstance(step, int):
                 length = _length(value)
                 if length is None:
-                    reason = f"{before!r} is {_kind(value)}, not an array"
-                elif step >= length:
-                    reason = f"{before!r} has {length} elements, so there is no index {step}"
-                else:
-                    value = _element(value, step)
-                    continue
+                    return f": {before!r} is {_kind(value)}, not an array"
+                if step >= length:
+                    return f": {before!r} has {length} elements, so there is no index {step}"
+                value = _element(value, step)
             elif not isinstance(value, dict):
-                reason = f"{before!r} is {_kind(value)}, not an object"
+                return f": {before!r} is {_kind(value)}, not an object"
             elif step not in value:
-                reason = f"it has no {step!r}{where}; it has {_list_fields(value)}"
+                return f": it has no {step!r}{where}; it has {_list_fields(value)}"
             else:
                 value = value[step]
-                continue
-            return f": {reason}"
         return ""
 
 

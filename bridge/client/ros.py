@@ -18,21 +18,13 @@ from bridge.client.actions import ActionServer, Goal, GoalHandler
 from bridge.client.handles import PUBLISH_QUEUE_SIZE, QUEUE_SIZE, Handler, Publication, Service, Subscription
 from bridge.client.protocol import ClientCore, Compression, Delivery, RosVersion
 from bridge.client.protocol.events import StatusReceived
-from bridge.client.rosapi import (
-    NodeDetails,
-    Params,
-    TypeChecks,
-    ask_definitions,
-    ask_names,
-    ask_node,
-    ask_text,
-)
+from bridge.client.rosapi import NodeDetails, Params, TypeChecks
 from bridge.client.route import Path, make_route, shown
 from bridge.client.session import Session, State, StateCallback
 from bridge.client.websocket import Limits, check_uri
 from bridge.codecs.cbor_codec import Arrays
 from bridge.codecs.json_codec import MAX_SIZE
-from bridge.codecs.message_check import Definitions
+from bridge.codecs.message_check import Definitions, definitions_from_rosapi
 from bridge.errors import ActionlibError, OptionError
 from bridge.names import ros2_type, ros_version_of_type
 from bridge.qos import Qos
@@ -380,75 +372,83 @@ class Ros:
         if self.ros_version is None:
             # The type of /rosout first: a ROS 1 server without `get_ros_version` logs an error when it is asked
             ends = time.monotonic() + timeout
-            version, has_rosapi = await self._ask_rosout_type(timeout)
-            if version is None and has_rosapi and self.ros_version is None:
-                version = await self._ask_version(max(0.0, ends - time.monotonic()))
+            rosout = await self.topic_type("/rosout", timeout)
+            version = None if rosout is None else ros_version_of_type(rosout)
+            if rosout is not None and version is None and self.ros_version is None:
+                left = max(0.0, ends - time.monotonic())
+                known = (await self._session.ask_rosapi("get_ros_version", {}, left)).get("version")
+                version = 1 if known == 1 else 2 if known == 2 else None
             self._session.core.wire.ros_version = version
         self._session.core.wire.ros_version = self.ros_version
         return self.ros_version
 
     async def topic_type(self, topic: str, timeout: float = 1.0) -> str | None:
         """Return the type of a topic at the server: empty if it does not know the topic, None without rosapi."""
-        return await ask_text(self._session, "topic_type", {"topic": topic}, "type", timeout)
+        return await self._ask_text(timeout, "topic_type", "type", topic=topic)
 
     async def topics(self, timeout: float = 1.0) -> list[str] | None:
         """Return the names of all topics at the server; None without rosapi."""
-        return await ask_names(self._session, "topics", {}, "topics", timeout)
+        return await self._ask_names(timeout, "topics", "topics")
 
     async def publishers(self, topic: str, timeout: float = 1.0) -> list[str] | None:
         """Return the names of the nodes that publish a topic; None without rosapi."""
-        return await ask_names(self._session, "publishers", {"topic": topic}, "publishers", timeout)
+        return await self._ask_names(timeout, "publishers", "publishers", topic=topic)
 
     async def subscribers(self, topic: str, timeout: float = 1.0) -> list[str] | None:
         """Return the names of the nodes that subscribe to a topic; None without rosapi."""
-        return await ask_names(self._session, "subscribers", {"topic": topic}, "subscribers", timeout)
+        return await self._ask_names(timeout, "subscribers", "subscribers", topic=topic)
 
     async def topics_for_type(self, type: str, timeout: float = 1.0) -> list[str] | None:
         """Return the names of the topics of a type; None without rosapi."""
         await self.detect_ros_version()  # rosapi compares type names literally
-        args = {"type": self._session.core.wire.type_name(type)}
-        return await ask_names(self._session, "topics_for_type", args, "topics", timeout)
+        spelt = self._session.core.wire.type_name(type)
+        return await self._ask_names(timeout, "topics_for_type", "topics", type=spelt)
 
     async def message_details(self, type: str, timeout: float = 1.0) -> Definitions:
         """Return the fields of a message type and of its parts, by type in the form of ROS 1; empty if unknown."""
-        return await ask_definitions(self._session, type, timeout)
+        args = {"type": self._session.core.wire.type_name(type)}
+        return definitions_from_rosapi(await self._session.ask_rosapi("message_details", args, timeout))
 
     async def nodes(self, timeout: float = 1.0) -> list[str] | None:
         """Return the names of all nodes; None without rosapi."""
-        return await ask_names(self._session, "nodes", {}, "nodes", timeout)
+        return await self._ask_names(timeout, "nodes", "nodes")
 
     async def node_details(self, node: str, timeout: float = 1.0) -> NodeDetails | None:
         """Return the topics and services of a node, none if it is unknown; None without rosapi."""
-        return await ask_node(self._session, node, timeout)
+        answer = await self._session.ask_rosapi("node_details", {"node": node}, timeout)
+        fields = [_names_in(answer, name) for name in ("subscribing", "publishing", "services")]
+        return None if None in fields else NodeDetails(*(names or [] for names in fields))
 
     async def services(self, timeout: float = 1.0) -> list[str] | None:
         """Return the names of all services; None without rosapi."""
-        return await ask_names(self._session, "services", {}, "services", timeout)
+        return await self._ask_names(timeout, "services", "services")
 
     async def service_type(self, service: str, timeout: float = 1.0) -> str | None:
         """Return the type of a service: empty if the server does not know it, None without rosapi."""
-        return await ask_text(self._session, "service_type", {"service": service}, "type", timeout)
+        return await self._ask_text(timeout, "service_type", "type", service=service)
 
     async def service_node(self, service: str, timeout: float = 1.0) -> str | None:
         """Return the name of the node that serves a service, empty if none does; None without rosapi."""
-        return await ask_text(self._session, "service_node", {"service": service}, "node", timeout)
+        return await self._ask_text(timeout, "service_node", "node", service=service)
 
     async def service_providers(self, type: str, timeout: float = 1.0) -> list[str] | None:
         """Return the names of the nodes that serve services of a type; None without rosapi."""
         await self.detect_ros_version()  # as in `topics_for_type`
-        args = {"service": self._session.core.wire.type_name(type, "srv")}
-        return await ask_names(self._session, "service_providers", args, "providers", timeout)
+        spelt = self._session.core.wire.type_name(type, "srv")
+        return await self._ask_names(timeout, "service_providers", "providers", service=spelt)
 
-    async def _ask_version(self, limit: float) -> RosVersion | None:
-        version = (await self._session.ask_rosapi("get_ros_version", {}, limit)).get("version")
-        return 1 if version == 1 else 2 if version == 2 else None
+    async def _ask_text(self, limit: float, question: str, field: str, **args: str) -> str | None:
+        value = (await self._session.ask_rosapi(question, args, limit)).get(field)
+        return value if isinstance(value, str) else None
 
-    async def _ask_rosout_type(self, limit: float) -> tuple[RosVersion | None, bool]:
-        """Return the version according to the type of `/rosout`, and whether there is rosapi."""
-        rosout_type = (await self._session.ask_rosapi("topic_type", {"topic": "/rosout"}, limit)).get("type")
-        if not isinstance(rosout_type, str):
-            return None, False
-        return ros_version_of_type(rosout_type), True
+    async def _ask_names(self, limit: float, question: str, field: str, **args: str) -> list[str] | None:
+        return _names_in(await self._session.ask_rosapi(question, args, limit), field)
+
+
+def _names_in(answer: dict[str, Any], field: str) -> list[str] | None:
+    """Return a list of names from an answer of rosapi; None if there is none."""
+    names = answer.get(field)
+    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else None
 
 
 def connect(

@@ -43,37 +43,6 @@ class NodeDetails:
     services: list[str]
 
 
-async def ask_text(
-    session: Session, question: str, args: Mapping[str, Any], field: str, limit: float
-) -> str | None:
-    """Return a text from an answer of rosapi; None without rosapi."""
-    value = (await session.ask_rosapi(question, args, limit)).get(field)
-    return value if isinstance(value, str) else None
-
-
-async def ask_names(
-    session: Session, question: str, args: Mapping[str, Any], field: str, limit: float
-) -> list[str] | None:
-    """Return a list of names from an answer of rosapi; None without rosapi."""
-    names = (await session.ask_rosapi(question, args, limit)).get(field)
-    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else None
-
-
-async def ask_node(session: Session, node: str, limit: float) -> NodeDetails | None:
-    """Return the topics and services of a node; None without rosapi."""
-    answer = await session.ask_rosapi("node_details", {"node": node}, limit)
-    fields = [answer.get(name) for name in ("subscribing", "publishing", "services")]
-    if not all(isinstance(names, list) for names in fields):
-        return None
-    return NodeDetails(*([name for name in names or [] if isinstance(name, str)] for names in fields))
-
-
-async def ask_definitions(session: Session, type_name: str, limit: float) -> Definitions:
-    """Return the fields of a message type and of its parts; empty if rosapi does not know it."""
-    args = {"type": session.core.wire.type_name(type_name)}
-    return definitions_from_rosapi(await session.ask_rosapi("message_details", args, limit))
-
-
 class Params:
     """The parameters of a ROS system. In ROS 2 a parameter belongs to a node, and its name is `/node:param`.
 

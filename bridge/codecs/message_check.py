@@ -80,13 +80,14 @@ def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
     while waiting:
         name = waiting.pop()
         if name in store.fielddefs and _key(name) not in found:
-            fields = {field: _field_type(*kind) for field, kind in store.fielddefs[name][1]}
+            fields = {field: element_of(*kind) for field, kind in store.fielddefs[name][1]}
             found[_key(name)] = {field: FieldType(_key(kind[0]), kind[1]) for field, kind in fields.items()}
             waiting += [element for element, _ in fields.values()]
     return found
 
 
-def _field_type(kind: Any, content: Any) -> tuple[str, int]:
+def element_of(kind: Any, content: Any) -> tuple[str, int]:
+    """Return the type of a field of rosbags, or of its elements, and its length: `SCALAR`, 0 for any, or fixed."""
     match kind.name:
         case "BASE":
             return str(content[0]), SCALAR
@@ -94,7 +95,7 @@ def _field_type(kind: Any, content: Any) -> tuple[str, int]:
             return str(content), SCALAR
         case array:
             inner, length = content
-            return _field_type(*inner)[0], length if array == "ARRAY" else 0
+            return element_of(*inner)[0], length if array == "ARRAY" else 0
 
 
 def _key(type_name: str) -> str:

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from math import inf, nan
 from typing import TYPE_CHECKING, Any, Final
 
+from bridge.codecs.message_check import element_of
+
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
@@ -109,18 +111,6 @@ class Builder:
 def fields_of(store: "Typestore", name: str) -> list[Any]:
     """Return the fields of a type, without the one that ROS 2 adds to an empty message."""
     return [entry for entry in store.fielddefs[name][1] if entry[0] != DUMMY]
-
-
-def element_of(kind: Any, content: Any) -> tuple[str, int]:
-    """Return the type of a field or of its elements, and its length: -1 for a scalar, 0 for any."""
-    name = kind.name
-    if name == "BASE":
-        return str(content[0]), -1
-    if name == "NAME":
-        return str(content), -1
-    inner, length = content
-    element, _ = element_of(*inner)
-    return element, length if name == "ARRAY" else 0
 
 
 def _scalar(value: Any, element: str, place: str) -> Any:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from bridge.codecs.message_check import element_of
 from bridge.errors import BridgeError
 from bridge.hub.conversions import (
     DEFAULTS,
@@ -20,7 +21,6 @@ from bridge.hub.conversions import (
     TIMES,
     Builder,
     Convert,
-    element_of,
     fields_of,
     typed_converter,
 )
