@@ -28,7 +28,7 @@ from tests.services.conftest import until
 async def say(fake, number, *, published=True):
     await fake.publish("/bm/frame", frame_message({"sec": number, "nanosec": 0}, number, published=published))
     if published:
-        await fake.publish("/BMresults", posterior_message(certain(number)))
+        await fake.publish("/BMresults", posterior_message(certain(number), 32, 32))
 
 
 class Listening:
