@@ -150,6 +150,11 @@ def test_a_wrong_target_is_refused_before_the_model_is_read(case, option, value)
     assert_refused(result, f"error: {option}: ")
 
 
+@pytest.mark.parametrize("name", ["nope", "nope.bif"])
+def test_a_missing_model_is_named_before_a_missing_target(tmp_path, name):
+    assert_refused(build(tmp_path / name, target=()), str(tmp_path / name))
+
+
 @pytest.mark.parametrize("at", [0, 2, 4], ids=TARGET[::2])
 def test_a_target_with_a_part_missing(case, at):
     assert_refused(build(case, target=TARGET[:at] + TARGET[at + 2 :]), f"{TARGET[at]} is missing")
