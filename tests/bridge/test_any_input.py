@@ -29,6 +29,7 @@ from bridge.codecs.serialised import MessageTypes
 from bridge.errors import BridgeError, DecodeError, EncodeError
 from bridge.hub.broker import Broker
 from bridge.hub.limits import HubLimits
+from bridge.names import absolute
 from bridge.qos import Qos
 
 MAX_SIZE, MAX_DEPTH = 4096, 8
@@ -189,7 +190,7 @@ def test_serialised_bytes_give_a_message_of_the_type(name, data):
 
 # The client's core between a user and a server that both may do anything
 
-TOPICS = st.sampled_from(("/a", "b", "/a/b"))
+TOPICS = st.sampled_from(("/a", "a", "b", "/a/b"))
 ODD = (
     *(None, True, 0, -1, 3, 1.5, 1e300, 2**63, 2**70, "", "x", "/a", "9", [], [1.5, None], [[[]]]),
     *({}, {"a": [1]}),
@@ -226,21 +227,54 @@ def refusals():
         check_sentence(error)
 
 
+class PaperServer:
+    """The state of a server, as known from the wire, in the simplest form."""
+
+    def __init__(self):
+        self.advertised = {}
+        self.subscribed = {}
+        self.services = set()
+
+    def hear(self, operation):
+        operation["topic"] = absolute(operation.get("topic", ""))
+        match operation["op"]:
+            case "advertise":
+                assert operation["topic"] not in self.advertised, "advertised twice"
+                self.advertised[operation["topic"]] = operation
+            case "unadvertise":
+                assert self.advertised.pop(operation["topic"])["id"] == operation["id"]
+            case "subscribe":
+                self.subscribed.setdefault(operation["topic"], {})[operation["id"]] = operation
+            case "unsubscribe":
+                del self.subscribed[operation["topic"]][operation["id"]]
+            case "advertise_service":
+                self.services.add(operation["service"])
+            case "unadvertise_service":
+                self.services.remove(operation["service"])
+            case other:
+                assert (
+                    other in {"publish", "fragment", "call_service", "service_response"} or "action" in other
+                )
+
+
 class AnyServer(RuleBasedStateMachine):
-    """Check that errors are the bridge's, memory is bounded, and output is strict JSON."""
+    """Check that errors are the bridge's, memory is bounded, output is strict JSON, and the server knows what is wanted."""
 
     def __init__(self):
         super().__init__()
         self.core = ClientCore(max_size=MAX_SIZE, max_depth=MAX_DEPTH, fragment_size=50)
+        self.core.restore()
         self.now = 0.0
-        self.subscriptions = set()
+        self.server = PaperServer()
+        self.subscriptions = {}
         self.advertisements = []
+        self.services = set()
         self.asked = []
         """Identities of calls and goals."""
         self.tickets = []
 
     @invariant()
-    def bounds_and_strict_json(self):
+    def bounds_strict_json_and_the_server_knows_what_is_wanted(self):
         core = self.core
         for data in core.data_to_send():
             assert core.wire.connected
@@ -249,17 +283,33 @@ class AnyServer(RuleBasedStateMachine):
             assert type(operation["op"]) is str
             pieces = list(core.wire.pieces(data))
             assert pieces == [data] or all(json.loads(piece)["op"] == "fragment" for piece in pieces)
+            self.server.hear(operation)
         assert len(core.services) <= MAX_REQUESTS
         assert len(core.calls) <= MAX_CALLS
         assert len(core.goals) <= MAX_GOALS
         assert core._fragments.waiting_bytes <= 4 * (MAX_SIZE + 128)
+        if core.wire.connected:
+            assert set(self.server.advertised) == {topic for _number, topic in self.advertisements}
+            assert self.server.services == self.services
+            asked = {topic: by_id for topic, by_id in self.server.subscribed.items() if by_id}
+            assert set(asked) == {topic for topic, _rate, _length in self.subscriptions.values()}
+            for topic, by_id in asked.items():
+                (subscribe,) = by_id.values()  # one on the wire
+                _, rates, lengths = zip(
+                    *(w for w in self.subscriptions.values() if w[0] == topic), strict=True
+                )
+                assert (subscribe["throttle_rate"], subscribe["queue_length"]) == (min(rates), max(lengths))
 
-    def take(self, data):
-        self.now += 0.5
+    def take(self, data, step=0.5):
+        self.now += step
         event = self.core.receive(data if isinstance(data, bytes) else data.encode(), self.now)
         if isinstance(event, MessageReceived | MessageDiscarded):
             assert event.subscriptions
-            assert set(event.subscriptions) <= self.subscriptions
+            assert len(set(event.subscriptions)) == len(event.subscriptions)
+            wanting = self.wanting(event.topic)
+            # Only those who want fewer than the server was asked for can be left out.
+            fastest = {number for number, rate in wanting.items() if rate == min(wanting.values())}
+            assert fastest <= set(event.subscriptions) <= set(wanting)
         if isinstance(event, MessageReceived):
             assert type(event.msg) is dict
         elif isinstance(event, MessageDiscarded):
@@ -269,6 +319,16 @@ class AnyServer(RuleBasedStateMachine):
         elif isinstance(event, UnusableReceived):
             assert len(event.reason) <= LONGEST_SENTENCE
             assert "\n" not in event.reason
+        return event
+
+    def wanting(self, topic):
+        wanted = self.subscriptions.items()
+        return {number: rate for number, (name, rate, _length) in wanted if name == absolute(topic)}
+
+    @rule(topic=TOPICS, step=st.sampled_from([0.0, 0.05, 0.2, 2.0]))
+    def message(self, topic, step):
+        event = self.take(json.dumps({"op": "publish", "topic": topic, "msg": {}}), step)
+        assert (event is None) == (not self.wanting(topic))
 
     @rule(data=st.binary(max_size=60) | json_like)
     def receive_raw(self, data):
@@ -308,6 +368,7 @@ class AnyServer(RuleBasedStateMachine):
     @rule()
     def connect(self):
         self.core.lost()
+        self.server = PaperServer()
         self.core.restore()
 
     @rule()
@@ -316,27 +377,30 @@ class AnyServer(RuleBasedStateMachine):
 
     @rule(
         topic=TOPICS,
-        type_name=st.sampled_from(("p/T", "p/msg/T", None, "p/U")),
-        rate=st.sampled_from((0, 0, 700, -1)),
-        delivery=st.sampled_from(DELIVERIES),
+        type_name=st.sampled_from((*("p/T", "p/msg/T", None) * 3, "p/U")),
+        rate=st.sampled_from((0, 100, 700, 0, 100, 700, -1)),
+        length=st.sampled_from((0, 5)),
+        delivery=st.sampled_from((*[Delivery()] * 20, *DELIVERIES)),
     )
-    def subscribe(self, topic, type_name, rate, delivery):
+    def subscribe(self, topic, type_name, rate, length, delivery):
+        options = {"throttle_rate": rate, "queue_length": length, "delivery": delivery}
         with refusals():
-            self.subscriptions.add(
-                self.core.subscriptions.subscribe(topic, type_name, throttle_rate=rate, delivery=delivery)
-            )
+            number = self.core.subscriptions.subscribe(topic, type_name, **options)
+            assert number not in self.subscriptions
+            self.subscriptions[number] = (absolute(topic), rate, length)
 
     @rule(draw=st.data())
     @precondition(lambda self: self.subscriptions)
     def unsubscribe(self, draw):
         number = draw.draw(st.sampled_from(sorted(self.subscriptions)))
-        self.subscriptions.remove(number)
+        del self.subscriptions[number]
         self.core.subscriptions.unsubscribe(number)
 
     @rule(topic=TOPICS, type_name=st.sampled_from(("p/T", "p/msg/T", "q")), latch=st.booleans())
     def advertise(self, topic, type_name, latch):
         with refusals():
-            self.advertisements.append(self.core.publications.advertise(topic, type_name, latch=latch))
+            number = self.core.publications.advertise(topic, type_name, latch=latch)
+            self.advertisements.append((number, absolute(topic)))
 
     @rule(
         value=st.sampled_from((*ODD, "\ud800", math.nan, np.arange(3.0), np.array([math.inf]), b"x", {1: 2}))
@@ -344,13 +408,14 @@ class AnyServer(RuleBasedStateMachine):
     @precondition(lambda self: self.advertisements)
     def publish(self, value):
         with refusals():
-            data = self.core.publications.publish(self.advertisements[-1], {"value": value})
+            data = self.core.publications.publish(self.advertisements[-1][0], {"value": value})
             assert type(json.loads(data, parse_constant=no_constant)["msg"]) is dict
 
-    @rule()
+    @rule(draw=st.data())
     @precondition(lambda self: self.advertisements)
-    def unadvertise(self):
-        self.core.publications.unadvertise(self.advertisements.pop())
+    def unadvertise(self, draw):
+        at = draw.draw(st.integers(0, len(self.advertisements) - 1))
+        self.core.publications.unadvertise(self.advertisements.pop(at)[0])
 
     @rule(name=st.sampled_from(("/s", "t")), value=st.sampled_from(ODD), forget=st.booleans())
     def call(self, name, value, forget):
@@ -368,10 +433,11 @@ class AnyServer(RuleBasedStateMachine):
 
     @rule(service=st.sampled_from(("/s", "/t")))
     def serve(self, service):
-        if service in self.core.services:
+        if service in self.services:
             self.core.services.unadvertise(service)
         else:
             self.core.services.advertise(service, "p/T")
+        self.services ^= {service}
 
     @rule(value=st.sampled_from(ODD), ok=st.booleans())
     @precondition(lambda self: self.tickets)
@@ -384,9 +450,11 @@ class AnyServer(RuleBasedStateMachine):
     def pass_time(self, seconds):
         self.now += seconds
         self.core.subscriptions.retry_untyped()
+        for topic in self.core.subscriptions.silent():
+            self.core.subscriptions.renew(topic)
 
 
-AnyServer.TestCase.settings = settings(max_examples=100, stateful_step_count=30)
+AnyServer.TestCase.settings = settings(max_examples=200, stateful_step_count=30)
 TestAnyServer = AnyServer.TestCase
 
 

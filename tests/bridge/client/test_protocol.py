@@ -1,20 +1,16 @@
 """The client's state machine without a network.
 
-ClientCore ──data_to_send──▶ PaperServer (keeps what the wire said)
-    ▲                              │
-    └───────────receive────────────┘
+ClientCore ──data_to_send──▶ the test (plays the server; any one is in tests/bridge/test_any_input.py)
+    ▲                          │
+    └──────────receive─────────┘
 """
 
 import json
-import math
 
 import cbor2
 import pytest
-from hypothesis import settings
-from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from bridge.client.protocol import ClientCore, Delivery
+from bridge.client.protocol import Delivery
 from bridge.client.protocol.calls_and_goals import MAX_CALLS, MAX_REQUESTS
 from bridge.client.protocol.events import (
     CallAnswered,
@@ -25,7 +21,6 @@ from bridge.client.protocol.events import (
 )
 from bridge.codecs import png
 from bridge.errors import EncodeError, NameFormError, OptionError, SlowPeerError, TypeConflictError
-from bridge.names import absolute
 from bridge.qos import Qos
 from tests.bridge.client.stand_ins import connected, sent, tell
 
@@ -76,13 +71,6 @@ def test_one_topic_wanted_as_two_things_is_refused(wish, change):
     for number in wanted:
         forget(number)
     want("/a", **{"type_name": "p/T"} | change)
-
-
-def test_a_message_that_cannot_leave_is_named():
-    core = connected()
-    number = core.publications.advertise("/a", "p/T")
-    with pytest.raises(EncodeError, match=r"^a message of /a cannot be published: x\.y is NaN"):
-        core.publications.publish(number, {"x": {"y": math.nan}})
 
 
 def test_the_limits_of_a_published_message():
@@ -311,137 +299,3 @@ def test_what_is_unusable_says_so(data):
     event = core.receive(data, 0.0)
     assert isinstance(event, UnusableReceived)
     assert 10 < len(event.reason) < 300
-
-
-# Any sequence of wishes, losses and messages
-
-TOPICS = ["/a", "a", "/b", "c"]
-
-
-class PaperServer:
-    """The state of a server, as known from the wire, in the simplest form."""
-
-    def __init__(self):
-        self.advertised = {}
-        self.subscribed = {}
-        self.services = set()
-
-    def hear(self, operation):
-        operation["topic"] = absolute(operation.get("topic", ""))
-        match operation["op"]:
-            case "advertise":
-                assert operation["topic"] not in self.advertised, "advertised twice"
-                self.advertised[operation["topic"]] = operation
-            case "unadvertise":
-                assert self.advertised.pop(operation["topic"])["id"] == operation["id"]
-            case "subscribe":
-                self.subscribed.setdefault(operation["topic"], {})[operation["id"]] = operation
-            case "unsubscribe":
-                del self.subscribed[operation["topic"]][operation["id"]]
-            case "advertise_service":
-                self.services.add(operation["service"])
-            case "unadvertise_service":
-                self.services.remove(operation["service"])
-            case other:
-                raise AssertionError(other)
-
-
-class Wishes(RuleBasedStateMachine):
-    """Check that the client's requests and the server's state always agree while connected."""
-
-    def __init__(self):
-        super().__init__()
-        self.core = ClientCore()
-        self.server = PaperServer()
-        self.now = 0.0
-        self.advertisements = {}
-        self.subscriptions = {}
-        self.services = set()
-
-    @rule()
-    def connect(self):
-        self.core.lost()
-        self.server = PaperServer()
-        self.core.restore()
-
-    @rule()
-    def lose(self):
-        self.core.lost()
-
-    @rule(topic=st.sampled_from(TOPICS), type_name=st.sampled_from(["p/T", "p/msg/T"]))
-    def advertise(self, topic, type_name):
-        self.advertisements[self.core.publications.advertise(topic, type_name)] = absolute(topic)
-
-    @rule(data=st.data())
-    @precondition(lambda self: self.advertisements)
-    def unadvertise(self, data):
-        number = data.draw(st.sampled_from(sorted(self.advertisements)))
-        self.core.publications.unadvertise(number)
-        del self.advertisements[number]
-
-    @rule(
-        topic=st.sampled_from(TOPICS),
-        type_name=st.sampled_from([None, "p/T", "p/msg/T"]),
-        rate=st.sampled_from([0, 100, 1000]),
-        length=st.sampled_from([0, 5]),
-    )
-    def subscribe(self, topic, type_name, rate, length):
-        number = self.core.subscriptions.subscribe(topic, type_name, throttle_rate=rate, queue_length=length)
-        assert number not in self.subscriptions
-        self.subscriptions[number] = (absolute(topic), rate, length)
-
-    @rule(data=st.data())
-    @precondition(lambda self: self.subscriptions)
-    def unsubscribe(self, data):
-        number = data.draw(st.sampled_from(sorted(self.subscriptions)))
-        self.core.subscriptions.unsubscribe(number)
-        del self.subscriptions[number]
-
-    @rule(service=st.sampled_from(["/s", "/t"]))
-    def toggle_service(self, service):
-        if service in self.services:
-            self.core.services.unadvertise(service)
-        else:
-            self.core.services.advertise(service, "p/T")
-        self.services ^= {service}
-
-    @rule()
-    def ask_again(self):
-        self.core.subscriptions.retry_untyped()
-        for topic in self.core.subscriptions.silent():
-            self.core.subscriptions.renew(topic)
-
-    @rule(topic=st.sampled_from([*TOPICS, "/c"]), step=st.sampled_from([0.0, 0.05, 0.2, 2.0]))
-    def message(self, topic, step):
-        self.now += step
-        event = self.core.receive(json.dumps({"op": "publish", "topic": topic, "msg": {}}).encode(), self.now)
-        assert event is None or isinstance(event, MessageReceived)
-        received = [] if event is None else list(event.subscriptions)
-        assert len(set(received)) == len(received)
-        wanting = {
-            n: rate for n, (wanted, rate, _length) in self.subscriptions.items() if wanted == absolute(topic)
-        }
-        # Only those who want fewer than the server was asked for can be left out.
-        fastest = {number for number, rate in wanting.items() if rate == min(wanting.values())}
-        assert fastest <= set(received) <= set(wanting)
-
-    @invariant()
-    def the_server_knows_what_is_wanted(self):
-        for operation in sent(self.core):
-            assert self.core.wire.connected
-            self.server.hear(operation)
-        if not self.core.wire.connected:
-            return
-        assert set(self.server.advertised) == set(self.advertisements.values())
-        assert self.server.services == self.services
-        by_topic = {topic: by_id for topic, by_id in self.server.subscribed.items() if by_id}
-        assert set(by_topic) == {topic for topic, _rate, _length in self.subscriptions.values()}
-        for topic, by_id in by_topic.items():
-            ((_id, subscribe),) = by_id.items()  # one on the wire
-            wanted = [w for w in self.subscriptions.values() if w[0] == topic]
-            assert subscribe["throttle_rate"] == min(rate for _topic, rate, _length in wanted)
-            assert subscribe["queue_length"] == max(length for _topic, _rate, length in wanted)
-
-
-TestWishes = Wishes.TestCase
-TestWishes.settings = settings(max_examples=100, stateful_step_count=30, deadline=None)
