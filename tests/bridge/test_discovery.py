@@ -11,7 +11,7 @@ import zeroconf.asyncio  # noqa: F401 - here, because it runs ldconfig when it i
 
 from bridge import discovery
 from bridge.discovery import DiscoveryError, Robot, UnknownRobotError, announced, discover, resolve
-from tests.patience import PATIENCE, PROCESS_PATIENCE
+from tests.patience import PATIENCE
 
 LOOPBACK = ("127.0.0.1",)
 
@@ -78,14 +78,6 @@ async def test_without_zeroconf_one_sentence_says_so(monkeypatch):
 async def test_without_a_network_one_sentence_says_so():
     with pytest.raises(DiscoveryError, match="no network"):
         await discover(0.1, interfaces=("192.0.2.77",))
-
-
-@pytest.mark.thorough
-def test_importing_this_imports_no_zeroconf():
-    import subprocess
-
-    code = "import sys, bridge.discovery, services.commands.discover; sys.exit('zeroconf' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], check=False, timeout=PROCESS_PATIENCE).returncode == 0
 
 
 def _announced(**properties):

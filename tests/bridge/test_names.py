@@ -1,8 +1,12 @@
+"""Names, types, stamps and qualities of service: what is written is read, and the malformed is refused."""
+
+import math
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.errors import BridgeError, NameFormError
+from bridge.errors import BridgeError, NameFormError, OptionError
 from bridge.names import (
     MAX_NAME,
     absolute,
@@ -13,6 +17,8 @@ from bridge.names import (
     same_type,
     split_type,
 )
+from bridge.qos import Qos
+from bridge.stamps import header, header_stamp_ns, ros_version_of_message, stamp, stamp_ns
 
 names = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,20}", fullmatch=True)
 
@@ -77,3 +83,80 @@ def test_any_text_is_named_or_refused(text):
         except BridgeError as error:
             assert error.exit_code == 2
             assert len(str(error)) < 500
+
+
+# Stamps
+
+times = st.integers(min_value=0, max_value=2**31 * 10**9)
+
+
+def test_keys_of_either_ros_or_of_both():
+    assert stamp(5_000_000_006, 1) == {"secs": 5, "nsecs": 6}
+    assert stamp(5_000_000_006, 2) == {"sec": 5, "nanosec": 6}
+    assert stamp(5_000_000_006) == {"sec": 5, "nanosec": 6, "secs": 5, "nsecs": 6}
+
+
+@given(times, st.sampled_from([1, 2, None]))
+def test_what_is_built_is_read(time, version):
+    assert stamp_ns(stamp(time, version)) == time
+    msg = {"header": header(time, "map", version)}
+    assert set(msg["header"]) == {"stamp", "frame_id"}
+    assert header_stamp_ns(msg) == (time or None)
+    assert ros_version_of_message(msg) == version
+
+
+@pytest.mark.parametrize(
+    ("time", "nanoseconds"),
+    [(time, None) for time in (None, 5, "now", [], {}, {"sec": "5"}, {"sec": 5, "nanosec": None})]
+    + [({"secs": 1.5}, None), ({"sec": True}, None), ({"sec": 3}, 3_000_000_000)],
+)
+def test_what_is_a_time(time, nanoseconds):
+    assert stamp_ns(time) == nanoseconds
+
+
+@pytest.mark.parametrize("head", [None, 3, {}, {"stamp": 1}, {"stamp": {}}])
+def test_messages_without_a_stamp(head):
+    for msg in ({}, {"header": head}):
+        assert header_stamp_ns(msg) is None
+        assert ros_version_of_message(msg) is None
+
+
+# Quality of service
+
+
+def test_only_given_options_are_requested():
+    assert Qos().as_operation() == {}
+    assert Qos(
+        history="keep_last",
+        depth=5,
+        reliability="best_effort",
+        durability="transient_local",
+        deadline=1.25,
+        lifespan=math.inf,
+    ).as_operation() == {
+        "history": "keep_last",
+        "depth": 5,
+        "reliability": "best_effort",
+        "durability": "transient_local",
+        "deadline": {"secs": 1, "nsecs": 250_000_000},
+        "lifespan": "infinite",
+    }
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"history": "all"},
+        {"reliability": "RELIABLE"},
+        {"durability": 1},
+        {"depth": -1},
+        {"depth": 1.0},
+        {"depth": True},
+        {"deadline": -1},
+        {"deadline": math.nan},
+        {"lifespan": True},
+    ],
+)
+def test_what_servers_would_refuse_is_refused_here(wrong):
+    with pytest.raises(OptionError, match=f"qos {next(iter(wrong))}"):
+        Qos(**wrong)

@@ -2,11 +2,22 @@ import json
 import math
 
 import numpy as np
+import orjson
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from bridge.codecs.json_codec import MAX_DEPTH, MAX_SIZE, decode, encode, find_nonfinite, is_deeper
+from bridge.codecs.json_codec import (
+    LONGEST,
+    MAX_DEPTH,
+    MAX_SIZE,
+    decode,
+    encode,
+    envelope_of,
+    find_nonfinite,
+    is_deeper,
+    topic_of,
+)
 from bridge.errors import DecodeError, EncodeError
 
 numbers = st.integers(-(2**63), 2**64 - 1) | st.floats()
@@ -30,23 +41,12 @@ def depth_of(value):
     return 1 + max(map(depth_of, value.values() if isinstance(value, dict) else value), default=0)
 
 
-def numbers_of(value):
-    if isinstance(value, dict):
-        return [n for part in value.values() for n in numbers_of(part)]
-    if isinstance(value, list):
-        return [n for part in value for n in numbers_of(part)]
-    return [value] if isinstance(value, float) else []
-
-
 # Inbound
 
 
 @given(objects)
 def test_output_of_the_standard_library_is_read(message):
-    read = decode(json.dumps(message))
-    assert all(map(math.isfinite, numbers_of(read)))
-    # Written again without what is not finite, it is the same for both.
-    assert read == json.loads(encode(message))
+    assert decode(json.dumps(message)) == json.loads(encode(message))  # both without what is not finite
 
 
 @pytest.mark.parametrize(
@@ -219,3 +219,55 @@ def test_the_limits_of_size_and_of_what_goes_out():
     for message in (loop, *(nested(levels) for levels in (MAX_DEPTH + 1, 250, 260, 5000))):
         with pytest.raises(EncodeError):
             encode(message)
+
+
+# Envelopes: the bytes before a message, which tell its topic
+
+CANONICAL = b'{"op":"publish","topic":"/t","msg":'
+
+
+def test_the_bytes_before_a_message_are_its_envelope():
+    assert envelope_of(CANONICAL + b'{"msg":1}}') == CANONICAL
+    assert envelope_of(b'{"op":"status"}') == b""
+    assert envelope_of(b'{"op":"publish","topic":"' + b"t" * LONGEST + b'","msg":{}}') == b""
+
+
+@pytest.mark.parametrize(
+    ("envelope", "topic"),
+    [
+        (CANONICAL, "/t"),
+        (b'{"op": "publish", "topic": "/t", "msg": ', "/t"),
+        (b'{"topic":"\\/t","op":"publish","msg":', "/t"),
+        (b'{"op":"publish","msg":{},"topic":"/t","msg":', "/t"),
+        (b"", None),
+        (b'{"op":"publish","topic":"/t","msg"', None),
+        (b'{"op":"publish","topic":"/t","id":1,"msg":', None),
+        (b'{"op":"publish","topic":7,"msg":', None),
+        (b'{"op":"status","topic":"/t","msg":', None),
+        (b'{"op":"publish","topic":"/t","msg":{"a":', None),
+        (b'{"op":"publish","topic":"/t","msg":{},"x":', None),
+        (b'{"op":"publish","topic":"/t","msg":"', None),
+        (b'{"op":"publish","msg":{},"topic":', None),
+        (CANONICAL + b"{}}", None),
+    ],
+)
+def test_an_envelope_tells_its_topic_and_other_beginnings_are_none(envelope, topic):
+    assert topic_of(envelope) == topic
+
+
+@settings(max_examples=500, deadline=None)
+@given(
+    st.lists(
+        st.sampled_from([*b'{}[]":, \\', *b'"op""topic""msg""publish""/t"']).map(lambda byte: bytes([byte]))
+        | st.sampled_from([b'"op":"publish"', b'"topic":"/t"', b'"topic":"/u"', b'"msg":', b"{}", b","]),
+        max_size=12,
+    ).map(b"".join)
+)
+@example(b'"op":"publish","msg":{},"topic":"/t","msg":')
+def test_a_proven_envelope_says_the_same_around_any_message(middle):
+    envelope = b"{" + middle
+    topic = topic_of(envelope)
+    if topic is not None:
+        for message in (b"{}", b'{"a":1}', b'{"op":"x","topic":"y","msg":{}}', b' {"}":"{"} '):
+            whole = orjson.loads(envelope + message + b"}")
+            assert whole == {"op": "publish", "topic": topic, "msg": orjson.loads(message)}

@@ -24,18 +24,9 @@ def scan(store):
     time = types["builtin_interfaces/msg/Time"](sec=12, nanosec=34)
     extra = {"seq": 7} if store is ROS1 else {}
     header = types["std_msgs/msg/Header"](stamp=time, frame_id="laser", **extra)
-    return types["sensor_msgs/msg/LaserScan"](
-        header,
-        -1.5,
-        1.5,
-        0.1,
-        0.0,
-        0.05,
-        0.2,
-        10.0,
-        np.array([1, np.inf, 3], np.float32),
-        np.empty(0, np.float32),
-    )
+    numbers = (-1.5, 1.5, 0.1, 0.0, 0.05, 0.2, 10.0)
+    arrays = (np.array([1, np.inf, 3], np.float32), np.empty(0, np.float32))
+    return types["sensor_msgs/msg/LaserScan"](header, *numbers, *arrays)
 
 
 def of_ros1(message):
@@ -136,7 +127,7 @@ def test_without_rosbags_one_sentence_says_so(monkeypatch):
 @pytest.mark.parametrize(
     "use",
     [
-        "import bridge.client, bridge.codecs.serialised",
+        "import bridge.client, bridge.codecs.serialised, bridge.discovery",
         "import bridge.fields, bridge.stamps; from bridge.codecs.json_codec import encode; encode({'a': 1.0})",
         "from bridge.codecs.cbor_codec import *; decode(encode({'a': typed_array([1.5], 'f8')}))",
     ],
