@@ -16,7 +16,6 @@ It behaves as real servers do (A: rosbridge_suite on ROS 1, B: on ROS 2, R: rosb
 * a `throttle_rate` that is not an int ends a subscription (A and B silently, R with a status);
 * errors are not reported (A, B), unless `statuses` (R: `{"op": "status", "level": "error", ...}`);
 * a client that subscribes to a topic by two ids gets its first message twice (B);
-* NaN and infinities leave as null (A, B, R);
 * type names of the ROS 2 form are refused (A), with `ros=1`; rosapi, if present, answers as in that ROS version;
 * a subscription made before a best-effort publisher started never hears it (B: `MultiSubscriber.__init__` in
   rosbridge_library/internal/subscribers.py chooses the reliability once), for topics of `start_best_effort`;
@@ -30,7 +29,6 @@ import asyncio
 import contextlib
 import itertools
 import json
-import math
 import socket
 import time
 from dataclasses import dataclass, field
@@ -278,7 +276,7 @@ class FakeRosbridge:
 
     async def _say(self, client, data):
         if isinstance(data, dict):
-            data = json.dumps(_without_nan(data))
+            data = json.dumps(data)
         if self.delay:
             task = asyncio.create_task(self._say_late(client, data))
             self._late.add(task)
@@ -403,9 +401,6 @@ class FakeRosbridge:
             answer["id"] = call["id"]
         await self._say(client, answer)
 
-    async def _op_status(self, client, op):
-        """Ignore operations that clients may send too."""
-
     # rosapi
 
     def _rosapi(self, service):
@@ -429,13 +424,3 @@ class FakeRosbridge:
 def _bare(type_name):
     parts = type_name.split("/")
     return parts[0], parts[-1]
-
-
-def _without_nan(value):
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: _without_nan(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(part) for part in value]
-    return value

@@ -26,26 +26,6 @@ def find(message, name):
     return value
 
 
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("D1", 4),
-        ("w", 1.0),
-        ("frame_id", "map"),
-        ("position", {"x": 1.5, "y": 2.5}),
-        ("ranges", POSE["ranges"]),
-        ("pose.position.x", 1.5),
-        ("header.stamp.sec", 1),
-        ("ranges[0]", 0.1),
-        ("ranges[1]", None),
-        ("ranges[2].deep", 7),
-        ("ranges[3][1]", 9),
-    ],
-)
-def test_what_is_there(name, value):
-    assert Field(name).value(POSE) == (True, value)
-
-
 def test_a_bare_name_that_is_there_more_than_once_is_an_error_with_all_places():
     message = {"v": {"v": 3}, "a": [{"v": 1}], "b": {"c": {"v": {}}, "v": []}}
     with pytest.raises(FieldAmbiguousError, match=r"4 fields named 'v' \(v, v\.v, b\.c\.v, b\.v\)") as caught:

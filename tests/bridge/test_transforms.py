@@ -124,12 +124,6 @@ def test_the_history_is_limited():
         {"header": {"stamp": "now", "frame_id": "a"}},
         {
             "transform": {
-                "translation": {"x": None, "y": 0, "z": 0},
-                "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
-            }
-        },
-        {
-            "transform": {
                 "translation": {"x": 0, "y": 0, "z": 0},
                 "rotation": {"x": 0, "y": 0, "z": 0, "w": 0},
             }

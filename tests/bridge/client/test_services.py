@@ -28,12 +28,6 @@ async def test_calls_and_refusals(fake, ros):
     assert [call["service"] for call in calls].count("/rosapi/service_type") == 1
 
 
-async def test_a_request_for_an_unserved_service_is_refused_at_once(fake, ros):
-    ros._session._take([b'{"op": "call_service", "service": "/nope", "id": "1", "args": {}}'])
-    refusal = await fake.wait_for_op("service_response", service="/nope")
-    assert refusal["result"] is False
-
-
 @pytest.mark.parametrize("fake", [{"delay": 0.5}], indirect=True)
 async def test_no_answer_in_time(fake, ros):
     fake.serve("/s", lambda args: args)
@@ -133,18 +127,3 @@ async def test_closing_ends_what_is_being_handled(fake, ros, caller):
     assert ended.is_set()
     with pytest.raises(NoAnswerError):
         await call
-
-
-async def test_more_requests_than_can_be_handled_are_refused(fake, ros, caller):
-    release = asyncio.Event()
-
-    async def handler(_args):
-        await release.wait()
-
-    await ros.advertise_service("/s", "p/T", handler)
-    await fake.wait_for_op("advertise_service")
-    calls = [asyncio.create_task(caller.call("/s", timeout=PATIENCE)) for _ in range(70)]
-    await fake.wait_for_op("service_response", count=6)
-    release.set()
-    await asyncio.gather(*calls)
-    assert [answer["result"] for answer in fake.ops("service_response")] == [False] * 6 + [True] * 64

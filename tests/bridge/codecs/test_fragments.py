@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.codecs.fragments import MAX_FRAGMENTS, Reassembler, split
+from bridge.codecs.fragments import MAX_FRAGMENTS, OVERHEAD, Reassembler, split
 from bridge.errors import DecodeError
 
 
@@ -135,8 +135,11 @@ def test_a_message_that_cannot_become_whole_or_is_too_large_is_given_up(taken, r
     assert (len(box), box.waiting_bytes, box.given_up) == (0, 0, 1)
 
 
-def test_messages_that_never_end_are_bounded_in_time():
+def test_messages_that_never_end_are_bounded_in_time_and_charged_in_bytes():
     box = Reassembler(max_age=10)
+    box.take(fragment(0, "\N{GRINNING FACE}" * 100, 2), 0.0)
+    assert box.waiting_bytes == 400 + OVERHEAD  # one such character makes Python store four bytes each
+    box.clear()
     box.take(fragment(0, "a", 3), 0.0)
     box.take(fragment(1, "b", 3), 9.0)
     box.take(fragment(0, "z", 3, "other"), 18.0)

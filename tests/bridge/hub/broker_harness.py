@@ -1,9 +1,8 @@
 """A broker without sockets for tests, its clients, and the invariants that are checked after each of their steps."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import inf
-from typing import Any
 
 from bridge.codecs import cbor_codec
 from bridge.hub.broker import Broker
@@ -24,7 +23,6 @@ class Peer:
 
     hub: "Harness"
     client: Client
-    arrived: list[dict[str, Any]] = field(default_factory=list)
 
     def send(self, **operation):
         self.send_raw(json.dumps(operation).encode())
@@ -122,12 +120,9 @@ class Harness:
                 assert subscription.options
         assert graph.latched_bytes == sum(len(topic.latched or b"") for topic in graph.topics.values())
         assert graph.latched_bytes <= limits.latched_bytes
-        for name, service in graph.services.items():
-            assert service.name == name
-            assert name in service.client.services
-        for name, action in graph.actions.items():
-            assert action.name == name
-            assert name in action.client.actions
+        for name, offer in [*graph.services.items(), *graph.actions.items()]:
+            assert offer.name == name
+            assert name in offer.client.services | offer.client.actions
         calls, goals = broker._calls.pending, broker._actions.goals
         for client in clients:
             assert all(graph.actions[name].client is client for name in client.actions)

@@ -101,21 +101,6 @@ async def test_a_first_connection_is_tried_until_its_time_is_over(unused_tcp_por
     assert states == [State.CONNECTING, State.CONNECTED, State.CLOSED]
 
 
-async def test_a_host_that_takes_nothing():
-    with socket.socket() as full:
-        full.bind(("127.0.0.1", 0))
-        full.listen(0)
-        # The kernel does not answer connections beyond its queue, like a host that does not exist.
-        fillers = [socket.socket() for _ in range(4)]
-        for filler in fillers:
-            filler.setblocking(False)
-            filler.connect_ex(full.getsockname())
-        uri = f"ws://127.0.0.1:{full.getsockname()[1]}"
-        assert "did not answer within 0.3 s" in await fails(uri, UnreachableError, connect_timeout=0.3)
-        for filler in fillers:
-            filler.close()
-
-
 async def test_a_host_that_is_switched_on_later_is_not_missed(monkeypatch):
     """An attempt at a host that answers nothing must not use up the whole time for the first connection."""
     monkeypatch.setattr("bridge.client.session.ATTEMPT_TIMEOUT", 0.2)

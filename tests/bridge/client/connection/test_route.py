@@ -9,12 +9,11 @@ import contextlib
 import logging
 import re
 import ssl
-from dataclasses import dataclass, field
 from http import HTTPStatus
+from types import SimpleNamespace
 
 import pytest
 from websockets.asyncio.server import serve
-from websockets.http11 import Request
 
 from bridge.client import State, connect
 from bridge.client.route import shown
@@ -38,18 +37,10 @@ def certificates(tmp_path_factory):
     return folder
 
 
-@dataclass
-class AccessPolicy:
-    """A WebSocket server, what it wants, and what it was shown."""
-
-    port: int = 0
-    wants: str | None = None
-    shown: list[Request] = field(default_factory=list)
-
-
 @contextlib.asynccontextmanager
 async def access(tls=None, wants=None, host="127.0.0.1"):
-    made = AccessPolicy(wants=wants)
+    """Run a WebSocket server: its port, what it wants, and what it was shown."""
+    made = SimpleNamespace(wants=wants, shown=[])
 
     def look(connection, request):
         made.shown.append(request)

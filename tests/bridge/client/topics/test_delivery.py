@@ -12,13 +12,7 @@ import pytest
 
 from bridge.client.protocol import ClientCore, Delivery
 from bridge.client.protocol.calls_and_goals import MAX_GOALS
-from bridge.client.protocol.events import (
-    GoalEnded,
-    GoalFeedback,
-    GoalStatus,
-    MessageReceived,
-    UnusableReceived,
-)
+from bridge.client.protocol.events import GoalEnded, GoalStatus, MessageReceived, UnusableReceived
 from bridge.codecs import cbor_codec
 from bridge.codecs.fragments import split
 from bridge.errors import OptionError, SlowPeerError
@@ -147,32 +141,6 @@ def test_large_messages_leave_in_fragments():
 
 def goal_of(core, **options):
     return core.goals.send("/fly", "boat_msgs/Fly", {"to": [1, 2]}, feedback=True, **options)
-
-
-def test_a_goal_its_feedback_and_its_end():
-    core = connected()
-    goal = goal_of(core)
-    assert sent(core) == [
-        {
-            "op": "send_action_goal",
-            "id": goal,
-            "action": "/fly",
-            "action_type": "boat_msgs/action/Fly",
-            "args": {"to": [1, 2]},
-            "feedback": True,
-        }
-    ]
-    assert tell(core, op="action_feedback", id=goal, action="/fly", values={"n": 1}) == GoalFeedback(
-        goal, {"n": 1}
-    )
-    core.goals.cancel(goal)
-    assert sent(core) == [{"op": "cancel_action_goal", "id": goal, "action": "/fly"}]
-    ended = tell(core, op="action_result", id=goal, action="/fly", values={"at": 2}, status=5, result=True)
-    assert ended == GoalEnded(goal, ok=True, status=GoalStatus.CANCELED, values={"at": 2})
-    assert tell(core, op="action_feedback", id=goal, values={}) is None
-    assert tell(core, op="action_result", id=goal, values={}) is None
-    core.goals.cancel(goal)
-    assert sent(core) == []
 
 
 @pytest.mark.parametrize(

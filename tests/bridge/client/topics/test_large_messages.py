@@ -7,7 +7,7 @@ import pytest
 
 from bridge.client import State, connect
 from bridge.client.protocol.wire import SMALLEST_LIMIT
-from bridge.errors import EncodeError, MessageTooLargeError, TopicLeftOutError
+from bridge.errors import DisconnectedError, EncodeError, MessageTooLargeError, TopicLeftOutError
 from bridge.hub.limits import HubLimits
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
@@ -83,31 +83,23 @@ async def test_a_message_that_does_not_name_its_topic_leaves_none_out_and_the_la
         assert (await camera.next(PATIENCE)).msg == {"n": 1}
 
 
-async def test_a_frame_of_an_impossible_length_leaves_no_topic_out(fake):
-    async with connect(fake.uri) as ros:
+@pytest.mark.parametrize("what", ["a frame of an impossible length", "an answer that is too large"])
+async def test_what_is_too_large_and_no_message_leaves_no_topic_out(fake, what):
+    fake.serve("/large", lambda _args: LARGE)
+    async with connect(fake.uri, max_size=LIMIT) as ros:
         subscription = ros.subscribe("/a", "p/T")
         for number in range(1, 4):
             await fake.wait_for_op("subscribe", topic="/a", count=number)
-            for client in fake._clients:
+            if what == "an answer that is too large":
+                with contextlib.suppress(DisconnectedError):
+                    await ros.call("/large", timeout=PATIENCE)
+            for client in fake._clients if what == "a frame of an impossible length" else ():
                 client.connection.transport.write(b"\x81\x7f" + b"\xff" * 8)
             while ros.reconnections < number:
                 await asyncio.sleep(0.01)
         await fake.wait_for_op("subscribe", topic="/a", count=4)
         await fake.publish("/a", {"n": 1})
         assert (await subscription.next(PATIENCE)).msg == {"n": 1}
-
-
-async def test_an_answer_that_is_too_large_leaves_no_topic_out(fake):
-    fake.serve("/large", lambda _args: LARGE)
-    async with connect(fake.uri, max_size=LIMIT) as ros:
-        subscription = ros.subscribe("/a", "p/T")
-        for _ in range(3):
-            await ros.wait_for_state(State.CONNECTED, PATIENCE)
-            with contextlib.suppress(Exception):
-                await ros.call("/large", timeout=PATIENCE)
-        await ros.wait_for_state(State.CONNECTED, PATIENCE)
-        async with publishing(fake, {"/a": {"n": 1}}):
-            assert (await subscription.next(PATIENCE)).msg == {"n": 1}
 
 
 async def test_messages_above_the_limit_of_their_topic_are_discarded_and_counted(fake):

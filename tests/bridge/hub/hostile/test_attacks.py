@@ -16,8 +16,7 @@ import pytest
 from websockets.frames import Frame, Opcode
 
 from bridge.codecs import cbor_codec, json_codec
-from bridge.codecs.fragments import OVERHEAD, Reassembler
-from bridge.errors import DecodeError
+from bridge.codecs.fragments import Reassembler
 from bridge.hub import server
 from bridge.hub.broker import TURN_WORK
 from bridge.hub.limits import HubLimits
@@ -108,19 +107,6 @@ def test_defaults_of_left_out_fields_are_bounded(ros_version):
 # --- fragments
 
 
-def test_incomplete_messages_are_charged_in_bytes():
-    box, limit = Reassembler(), 4 * (MEBIBYTE + OVERHEAD)
-    with memory_bounded(limit):
-        for number in range(800):
-            data = "\N{GRINNING FACE}" + "x" * 60_000  # one such character makes Python store four bytes each
-            with contextlib.suppress(DecodeError):
-                box.take({"id": number % 16, "data": data, "num": number // 16, "total": 60}, 0.0)
-            assert box.waiting_bytes <= limit
-    box.clear()
-    box.take({"id": "one", "data": "\N{GRINNING FACE}" * 100, "num": 0, "total": 2}, 0.0)
-    assert box.waiting_bytes == 400 + OVERHEAD
-
-
 def test_incomplete_messages_expire_without_another_fragment():
     hub = Harness()
     peers = [hub.connect() for _ in range(2)]
@@ -131,22 +117,6 @@ def test_incomplete_messages_expire_without_another_fragment():
     assert [len(peer.client.fragments or ()) for peer in peers] == [0, 1]
     hub.advance(10)
     assert [len(peer.client.fragments or ()) for peer in peers] == [0, 0]
-
-
-def test_a_message_in_fragments_counts_until_its_last_fragment_has_left():
-    limits = {"client_bytes": 2 * MEBIBYTE}
-    publisher, subscriber = publisher_and_subscriber("a/B", limits=limits, fragment_size=1)
-    outbox = subscriber.client.outbox
-    publisher.publish("/t", {"data": "x" * 1_000_000})
-    fragment = outbox.pop()
-    assert fragment is not None
-    assert len(json.loads(fragment)["data"]) == 256
-    for _ in range(3):
-        publisher.publish("/t", {"data": "y" * 1_000_000})
-        assert MEBIBYTE < outbox.size <= 2 * MEBIBYTE
-    while outbox.pop() is not None:
-        pass
-    assert outbox.size == 0
 
 
 async def test_fragments_are_written_in_turns(monkeypatch):
