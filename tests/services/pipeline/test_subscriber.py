@@ -4,14 +4,14 @@ import asyncio
 import contextlib
 import time
 from contextlib import nullcontext
-from unittest.mock import Mock
+from unittest.mock import AsyncMock, Mock
 
 import pytest
 
 from bridge.client import Message
 from bridge.errors import TopicLeftOutError
 from services.errors import RosbridgeLostError
-from services.pipeline.subscriber import Subscriber
+from services.pipeline.subscriber import Subscriber, newest_message
 from services.settings import Settings
 from services.sockets.records import Begin, LossReason, Notice, Reading, Rosbridge, Unusable
 from tests.fake_rosbridge import FakeRosbridge
@@ -107,6 +107,27 @@ async def test_a_large_message_is_taken_up_to_the_limit_of_the_settings(boat, li
             await fake.publish("/boat/sensors", READING | {"image": "x" * (2 << 20)})
             with expected:
                 await link.until(lambda: link.of(Reading) or (task.done() and task.result()))
+
+
+async def test_of_what_a_server_sends_from_before_only_the_newest_counts(boat, link, monkeypatch):
+    async def messages():
+        yield 2
+        yield 3
+        await asyncio.Event().wait()
+
+    assert await newest_message(messages(), 1) == (3, 2)
+    older = AsyncMock(side_effect=lambda _, message: (message, 2))
+    monkeypatch.setattr("services.pipeline.subscriber.newest_message", older)
+    async with FakeRosbridge() as fake, running(Subscriber(Settings(uri=fake.uri), boat, link.make), link):
+        link.take(Begin(once=False))
+        for count in range(1, 5):
+            if count == 3:
+                await fake.vanish()
+                await fake.come_back()
+            await fake.wait_for_op("subscribe", topic="/boat/sensors", count=(count + 1) // 2)
+            await fake.publish("/boat/sensors", READING)
+            await link.until(lambda count=count: len(link.of(Reading)) == count)
+    assert [each.passed_over for each in link.of(Reading)] == [2, 0, 2, 0]
 
 
 def test_the_status_shows_the_time_without_readings(boat, link, monkeypatch):

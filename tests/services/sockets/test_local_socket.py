@@ -25,7 +25,9 @@ records = st.one_of(
     st.builds(
         FrameRequest,
         number=small,
-        addresses=st.lists(st.none() | st.integers(0, 2**16), max_size=40),
+        addresses=st.lists(
+            st.none() | st.integers(0, 2**16) | st.lists(st.integers(-1, 9), max_size=4), max_size=40
+        ),
         bank=small,
     ),
     st.builds(Notice, level=st.text(max_size=9), sentence=st.text(max_size=99)),
