@@ -93,18 +93,18 @@ async def test_a_flood_of_nonsense_is_reported_and_leaves_others_served():
         raw = await RawClient.connect(port)
         raw.send_operation(op="set_level", level="error")
         flood = b"\x81\x82mask\x59\x53" * 20_000  # "42"
-        flooding = asyncio.create_task(_flood(raw, flood))
+
+        async def write():
+            while True:
+                raw.writer.write(flood)
+                await raw.writer.drain()
+
+        flooding = asyncio.create_task(write())
         assert (await listener.receive())["topic"] == "/rosout"
         for _ in range(30):
             await _serves(witness)
         flooding.cancel()
         raw.cut()
-
-
-async def _flood(raw, data):
-    while True:
-        raw.writer.write(data)
-        await raw.writer.drain()
 
 
 async def test_a_flood_of_calls_without_reading_costs_the_connection(quick_sweeps):
