@@ -138,6 +138,9 @@ class _Checked(BaseModel):
 
 _Word: TypeAlias = Annotated[int, Field(ge=0, lt=2**32)]
 
+# SHA-256 in hex, or the name of a kind: bounded, because errors quote them
+_Quoted: TypeAlias = Annotated[str, Field(max_length=64)]
+
 
 class _PartitionEntry(_Checked):
     index: _Word
@@ -155,7 +158,7 @@ class _Section(_Checked):
     name: str
     dtype: str
     shape: tuple[_Word, ...]
-    sha256: str
+    sha256: _Quoted
 
 
 _Parameters = TypeVar("_Parameters")
@@ -168,8 +171,8 @@ class _Identity(_Checked, Generic[_Parameters]):
     parameters: _Parameters
     partition: _PartitionEntry
     interface: _Interface
-    model_hash: str
-    map_hash: str
+    model_hash: _Quoted
+    map_hash: _Quoted
     sections: tuple[_Section, ...]
 
     @property
@@ -181,14 +184,14 @@ class _Manifest(_Checked, Generic[_Parameters]):
     emulated: bool
     tool_version: str
     build_date: str
-    image_hash: str
+    image_hash: _Quoted
     identity: _Identity[_Parameters]
 
 
 class _Named(BaseModel):
     """The field of `_Identity` that names the kind of machine."""
 
-    machine: str
+    machine: _Quoted
 
 
 class _Kind(BaseModel):

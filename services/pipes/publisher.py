@@ -17,7 +17,7 @@ from services.sockets.records import FrameResult, Outcome, Publish
 from terminal.output import say
 from toolchain.deployment import Deployment, MachineSection
 
-Unsigned = Annotated[int, msgspec.Meta(ge=0)]
+Unsigned = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]  # a record has no wider integers
 
 
 class _LineBoard(msgspec.Struct):
@@ -29,7 +29,7 @@ class _LineBoard(msgspec.Struct):
 
 
 class _LineResult(msgspec.Struct):
-    number: int
+    number: Unsigned
     boards: list[_LineBoard]
     stamp_ns: int | None = None
 

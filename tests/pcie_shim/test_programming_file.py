@@ -155,6 +155,9 @@ def _section(shape, **others):
         lambda identity: identity["parameters"].update(prior_bits=16),
         lambda identity: identity["partition"].update(total_lines=10**30),
         lambda identity: identity["interface"].update(results=10**30),
+        lambda identity: identity.update(machine="A" * 2000),
+        lambda identity: identity.update(map_hash="A" * 2000),
+        _section([1, 8], sha256="A" * 2000),
     ],
 )  # fmt: skip
 def test_a_crafted_manifest_is_refused_before_anything_is_allocated(change):

@@ -70,6 +70,8 @@ OF_REPLICAS = {"cycles": 9, "replica_cycles": [9, 5], "replica_reasons": [1, 3]}
         *((line, 2, 1) for line in ("[1, -1]", "[1e999, 1]", "[1]", board([1]))),
         *((board(counts), 2, 1) for counts in ([1, True], [1, 4294967296], [-1, 1])),
         (board([1, 2], reason=9), 2, 1),
+        *((board([1, 2], cycles=cycles), 2, 1) for cycles in (-1, 2**63, 2**64)),
+        (board([1, 2]).replace('"number": 1', f'"number": {2**64}'), 2, 1),
         (board([1, 2, 3, 4], **OF_REPLICAS), 4, 1),
         *(
             (board([1, 2, 3, 4], **OF_REPLICAS | changed), 4, 2)
