@@ -35,20 +35,14 @@ def test_every_code_is_the_nearest_to_what_it_makes(prob_bits):
     assert (encode_probability(made, prob_bits) == codes).all()
 
 
-@pytest.mark.parametrize("p", [-0.01, 1.01, np.nan, np.inf])
-def test_a_number_that_is_not_a_probability_is_refused(p):
+@pytest.mark.parametrize(
+    ("function", "values", "prob_bits"),
+    [
+        *((encode_probability, [0.5, p], 8) for p in (-0.01, 1.01, np.nan, np.inf)),
+        *((decode_code, codes, 8) for codes in ([256], [-1], [0.5])),
+        *((function, [0], bits) for function in (encode_probability, decode_code) for bits in (0, 17)),
+    ],
+)
+def test_a_number_that_is_not_a_probability_or_a_code_is_refused(function, values, prob_bits):
     with pytest.raises(ParameterError):
-        encode_probability([0.5, p], 8)
-
-
-@pytest.mark.parametrize("codes", [[256], [-1], [0.5]])
-def test_a_number_that_is_not_a_code_is_refused(codes):
-    with pytest.raises(ParameterError):
-        decode_code(codes, 8)
-
-
-@pytest.mark.parametrize("prob_bits", [0, 17])
-def test_there_are_no_codes_of_so_many_bits(prob_bits):
-    for function in (encode_probability, decode_code):
-        with pytest.raises(ParameterError):
-            function([0], prob_bits)
+        function(values, prob_bits)

@@ -36,11 +36,10 @@ class OnBoard(BoardMachine):
     def __init__(self, machine, memory):
         self._machine, self._memory = machine, memory
 
-    def prepare(self):
-        self.reset()
-
     def reset(self):
         self.paused, self.reason, self.cycles = False, 0, 0
+
+    prepare = reset
 
     def start(self, settings, end):
         self._target, self.cycles = settings.target_count, 0
@@ -49,13 +48,12 @@ class OnBoard(BoardMachine):
         ).tobytes()
         self.step(end)
 
-    def resume(self, end):
-        self.step(end)
-
     def step(self, end):
         self.cycles = min(self._target, end or self._target)
         self.paused = self.cycles < self._target
         self.reason = 7 if self.paused else 9
+
+    resume = step
 
 
 class Course(FrameCourse):
@@ -112,14 +110,7 @@ class Weighing(MachineKind):
     def kernel(self, machine):
         return machine
 
-    def on_board(self, kernel, memory):
-        return OnBoard(kernel, memory)
-
-    def on_host(self, machines):
-        return OnHost(machines)
-
-    def joint_reason(self, reasons):
-        return max(reasons)
+    on_board, on_host, joint_reason = staticmethod(OnBoard), staticmethod(OnHost), staticmethod(max)
 
     def infer(self, results):
         counts = np.concatenate([board.counts for board in results])

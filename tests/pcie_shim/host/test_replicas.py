@@ -169,8 +169,6 @@ def test_capabilities_and_windows():
     with pytest.raises(RefusedError):
         board.read(rm.INPUTS, 1)
     board.load(image_bytes(dataclasses.replace(image(of), interface_sensors=40, interface_results=16)))
-    machine_word = struct.unpack("<I", board.read(rm.CAP_MACHINE, 1))[0]
-    assert machine_word & rm.CAP_MACHINE_SENSOR_MODE_MASK == 1 << rm.CAP_MACHINE_SENSOR_MODE_SHIFT
     assert board.read(rm.CAP_REPLICAS, 1) == words(3)
     assert board.read(rm.CAP_INTERFACE, 1) == words(40 | 16 << 16)
     assert len(board.read(rm.INPUTS, 40)) == 160
