@@ -326,7 +326,6 @@ async def test_frames_sent_before_the_handshakes_answer_are_read():
 
 
 SIZES = [0, 1, 125, 126, 127, 65_535, 65_536]
-#: Bytes of a message at most, in what is generated here.
 
 
 @pytest.mark.parametrize("size", SIZES)
