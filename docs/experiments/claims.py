@@ -26,6 +26,7 @@ from toolchain.analysis.sweep import COLOURS, MARKERS, new_figure, save_figure
 from toolchain.building.quantise import quantise
 from toolchain.commands.explore import progress
 from toolchain.deployment import Scale, Stop
+from toolchain.errors import BuildError
 from toolchain.models.conditional import normal
 from toolchain.models.model import Model, cell_centres, exact_posterior, interval
 
@@ -359,13 +360,16 @@ def main() -> None:
         "--seed", type=int, default=1, help="seed of the readings and of the flipped bits (1)"
     )
     options = parser.parse_args()
-    check_frames(options.frames)
-    options.directory.mkdir(parents=True, exist_ok=True)
-    with progress(experiments()) as advance:
-        claims = run_claims(frames=options.frames, seed=options.seed, advance=advance)
+    try:
+        check_frames(options.frames)
+        options.directory.mkdir(parents=True, exist_ok=True)
+        with progress(experiments()) as advance:
+            claims = run_claims(frames=options.frames, seed=options.seed, advance=advance)
+        (options.directory / "claims.json").write_text(claims.as_json(), encoding="utf-8")
+        draw_claims(options.directory / "claims.png", claims)
+    except (BuildError, OSError) as reason:
+        parser.error(str(reason))
     print(claims.as_text(), end="")
-    (options.directory / "claims.json").write_text(claims.as_json(), encoding="utf-8")
-    draw_claims(options.directory / "claims.png", claims)
     print(f"Wrote claims.json and claims.png to {options.directory}")
 
 

@@ -36,7 +36,11 @@ def to_address(variable: Variable, value: object) -> int | None:
     if not isinstance(value, int | float):  # bool is an int: False is 0, True is 1
         if isinstance(value, list | tuple) and not value:
             return _missing(variable, "is an empty array")
-        raise NotANumberError(f"variable {variable.name}: {_shown(value)} is {_kind(value)}, not a number")
+        states = ", ".join(variable.states)
+        names = f", nor one of its states: {_shortened(states)}" if states else ""
+        raise NotANumberError(
+            f"variable {variable.name}: {_shown(value)} is {_kind(value)}, not a number{names}"
+        )
     if value != value:  # noqa: PLR0124 - NaN; math.isnan fails on integers beyond a double
         return _missing(variable, "is NaN")
 
@@ -80,6 +84,10 @@ def _shown(value: object) -> str:
         text = repr(value)
     except ValueError:  # an integer with more digits than Python prints
         return "an integer of thousands of digits"
+    return _shortened(text)
+
+
+def _shortened(text: str) -> str:
     return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
 
 

@@ -73,6 +73,11 @@ def test_a_value_that_is_not_a_number_is_never_read_as_one(variable, value):
     assert "\n" not in str(caught.value)
 
 
+def test_a_wrong_state_is_refused_with_the_right_ones():
+    with pytest.raises(NotANumberError, match="'damp' is a string, .* states: wet, dry"):
+        to_address(variable(values=2, states=("wet", "dry")), "damp")
+
+
 @pytest.mark.parametrize(("value", "address"), [(49.5, 50), (-0.5, 0), (True, 1), (False, 0)])
 def test_rounding_and_booleans(value, address):
     assert to_address(variable(), value) == address
