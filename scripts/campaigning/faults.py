@@ -78,6 +78,8 @@ MOST_ENDS = 2
 _ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memory"}
 _FAILS_BOARD = {*_ENDS_LINK, "stop", "hold"}
 _CUTS_ROSBRIDGE = {"gone", "finish", "nonsense", "cut-inside", "files"}
+_SILENCE = 9.0
+"""Seconds for which a server may be silent; a client gives up a connection that is silent for 10 s."""
 _REASONS = {
     "pcie-app": {WITH_APP},
     "publisher": {WITH_PUBLISHER, ROSBRIDGE_AWAY},
@@ -119,7 +121,8 @@ def excuses_of(step: Step, topology: Topology, until: float = 0.0) -> Excuses:
     readings = results = False
     for fault in step:
         reasons |= _reasons(fault, topology)
-        cut = fault.target == "rosbridge" and fault.what in _CUTS_ROSBRIDGE
+        given_up = fault.what == "hold" and fault.seconds > _SILENCE
+        cut = fault.target == "rosbridge" and (fault.what in _CUTS_ROSBRIDGE or given_up)
         ended = fault.target if fault.what in _ENDS_LINK else ""
         both = cut or fault.what == "files"
         readings |= both or ended in {"hub", "master", "subscriber"}
