@@ -48,7 +48,7 @@ class BM1Kind(MachineKind):
     }
 
     def sections(self, machine: BM1Machine) -> list[tuple[str, npt.NDArray[Any]]]:
-        """Return the prior, the table of each column (one per MIF of the thesis's hardware project), and a table of random numbers."""
+        """Return the prior, the table of each column (each a MIF of the thesis), and a table of random numbers."""
         sections: list[tuple[str, npt.NDArray[Any]]] = [("prior", machine.prior.astype("<u2", copy=False))]
         for column, table in enumerate(machine.tables, start=1):
             sections.append((f"column {column}", table.astype("<u2", copy=False)))
@@ -71,7 +71,7 @@ class BM1Kind(MachineKind):
         return BM1Machine(parameters, sections["prior"], columns, sections.get("rng"))
 
     def registers(self, parameters: BM1Parameters) -> UsedRegisters:
-        """Return the registers; inputs are in SENSORS for a single machine with one input per column, otherwise in INPUTS."""
+        """Return the registers; INPUTS replaces SENSORS for several machines or inputs per cell."""
         inputs, results = math.prod(parameters.input_shape), math.prod(parameters.count_shape)
         size = f"{parameters.sensors} sensors and {parameters.lines} lines"
         if not _is_plain(parameters):
@@ -303,7 +303,7 @@ class _Course(FrameCourse):
         self.end = 0 if end >= self._max_cycles else end
 
     def proceed(self, reasons: Sequence[Sequence[int]]) -> tuple[Sequence[int], Blocks]:
-        """With `slices`, a machine ends on all boards if it has overflowed on one; with `own`, there are no further slices."""
+        """With `slices`, a machine that has overflowed on a board ends on all; with `own`, there is one slice."""
         over = {
             replica
             for of_board in reasons

@@ -48,7 +48,7 @@ _LFSR_BITS: Final = {RngKind.LFSR8: 8, RngKind.LFSR16: 16, RngKind.LFSR24: 24, R
 
 
 class RngReset(StrEnum):
-    """Where a frame's random numbers start: at the bank of the frame, or where the last frame ended (`free`)."""
+    """Start of a frame's random numbers: at the frame's bank, or at the end of the frame before (`free`)."""
 
     BANK = "bank"
     FREE = "free"

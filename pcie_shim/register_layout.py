@@ -29,7 +29,7 @@ def next_doorbell(number: int) -> int:
 
 
 def register_values(fields: Mapping[str, int]) -> dict[int, int]:
-    """Return register values by address, from values of registers (`CAP_LINES`) and fields (`CAP_MACHINE.RNG`) by name."""
+    """Return register values by address, given those of registers (`CAP_LINES`) or fields (`CAP_MACHINE.RNG`)."""
     values: dict[int, int] = {}
     for name, value in fields.items():
         register, _, field = name.partition(".")

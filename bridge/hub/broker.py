@@ -107,7 +107,7 @@ class Broker:
 
     @property
     def deadline(self) -> float:
-        """When `wake` may have something to do (monotonic seconds), infinity for never."""
+        """Time of the next possible work of `wake` (monotonic seconds), infinity for never."""
         return self._dispatcher.deadline
 
     def connect(self, address: str) -> Client:

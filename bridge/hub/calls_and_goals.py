@@ -225,7 +225,7 @@ class Calls(_Exchange):
 
     @property
     def deadline(self) -> float:
-        """When `expire` may have something to do, infinity for never."""
+        """Time of the next possible work of `expire`, infinity for never."""
         return self._deadlines[0][0] if self._deadlines else inf
 
     def leave(self, client: Client) -> None:

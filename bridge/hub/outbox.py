@@ -51,7 +51,7 @@ class Lane:
         self.fragment_size = 0
         """Maximum bytes of a message in one fragment, 0 for whole messages."""
         self.next_time = -inf
-        """When the throttle admits the next message (monotonic seconds)."""
+        """Time at which the throttle admits the next message (monotonic seconds)."""
         self.queued: deque[_Entry] = deque()
         """Messages that wait for the socket."""
         self.held: deque[bytes] = deque()
@@ -107,7 +107,7 @@ class Outbox:
         """True if output that cannot be dropped exceeds the bound: the client does not read its answers.
         """
         self.deadline = inf
-        """When `release` may have something to do (monotonic seconds), infinity for never."""
+        """Time of the next possible work of `release` (monotonic seconds), infinity for never."""
 
     def __len__(self) -> int:
         return len(self._entries) - self._gaps

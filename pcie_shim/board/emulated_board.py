@@ -17,6 +17,7 @@ from typing import Any, Final, NoReturn
 
 from machines.errors import MachineError, StartError
 from machines.kind import OUTCOME, BoardMachine, FrameSettings
+from machines.parameters import CYCLES_MAX
 from pcie_shim import register_map as rm
 from pcie_shim.errors import ImageError, PcieShimError
 from pcie_shim.programming_file import Image, image_from_bytes
@@ -38,7 +39,6 @@ _NO_ACCESS, _READ, _READ_WRITE = 0, 1, 3
 _SETTINGS: Final = struct.Struct(f"{SETTINGS.format}Q")  # and RUN_UNTIL
 _SHORTEST_CHUNK: Final = 64  # cycles, even if the machine is slow
 _ALIGNMENT: Final = 4096  # chunks end between the blocks of a fast kernel
-_CYCLES_MAX: Final = 2**63 - 1  # of registers whose values must fit into a signed number
 
 
 class RefusedError(PcieShimError):
@@ -302,9 +302,9 @@ class EmulatedBoard:
         if self.running or number != due:
             self._refuse(ErrorCode.DOORBELL, f"number {number} was written, {due} was expected")
         *settings, run_until = _SETTINGS.unpack_from(self._memory, rm.TARGET_COUNT)
-        if run_until > _CYCLES_MAX:
+        if run_until > CYCLES_MAX:
             self._refuse(
-                ErrorCode.BAD_VALUE, f"a slice cannot end at cycle {run_until}: the maximum is {_CYCLES_MAX}"
+                ErrorCode.BAD_VALUE, f"a slice cannot end at cycle {run_until}: the maximum is {CYCLES_MAX}"
             )
         if doorbell == rm.RESUME:
             if not machine.paused:

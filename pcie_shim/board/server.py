@@ -80,7 +80,7 @@ class Board(Protocol):
         """Run the machine for one more chunk; then `running` tells whether it must continue."""
 
     def interrupt_words(self) -> bytes:
-        """Return the payload of an interrupt: DONE to COMPUTE_NS, one count per line, replicas' outcomes."""
+        """Return the payload of an interrupt: DONE to COMPUTE_NS, the results, replicas' outcomes."""
 
     def release(self) -> None:
         """Stop a running machine and disable interrupts, because the host has disconnected."""

@@ -58,7 +58,7 @@ class Done(NamedTuple):
         status: The STATUS register.
         cycles: Cycles run in this frame.
         compute_ns: Computing time since that start or resume, in nanoseconds.
-        results: One 32-bit count per line, replica after replica, followed by OUTCOMES if there are replicas;
+        results: The result words of the machine, replica after replica, followed by OUTCOMES if there are replicas;
             as bytes, valid until the link receives again.
     """
 

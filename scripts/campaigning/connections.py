@@ -36,7 +36,7 @@ _AGAIN = 0.05
 
 @dataclass(slots=True)
 class Weather:
-    """How a proxy treats data.
+    """Treatment of data by a proxy.
 
     Attributes:
         open: Whether data is forwarded; otherwise connections remain open and silent.

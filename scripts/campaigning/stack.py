@@ -31,7 +31,7 @@ BOARD_TIMEOUT = 2.0 * FACTOR
 
 
 class Topology(StrEnum):
-    """Who starts the processes, and so where the proxies are."""
+    """The starter of the processes, which also decides the places of the proxies."""
 
     OWN = "processes"
     """The master starts services and boards; a proxy stands between them and rosbridge."""

@@ -131,7 +131,7 @@ class DeployedBoards:
             self._times_gone[board] += 1
 
     def recover(self) -> list[int]:
-        """Try once to reopen the missing boards, and return the numbers of those that are back, or raise a BoardError if none can be."""
+        """Try once to reopen the missing boards; return the numbers of those that are back, or raise a BoardError."""
         back: list[int] = []
         if self._cluster is None:
             return back

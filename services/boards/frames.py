@@ -56,7 +56,7 @@ def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> Fram
 
 
 def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.NDArray[np.int64], PriorRow]:
-    """Return the sensors' inputs (-1: missing) and the prior's row of a machine whose replicas or lines have their own readings."""
+    """Return inputs (-1: missing) and the row of the prior, for a machine with several readings of a variable."""
     variables = deployment.variables
     if len(addresses) != len(variables):
         raise FrameInputError(

@@ -5,7 +5,8 @@ import csv
 import io
 import os
 import time
-from collections.abc import Iterable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
@@ -26,19 +27,19 @@ _SHARE: Final = 20
 _NOT_KNOWN: Final = -1
 
 
-class ResultFile:
+class ResultFile(ABC):
     """A file of posteriors."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
+    @abstractmethod
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
         """Save one frame, or raise a SettingsError for an unwritable file or one with another shape."""
-        raise NotImplementedError
 
+    @abstractmethod
     def close(self) -> None:
         """Write everything to the file."""
-        raise NotImplementedError
 
     def _error(self, why: str | OSError) -> SettingsError:
         if isinstance(why, OSError):
@@ -48,7 +49,11 @@ class ResultFile:
 
 def open_result_file(path: Path) -> ResultFile:
     """Open a file, or raise a SettingsError: `.jsonl` and `.csv` are appended to, `.npz` is overwritten."""
-    kinds = {".jsonl": _JsonLines, ".csv": _CsvLines, ".npz": _Archive}
+    kinds: dict[str, Callable[[Path], ResultFile]] = {
+        ".jsonl": _JsonLines,
+        ".csv": _CsvLines,
+        ".npz": _Archive,
+    }
     kind = kinds.get(path.suffix)
     if kind is None:
         raise SettingsError(

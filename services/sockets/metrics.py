@@ -43,7 +43,7 @@ async def serve_metrics(
         yield
         return
     # it would print a traceback for each client that resets its connection
-    server.handle_error = lambda *_: None  # type: ignore[method-assign]
+    server.handle_error = lambda *_: None  # type: ignore[method-assign]  # of this server alone
     try:
         yield
     finally:

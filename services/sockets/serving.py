@@ -9,6 +9,7 @@ master ──connects──▶ service   a second one is refused with `Trouble`
 
 import asyncio
 import socket
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -223,7 +224,7 @@ def listening(
     return lambda on_record: MasterLink(endpoint, role, deployment, on_record)
 
 
-class Service:
+class Service(ABC):
     """A service of a run, which works for one master at a time through its link, and reports its status."""
 
     role: ClassVar[str]
@@ -251,17 +252,17 @@ class Service:
                 raise
         return 0
 
+    @abstractmethod
     def status(self) -> ProcessStatus:
         """Return the status of this process."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _take(self, record: AnyRecord) -> None:
         """Handle a record of the master."""
-        raise NotImplementedError
 
+    @abstractmethod
     async def _serve(self) -> None:
         """Do the work; the link is open."""
-        raise NotImplementedError
 
 
 async def report_failure(link: Link, error: BaseException) -> None:

@@ -1,13 +1,11 @@
-"""The campaign finds planted bugs, and faults explain only their own losses; which failures scripts/test forgives."""
+"""The campaign: its observer finds planted bugs, faults explain only their own losses, and schedules are seeded."""
 
 import copy
 import random
-import sys
 from collections import Counter
 
 import pytest
 
-from bridge.discovery import UnknownRobotError
 from scripts.campaigning.accounts import (
     FAILED,
     PASSED_OVER,
@@ -21,7 +19,6 @@ from scripts.campaigning.expected import BANKS, LINES, BoardOutcome, Outcome
 from scripts.campaigning.faults import ENDS, MOST_ENDS, SHORT, Fault, Kind, Schedule, ended_roles, excuses_of
 from scripts.campaigning.observer import DEPLOYMENT, Flaw, Observer
 from scripts.campaigning.stack import Topology
-from scripts.running import demo, tests
 
 HALF = LINES // 2
 
@@ -204,6 +201,8 @@ def test_only_a_crowd_and_an_unusable_value_are_lost_without_a_fault():
         (Fault(Kind.SIGNALS, "stop", "subscriber", 1.0), set(), False, False),
         (Fault(Kind.SIGNALS, "kill", "subscriber"), set(), True, False),
         (Fault(Kind.ROSBRIDGE, "gone", "rosbridge", 1.0), {"rosbridge away"}, True, True),
+        (Fault(Kind.ROSBRIDGE, "hold", "rosbridge", 4.0), {"rosbridge away"}, False, False),
+        (Fault(Kind.ROSBRIDGE, "hold", "rosbridge", 11.0), {"rosbridge away"}, True, True),
         (Fault(Kind.INPUT, "burst", "readings", 0.0, 10_000), set(), False, False),
     ],
     ids=str,
@@ -222,48 +221,3 @@ def test_a_seed_gives_the_same_steps_within_what_a_master_forgives(topology):
         assert all(number <= ENDS.get(role, MOST_ENDS) for role, number in ends.items())
     ends = Counter(role for step in SHORT for fault in step for role in ended_roles(fault))
     assert all(number <= ENDS.get(role, MOST_ENDS) for role, number in ends.items())
-
-
-PASSED, ODD = (0, []), (2, [])
-"""A run of pytest that passed, and one in which no test failed, but pytest itself."""
-FLAKY = (1, ["a", "b"])
-
-
-@pytest.mark.parametrize(
-    ("outcomes", "code", "said"),
-    [
-        ([PASSED, PASSED], 0, []),
-        ([(1, ["a"]), PASSED], 1, ["FAILED a"]),  # a test without processes is not run again
-        ([PASSED, FLAKY, PASSED], 0, ["FLAKY a", "FLAKY b"]),
-        ([PASSED, FLAKY, (1, ["b"])], 1, ["FLAKY a", "FAILED b"]),
-        ([PASSED, (1, ["a", "b", "c"]), PASSED], 1, ["FAILED a", "FAILED b", "FAILED c"]),
-        ([ODD, PASSED], 1, ["FAILED pytest, with exit code 2"]),
-        ([PASSED, ODD], 1, ["FAILED pytest, with exit code 2"]),
-    ],
-)
-def test_what_is_run_again_and_what_fails(outcomes, code, said, monkeypatch, capsys):
-    left, runs = list(outcomes), []
-
-    def pytest_(*arguments):
-        runs.append(arguments)
-        return left.pop(0)
-
-    monkeypatch.setattr(tests, "pytest", pytest_)
-    monkeypatch.setattr("sys.argv", ["tests"])
-    assert tests.main() == code
-    assert not left
-    assert [run[1] for run in runs[:2]] == ["not process and not thorough", "process and not thorough"]
-    assert all(run == ("a", "b") for run in runs[2:] if len(said) < 3)
-    lines = capsys.readouterr().out.splitlines()
-    assert [line for line in lines if line.startswith(("FLAKY", "FAILED"))][-len(said) or 99 :] == said
-
-
-def test_a_robot_is_looked_up_before_anything_starts(tmp_path, monkeypatch, capsys):
-    async def resolve(name):
-        raise UnknownRobotError(f"no robot called {name}")
-
-    monkeypatch.setattr("bridge.discovery.resolve", resolve)
-    monkeypatch.setattr(demo.Process, "start", pytest.fail)
-    monkeypatch.setattr(sys, "argv", ["demo", "--uri", "robot:Adam", "--out", str(tmp_path)])
-    assert demo.main() == UnknownRobotError.exit_code
-    assert "no robot called Adam" in capsys.readouterr().err

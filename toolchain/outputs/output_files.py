@@ -84,7 +84,7 @@ foreach revision {{{" ".join(revisions)}}} {{
 
 
 class Change(StrEnum):
-    """How writing changes a file."""
+    """Effect of writing on a file."""
 
     UNCHANGED = "unchanged"
     CHANGED = "changed"

@@ -1,4 +1,4 @@
-"""What a user sees of a run: its status, its metrics, and its posteriors in the command `listen`."""
+"""Status and metrics of a run, and its posteriors in the command `listen`."""
 
 import asyncio
 import json

@@ -1,10 +1,8 @@
 """Pipe mode: the lines that pcie-app and publisher read, and the limit of a line."""
 
 import asyncio
-import contextlib
 import json
 import os
-import socket
 import sys
 from pathlib import Path
 
@@ -17,12 +15,8 @@ from services.errors import InputLineError
 from services.pipes import lines
 from services.pipes.pcie_app import reading_from_line
 from services.pipes.publisher import result_from_line
-from services.pipes.subscriber import print_addresses, print_variables
-from services.settings import Settings
 from tests.command_runner import invoke
-from tests.fake_rosbridge import FakeRosbridge
-from tests.patience import PATIENCE
-from toolchain.deployment import MachineSection, Source
+from toolchain.deployment import MachineSection
 
 BOAT = Path(__file__).parents[3] / "casestudies" / "boat"
 
@@ -136,44 +130,3 @@ async def test_a_line_has_a_limit_however_it_arrives(monkeypatch, tmp_path):
             while transports:
                 transports.pop().close()
                 await asyncio.sleep(0)
-
-
-@pytest.mark.parametrize("of_deployment", [False, True])
-async def test_a_mistyped_topic_is_named_with_similar_ones(boat, capsys, monkeypatch, of_deployment):
-    monkeypatch.setattr("services.pipeline.connections.AFTER", 0.05)
-    async with FakeRosbridge(rosapi=True) as fake:
-        fake.know("/boat/sensors2", "boat_msgs/Sensors")
-        settings = Settings(uri=fake.uri, first_data_timeout=PATIENCE)
-        source = Source(uri=fake.uri, topic="/boat/sensors", type="boat_msgs/Sensors")
-        printing = (
-            print_addresses(settings, boat, 1) if of_deployment else print_variables(settings, source, [], 1)
-        )
-        printing = asyncio.ensure_future(printing)
-        said = ""
-        async with asyncio.timeout(PATIENCE):
-            while "/boat/sensors2" not in said:
-                said += capsys.readouterr().err
-                await asyncio.sleep(0.01)
-        printing.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await printing
-    (warning,) = (line for line in said.splitlines() if "/boat/sensors2" in line)
-    assert warning.startswith("warning: ")
-
-
-async def test_a_server_that_comes_later_is_waited_for_aloud(capsys):
-    with socket.socket() as place:
-        place.bind(("127.0.0.1", 0))
-        port = place.getsockname()[1]
-    source = Source(uri=f"ws://127.0.0.1:{port}", topic="/t", type="p/T")
-    printing = asyncio.create_task(print_variables(Settings(connect_timeout=PATIENCE), source, [], 1))
-    said = ""
-    async with asyncio.timeout(PATIENCE):
-        while source.uri not in said:
-            await asyncio.sleep(0.01)
-            said += capsys.readouterr().err
-        async with FakeRosbridge(port=port) as fake:
-            await fake.wait_for_op("subscribe", topic="/t")
-            await fake.publish("/t", {"x": 1})
-            await printing
-    assert json.loads(capsys.readouterr().out) == {"x": 1}
