@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from machines.bm1 import BM1Machine, Start, addressed_codes
 from machines.encode import decode_code
 from machines.parameters import RngReset
-from toolchain.analysis.emulation import EmulatedBoards, Inputs, Readings, inputs_of_boards
+from toolchain.analysis.emulation import EmulatedBoards, Inputs, inputs_of_boards
+from toolchain.analysis.readings import Readings
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.model import Model, exact_posterior, fuse
 

@@ -13,18 +13,16 @@ from machines.bm1 import BM1Machine
 from machines.parameters import SensorMode
 from toolchain.analysis import InspectOptions
 from toolchain.analysis.accuracy import Accuracy, Interval, measure
-from toolchain.analysis.emulation import (
-    EmulatedBoards,
+from toolchain.analysis.emulation import EmulatedBoards, joined, one_replica
+from toolchain.analysis.logic import device_named
+from toolchain.analysis.readings import (
     Readings,
     check_frames,
-    joined,
     model_of_codes,
-    one_replica,
     readings_of_lines,
     recorded_readings,
     sample_readings,
 )
-from toolchain.analysis.logic import device_named
 from toolchain.analysis.resources import ASSUMPTIONS, Energy, Estimate, energy, estimate
 from toolchain.building.build import loss_heading, many_sentence, read_images
 from toolchain.building.quantise import ColumnLoss, quantise

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from machines.bm1 import BM1Machine
     from machines.parameters import BM1Parameters
-    from toolchain.analysis.emulation import Readings
     from toolchain.analysis.logic import Device
+    from toolchain.analysis.readings import Readings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,8 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from machines.parameters import RngKind
 from toolchain.analysis import Sweep
 from toolchain.analysis.accuracy import measure
-from toolchain.analysis.emulation import EmulatedBoards, Readings
+from toolchain.analysis.emulation import EmulatedBoards
 from toolchain.analysis.logic import Device
+from toolchain.analysis.readings import Readings
 from toolchain.analysis.resources import estimate
 from toolchain.bounded_files import file_errors, read_bounded
 from toolchain.building.machine import (

@@ -86,8 +86,8 @@ def explore(
     Ctrl-C, the same command resumes the sweep, whose points are in the results file.
     """
     from toolchain.analysis import sweep as sweeps
-    from toolchain.analysis.emulation import recorded_readings, sample_readings
     from toolchain.analysis.logic import device_named
+    from toolchain.analysis.readings import recorded_readings, sample_readings
 
     if plot is not None:
         sweeps.check_pictures_possible(plot)

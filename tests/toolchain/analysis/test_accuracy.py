@@ -8,19 +8,12 @@ from machines.parameters import BM1Parameters
 from machines.reference import ReferenceBM1
 from tests.toolchain.builders import corridor, machine_of
 from toolchain.analysis.accuracy import _difference, _line_probabilities, bootstrap, measure, share_of_frames
-from toolchain.analysis.emulation import (
-    MISSING,
-    EmulatedBoards,
-    Readings,
-    joined,
-    model_of_codes,
-    reading_columns,
-    recorded_readings,
-    sample_readings,
-)
+from toolchain.analysis.emulation import EmulatedBoards, joined
+from toolchain.analysis.readings import MISSING, Readings, model_of_codes, recorded_readings, sample_readings
 from toolchain.building.machine import split
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError, ModelError
+from toolchain.learning.recording import reading_columns
 from toolchain.models.model import Known, Model, dimension, exact_posterior
 
 MACHINE = machine_of(corridor(13, sigma=0.7))

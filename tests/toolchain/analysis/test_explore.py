@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from tests.toolchain.builders import corridor
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis import Sweep
-from toolchain.analysis.emulation import sample_readings
 from toolchain.analysis.logic import DEVICES
+from toolchain.analysis.readings import sample_readings
 from toolchain.analysis.sweep import Point, Results, pareto, run_sweep, run_task, tasks
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError

@@ -17,8 +17,9 @@ from machines.parameters import RngKind, SensorMode
 from pcie_shim.programming_file import read_image
 from tests.toolchain.running import OPTIONS
 from toolchain.analysis.accuracy import measure
-from toolchain.analysis.emulation import EmulatedBoards, one_replica, readings_of_lines, sample_readings
+from toolchain.analysis.emulation import EmulatedBoards, one_replica
 from toolchain.analysis.logic import DEVICES, logic_of
+from toolchain.analysis.readings import readings_of_lines, sample_readings
 from toolchain.analysis.resources import estimate
 from toolchain.building.build import BuildError, assemble, build_deployment
 from toolchain.building.machine import plan_machine

@@ -1,0 +1,228 @@
+"""The readings that emulated boards are given: drawn from a model, or recorded."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from machines.bm1 import BM1Machine
+from machines.encode import decode_code
+from toolchain.analysis.emulation import Inputs
+from toolchain.deployment import Dimension, Scale, Variable
+from toolchain.deployment.address import to_address
+from toolchain.deployment.address_array import written_codes
+from toolchain.errors import BuildError, ModelError, ReadingError
+from toolchain.learning.recording import read_recording, reading_columns
+from toolchain.models.model import Known, Model, PriorSelect
+
+MISSING: Final = -1
+MOST_FRAMES: Final = 100_000
+"""Maximum number of frames, because all are in memory with a row of every column's table."""
+
+_WEIGHT_STEPS: Final = 500
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Frames of readings.
+
+    Attributes:
+        source: Their origin, as a clause.
+        addresses: int64[frames, sensors], in the order of the columns; `MISSING` for a missing reading. If
+            lines have their own readings, int64[frames, sensors, lines].
+        prior_addresses: int64[frames], the row of the prior; `MISSING` if none is selected.
+        codes: uint16[frames, sensors, lines], the codes of these readings' likelihoods, for a machine with
+            `sensor_mode = threshold`; None for other machines.
+        lines: int64[frames], the true line of each; None if unknown.
+    """
+
+    source: str
+    addresses: NDArray[np.int64]
+    prior_addresses: NDArray[np.int64]
+    codes: NDArray[np.uint16] | None = None
+    lines: NDArray[np.int64] | None = None
+
+    def __len__(self) -> int:
+        return len(self.addresses)
+
+    def of_model(self, frame: int) -> tuple[tuple[int | NDArray[np.int64] | None, ...], int | None]:
+        """Return a frame in the form for `toolchain.models.model.exact_posterior`."""
+        row = int(self.prior_addresses[frame])
+        addresses: tuple[int | NDArray[np.int64] | None, ...]
+        if self.addresses.ndim > 2:
+            return tuple(self.addresses[frame]), None if row == MISSING else row
+        addresses = tuple(None if at == MISSING else at for at in self.addresses[frame].tolist())
+        return addresses, None if row == MISSING else row
+
+    def of_machine(self, frame: int, machine: BM1Machine) -> tuple[Inputs, int]:
+        """Return a frame in the form for a machine: a missing reading is the top address of its column.
+
+        If lines have their own readings, those of all lines are returned, even if the machine has only some
+        of them.
+        """
+        parameters = machine.parameters
+        row = int(self.prior_addresses[frame])
+        prior_row = parameters.prior_addresses - 1 if row == MISSING else row
+        if self.codes is not None:
+            return self.codes[frame].astype(np.int64), prior_row
+        if self.addresses.ndim > 2:
+            return self.addresses[frame], prior_row
+        addresses = tuple(
+            parameters.missing_address(column) if at == MISSING else at
+            for column, at in enumerate(self.addresses[frame].tolist(), start=1)
+        )
+        return addresses, prior_row
+
+
+def check_frames(frames: int) -> None:
+    """Refuse, with a BuildError, a number of frames that is not 1 to `MOST_FRAMES`."""
+    if not 1 <= frames <= MOST_FRAMES:
+        raise BuildError(f"--frames is {frames}, expected 1 to {MOST_FRAMES}")
+
+
+def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -> Readings:
+    """Draw a line from the prior, or from an equally probable selection, then its readings."""
+    check_frames(frames)
+    random = np.random.default_rng(seed)
+    rows = np.full(frames, MISSING, dtype=np.int64)
+    if model.prior_select is None:
+        lines = random.choice(model.lines, size=frames, p=_normalised(model.prior_distribution))
+    else:
+        rows = random.integers(0, model.prior_select.values, frames)
+        lines = np.array(
+            [random.choice(model.lines, p=_normalised(model.prior_select.table[row])) for row in rows]
+        )
+    addresses = np.empty((frames, len(model.known)), dtype=np.int64)
+    for column, known in enumerate(model.known):
+        cumulative = np.cumsum(known.table[:, lines], axis=0)
+        drawn = random.random(frames) * cumulative[-1]
+        addresses[:, column] = (cumulative <= drawn).sum(axis=0)
+    origin = source or f"{frames} frames drawn from the model (seed {seed})"
+    return Readings(origin, addresses, rows, lines=lines)
+
+
+def readings_of_lines(
+    drawn: Readings, model: Model, machine: BM1Machine, *, scale: Scale, seed: int
+) -> Readings:
+    """Convert drawn readings for a machine whose lines have their own readings.
+
+    The cell of the true line reads the drawn value. The model does not define the readings of the other
+    lines, which are drawn from the mean of all lines. With sensor_mode `threshold`, the likelihoods are
+    returned as codes.
+
+    Raises:
+        BuildError: The readings were not drawn, so their true line is unknown.
+    """
+    if drawn.lines is None:
+        raise BuildError("the true line is known only for drawn readings")
+    frames = len(drawn)
+    shape = (frames, len(model.known), model.lines)
+    random = np.random.default_rng((seed, 1))
+    addresses = np.empty(shape, dtype=np.int64)
+    for column, known in enumerate(model.known):
+        mean = np.cumsum(known.table @ _normalised(model.prior_distribution))
+        others = np.searchsorted(mean, random.random((frames, model.lines)) * mean[-1], side="right")
+        addresses[:, column] = np.minimum(others, known.values - 1)
+    addresses[np.arange(frames), :, drawn.lines] = drawn.addresses
+    if machine.parameters.has_tables:
+        return replace(drawn, addresses=addresses)
+    codes = np.empty(shape, dtype=np.uint16)
+    for column, known in enumerate(model.known):
+        likelihoods = known.table[addresses[:, column], np.arange(model.lines)]
+        codes[:, column] = written_codes(likelihoods, prob_bits=machine.parameters.prob_bits, scale=scale)
+    return replace(drawn, addresses=addresses, codes=codes)
+
+
+def model_of_codes(
+    name: str, searched: Sequence[Dimension], variables: Sequence[Variable], machine: BM1Machine
+) -> Model:
+    """Return a model that quantises to the codes of a machine, for drawing readings without the original.
+
+    Each row of a table was divided by its maximum before quantising. The factors are estimated so that the
+    column of every line sums to 1 as nearly as possible (expectation maximisation).
+    """
+    width = machine.parameters.prob_bits
+    known = []
+    sensors = [variable for variable in variables if variable.kind == "sensor"]
+    for variable, table in zip(sensors, machine.tables, strict=True):
+        codes = decode_code(table[: variable.values], width)
+        known.append(Known(name=variable.name, table=_conditional(codes), bits=variable.bits))
+    prior = decode_code(machine.prior, width)
+    select = next((variable for variable in variables if variable.kind == "prior_select"), None)
+    if select is None:
+        return Model(name=name, searched=tuple(searched), known=tuple(known), prior=_distribution(prior[0]))
+    rows = np.stack([_distribution(row) for row in prior[: select.values]])
+    return Model(
+        name=name,
+        searched=tuple(searched),
+        known=tuple(known),
+        prior=_distribution(prior[-1]),
+        prior_select=PriorSelect(name=select.name, table=rows, bits=select.bits),
+    )
+
+
+def _conditional(codes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Scale rows so that columns sum to about 1, then normalise them; a column of zeros becomes uniform."""
+    codes = np.where(codes.sum(axis=0) > 0, codes, 1.0)
+    served = codes.sum(axis=1) > 0
+    weights = served / max(int(served.sum()), 1)
+    for _ in range(_WEIGHT_STEPS):
+        back = codes @ (1.0 / (weights @ codes))
+        weights = np.divide(weights * back, codes.sum(axis=1), out=np.zeros_like(weights), where=served)
+    table = weights[:, np.newaxis] * codes
+    scaled: NDArray[np.float64] = table / table.sum(axis=0)
+    return scaled
+
+
+def _distribution(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
+    total = ratios.sum()
+    return ratios / total if total > 0 else np.full(ratios.shape, 1 / ratios.size)
+
+
+def _normalised(distribution: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Normalise a distribution of a model, which sums to 1 only within 1e-6."""
+    exact: NDArray[np.float64] = distribution / distribution.sum()
+    return exact
+
+
+def recorded_readings(
+    path: Path, variables: Sequence[Variable], given: Sequence[str], *, frames: int, tolerance_s: float = 0.1
+) -> Readings:
+    """Return at most `frames` readings of a recording (CSV, MCAP or bag), spread over its length.
+
+    `given` are NAME=COLUMN for variables whose column has another name, with `*` for the same text in both;
+    in a bag, messages of other topics may be `tolerance_s` apart from a row.
+
+    Raises:
+        ModelError: The recording or a column does not exist, or no row fits the machine.
+        BuildError: An unknown variable, no frames, or too many.
+    """
+    check_frames(frames)
+    columns = reading_columns([variable.name for variable in variables], given)
+    recording = read_recording(path, list(dict.fromkeys(columns.values())), tolerance_s=tolerance_s)
+    rows: list[list[int]] = []
+    refused, first = 0, ""
+    for at in np.unique(np.linspace(0, recording.rows - 1, min(frames, recording.rows)).astype(int)).tolist():
+        try:
+            row = [
+                to_address(variable, recording.columns[columns[variable.name]][at])
+                if variable.name in columns
+                else to_address(variable, None)
+                for variable in variables
+            ]
+        except ReadingError as error:
+            refused, first = refused + 1, first or str(error)
+            continue
+        rows.append([MISSING if address is None else address for address in row])
+    if not rows:
+        raise ModelError(f"{path} has no row that fits this machine" + (f": {first}" if first else ""))
+    addresses = np.array(rows, dtype=np.int64).reshape(len(rows), len(variables))
+    sensors = [at for at, variable in enumerate(variables) if variable.kind == "sensor"]
+    selects = [at for at, variable in enumerate(variables) if variable.kind == "prior_select"]
+    prior = addresses[:, selects[0]] if selects else np.full(len(rows), MISSING, dtype=np.int64)
+    left_out = f", without {refused} that do not fit ({first})" if refused else ""
+    source = f"{len(rows)} of {recording.rows} rows of {path.name}{left_out}"
+    return Readings(source, addresses[:, sensors], prior)
