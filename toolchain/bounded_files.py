@@ -96,6 +96,7 @@ _DEEP_KEY: Final = re.compile(
 _HEADER: Final = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _PLACE: Final = re.compile(r"\s*\(at (?:line (\d+), column \d+|end of document)\)$")
 _SHOWN: Final = 60
+_LISTED: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,10 +211,15 @@ def _split(place: Sequence[str | int]) -> tuple[str, int | None, str]:
             return "", None, ""
 
 
-def nearest_name(word: str, known: Sequence[str]) -> str:
-    """Return advice on a wrong name: the nearest valid name, or all valid ones."""
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
-    return f"did you mean '{close[0]}'?" if close else f"expected one of {', '.join(known) or 'none'}"
+def nearest_name(word: str, known: Sequence[str], *, cutoff: float = 0.5) -> str:
+    """Return advice on a wrong name: the nearest valid name, or the first valid ones."""
+    close = difflib.get_close_matches(word, known, n=1, cutoff=cutoff)
+    more = f" and {len(known) - _LISTED} more" if len(known) > _LISTED else ""
+    return (
+        f"did you mean '{close[0]}'?"
+        if close
+        else f"expected one of {', '.join(known[:_LISTED]) or 'none'}{more}"
+    )
 
 
 def _keys(model: type[BaseModel]) -> list[str]:

@@ -26,7 +26,11 @@ class ToolchainError(Exception):
 
 
 class ModelError(ToolchainError):
-    """A model that a BM1 cannot compute: wrong shapes, names, probabilities or parameters."""
+    """A model that a machine cannot compute: wrong shapes, names, probabilities or parameters."""
+
+
+class NotFusionError(ModelError):
+    """A question that is not a naive fusion, so that a BM1 cannot compute it: two known symbols depend on each other."""
 
 
 class NetworkFileError(ModelError):

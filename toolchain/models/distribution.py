@@ -14,6 +14,7 @@ from typing import ClassVar, Final, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from toolchain.bounded_files import nearest_name
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal_table, wrapped_normal_table
 from toolchain.models.model import MAX_ENTRIES, Normal, check_size
@@ -190,8 +191,10 @@ class Symbol:
             if 0 <= at < self.size:
                 return at
         last = self.type.offset + (self.size - 1) * self.type.step
-        expected = ", ".join(self.type.labels[:20]) or f"{self.type.offset:g} to {last:g}"
-        raise ModelError(f"{self.name} is never {label!r}; expected {expected}")
+        expected = f"expected {self.type.offset:g} to {last:g}"
+        if self.type.labels:
+            expected = nearest_name(label, self.type.labels, cutoff=0.6)
+        raise ModelError(f"{self.name} is never {label!r}; {expected}")
 
 
 Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike

@@ -2,7 +2,8 @@
 
 A question with the form of naive fusion, P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2), becomes a `Model`,
 which a BM1 computes. Symbols that are neither searched nor known are summed out exactly. A question of
-another form is refused with the path that joins two known symbols.
+another form is refused with the path that joins two known symbols. Every question becomes a `NetworkModel`,
+which a BM2 samples.
 """
 
 from __future__ import annotations
@@ -12,12 +13,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
 from operator import itemgetter
-from typing import Any, Final, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from toolchain.errors import ModelError
+from toolchain.bounded_files import nearest_name
+from toolchain.errors import ModelError, NotFusionError
 from toolchain.models.distribution import Distribution, Factor, Symbol
 from toolchain.models.inference import Links, Term, eliminate, product, reduced, relevant, without_idle
 from toolchain.models.model import (
@@ -30,10 +32,9 @@ from toolchain.models.model import (
     check_size,
     dimension,
 )
+from toolchain.models.network import NetworkModel, network_model
 
 Named: TypeAlias = Symbol | str
-
-_LISTED: Final = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +82,7 @@ class JointDistribution:
             if symbol.name == wanted:
                 return symbol
         names = [symbol.name for symbol in self.symbols]
-        more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-        raise ModelError(f"{self.name} has no variable {wanted!r}; it has {', '.join(names[:_LISTED])}{more}")
+        raise ModelError(f"{self.name} has no variable {wanted!r}; {nearest_name(wanted, names)}")
 
     def ask(
         self,
@@ -155,8 +155,9 @@ class Question:
         """Return the model that a BM1 computes.
 
         Raises:
-            ModelError: The question is not naive fusion (the sentence contains the path that joins two known
-                symbols), is impossible, or needs a table above the limit.
+            NotFusionError: The question is not naive fusion; the sentence contains the path that joins two known
+                symbols.
+            ModelError: It is impossible, or needs a table above the limit.
         """
         observed = [symbol.name for symbol in self.observed]
         active = [without_idle(factor) for factor in self.joint.factors]
@@ -188,6 +189,17 @@ class Question:
                 common += left
         common += [term for term in terms if set(term.scope) <= set(searched)]
         return self._fusion(own, product(common, searched, sizes).ravel(), sizes)
+
+    def network(self) -> NetworkModel:
+        """Return the network that a BM2 samples; a symbol that selects the prior is one of the known.
+
+        Raises:
+            ModelError: A factor has a wrong number, or is 0 for all values that the given ones leave.
+        """
+        joint = self.joint
+        return network_model(
+            joint.name, joint.factors, joint.symbols, self.searched, self.observed, self.given
+        )
 
     def _factors(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], list[Term]]:
         """Return the relevant factors for some observed symbols, and their terms at the given values."""
@@ -231,7 +243,7 @@ class Question:
         ends = f"{path[0]} or {path[-1]}"
         way_out = f"search {path[1]} too, or leave {ends} out" if len(path) > 2 else f"leave {ends} out"
         names = ", ".join(each.name for each in self.searched)
-        return ModelError(
+        return NotFusionError(
             f"{path[0]} and {path[-1]} are not independent given {names}: {drawn} joins them; {way_out} of the known "
             "variables"
         )

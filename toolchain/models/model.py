@@ -109,7 +109,7 @@ class TabulatedVariable:
                 kind="sensor" if isinstance(self, Known) else "prior_select", values=self.values, **rule
             )
         except ValidationError as reason:
-            raise ModelError(f"variable {self.name!r}: {_first(reason)}") from None
+            raise ModelError(f"variable {self.name!r}: {first_mistake(reason)}") from None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -254,7 +254,7 @@ def dimension(
     try:
         return Dimension(label=label, size=size, offset=offset, step=step, unit=unit, states=states)
     except ValidationError as reason:
-        raise ModelError(f"searched dimension {label!r}: {_first(reason)}") from None
+        raise ModelError(f"searched dimension {label!r}: {first_mistake(reason)}") from None
 
 
 def interval(label: str, low: float, high: float, *, cells: int, unit: str = "") -> Dimension:
@@ -294,7 +294,8 @@ def _check_distribution(what: str, table: NDArray[np.float64]) -> None:
         raise ModelError(f"{what} sums to {sums[line]:.9g}{where}; a distribution sums to 1")
 
 
-def _first(reason: ValidationError) -> str:
+def first_mistake(reason: ValidationError) -> str:
+    """Return the first thing that pydantic refuses, as a clause."""
     detail = reason.errors(include_url=False)[0]
     if detail["type"] == "value_error":
         return str(detail["ctx"]["error"])

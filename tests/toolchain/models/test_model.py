@@ -265,7 +265,7 @@ def test_a_number_is_its_value_or_refused(low, more, number):
 def test_a_label_is_its_value_or_the_labels_are_listed():
     symbol = Symbol("smoke", LabelType("yes", "no"))
     assert [symbol.index(label) for label in ("yes", "no")] == [0, 1]
-    with pytest.raises(ModelError, match="smoke is never 'maybe'; expected yes, no"):
+    with pytest.raises(ModelError, match="smoke is never 'maybe'; expected one of yes, no"):
         symbol.index("maybe")
 
 
