@@ -48,14 +48,17 @@ class BM1Machine:
                 f"these parameters have {parameters.sensors} sensor columns."
             )
         prior = checked_codes(
-            "The prior's table", self.prior, (parameters.prior_addresses, parameters.lines), parameters
+            "The prior's table",
+            self.prior,
+            (parameters.prior_addresses, parameters.lines),
+            parameters.prob_bits,
         )
         tables = []
         for column, (table, bits) in enumerate(
             zip(self.tables, parameters.sensor_bits, strict=parameters.has_tables), start=1
         ):
             name = f"The table of column {column}"
-            codes = checked_codes(name, table, (1 << bits, parameters.lines), parameters)
+            codes = checked_codes(name, table, (1 << bits, parameters.lines), parameters.prob_bits)
             if not (codes[-1] == parameters.ones_code).all():
                 raise ParameterError(
                     f"{name} has other codes than all-ones ({parameters.ones_code}) "
@@ -64,7 +67,7 @@ class BM1Machine:
             tables.append(codes)
         object.__setattr__(self, "prior", prior)
         object.__setattr__(self, "tables", tuple(tables))
-        object.__setattr__(self, "rng_table", _rng_table(self.rng_table, parameters))
+        object.__setattr__(self, "rng_table", checked_rng_table(self.rng_table, parameters.rng))
 
     def __eq__(self, other: object) -> bool:
         """Compare parameters and codes."""
@@ -188,7 +191,7 @@ def addressed_codes(machine: BM1Machine, start: Start) -> npt.NDArray[np.uint16]
 
 
 def checked_codes(
-    name: str, given: npt.NDArray[np.uint16], shape: tuple[int, ...], parameters: BM1Parameters
+    name: str, given: npt.NDArray[np.uint16], shape: tuple[int, ...], prob_bits: int, lowest: int = 0
 ) -> npt.NDArray[np.uint16]:
     """Return `given` as a read-only uint16 array, after checking its shape and its codes."""
     array = np.asarray(given)
@@ -196,23 +199,19 @@ def checked_codes(
         raise ParameterError(f"{name} has the shape {array.shape}; it must be {shape}.")
     if array.dtype.kind not in "ui":
         raise ParameterError(f"{name} holds {array.dtype}; codes are integers.")
-    if array.size and not 0 <= int(array.min()) <= int(array.max()) <= parameters.ones_code:
+    if array.size and not lowest <= int(array.min()) <= int(array.max()) < 1 << prob_bits:
         raise ParameterError(
             f"{name} holds codes from {array.min()} to {array.max()}; with "
-            f"prob_bits = {parameters.prob_bits} they must be from 0 to {parameters.ones_code}."
+            f"prob_bits = {prob_bits} they must be from {lowest} to {(1 << prob_bits) - 1}."
         )
-    return _frozen(array.astype(np.uint16, copy=False))
+    return frozen(array.astype(np.uint16, copy=False))
 
 
-def _rng_table(
-    given: npt.NDArray[np.uint32] | None, parameters: BM1Parameters
-) -> npt.NDArray[np.uint32] | None:
+def checked_rng_table(given: npt.NDArray[np.uint32] | None, rng: RngKind) -> npt.NDArray[np.uint32] | None:
     """Return `given` as a read-only uint32 array; it must exist if and only if the generator uses a table."""
-    if parameters.rng is not RngKind.TABLE:
+    if rng is not RngKind.TABLE:
         if given is not None:
-            raise ParameterError(
-                f"There is a table of random numbers, but rng = {parameters.rng} does not use one."
-            )
+            raise ParameterError(f"There is a table of random numbers, but rng = {rng} does not use one.")
         return None
     if given is None:
         raise ParameterError("rng = table needs a table of random numbers (rng_table), and there is none.")
@@ -225,10 +224,10 @@ def _rng_table(
         raise ParameterError(
             "The table of random numbers holds values that are not integers from 0 to 2**32 - 1."
         )
-    return _frozen(array.astype(np.uint32, copy=False))
+    return frozen(array.astype(np.uint32, copy=False))
 
 
-def _frozen(array: npt.NDArray[_Scalar]) -> npt.NDArray[_Scalar]:
+def frozen(array: npt.NDArray[_Scalar]) -> npt.NDArray[_Scalar]:
     """Return a C-contiguous read-only array: a copy, unless the array already is one."""
     if array.flags.c_contiguous and array.flags.owndata and not array.flags.writeable:
         return array

@@ -134,7 +134,7 @@ class BM1Kernel(ABC):
                 else f"There is no slice to resume: the machine has stopped with reason {reason.name.lower()}."
             )
         if run_until != 0:
-            _check("run_until", run_until, self.cycles + 1, CYCLES_MAX)
+            check_start_value("run_until", run_until, self.cycles + 1, CYCLES_MAX)
 
 
 def check_start(parameters: BM1Parameters, start: Start) -> None:
@@ -152,13 +152,15 @@ def check_start(parameters: BM1Parameters, start: Start) -> None:
                 f"one for each of its replicas, of which it has {parameters.replicas}."
             )
         for replica, address in enumerate(start.prior_address):
-            _check(f"prior_address of replica {replica}", address, 0, parameters.prior_addresses - 1)
+            check_start_value(
+                f"prior_address of replica {replica}", address, 0, parameters.prior_addresses - 1
+            )
     else:
-        _check("prior_address", start.prior_address, 0, parameters.prior_addresses - 1)
-    _check("target_count", start.target_count, 1, parameters.target_count_max)
-    _check("max_cycles", start.max_cycles, 1, CYCLES_MAX)
-    _check("bank", start.bank, 0, parameters.rng_banks - 1)
-    _check("run_until", start.run_until, 0, CYCLES_MAX)
+        check_start_value("prior_address", start.prior_address, 0, parameters.prior_addresses - 1)
+    check_start_value("target_count", start.target_count, 1, parameters.target_count_max)
+    check_start_value("max_cycles", start.max_cycles, 1, CYCLES_MAX)
+    check_start_value("bank", start.bank, 0, parameters.rng_banks - 1)
+    check_start_value("run_until", start.run_until, 0, CYCLES_MAX)
     if start.prior_codes is not None:
         if parameters.prior_mode is not PriorMode.WRITTEN:
             raise StartError(
@@ -167,7 +169,7 @@ def check_start(parameters: BM1Parameters, start: Start) -> None:
         own = parameters.replicas > 1 and np.shape(start.prior_codes) == parameters.count_shape
         shape = parameters.count_shape if own else (parameters.lines,)
         try:
-            checked_codes("The written prior", start.prior_codes, shape, parameters)
+            checked_codes("The written prior", start.prior_codes, shape, parameters.prob_bits)
         except ParameterError as error:
             raise StartError(str(error)) from None
 
@@ -200,12 +202,12 @@ def _check_inputs(parameters: BM1Parameters, given: object) -> None:
         name = "The address" if parameters.has_tables else "The code"
         where = f" at line {line}" if parameters.sensor_mode is not SensorMode.COLUMN else ""
         where += f" of replica {replica}" if parameters.replicas > 1 else ""
-        _check(
+        check_start_value(
             f"{name} of column {column + 1}{where}", by_column[replica, column, line], 0, int(tops[column])
         )
 
 
-def _check(name: str, value: object, lowest: int, highest: int) -> None:
+def check_start_value(name: str, value: object, lowest: int, highest: int) -> None:
     """Refuse a value that is not an integer from `lowest` to `highest`."""
     if not isinstance(value, int | np.integer) or isinstance(value, bool):
         raise StartError(f"{name} is {value!r}; it must be an integer.")

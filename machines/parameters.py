@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Final, TypeVar
 
 from machines.errors import ParameterError
+
+_Choice = TypeVar("_Choice", bound=StrEnum)
 
 PROB_BITS_MAX: Final = 16
 """Maximum width of a code in bits, because tables contain uint16."""
@@ -122,23 +124,18 @@ class BM1Parameters:
             ("rng_reset", RngReset),
             ("sensor_mode", SensorMode),
         ):
-            given = getattr(self, name)
-            try:
-                object.__setattr__(self, name, kind(given))
-            except ValueError:
-                allowed = ", ".join(kind)
-                raise ParameterError(f"{name} is {given!r}; it must be one of {allowed}.") from None
+            object.__setattr__(self, name, checked_choice(name, getattr(self, name), kind))
         object.__setattr__(self, "sensor_bits", tuple(self.sensor_bits))
-        _check("lines", self.lines, 1, 2**32 - 1)
+        check_parameter("lines", self.lines, 1, 2**32 - 1)
         for column, bits in enumerate(self.sensor_bits, start=1):
-            _check(f"sensor_bits of column {column}", bits, 1, ADDRESS_BITS_MAX)
-        _check("prob_bits", self.prob_bits, 1, PROB_BITS_MAX)
-        _check("prior_bits", self.prior_bits, 0, ADDRESS_BITS_MAX)
-        _check("counter_bits", self.counter_bits, 1, COUNTER_BITS_MAX)
-        _check("steps_per_clock", self.steps_per_clock, 0, STEPS_PER_CLOCK_MAX)
-        _check("rng_banks", self.rng_banks, 1, RNG_BANKS_MAX)
-        _check("ideal_seed", self.ideal_seed, 0, 2**64 - 1)
-        _check("replicas", self.replicas, 1, REPLICAS_MAX)
+            check_parameter(f"sensor_bits of column {column}", bits, 1, ADDRESS_BITS_MAX)
+        check_parameter("prob_bits", self.prob_bits, 1, PROB_BITS_MAX)
+        check_parameter("prior_bits", self.prior_bits, 0, ADDRESS_BITS_MAX)
+        check_parameter("counter_bits", self.counter_bits, 1, COUNTER_BITS_MAX)
+        check_parameter("steps_per_clock", self.steps_per_clock, 0, STEPS_PER_CLOCK_MAX)
+        check_parameter("rng_banks", self.rng_banks, 1, RNG_BANKS_MAX)
+        check_parameter("ideal_seed", self.ideal_seed, 0, 2**64 - 1)
+        check_parameter("replicas", self.replicas, 1, REPLICAS_MAX)
         if self.sensor_mode is SensorMode.THRESHOLD:
             for column, bits in enumerate(self.sensor_bits, start=1):
                 if bits != self.prob_bits:
@@ -167,6 +164,20 @@ class BM1Parameters:
     def columns(self) -> int:
         """Number of columns, including the prior (N + 1)."""
         return len(self.sensor_bits) + 1
+
+    @property
+    def generator_shape(self) -> tuple[int, ...]:
+        """Shape of the generators' states: [columns], or [lines, columns] if they are not shared."""
+        return (self.columns,) if self.shared else (self.lines, self.columns)
+
+    @property
+    def seed_sets(self) -> int:
+        """Number of sets of seeds: one per bank, since all boards have the same ones."""
+        return self.rng_banks
+
+    def seed_set(self, bank: int) -> int:
+        """Return the set of seeds of a bank."""
+        return bank
 
     @property
     def has_tables(self) -> bool:
@@ -210,7 +221,15 @@ class BM1Parameters:
         return (1 << self.sensor_bits[column - 1]) - 1
 
 
-def _check(name: str, value: object, lowest: int, highest: int) -> None:
+def checked_choice(name: str, value: str, kind: type[_Choice]) -> _Choice:
+    """Return a value as a member of an enumeration of strings."""
+    try:
+        return kind(value)
+    except ValueError:
+        raise ParameterError(f"{name} is {value!r}; it must be one of {', '.join(kind)}.") from None
+
+
+def check_parameter(name: str, value: object, lowest: int, highest: int) -> None:
     """Refuse a value that is not an integer from `lowest` to `highest`."""
     if not isinstance(value, int) or isinstance(value, bool):
         raise ParameterError(f"{name} is {value!r}; it must be an integer.")

@@ -1,11 +1,12 @@
 """The random number generators of a machine: seeds, steps and outputs.
 
-There is one generator for each column, or for each cell if they are not shared. The number of a generator is
-its column, or line * columns + column for a cell; the numbers of bank b begin at b times the number of
-generators. The state of a generator is one uint64, and a cell compares its code with the low `prob_bits` bits
-of the output.
+BM1 has one generator for each column, or for each cell if they are not shared; BM2 has one for each CDE. The
+number of a generator is its column or CDE, or line * columns + column for a cell; the numbers of seed set s
+begin at s times the number of generators. The state of a generator is one uint64, and a cell or CDE compares
+its code with the low `prob_bits` bits of the output.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cache
 from typing import Final, Protocol, TypeAlias
@@ -13,8 +14,7 @@ from typing import Final, Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from machines.bm1 import BM1Machine
-from machines.parameters import BM1Parameters, RngKind
+from machines.parameters import RngKind
 
 Words: TypeAlias = npt.NDArray[np.uint64]
 
@@ -33,11 +33,54 @@ POLYNOMIALS: Final = {
 """Non-zero exponents of the maximal-length polynomial of each LFSR, in descending order."""
 
 
+class RngParameters(Protocol):
+    """The parameters of any machine on which its generators depend."""
+
+    @property
+    def rng(self) -> RngKind:
+        """Kind of random number generators."""
+
+    @property
+    def ones_code(self) -> int:
+        """Mask of the low `prob_bits` bits."""
+
+    @property
+    def steps_per_clock(self) -> int:
+        """Steps of a generator per cycle."""
+
+    @property
+    def ideal_seed(self) -> int:
+        """Seed of the `ideal` generator."""
+
+    @property
+    def generator_shape(self) -> tuple[int, ...]:
+        """Shape of the generators' states."""
+
+    @property
+    def seed_sets(self) -> int:
+        """Number of sets of seeds, over all banks and boards."""
+
+    def seed_set(self, bank: int) -> int:
+        """Return the set of seeds of a bank."""
+
+
+class RandomMachine(Protocol):
+    """Any machine with generators."""
+
+    @property
+    def parameters(self) -> RngParameters:
+        """The parameters."""
+
+    @property
+    def rng_table(self) -> npt.NDArray[np.uint32] | None:
+        """The random numbers of all generators, if they use a table."""
+
+
 class RandomNumbers(Protocol):
     """All generators of a machine: arrays have one element per generator."""
 
     def restart(self, bank: int) -> Words:
-        """Return the states at the start of a bank: uint64[columns], or uint64[lines, columns] if unshared."""
+        """Return the states at the start of a bank, in the parameters' `generator_shape`."""
 
     def show(self, states: Words) -> Words:
         """Return the outputs for these states, `prob_bits` bits each."""
@@ -46,7 +89,7 @@ class RandomNumbers(Protocol):
         """Return the states after one clock, which is `steps_per_clock` steps."""
 
 
-def random_numbers(machine: BM1Machine) -> RandomNumbers:
+def random_numbers(machine: RandomMachine) -> RandomNumbers:
     """Return the generators of a machine."""
     parameters = machine.parameters
     if parameters.rng in POLYNOMIALS:
@@ -56,11 +99,11 @@ def random_numbers(machine: BM1Machine) -> RandomNumbers:
     return IdealNumbers(parameters)
 
 
-def generator_numbers(parameters: BM1Parameters, bank: int) -> Words:
-    """Return the numbers of a bank's generators: uint64[columns], or uint64[lines, columns] if unshared."""
-    shape = (parameters.columns,) if parameters.shared else (parameters.lines, parameters.columns)
-    count = int(np.prod(shape, dtype=np.int64))
-    return np.arange(bank * count, (bank + 1) * count, dtype=np.uint64).reshape(shape)
+def generator_numbers(parameters: RngParameters, bank: int) -> Words:
+    """Return the numbers of a bank's generators, in the parameters' `generator_shape`."""
+    count = math.prod(parameters.generator_shape)
+    first = parameters.seed_set(bank) * count
+    return np.arange(first, first + count, dtype=np.uint64).reshape(parameters.generator_shape)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +160,7 @@ class LFSR:
 class LFSRNumbers:
     """LFSRs, which output the low bits of their states."""
 
-    parameters: BM1Parameters
+    parameters: RngParameters
 
     def restart(self, bank: int) -> Words:
         """Return the seeds of the bank's generators."""
@@ -139,20 +182,20 @@ class LFSRNumbers:
 class TableNumbers:
     """Generators that all repeat one table of recorded numbers; a state is an index.
 
-    Generator n of `count` starts at floor(n * length / count), and bank b adds b / banks of the distance to
-    the start of the next generator.
+    Generator n of `count` starts at floor(n * length / count), and seed set s of `sets` adds s / sets of the
+    distance to the start of the next generator.
     """
 
-    parameters: BM1Parameters
+    parameters: RngParameters
     table: npt.NDArray[np.uint32]
 
     def restart(self, bank: int) -> Words:
         """Return the initial indices."""
-        numbers = generator_numbers(self.parameters, 0)
-        banks = self.parameters.rng_banks
+        shape = self.parameters.generator_shape
+        count, sets, own = math.prod(shape), self.parameters.seed_sets, self.parameters.seed_set(bank)
         # Python integers, because the products may exceed 64 bits
-        starts = [(n * banks + bank) * len(self.table) // (numbers.size * banks) for n in range(numbers.size)]
-        return np.array(starts, dtype=np.uint64).reshape(numbers.shape)
+        starts = [(n * sets + own) * len(self.table) // (count * sets) for n in range(count)]
+        return np.array(starts, dtype=np.uint64).reshape(shape)
 
     def show(self, states: Words) -> Words:
         """Return the low `prob_bits` bits of the table's numbers."""
@@ -171,7 +214,7 @@ class IdealNumbers:
     output is mix(state), all modulo 2**64.
     """
 
-    parameters: BM1Parameters
+    parameters: RngParameters
 
     def restart(self, bank: int) -> Words:
         """Return the initial states."""

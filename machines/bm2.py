@@ -1,0 +1,567 @@
+"""The data of a BM2: its parameters, tables, the start of a frame, and its stop reasons (thesis 2.1.3)."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+from itertools import accumulate
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from machines.bm1 import checked_codes, checked_rng_table, frozen
+from machines.errors import ParameterError, StartError
+from machines.parameters import (
+    PROB_BITS_MAX,
+    RNG_BANKS_MAX,
+    STEPS_PER_CLOCK_MAX,
+    RngKind,
+    RngReset,
+    check_parameter,
+    checked_choice,
+)
+
+STATE_BITS_MAX: Final = 2048
+"""Maximum number of bits of the state: the register map has 64 words for it."""
+
+FACTOR_BITS_MAX: Final = 20
+"""Maximum number of bits of a factor's variables: a table of 20 * 2**19 codes has 20 MB."""
+
+RESULT_WORDS_MAX: Final = 4096
+"""Maximum number of words of histograms and joint: the result memory of the register map."""
+
+CHAINS_MAX: Final = 65536
+"""Maximum number of boards that run chains of one model."""
+
+SAMPLES_MAX: Final = 2**32 - 1
+"""Maximum number of samples of a frame; no 32-bit histogram overflows."""
+
+SEARCH_MAX: Final = 20_000
+"""Maximum number of values that the search for a start state tries."""
+
+
+class Sequencer(StrEnum):
+    """Orders in which the sequencer points at the unknown bits."""
+
+    LINEAR = "linear"
+    RANDOM = "random"
+    COLOURED = "coloured"
+
+
+class SampleEvery(StrEnum):
+    """Moves after which a state becomes a sample: the last one of every sweep, or every move."""
+
+    SWEEP = "sweep"
+    MOVE = "move"
+
+
+class BM2StopReason(IntEnum):
+    """The reason why a BM2 stopped. The numbers are those of the status register."""
+
+    NONE = 0
+    """The machine has not run since the reset."""
+    SAMPLES = 1
+    """All samples are drawn; a resume draws more."""
+    MAX_CYCLES = 2
+    """The frame's last cycle was run before all samples were drawn."""
+    PAUSED = 3
+    """The cycle `pause_at` was run; `step` continues."""
+    IMPOSSIBLE = 4
+    """The start had 0 samples (no state agrees with the evidence), so the machine did not run."""
+    OPS_TIMEOUT = 5
+    """The CDEs of a bit did not agree within `ops_timeout` cycles of a move."""
+    FULL = 6
+    """The stream's buffer is full; a resume empties it and continues."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BM2Parameters:
+    """Parameters of a BM2: bit-level Gibbs sampling in a product of factors, each of which has a CDE.
+
+    Attributes:
+        cardinalities: Number of values of each variable, in the model's order.
+        factors: Variables of each factor, in rising order; every variable is in a factor.
+        searched: Variables whose joint is counted, slowest first.
+        known: Variables of a frame's addresses, in that order.
+        prob_bits: Bits of a code (W), 2 to 16.
+        sequencer: Default order of the sequencer.
+        literal: All CDEs are compared, as the thesis draws it, not only those whose factor has the pointed bit.
+        sample_every: Moves after which a sample is taken.
+        burn_in: Default number of whole sweeps before the first sample.
+        ops_timeout: Default maximum number of cycles of a move.
+        rng: Kind of random number generators; `lfsr8` and `lfsr16` are too narrow.
+        steps_per_clock: Steps of a generator per cycle, a power of two. 0 is replaced by the default: for an LFSR the
+            smallest power of two that is at least `prob_bits`; 1 for `table` and `ideal`.
+        rng_banks: Number of seed sets of each board; a start selects one.
+        rng_reset: Whether a start restarts the generators.
+        ideal_seed: Seed of the `ideal` generator, 64 bits.
+        chain: Number of this board.
+        chains: Number of boards; each runs a chain of its own.
+        stream: Number of samples that the stream's buffer holds; 0 for no stream.
+
+    Raises:
+        ParameterError: A machine with these parameters cannot be built.
+    """
+
+    cardinalities: tuple[int, ...]
+    factors: tuple[tuple[int, ...], ...]
+    searched: tuple[int, ...] = ()
+    known: tuple[int, ...] = ()
+    prob_bits: int = 16
+    sequencer: Sequencer = Sequencer.LINEAR
+    literal: bool = False
+    sample_every: SampleEvery = SampleEvery.SWEEP
+    burn_in: int = 1000
+    ops_timeout: int = 2**20
+    rng: RngKind = RngKind.LFSR32
+    steps_per_clock: int = 0
+    rng_banks: int = 16
+    rng_reset: RngReset = RngReset.BANK
+    ideal_seed: int = 0
+    chain: int = 0
+    chains: int = 1
+    stream: int = 0
+
+    def __post_init__(self) -> None:
+        """Check every parameter, convert strings to enum members, and set the default of `steps_per_clock`."""
+        for name, kind in (
+            ("sequencer", Sequencer),
+            ("sample_every", SampleEvery),
+            ("rng", RngKind),
+            ("rng_reset", RngReset),
+        ):
+            object.__setattr__(self, name, checked_choice(name, getattr(self, name), kind))
+        for name in ("cardinalities", "searched", "known"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        object.__setattr__(self, "factors", tuple(map(tuple, self.factors)))
+        for name, lowest, highest in (
+            ("prob_bits", 2, PROB_BITS_MAX),
+            ("burn_in", 0, SAMPLES_MAX),
+            ("ops_timeout", 1, SAMPLES_MAX),
+            ("steps_per_clock", 0, STEPS_PER_CLOCK_MAX),
+            ("rng_banks", 1, RNG_BANKS_MAX),
+            ("ideal_seed", 0, 2**64 - 1),
+            ("chains", 1, CHAINS_MAX),
+            ("chain", 0, self.chains - 1),
+            ("stream", 0, SAMPLES_MAX),
+        ):
+            check_parameter(name, getattr(self, name), lowest, highest)
+        self._check_variables()
+        if self.literal and self.sequencer is Sequencer.COLOURED:
+            raise ParameterError(
+                "sequencer = coloured is not possible with literal = true; use linear or random."
+            )
+        if self.rng in {RngKind.LFSR8, RngKind.LFSR16}:
+            raise ParameterError(
+                f"{self.rng} biases the samples of a BM2; use lfsr24, lfsr32, table or ideal."
+            )
+        if self.steps_per_clock == 0:
+            steps = 1 if self.rng.lfsr_bits is None else 1 << (self.prob_bits - 1).bit_length()
+            object.__setattr__(self, "steps_per_clock", steps)
+        if self.steps_per_clock.bit_count() != 1:
+            raise ParameterError(
+                f"steps_per_clock is {self.steps_per_clock}; on a BM2 it must be a power of two."
+            )
+
+    def _check_variables(self) -> None:
+        """Check variables, factors, and the sizes that follow from them."""
+        for variable, cardinality in enumerate(self.cardinalities):
+            check_parameter(f"The cardinality of variable {variable}", cardinality, 1, 2**16)
+        check_parameter("The number of bits of the state", self.state_bits, 1, STATE_BITS_MAX)
+        last = len(self.cardinalities) - 1
+        for name, variables in (
+            *((f"factor {at}", factor) for at, factor in enumerate(self.factors)),
+            ("searched", self.searched),
+            ("known", self.known),
+        ):
+            for variable in variables:
+                check_parameter(f"A variable of {name}", variable, 0, last)
+            if len(set(variables)) != len(variables):
+                raise ParameterError(f"A variable occurs twice in {name}.")
+        for at, factor in enumerate(self.factors):
+            if list(factor) != sorted(factor) or not factor:
+                raise ParameterError(
+                    f"The variables of factor {at} are {factor}; give one or more in rising order."
+                )
+            check_parameter(
+                f"The number of bits of factor {at}", len(self.factor_bits(at)), 0, FACTOR_BITS_MAX
+            )
+        for variable in range(last + 1):
+            if not any(variable in factor for factor in self.factors):
+                raise ParameterError(f"Variable {variable} is in no factor, so no CDE can sample it.")
+        both = set(self.searched) & set(self.known)
+        if both:
+            raise ParameterError(f"Variable {min(both)} is both searched and known.")
+        check_parameter("The number of words of the histograms", self.histogram_words, 1, RESULT_WORDS_MAX)
+
+    @property
+    def bits(self) -> tuple[int, ...]:
+        """Number of bits of each variable's code."""
+        return tuple((cardinality - 1).bit_length() for cardinality in self.cardinalities)
+
+    @property
+    def offsets(self) -> tuple[int, ...]:
+        """First (lowest) state bit of each variable."""
+        return tuple(accumulate(self.bits, initial=0))[:-1]
+
+    @property
+    def state_bits(self) -> int:
+        """Number of bits of the state."""
+        return sum(self.bits)
+
+    @property
+    def state_words(self) -> int:
+        """Number of 32-bit words of the packed state."""
+        return -(-self.state_bits // 32)
+
+    @property
+    def masks(self) -> tuple[int, ...]:
+        """The state bits of each variable, as a mask."""
+        return tuple(
+            ((1 << bits) - 1) << offset for bits, offset in zip(self.bits, self.offsets, strict=True)
+        )
+
+    @property
+    def cdes(self) -> int:
+        """Number of CDEs: one per factor."""
+        return len(self.factors)
+
+    @property
+    def histogram_words(self) -> int:
+        """Number of words of all histograms: one per code of every variable, also of unused codes."""
+        return sum(1 << bits for bits in self.bits)
+
+    @property
+    def joint_words(self) -> int:
+        """Number of words of the joint of the searched variables; 0 if it does not fit behind the histograms."""
+        words = 1 << sum(self.bits[variable] for variable in self.searched) if self.searched else 0
+        return words if self.histogram_words + words <= RESULT_WORDS_MAX else 0
+
+    @property
+    def result_words(self) -> int:
+        """Number of words of histograms and joint."""
+        return self.histogram_words + self.joint_words
+
+    @property
+    def ones_code(self) -> int:
+        """The largest code, and the mask of a generator's output."""
+        return (1 << self.prob_bits) - 1
+
+    @property
+    def generator_shape(self) -> tuple[int, ...]:
+        """Shape of the generators' states: [CDEs]."""
+        return (self.cdes,)
+
+    @property
+    def seed_sets(self) -> int:
+        """Number of sets of seeds, over all banks and boards."""
+        return self.rng_banks * self.chains
+
+    def seed_set(self, bank: int) -> int:
+        """Return the set of seeds of a bank on this board; no other board has it in any bank."""
+        return bank * self.chains + self.chain
+
+    def factor_bits(self, factor: int) -> tuple[int, ...]:
+        """Return the state bits of a factor's variables, in rising order: its local bits."""
+        bits, offsets = self.bits, self.offsets
+        return tuple(
+            offsets[variable] + bit for variable in self.factors[factor] for bit in range(bits[variable])
+        )
+
+    @property
+    def colours(self) -> tuple[int, ...]:
+        """The colour of each variable; variables of one colour are in no common factor.
+
+        Variables are coloured by falling number of neighbours, and each gets the smallest colour that no neighbour has.
+        """
+        neighbours: list[set[int]] = [set() for _ in self.cardinalities]
+        for factor in self.factors:
+            for variable in factor:
+                neighbours[variable].update(factor)
+        colours: dict[int, int] = {}
+        for variable in sorted(range(len(neighbours)), key=lambda at: (-len(neighbours[at]), at)):
+            taken = {colours.get(neighbour) for neighbour in neighbours[variable]}
+            colours[variable] = next(colour for colour in range(len(neighbours)) if colour not in taken)
+        return tuple(colours[variable] for variable in range(len(neighbours)))
+
+    def moves(self, known: int, sequencer: Sequencer) -> tuple[tuple[int, ...], ...]:
+        """Return the bits of each move of a sweep, in rising order; `random` draws its moves from these.
+
+        Args:
+            known: Mask of the known state bits.
+            sequencer: The order of the moves.
+        """
+        if sequencer is not Sequencer.COLOURED:
+            return tuple((bit,) for bit in range(self.state_bits) if not known >> bit & 1)
+        members = list(zip(self.colours, self.bits, self.offsets, self.masks, strict=True))
+        moves = (
+            tuple(
+                offset + k
+                for own, bits, offset, mask in members
+                if own == colour and k < bits and not known & mask
+            )
+            for colour in range(max(self.colours) + 1)
+            for k in range(max(self.bits))
+        )
+        return tuple(move for move in moves if move)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class BM2Machine:
+    """A complete machine: parameters and the tables of its CDEs. Arrays are stored as read-only copies.
+
+    Attributes:
+        parameters: Variables, factors, widths and generators.
+        tables: One uint16[n * 2**(n - 1)] per CDE whose factor has n bits: the codes at the addresses
+            j * 2**(n - 1) + others, of the pointed local bit j and the other local bits.
+        supports: One bool[cardinalities of the variables] per factor: True where it is not 0.
+        rng_table: uint32[length], the random numbers for all CDEs if `rng` is `table`; otherwise None.
+
+    Raises:
+        ParameterError: The arrays do not match the parameters.
+    """
+
+    parameters: BM2Parameters
+    tables: tuple[npt.NDArray[np.uint16], ...] = field(repr=False)
+    supports: tuple[npt.NDArray[np.bool_], ...] = field(repr=False)
+    rng_table: npt.NDArray[np.uint32] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check shapes and codes, and store read-only copies."""
+        parameters = self.parameters
+        if not len(self.tables) == len(self.supports) == parameters.cdes:
+            raise ParameterError(
+                f"There are {len(self.tables)} tables and {len(self.supports)} supports; these parameters have "
+                f"{parameters.cdes} factors."
+            )
+        tables, supports = [], []
+        for at, (table, support) in enumerate(zip(self.tables, self.supports, strict=True)):
+            bits = len(parameters.factor_bits(at))
+            shape = (bits << bits >> 1,)
+            tables.append(
+                checked_codes(f"The table of CDE {at}", table, shape, parameters.prob_bits, lowest=1)
+            )
+            supports.append(frozen(np.asarray(support, dtype=np.bool_)))
+            _check_shape(parameters, at, supports[-1].shape)
+        object.__setattr__(self, "tables", tuple(tables))
+        object.__setattr__(self, "supports", tuple(supports))
+        object.__setattr__(self, "rng_table", checked_rng_table(self.rng_table, parameters.rng))
+
+    @classmethod
+    def from_factors(
+        cls,
+        parameters: BM2Parameters,
+        factors: Sequence[npt.ArrayLike],
+        rng_table: npt.NDArray[np.uint32] | None = None,
+    ) -> "BM2Machine":
+        """Return the machine of a product of factors: float64[cardinalities of the factor's variables] each.
+
+        Raises:
+            ParameterError: A factor has a wrong shape, a negative or non-finite entry, or only zeros.
+        """
+        arrays = [np.asarray(factor, dtype=np.float64) for factor in factors]
+        for at, array in enumerate(arrays[: parameters.cdes]):
+            _check_shape(parameters, at, array.shape)
+            if not (np.isfinite(array) & (array >= 0)).all() or not array.any():
+                raise ParameterError(f"Factor {at} has a negative or non-finite entry, or only zeros.")
+        tables = tuple(cde_table(array, parameters.prob_bits) for array in arrays)
+        return cls(parameters, tables, tuple(array > 0 for array in arrays), rng_table)
+
+    def __eq__(self, other: object) -> bool:
+        """Compare parameters, codes and supports."""
+        if not isinstance(other, BM2Machine):
+            return NotImplemented
+        return (
+            self.parameters == other.parameters
+            and all(map(np.array_equal, self.tables, other.tables))
+            and all(map(np.array_equal, self.supports, other.supports))
+            and (self.rng_table is None or np.array_equal(self.rng_table, np.asarray(other.rng_table)))
+        )
+
+    def __hash__(self) -> int:
+        """Hash the parameters, which are equal for equal machines."""
+        return hash(self.parameters)
+
+
+def _check_shape(parameters: BM2Parameters, factor: int, shape: tuple[int, ...]) -> None:
+    due = tuple(parameters.cardinalities[variable] for variable in parameters.factors[factor])
+    if shape != due:
+        raise ParameterError(f"Factor {factor} has the shape {shape}; its variables have {due} values.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BM2Start:
+    """The registers that the host writes to start a frame.
+
+    Attributes:
+        state: The packed start state, with the evidence.
+        known: Mask of the state bits of the known variables.
+        samples: Number of samples after which the machine stops, 1 to 2**32 - 1; 0 if there is no start state.
+        burn_in: Whole sweeps before the first sample.
+        ops_timeout: Maximum number of cycles of a move.
+        max_cycles: The frame's last cycle.
+        bank: Set of seeds from which the generators restart (`rng_reset` = `bank`); free generators ignore it.
+        sequencer: Order of the sequencer.
+    """
+
+    state: int
+    known: int
+    samples: int
+    burn_in: int
+    ops_timeout: int
+    max_cycles: int
+    bank: int = 0
+    sequencer: Sequencer = Sequencer.LINEAR
+
+
+def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np.uint16]:
+    """Return the codes of a CDE: of the odds factor(bit = 1) / factor(bit = 0), for each pointed bit.
+
+    The odds of a used code against an unused one (cardinality no power of two) are clipped towards the used one; if
+    both are unused, or another variable is at an unused code, they are 1.
+
+    Args:
+        factor: float64[cardinalities of the variables].
+        prob_bits: Bits of a code (W).
+
+    Returns:
+        uint16[n * 2**(n - 1)] for n bits.
+    """
+    bits = [(cardinality - 1).bit_length() for cardinality in factor.shape]
+    n = sum(bits)
+    local = np.arange(1 << n)
+    offsets = list(accumulate(bits, initial=0))
+    codes = [local >> offset & (1 << width) - 1 for offset, width in zip(offsets, bits, strict=False)]
+    used = [code < cardinality for code, cardinality in zip(codes, factor.shape, strict=True)]
+    indices = tuple(np.where(legal, code, 0) for code, legal in zip(codes, used, strict=True))
+    values = factor[indices]
+    others = np.arange(1 << n >> 1)
+    half = 1 << (prob_bits - 1)
+    tables = []
+    for variable, width in enumerate(bits):
+        rest = np.all(used[:variable] + used[variable + 1 :], axis=0) if len(used) > 1 else np.array(True)
+        for j in range(offsets[variable], offsets[variable] + width):
+            zero = others >> j << (j + 1) | others & (1 << j) - 1
+            one = zero | 1 << j
+            with np.errstate(invalid="ignore"):
+                code = np.floor((1 << prob_bits) * (values[one] / (values[one] + values[zero])) + 0.5)
+            code = np.clip(np.where(np.isnan(code), half, code), 1, (1 << prob_bits) - 1)
+            # a code with the bit set is the larger one, so it alone can be the unused one of the two
+            code = np.where(used[variable][one], code, 1)
+            comparable = used[variable][zero] & np.broadcast_to(rest, local.shape)[zero]
+            tables.append(np.where(comparable, code, half))
+    return np.concatenate([*tables, np.empty(0)]).astype(np.uint16)
+
+
+def pack(parameters: BM2Parameters, values: Sequence[int]) -> int:
+    """Return the state of one value per variable."""
+    return sum(value << offset for value, offset in zip(values, parameters.offsets, strict=True))
+
+
+def unpack(parameters: BM2Parameters, state: int) -> tuple[int, ...]:
+    """Return the code of every variable in a state; with an unused code, it is no value."""
+    return tuple(
+        state >> offset & (1 << bits) - 1
+        for offset, bits in zip(parameters.offsets, parameters.bits, strict=True)
+    )
+
+
+# ---- start state ----------------------------------------------------------------------------------
+
+
+def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bool = False) -> int | None:
+    """Return the lexicographically smallest (or largest) state of non-zero probability; variable 0 comes first.
+
+    Args:
+        machine: The machine.
+        evidence: Values of the known variables.
+        largest: Return the largest state, for every other board.
+
+    Returns:
+        The packed state; None if the evidence has probability 0.
+
+    Raises:
+        StartError: A value is out of range, or the search takes too long.
+    """
+    parameters = machine.parameters
+    domains = []
+    for variable, cardinality in enumerate(parameters.cardinalities):
+        domain = np.ones(cardinality, dtype=np.bool_)
+        if variable in evidence:
+            given = evidence[variable]
+            if not 0 <= given < cardinality:
+                raise StartError(
+                    f"The value of variable {variable} is {given}; it must be from 0 to {cardinality - 1}."
+                )
+            domain = np.arange(cardinality) == given
+        domains.append(domain)
+    constraints = _Constraints(machine)
+    if not constraints.propagate(domains, range(len(constraints.scopes))):
+        return None
+    # One entry per variable on the path: the domains before it, and the values to try. The first complete
+    # path is the answer, since variables and values are tried in order.
+    path: list[tuple[list[npt.NDArray[np.bool_]], Iterator[int]]] = []
+    tried = 0
+    while len(path) < len(domains):
+        values = np.flatnonzero(domains[len(path)]).tolist()
+        path.append((domains, iter(values[::-1] if largest else values)))
+        while path:
+            before, left = path[-1]
+            value = next(left, None)
+            if value is None:
+                path.pop()
+                continue
+            tried += 1
+            if tried > SEARCH_MAX:
+                raise StartError(
+                    f"No start state was found among the first {SEARCH_MAX} tries; the model has too many zeros: "
+                    "replace them by small probabilities."
+                )
+            variable = len(path) - 1
+            domains = list(before)
+            domains[variable] = np.arange(len(before[variable])) == value
+            if before[variable].sum() == 1 or constraints.propagate(
+                domains, constraints.of_variable[variable]
+            ):
+                break
+        else:
+            return None
+    return pack(parameters, [int(domain.argmax()) for domain in domains])
+
+
+class _Constraints:
+    """The factors that have zeros, for the search of a start state."""
+
+    def __init__(self, machine: BM2Machine) -> None:
+        self.scopes: list[tuple[int, ...]] = []
+        self.of_variable: list[list[int]] = [[] for _ in machine.parameters.cardinalities]
+        self._supports = []
+        for scope, support in zip(machine.parameters.factors, machine.supports, strict=True):
+            if not support.all():
+                for variable in scope:
+                    self.of_variable[variable].append(len(self.scopes))
+                self.scopes.append(scope)
+                self._supports.append(support)
+
+    def propagate(self, domains: list[npt.NDArray[np.bool_]], changed: Sequence[int]) -> bool:
+        """Remove the values that a factor excludes, until nothing changes; return False if a domain becomes empty.
+
+        Args:
+            domains: The possible values of each variable, bool[cardinality].
+            changed: Numbers of the factors that have a variable whose domain has changed.
+        """
+        due = list(changed)
+        while due:
+            at = due.pop()
+            scope = self.scopes[at]
+            possible = self._supports[at][np.ix_(*(domains[variable] for variable in scope))]
+            for axis, variable in enumerate(scope):
+                kept = possible.any(axis=tuple(other for other in range(len(scope)) if other != axis))
+                if not kept.any():
+                    return False
+                if not kept.all():
+                    domain = np.zeros_like(domains[variable])
+                    domain[np.flatnonzero(domains[variable])[kept]] = True
+                    domains[variable] = domain
+                    due += [other for other in self.of_variable[variable] if other != at and other not in due]
+        return True

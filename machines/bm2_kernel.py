@@ -1,0 +1,188 @@
+"""The common base of the kernels of a BM2, and the checks of their arguments."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import numpy.typing as npt
+
+from machines.bm2 import SAMPLES_MAX, BM2Machine, BM2Parameters, BM2Start, BM2StopReason, Sequencer, unpack
+from machines.errors import StartError
+from machines.kernel import check_start_value
+from machines.parameters import CYCLES_MAX
+
+
+class BM2Kernel(ABC):
+    """A running machine: one chain of samples (thesis 2.1.3).
+
+    All that it shows after a call is the same in every kernel, bit for bit.
+    """
+
+    def __init__(self, machine: BM2Machine) -> None:
+        self._machine = machine
+        self._clear()
+
+    def _clear(self) -> None:
+        # Set by each kernel's `_run`; counted since the frame's start.
+        self.cycles = 0
+        self.samples = 0
+        """Samples drawn, without those of the burn-in."""
+        self.unused = 0
+        """Samples with an unknown variable at an unused code; they enter no histogram."""
+        self.reason = BM2StopReason.NONE
+        self.timed_out_bit = -1
+        """After `OPS_TIMEOUT`: the lowest-numbered bit of the move that was not written."""
+        # The registers of the frame; `resume` changes the samples.
+        self._samples_due = 0
+        self._max_cycles = 1
+
+    @property
+    def machine(self) -> BM2Machine:
+        """The machine that this kernel runs."""
+        return self._machine
+
+    @property
+    @abstractmethod
+    def state(self) -> int:
+        """The packed state after the last cycle."""
+
+    @property
+    @abstractmethod
+    def results(self) -> npt.NDArray[np.uint32]:
+        """A copy of the result words: uint32[result_words], histograms, then the joint."""
+
+    @property
+    @abstractmethod
+    def rng_state(self) -> npt.NDArray[np.uint64]:
+        """A copy of the generators' states: uint64[CDEs]."""
+
+    @property
+    @abstractmethod
+    def sequencer_state(self) -> int:
+        """The state of the sequencer's own generator, which only moves in `random` order."""
+
+    @property
+    @abstractmethod
+    def stream(self) -> npt.NDArray[np.uint32]:
+        """A copy of the stream's buffer: uint32[samples since the last start or resume, state_words]."""
+
+    def reset(self) -> None:
+        """Set state, results and cycles to 0, and restart the generators from bank 0."""
+        self._clear()
+        self._reset()
+
+    def prepare(self) -> None:
+        """Do in advance the work that would slow down the first frames, and reset the machine."""
+        self.reset()
+
+    def start(self, start: BM2Start, pause_at: int = 0) -> BM2StopReason:
+        """Run a new frame, from its start state to a stop.
+
+        Args:
+            start: The registers of the frame.
+            pause_at: Cycle after which the machine pauses, 1 or more; 0 for no pause.
+
+        Raises:
+            StartError: The start does not fit the machine; nothing has changed.
+        """
+        check_bm2_start(self._machine.parameters, start)
+        check_start_value("pause_at", pause_at, 0, CYCLES_MAX)
+        self._clear()
+        self._samples_due = start.samples
+        self._max_cycles = start.max_cycles
+        self._load(start)
+        if start.samples:
+            self._run(pause_at)
+        else:
+            self.reason = BM2StopReason.IMPOSSIBLE
+        return self.reason
+
+    def resume(self, samples: int, pause_at: int = 0) -> BM2StopReason:
+        """Continue the frame without another burn-in, with an empty stream's buffer.
+
+        Args:
+            samples: The new total of samples.
+            pause_at: As for `start`, a later cycle than the last one.
+
+        Raises:
+            StartError: The frame cannot be continued, or a value does not fit; nothing has changed.
+        """
+        if self.reason not in {BM2StopReason.SAMPLES, BM2StopReason.FULL}:
+            raise StartError(
+                f"There is nothing to resume: the machine has stopped with reason {self.reason.name.lower()}."
+            )
+        check_start_value("samples", samples, self.samples + 1, SAMPLES_MAX)
+        self._check_pause(pause_at)
+        self._samples_due = samples
+        self._empty_stream()
+        return self._continue(pause_at)
+
+    def step(self, pause_at: int = 0) -> BM2StopReason:
+        """Continue after a pause.
+
+        Raises:
+            StartError: The machine is not paused, or `pause_at` is not a later cycle; nothing has changed.
+        """
+        if self.reason is not BM2StopReason.PAUSED:
+            raise StartError(
+                f"The machine is not paused: it has stopped with reason {self.reason.name.lower()}."
+            )
+        self._check_pause(pause_at)
+        return self._continue(pause_at)
+
+    def _check_pause(self, pause_at: int) -> None:
+        if pause_at != 0:
+            check_start_value("pause_at", pause_at, self.cycles + 1, CYCLES_MAX)
+
+    def _continue(self, pause_at: int) -> BM2StopReason:
+        # all samples may have been drawn in the frame's last cycle
+        if self.cycles == self._max_cycles:
+            self.reason = BM2StopReason.MAX_CYCLES
+        else:
+            self._run(pause_at)
+        return self.reason
+
+    @abstractmethod
+    def _reset(self) -> None:
+        """Set state and results to 0, empty the stream's buffer, and restart the generators from bank 0."""
+
+    @abstractmethod
+    def _load(self, start: BM2Start) -> None:
+        """Clear the results, empty the stream's buffer, load state and sequencer; restart the generators unless free."""
+
+    @abstractmethod
+    def _empty_stream(self) -> None:
+        """Empty the stream's buffer."""
+
+    @abstractmethod
+    def _run(self, pause_at: int) -> None:
+        """Run one cycle or more, up to a stop; sets the public attributes."""
+
+
+def check_bm2_start(parameters: BM2Parameters, start: BM2Start) -> None:
+    """Refuse a start that does not fit the machine.
+
+    Raises:
+        StartError: A value does not fit; the sentence names it and its range.
+    """
+    for name, value, lowest, highest in (
+        ("state", start.state, 0, (1 << parameters.state_bits) - 1),
+        ("known", start.known, 0, (1 << parameters.state_bits) - 1),
+        ("samples", start.samples, 0, SAMPLES_MAX),
+        ("burn_in", start.burn_in, 0, SAMPLES_MAX),
+        ("ops_timeout", start.ops_timeout, 1, SAMPLES_MAX),
+        ("max_cycles", start.max_cycles, 1, CYCLES_MAX),
+        ("bank", start.bank, 0, parameters.rng_banks - 1),
+    ):
+        check_start_value(name, value, lowest, highest)
+    if start.known == (1 << parameters.state_bits) - 1:
+        raise StartError("All variables are known; one or more must be unknown.")
+    values = zip(parameters.masks, unpack(parameters, start.state), parameters.cardinalities, strict=True)
+    for variable, (mask, value, cardinality) in enumerate(values):
+        if start.known & mask not in {0, mask}:
+            raise StartError(f"known has some of the bits of variable {variable}; it must have all or none.")
+        if start.known & mask and value >= cardinality:
+            check_start_value(f"The value of variable {variable}", value, 0, cardinality - 1)
+    if start.sequencer is Sequencer.COLOURED and parameters.literal:
+        raise StartError(
+            "The order coloured is not possible on a machine with literal = true; use linear or random."
+        )

@@ -1,0 +1,180 @@
+"""The reference BM2, which runs one cycle at a time as in the thesis; other kernels are tested against it."""
+
+import numpy as np
+import numpy.typing as npt
+
+from machines.bm2 import BM2Machine, BM2Start, BM2StopReason, SampleEvery, Sequencer, unpack
+from machines.bm2_kernel import BM2Kernel
+from machines.parameters import RngKind, RngReset
+from machines.rng import LFSR, random_numbers
+
+_SEQUENCER_STEPS = 16
+
+
+class ReferenceBM2(BM2Kernel):
+    """A kernel for any machine that runs cycle by cycle (thesis 2.1.3, figure 2.9)."""
+
+    def __init__(self, machine: BM2Machine) -> None:
+        super().__init__(machine)
+        parameters = self._parameters = machine.parameters
+        self._random_numbers = random_numbers(machine)
+        self._factor_bits = [parameters.factor_bits(factor) for factor in range(parameters.cdes)]
+        # the CDEs whose factor has the bit, for each bit of the state
+        self._concerned = [
+            [cde for cde, bits in enumerate(self._factor_bits) if bit in bits]
+            for bit in range(parameters.state_bits)
+        ]
+        self.reset()
+
+    @property
+    def state(self) -> int:
+        """The packed state after the last cycle."""
+        return self._state
+
+    @property
+    def results(self) -> npt.NDArray[np.uint32]:
+        """A copy of the result words: uint32[result_words], histograms, then the joint."""
+        return self._results.copy()
+
+    @property
+    def rng_state(self) -> npt.NDArray[np.uint64]:
+        """A copy of the generators' states: uint64[CDEs]."""
+        return self._states.copy()
+
+    @property
+    def sequencer_state(self) -> int:
+        """The state of the sequencer's own generator, which only moves in `random` order."""
+        return int(self._order_state[0])
+
+    @property
+    def stream(self) -> npt.NDArray[np.uint32]:
+        """A copy of the stream's buffer: uint32[samples since the last start or resume, state_words]."""
+        words = self._parameters.state_words
+        packed = b"".join(state.to_bytes(4 * words, "little") for state in self._stream)
+        return np.frombuffer(packed, "<u4").astype(np.uint32).reshape(-1, words)
+
+    def _reset(self) -> None:
+        self._restart(0)
+        self._load_state(0)
+
+    def _load(self, start: BM2Start) -> None:
+        parameters = self._parameters
+        if parameters.rng_reset is RngReset.BANK:
+            self._restart(start.bank)
+        self._load_state(start.state)
+        self._unknown = [
+            variable for variable, mask in enumerate(parameters.masks) if mask and not start.known & mask
+        ]
+        self._sequencer = start.sequencer
+        self._moves = parameters.moves(start.known, start.sequencer)
+        self._ops_timeout = start.ops_timeout
+        self._burn_in = start.burn_in  # sweeps left
+        self._move = 0  # number of the move within the sweep
+        self._begin_move()
+
+    def _restart(self, bank: int) -> None:
+        self._states = self._random_numbers.restart(bank)
+        number = np.array([self._parameters.seed_set(bank)], dtype=np.uint64)
+        self._order_state = LFSR(RngKind.LFSR16).seeds(number)
+
+    def _load_state(self, state: int) -> None:
+        self._state = state
+        self._results = np.zeros(self._parameters.result_words, dtype=np.uint32)
+        self._empty_stream()
+
+    def _empty_stream(self) -> None:
+        self._stream: list[int] = []
+
+    def _run(self, pause_at: int) -> None:
+        self.reason = BM2StopReason.NONE
+        while self.reason is BM2StopReason.NONE:
+            self.reason = self._cycle()
+            if self.reason is BM2StopReason.NONE and self.cycles == pause_at:
+                self.reason = BM2StopReason.PAUSED
+
+    def _cycle(self) -> BM2StopReason:
+        """Run one cycle: every pointed bit is written if its CDEs agree; then all generators step."""
+        random = self._random_numbers.show(self._states).tolist()
+        before = self._state
+        for bit in tuple(self._pending):
+            stochastic_bits = self._stochastic_bits(bit, before, random)
+            if len(stochastic_bits) == 1:
+                self._state = self._state & ~(1 << bit) | stochastic_bits.pop() << bit
+                self._pending.remove(bit)
+        self._states = self._random_numbers.clock(self._states)
+        self.cycles += 1
+        self._move_cycles += 1
+
+        reason = BM2StopReason.NONE
+        if self._pending:
+            if self._move_cycles == self._ops_timeout:
+                self.timed_out_bit = min(self._pending)
+                return BM2StopReason.OPS_TIMEOUT
+        else:
+            reason = self._end_move()
+        if reason is not BM2StopReason.SAMPLES and self.cycles == self._max_cycles:
+            return BM2StopReason.MAX_CYCLES
+        return reason
+
+    def _stochastic_bits(self, bit: int, state: int, random: list[int]) -> set[int]:
+        """Return the different bits that the compared CDEs make for a pointed bit."""
+        concerned = self._concerned[bit]
+        bits = {int(random[cde] < self._code(cde, bit, state)) for cde in concerned}
+        if self._parameters.literal:
+            half = 1 << (self._parameters.prob_bits - 1)
+            bits |= {int(random[cde] < half) for cde in range(self._parameters.cdes) if cde not in concerned}
+        return bits
+
+    def _code(self, cde: int, bit: int, state: int) -> int:
+        """Return the code in a CDE's table: at the pointed local bit, and at the values of the others."""
+        local_bits = self._factor_bits[cde]
+        others = [state >> other & 1 for other in local_bits if other != bit]
+        address = local_bits.index(bit) << len(others) | sum(value << at for at, value in enumerate(others))
+        return int(self._machine.tables[cde][address])
+
+    def _end_move(self) -> BM2StopReason:
+        """Take a sample if one is due, and point at the next bits."""
+        ends_sweep = self._move == len(self._moves) - 1
+        sampled = self._burn_in == 0 and (ends_sweep or self._parameters.sample_every is SampleEvery.MOVE)
+        if sampled:
+            self._take_sample()
+        if self._burn_in and ends_sweep:
+            self._burn_in -= 1
+        self._move = 0 if ends_sweep else self._move + 1
+        if self._sequencer is Sequencer.RANDOM:
+            for _ in range(_SEQUENCER_STEPS):
+                self._order_state = LFSR(RngKind.LFSR16).step(self._order_state)
+        self._begin_move()
+        if sampled and self.samples == self._samples_due:
+            return BM2StopReason.SAMPLES
+        if sampled and len(self._stream) == self._parameters.stream > 0:
+            return BM2StopReason.FULL
+        return BM2StopReason.NONE
+
+    def _begin_move(self) -> None:
+        move = self._move
+        if self._sequencer is Sequencer.RANDOM:
+            move = self.sequencer_state * len(self._moves) >> 16
+        self._pending = set(self._moves[move])  # its bits that are not yet written
+        self._move_cycles = 0
+
+    def _take_sample(self) -> None:
+        """Count the state: in the histogram of every unknown variable, and in the joint of the searched ones."""
+        parameters = self._parameters
+        self.samples += 1
+        if parameters.stream:
+            self._stream.append(self._state)
+        codes = unpack(parameters, self._state)
+        if any(codes[variable] >= parameters.cardinalities[variable] for variable in self._unknown):
+            self.unused += 1
+            return
+        word = 0
+        for variable, bits in enumerate(parameters.bits):
+            if variable in self._unknown:
+                self._results[word + codes[variable]] += 1
+            word += 1 << bits
+        if parameters.joint_words:
+            joint = 0
+            for variable in parameters.searched:
+                joint = joint << parameters.bits[variable] | codes[variable]
+            self._results[word + joint] += 1
