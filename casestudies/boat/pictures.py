@@ -4,13 +4,13 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from importlib.util import find_spec
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Final
 
 from casestudies.boat.sensors import BEACONS, map_grid
 from casestudies.grid import Grid
+from casestudies.pictures import new_figure, save_figure
 from casestudies.topics import Instance, Truth
 from posteriors.posterior import Posterior
 from terminal.errors import OutputError
@@ -82,18 +82,8 @@ _PART_COLOURS: Final = {
     StageKind.COMPUTING: "#ee6677",
 }
 _TRUTH_COLOUR: Final = "#ff4d4d"
-_DPI: Final = 130
 _EDGE: Final = 0.2
 """Share of the map's width at each edge; within it, labels are not centred."""
-
-
-def check_pictures_possible() -> None:
-    """Raise an OutputError if matplotlib is missing, so that a long run does not end without its pictures."""
-    if find_spec("matplotlib") is None:
-        raise OutputError(
-            "the pictures need matplotlib, which is not installed: run pip install matplotlib, "
-            "or leave out --out"
-        )
 
 
 def far_apart(instances: Iterable[Instance], count: int = POSITIONS_SHOWN) -> tuple[Instance, ...]:
@@ -119,10 +109,9 @@ def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence
     Raises:
         OutputError: matplotlib is missing, a posterior is not two-dimensional, or the file cannot be written.
     """
-    figure_class = _figure_class()
     across = 2 if len(instances) > 1 else 1
     down = math.ceil(len(instances) / across)
-    figure = figure_class(figsize=(5.6 * across + 0.9, 2.95 * down + 0.75), layout="constrained")
+    figure = new_figure(5.6 * across + 0.9, 2.95 * down + 0.75)
     axes = figure.subplots(down, 2 * across, squeeze=False)
     scale = max(_posterior_of(instance).probability for instance in instances)
     image = None
@@ -143,7 +132,7 @@ def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence
     figure.suptitle(
         f"The boat's position (a){between}and the Bayesian machine's posterior given its readings (b)"
     )
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> None:
@@ -152,7 +141,7 @@ def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> Non
     Raises:
         OutputError: matplotlib is missing, or the file cannot be written.
     """
-    figure = _figure_class()(figsize=(8.4, 1.5 + 0.42 * max(len(shares), 1)), layout="constrained")
+    figure = new_figure(8.4, 1.5 + 0.42 * max(len(shares), 1))
     axes = figure.subplots()
     names = [stage.name for stage in shares]
     times = [stage.mean_us / 1000 for stage in shares]
@@ -179,7 +168,7 @@ def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> Non
         frameon=False,
     )
     axes.set_title(f"Time of a frame by stage: {sum(times):.2f} ms, mean of {frames} frames")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def posterior_grid(posterior: Posterior) -> Grid:
@@ -308,19 +297,3 @@ def _apart(instances: Sequence[Instance], one: int, other: int) -> float:
     if a is None or b is None:
         return float(abs(one - other))
     return math.dist((a.x, a.y), (b.x, b.y))
-
-
-def _figure_class() -> Any:
-    """Return matplotlib's Figure, without pyplot, which would need a display and keep state."""
-    check_pictures_possible()
-    from matplotlib.figure import Figure
-
-    return Figure
-
-
-def _save(figure: Any, path: Path) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=_DPI)
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from None

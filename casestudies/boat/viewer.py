@@ -262,7 +262,7 @@ def boat_viewer(
 
     It subscribes to /BMresults, /bm/frame and the topic of the true pose, and needs nothing else.
     """
-    from casestudies.boat.pictures import check_pictures_possible
+    from casestudies.pictures import check_pictures_possible
 
     viewer = Viewer(count)
     if out is not None:
