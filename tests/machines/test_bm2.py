@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
 
 from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, Sequencer, start_state
 from machines.bm2_reference import ReferenceBM2
+from tests.machines.bm2_of_the_page import PageBM2
+from tests.machines.random_networks import play, runs
 
 RAIN, SPRINKLER, GRASS = range(3)
 WET = 1 << GRASS
@@ -51,3 +54,18 @@ def test_the_sprinkler(order):
     rain = kernel.results[:2]
     assert rain.sum() == kernel.samples == 2000
     assert rain[1] / 2000 == pytest.approx(0.3577, abs=0.12)
+
+
+@pytest.mark.parametrize(
+    ("examples", "cycles"), [(60, 60), pytest.param(300, 400, marks=pytest.mark.thorough)]
+)
+def test_equals_the_page(examples, cycles):
+    search = given(runs(cycles=cycles))(equals_the_page)
+    settings(max_examples=examples, suppress_health_check=list(HealthCheck), deadline=None)(search)()
+
+
+def equals_the_page(run):
+    page = PageBM2(run.machine.parameters, run.factors, run.machine.rng_table)
+    due = play(page, run.courses, lambda page, reason: page.shown(reason))
+    for shown, expected in zip(play(ReferenceBM2(run.machine), run.courses), due, strict=True):
+        assert shown == expected

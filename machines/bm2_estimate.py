@@ -1,0 +1,235 @@
+"""Estimates from the samples of a BM2: posterior, its error, effective samples and R-hat over all boards."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from machines.bm2 import BM2Parameters, BM2StopReason
+
+BATCHES_MIN: Final = 20
+"""Minimum number of batches from whose means the effective samples are computed."""
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """What one board has drawn in a frame.
+
+    Attributes:
+        reason: Its last stop reason.
+        counts: uint32[batches, values], the counts of the searched joint after each batch, since the frame's start.
+        values: int[samples], the searched value of each sample, -1 for an unused code; None without a stream.
+    """
+
+    reason: BM2StopReason
+    counts: npt.NDArray[np.integer]
+    values: npt.NDArray[np.integer] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """The estimate of a frame from the chains of all boards.
+
+    Attributes:
+        posterior: float64[values] of the searched joint; None if no board has a sample that counts.
+        error: float64[values], the posterior's standard error; NaN where the effective samples are unknown.
+        effective_samples: Those of the value that has the fewest, over all boards that count; NaN if unknown.
+        r_hat: The largest one of all values; NaN for one board, or if it is unknown.
+        left_out: Numbers of the boards that do not count: those that timed out, or have no sample.
+        is_marked: True if a board ended by its maximum number of cycles, which biases its samples.
+    """
+
+    posterior: Floats | None
+    error: Floats | None
+    effective_samples: float
+    r_hat: float
+    left_out: tuple[int, ...]
+    is_marked: bool
+
+
+def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
+    """Return the counts of the searched joint's values, row-major, from the result words of a machine.
+
+    Args:
+        parameters: Parameters of the machine; its joint fits the result words, or one variable is searched.
+        results: Integers[..., result_words].
+
+    Returns:
+        Integers[..., product of the searched cardinalities].
+    """
+    bits = [parameters.bits[variable] for variable in parameters.searched]
+    first = parameters.histogram_words
+    if not parameters.joint_words:
+        (variable,) = parameters.searched
+        first = sum(1 << own for own in parameters.bits[:variable])
+    words = results[..., first : first + (1 << sum(bits))]
+    # row-major, so the codes of the first searched variable are the slowest axis
+    codes = np.arange(1 << sum(bits)).reshape([1 << own for own in bits])
+    used = codes[np.ix_(*(range(parameters.cardinalities[variable]) for variable in parameters.searched))]
+    return words[..., used.ravel()]
+
+
+def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
+    """Return the searched joint's value of each sample of a stream; -1 if any variable is at an unused code.
+
+    Args:
+        parameters: Parameters of the machine.
+        stream: uint32[samples, state_words].
+    """
+    # one word more, because a code may begin in one word and end in the next
+    words = np.pad(stream.astype(np.uint64), ((0, 0), (0, 1)))
+    values = np.zeros(len(stream), dtype=np.int64)
+    unused = np.zeros(len(stream), dtype=np.bool_)
+    codes = []
+    for offset, bits, cardinality in zip(
+        parameters.offsets, parameters.bits, parameters.cardinalities, strict=True
+    ):
+        word, bit = divmod(offset, 32)
+        both = words[:, word] | words[:, word + 1] << np.uint64(32) if bits else words[:, 0]
+        codes.append((both >> np.uint64(bit) & np.uint64((1 << bits) - 1)).astype(np.int64))
+        unused |= codes[-1] >= cardinality
+    for variable in parameters.searched:
+        values = values * parameters.cardinalities[variable] + codes[variable]
+    return np.where(unused, -1, values)
+
+
+def estimate(chains: Sequence[Chain]) -> Estimate:
+    """Return the estimate from the chains of all boards."""
+    posterior, left_out, is_marked = merge(
+        [chain.counts[-1] for chain in chains], [chain.reason for chain in chains]
+    )
+    counted = [chain for board, chain in enumerate(chains) if board not in left_out]
+    if posterior is None:
+        return Estimate(None, None, math.nan, math.nan, left_out, is_marked)
+    effective = np.sum([_effective_samples_of(chain) for chain in counted], axis=0)
+    r_hat = math.nan
+    if len(counted) > 1:
+        halves = np.concatenate([_halves(chain) for chain in counted])
+        if halves.sum(axis=1).min() >= 2:
+            r_hat = float(split_r_hat(halves).max())
+    # Laplace's rule: a value that was never seen has an error, too
+    smooth = (effective * posterior + 1) / (effective + 2)
+    error = np.sqrt(smooth * (1 - smooth) / effective)
+    return Estimate(posterior, error, float(effective.min()), r_hat, left_out, is_marked)
+
+
+def merge(
+    counts: Sequence[npt.NDArray[np.integer]], reasons: Sequence[BM2StopReason]
+) -> tuple[Floats | None, tuple[int, ...], bool]:
+    """Return the posterior of all boards, the numbers of those left out, and whether the result is marked.
+
+    A board that timed out or has no sample is left out. The counts of the others are added, because all have drawn
+    as many samples; but if one ended by its maximum number of cycles, each board has the same weight.
+
+    Args:
+        counts: Counts of the searched joint's values, of each board.
+        reasons: Stop reason of each board.
+    """
+    left_out = tuple(
+        board
+        for board, (own, reason) in enumerate(zip(counts, reasons, strict=True))
+        if reason is BM2StopReason.OPS_TIMEOUT or not own.any()
+    )
+    is_marked = BM2StopReason.MAX_CYCLES in reasons
+    kept = [own.astype(np.float64) for board, own in enumerate(counts) if board not in left_out]
+    if not kept:
+        return None, left_out, is_marked
+    total: Floats = np.sum([own / own.sum() if is_marked else own for own in kept], axis=0)
+    return total / total.sum(), left_out, is_marked
+
+
+def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:
+    """Return the effective samples of each value's indicator, by Geyer's initial positive sequence (1992).
+
+    They are at most the samples; a value that is always or never there has as many.
+
+    Args:
+        values: Integers[samples] from 0 to size - 1.
+        size: Number of values.
+
+    Returns:
+        float64[size].
+    """
+    samples = len(values)
+    padded = 1 << (2 * samples - 1).bit_length()  # so that the correlations do not wrap around
+    effective = np.full(size, float(samples))
+    counts = np.bincount(values, minlength=size)
+    for value in np.flatnonzero((counts > 0) & (counts < samples)):
+        deviations = (values == value) - counts[value] / samples
+        correlations = np.fft.irfft(np.abs(np.fft.rfft(deviations, padded)) ** 2, padded)
+        correlations = correlations[: samples // 2 * 2] / correlations[0]
+        pairs = correlations[0::2] + correlations[1::2]
+        ends = np.flatnonzero(pairs <= 0)
+        time = 2 * pairs[: ends[0] if len(ends) else None].sum() - 1
+        effective[value] = samples / max(time, 1)
+    return effective
+
+
+def batch_effective_samples(counts: npt.NDArray[np.integer]) -> Floats:
+    """Return the effective samples of each value, from the means of a chain's batches.
+
+    They are at most the samples; a value that is equally frequent in all batches has as many.
+
+    Args:
+        counts: Integers[batches, values], the cumulative counts after each batch.
+
+    Returns:
+        float64[values]; NaN if there are fewer than `BATCHES_MIN` batches with samples.
+    """
+    of_batch = np.diff(counts.astype(np.float64), axis=0, prepend=0)
+    of_batch = of_batch[of_batch.any(axis=1)]
+    batches, values = of_batch.shape
+    if batches < BATCHES_MIN:
+        return np.full(values, np.nan)
+    sizes = of_batch.sum(axis=1, keepdims=True)
+    total = sizes.sum()
+    means = of_batch.sum(axis=0) / total
+    squares = ((sizes / total * (of_batch / sizes - means)) ** 2).sum(axis=0) * batches / (batches - 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        effective: Floats = np.fmin(means * (1 - means) / squares, total)  # total for 0 / 0
+    return effective
+
+
+def split_r_hat(counts: npt.NDArray[np.integer]) -> Floats:
+    """Return the split R-hat of each value's indicator (Gelman et al. 2013), from the counts of half chains.
+
+    If no half varies within itself, it is 1 where all are equal, else infinite.
+
+    Args:
+        counts: Integers[halves, values]; 2 or more samples in each half.
+
+    Returns:
+        float64[values].
+    """
+    n = counts.sum(axis=1, keepdims=True).astype(np.float64)
+    means = counts / n
+    within: Floats = (n / (n - 1) * means * (1 - means)).mean(axis=0)
+    between: Floats = means.var(axis=0, ddof=1)
+    length = n.mean()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r_hat: Floats = np.sqrt((length - 1) / length + between / within)
+    r_hat[within == 0] = np.where(between[within == 0] > 0, np.inf, 1.0)
+    return r_hat
+
+
+def _effective_samples_of(chain: Chain) -> Floats:
+    if chain.values is None:
+        return batch_effective_samples(chain.counts)
+    return effective_samples(chain.values[chain.values >= 0], chain.counts.shape[1])
+
+
+def _halves(chain: Chain) -> npt.NDArray[np.integer]:
+    """Return the counts of a chain's two halves: of its samples, or of its batches without a stream."""
+    if chain.values is None:
+        first, last = chain.counts[len(chain.counts) // 2 - 1], chain.counts[-1]
+        return np.stack([first, last - first])
+    used = chain.values[chain.values >= 0]
+    half = len(used) // 2
+    return np.stack(
+        [np.bincount(part, minlength=chain.counts.shape[1]) for part in (used[:half], used[half:])]
+    )
