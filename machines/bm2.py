@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import IntEnum, StrEnum
+from enum import IntEnum
 from itertools import accumulate
 from typing import Final
 
@@ -17,6 +17,8 @@ from machines.parameters import (
     STEPS_PER_CLOCK_MAX,
     RngKind,
     RngReset,
+    SampleEvery,
+    Sequencer,
     check_parameter,
     checked_choice,
 )
@@ -38,21 +40,6 @@ SAMPLES_MAX: Final = 2**32 - 1
 
 SEARCH_MAX: Final = 20_000
 """Maximum number of values that the search for a start state tries."""
-
-
-class Sequencer(StrEnum):
-    """Orders in which the sequencer points at the unknown bits."""
-
-    LINEAR = "linear"
-    RANDOM = "random"
-    COLOURED = "coloured"
-
-
-class SampleEvery(StrEnum):
-    """Moves after which a state becomes a sample: the last one of every sweep, or every move."""
-
-    SWEEP = "sweep"
-    MOVE = "move"
 
 
 class BM2StopReason(IntEnum):

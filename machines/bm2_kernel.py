@@ -5,10 +5,10 @@ from abc import ABC, abstractmethod
 import numpy as np
 import numpy.typing as npt
 
-from machines.bm2 import SAMPLES_MAX, BM2Machine, BM2Parameters, BM2Start, BM2StopReason, Sequencer, unpack
+from machines.bm2 import SAMPLES_MAX, BM2Machine, BM2Parameters, BM2Start, BM2StopReason, unpack
 from machines.errors import StartError
 from machines.kernel import check_start_value
-from machines.parameters import CYCLES_MAX
+from machines.parameters import CYCLES_MAX, Sequencer
 
 
 class BM2Kernel(ABC):

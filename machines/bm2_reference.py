@@ -3,9 +3,9 @@
 import numpy as np
 import numpy.typing as npt
 
-from machines.bm2 import BM2Machine, BM2Start, BM2StopReason, SampleEvery, Sequencer, unpack
+from machines.bm2 import BM2Machine, BM2Start, BM2StopReason, unpack
 from machines.bm2_kernel import BM2Kernel
-from machines.parameters import RngKind, RngReset
+from machines.parameters import RngKind, RngReset, SampleEvery, Sequencer
 from machines.rng import LFSR, random_numbers
 
 _SEQUENCER_STEPS = 16

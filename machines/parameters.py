@@ -71,6 +71,21 @@ class SensorMode(StrEnum):
     THRESHOLD = "threshold"
 
 
+class Sequencer(StrEnum):
+    """Orders in which the sequencer of a BM2 points at the unknown bits."""
+
+    LINEAR = "linear"
+    RANDOM = "random"
+    COLOURED = "coloured"
+
+
+class SampleEvery(StrEnum):
+    """Moves of a BM2 after which a state becomes a sample: the last one of every sweep, or every move."""
+
+    SWEEP = "sweep"
+    MOVE = "move"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BM1Parameters:
     """Parameters of a BM1: a matrix of `lines` lines and `sensors` + 1 columns; column 0 is the prior.

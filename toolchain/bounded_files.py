@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Final, Self, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
@@ -170,7 +170,9 @@ class TomlFile:
         return found
 
     def _wrong_value(self, model: type[BaseModel], detail: ErrorDetails) -> ToolchainError:
-        place = detail["loc"]
+        place = _followed(model, detail["loc"])[0]
+        if detail["type"] == "union_tag_invalid":
+            place.append("type")
         line = self._line_of(place)
         whole_table = line is None and len(place) == 1
         if whole_table:
@@ -182,10 +184,13 @@ class TomlFile:
         value = value if len(value) <= _SHOWN else value[:_SHOWN] + "..."
         match detail["type"]:
             case "extra_forbidden":
-                known = _keys(_model_at(model, place[:-1]))
+                known = _keys(_followed(model, detail["loc"][:-1])[1])
                 sentence = f"unknown key '{place[-1]}'{section}; {nearest_name(str(place[-1]), known)}"
             case "missing":
                 sentence = f"the key '{place[-1]}' is missing{section}"
+            case "union_tag_invalid":
+                nearest = nearest_name(detail["ctx"]["tag"], list(_models_of(model, place[0])))
+                sentence = f"type = {detail['ctx']['tag']!r}{section} is not a valid value; {nearest}"
             case "literal_error" | "enum":
                 expected = [word.strip("' ") for word in re.split(r",| or ", str(detail["ctx"]["expected"]))]
                 nearest = nearest_name(str(detail["input"]), expected)
@@ -195,7 +200,7 @@ class TomlFile:
                 sentence = ": ".join(part for part in (subject, str(detail["ctx"]["error"])) if part)
             case _:
                 sentence = f"{key or place} = {value}{section}: expected {detail['msg'].removeprefix('Input should be ')}"
-        return self.error(sentence, path=self.path, line=line, place=place)
+        return self.error(sentence, path=self.path, line=line, place=tuple(place))
 
 
 def _split(place: Sequence[str | int]) -> tuple[str, int | None, str]:
@@ -226,13 +231,31 @@ def _keys(model: type[BaseModel]) -> list[str]:
     return [str(field.validation_alias or name) for name, field in model.model_fields.items()]
 
 
-def _model_at(model: type[BaseModel], place: Sequence[str | int]) -> type[BaseModel]:
-    """Follow a place through the fields of models to the model at that place."""
+def _models_of(model: type[BaseModel], key: str | int) -> dict[str, type[BaseModel]]:
+    """Return the models of a field by their `type`, or by an empty text if it is always the same."""
+    for name, field in model.model_fields.items():
+        if key in (name, field.validation_alias):
+            inner = [
+                get_args(each)[0] if get_origin(each) is Annotated else each
+                for each in get_args(field.annotation)
+            ]
+            found = [
+                t for t in (field.annotation, *inner) if isinstance(t, type) and issubclass(t, BaseModel)
+            ]
+            return {"" if len(found) == 1 else str(each.model_fields["type"].default): each for each in found}
+    return {}
+
+
+def _followed(model: type[BaseModel], place: Sequence[str | int]) -> tuple[list[str | int], type[BaseModel]]:
+    """Follow a place through the fields of models; return it without the types of sections, and the model at its end."""
+    followed: list[str | int] = []
+    choice: dict[str, type[BaseModel]] = {}
     for step in place:
-        if isinstance(step, int):
+        if step in choice:
+            model, choice = choice[str(step)], {}
             continue
-        for name, field in model.model_fields.items():
-            if step in (name, field.validation_alias):
-                inner = [field.annotation, *get_args(field.annotation)]
-                model = next(t for t in inner if isinstance(t, type) and issubclass(t, BaseModel))
-    return model
+        followed.append(step)
+        if not isinstance(step, int):
+            choice = _models_of(model, step)
+            model, choice = (choice[""], {}) if "" in choice else (model, choice)
+    return followed, model

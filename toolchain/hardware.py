@@ -15,7 +15,7 @@ from typing import Final
 from machines.parameters import RngKind
 from pcie_shim.programming_file import Image
 from toolchain.building.machine import MACHINE_KEYS
-from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source, Variable
+from toolchain.deployment import BM1Section, BoardSection, Deployment, Dimension, Source, Variable
 from toolchain.errors import ToolchainError
 from toolchain.outputs.memories import Memory, memories
 from toolchain.outputs.vhdl_parameters import parameters_vhd
@@ -165,7 +165,7 @@ def _deployment(image: Image) -> Deployment:
             for at, bits in enumerate(widths)
         ),
         searched=(Dimension(label="line", size=total),),
-        machine=MachineSection(
+        machine=BM1Section(
             lines=total,
             interface=f"{image.interface_sensors}x{image.interface_results}",
             target_count=min(255, parameters.target_count_max),

@@ -32,7 +32,7 @@ from tests.patience import PATIENCE
 from tests.toolchain.running import TARGET, assert_refused, toolchain
 from toolchain.building.options import read_sources
 from toolchain.checks.findings import Check
-from toolchain.deployment import DeploymentFile, Variable
+from toolchain.deployment import BM1Section, BM2Section, DeploymentFile, Variable
 from toolchain.models.case_study import load_model
 
 ROOT = Path(__file__).parents[2]
@@ -121,7 +121,10 @@ def sections():
         inner = [field.annotation, *getattr(field.annotation, "__args__", ())]
         models = [each for each in inner if isinstance(each, type) and issubclass(each, BaseModel)]
         key = str(field.validation_alias or name)
-        if models:
+        if name == "machine":
+            yield "`[machine]`\n", list(BM1Section.model_fields)
+            yield "`[machine]` of a BM2", list(BM2Section.model_fields)
+        elif models:
             single = inner[0] is models[0] or type(None) in inner
             yield f"`[{key}]`" if single else f"`[[{key}]]`", list(models[0].model_fields)
         else:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, Sequencer, start_state
+from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, start_state
 from machines.bm2_reference import ReferenceBM2
+from machines.parameters import Sequencer
 from tests.machines.bm2_of_the_page import PageBM2
 from tests.machines.random_networks import play, runs
 

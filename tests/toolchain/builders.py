@@ -5,7 +5,7 @@ import numpy as np
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters
 from toolchain.building.quantise import quantise
-from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source, Variable
+from toolchain.deployment import BM1Section, BoardSection, Deployment, Dimension, Source, Variable
 from toolchain.models.conditional import normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
 
@@ -59,7 +59,7 @@ BOAT = {
         Variable(name="B1", bits=9, values=360, period=360, path="bearings[0]"),
     ),
     "searched": (Dimension(label="y", size=4, offset=-3.0, step=2.0), Dimension(label="x", size=3)),
-    "machine": MachineSection(lines=12),
+    "machine": BM1Section(lines=12),
     "boards": tuple(
         BoardSection(image=f"boards/board{at}.bm", image_hash=str(at) * 64, line_offset=6 * at, lines=6)
         for at in (0, 1)

@@ -31,6 +31,7 @@ from toolchain.building.options import BuildOptions, refused_option
 from toolchain.building.quantise import Quantised, quantise
 from toolchain.deployment import (
     FILE_NAME,
+    BM1Section,
     BoardSection,
     Deployment,
     MachineSection,
@@ -168,7 +169,7 @@ def describe(plan: MachinePlan, layout: BoardLayout, images: Sequence[Image]) ->
             sources=options.all_sources,
             variables=_variables(model, options),
             searched=model.searched,
-            machine=MachineSection(
+            machine=BM1Section(
                 lines=model.lines,
                 interface=layout.interface_text,
                 scale=options.scaling,

@@ -12,7 +12,7 @@ from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
 from pcie_shim.register_layout import interface_room
 from toolchain.building.options import BuildOptions
 from toolchain.building.quantise import Quantised
-from toolchain.deployment import MachineSection, Scale
+from toolchain.deployment import BM1Section, MachineSection, Scale
 from toolchain.errors import BuildError
 from toolchain.models.model import Model
 from toolchain.outputs.memories import generators
@@ -22,7 +22,7 @@ _MOST_CODES: Final = 1 << 30
 """Maximum number of codes of all columns, which take 2 bytes each while they are computed."""
 
 MACHINE_KEYS: Final = tuple(
-    key for key in MachineSection.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
+    key for key in BM1Section.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
 )
 """The parameters with the same names in `[machine]`; its `lines` are those of all boards."""
 

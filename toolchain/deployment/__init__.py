@@ -11,6 +11,8 @@ from toolchain.deployment.deployment import (
     write_deployment,
 )
 from toolchain.deployment.sections import (
+    BM1Section,
+    BM2Section,
     BoardSection,
     Dimension,
     MachineSection,
@@ -27,6 +29,8 @@ from toolchain.deployment.sections import (
 __all__ = [
     "FILE_NAME",
     "REPLICA",
+    "BM1Section",
+    "BM2Section",
     "BoardSection",
     "Deployment",
     "DeploymentFile",

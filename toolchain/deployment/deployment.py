@@ -77,7 +77,9 @@ class DeploymentFile(Section):
             if board.line_offset != offset:
                 raise ValueError(f"board {index} starts at line {board.line_offset}, expected {offset}")
             offset += board.lines
-        if offset != self.machine.lines:
+        if not self.machine.is_divided and offset != len(self.boards):
+            raise ValueError("every board of this machine has lines = 1: it runs a whole machine")
+        if self.machine.is_divided and offset != self.machine.lines:
             raise ValueError(
                 f"the boards have {offset} lines together, but the machine has {self.machine.lines}"
             )

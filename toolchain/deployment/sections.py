@@ -4,10 +4,20 @@ import re
 from collections import Counter
 from enum import StrEnum
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, Self, TypeAlias, TypeVar
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    FailFast,
+    Field,
+    Tag,
+    field_validator,
+    model_validator,
+)
 
 from machines import KINDS
 from machines.parameters import (
@@ -17,7 +27,9 @@ from machines.parameters import (
     PriorMode,
     RngKind,
     RngReset,
+    SampleEvery,
     SensorMode,
+    Sequencer,
 )
 
 if TYPE_CHECKING:
@@ -126,6 +138,8 @@ def names_differ(kind: str, names: list[str]) -> None:
         raise ValueError(f"[[{kind}]] has {twice[0]!r} twice; names must differ")
 
 
+_WORD_MAX: Final = 2**32 - 1
+"""Maximum value of a register."""
 _INTERFACE: Final = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,5})")
 
 
@@ -233,12 +247,40 @@ class Dimension(Section):
         return self.offset + index * self.step
 
 
-class MachineSection(Section):
-    """`[machine]`: the parameters of the BM1, its interface, and its stop conditions."""
+class CommonSection(Section):
+    """The part of `[machine]` that every kind of machine has."""
 
-    type: Literal["BM1"] = "BM1"
+    type: str
     lines: int = Field(ge=1)
     interface: str = "20x1200"
+    prob_bits: int = Field(ge=1, le=16)
+
+    @field_validator("interface")
+    @classmethod
+    def _inputs_by_results(cls, text: str) -> str:
+        parse_interface(text)
+        return text
+
+    @property
+    def kind(self) -> "MachineKind":
+        """The kind of the machine, which defines its frames and results."""
+        return KINDS[self.type]()
+
+    @property
+    def interface_sensors(self) -> int:
+        """The number of inputs in the registers of a board."""
+        return parse_interface(self.interface)[0]
+
+    @property
+    def interface_results(self) -> int:
+        """The number of results in the registers of a board."""
+        return parse_interface(self.interface)[1]
+
+
+class BM1Section(CommonSection):
+    """`[machine]` of a BM1: its parameters, its interface, and its stop conditions."""
+
+    type: Literal["BM1"] = "BM1"
     prob_bits: int = Field(default=8, ge=1, le=16)
     scale: Choice[Scale] = Field(default=Scale.ADDRESS, exclude_if=lambda scale: scale == Scale.ADDRESS)
     prior_bits: int = Field(default=0, ge=0, le=16)
@@ -256,12 +298,8 @@ class MachineSection(Section):
         default=SensorMode.COLUMN, exclude_if=lambda mode: mode == SensorMode.COLUMN
     )
     replicas: int = Field(default=1, ge=1, le=REPLICAS_MAX, exclude_if=lambda replicas: replicas == 1)
-
-    @field_validator("interface")
-    @classmethod
-    def _inputs_by_results(cls, text: str) -> str:
-        parse_interface(text)
-        return text
+    is_divided: ClassVar[bool] = True
+    """True if each board has a part of the lines, False if each has the whole machine."""
 
     @model_validator(mode="after")
     def _target_fits(self) -> Self:
@@ -274,11 +312,6 @@ class MachineSection(Section):
                 message += f", or counters of {enough} bits (--counter-bits {enough})"
             raise ValueError(message)
         return self
-
-    @property
-    def kind(self) -> "MachineKind":
-        """The kind of the machine, which defines its frames and results."""
-        return KINDS[self.type]()
 
     @property
     def reads_lines(self) -> bool:
@@ -295,15 +328,52 @@ class MachineSection(Section):
         """The number of probabilities of a frame: one per line and replica."""
         return self.replicas * self.lines
 
-    @property
-    def interface_sensors(self) -> int:
-        """The number of inputs in the registers of a board."""
-        return parse_interface(self.interface)[0]
+
+class BM2Section(CommonSection):
+    """`[machine]` of a BM2: its parameters, its interface, and its stop conditions; each board runs a chain of it."""
+
+    type: Literal["BM2"] = "BM2"
+    prob_bits: int = Field(default=16, ge=2, le=16)
+    sequencer: Choice[Sequencer] = Sequencer.LINEAR
+    literal: bool = False
+    sample_every: Choice[SampleEvery] = SampleEvery.SWEEP
+    burn_in: int = Field(default=1000, ge=0, le=_WORD_MAX)
+    ops_timeout: int = Field(default=2**20, ge=1, le=_WORD_MAX)
+    rng: Choice[RngKind] = RngKind.LFSR32
+    rng_banks: int = Field(default=16, ge=1)
+    rng_reset: Choice[RngReset] = RngReset.BANK
+    steps_per_clock: int = Field(default=16, ge=1)
+    target_count: int = Field(default=10_000, ge=1, le=_WORD_MAX)
+    max_cycles: int = Field(default=2**32, ge=1, le=CYCLES_MAX)
+    stream: int = Field(default=0, ge=0, le=_WORD_MAX)
+
+    # what a BM1 may have and a BM2 never has, so that nobody needs to ask which one it is
+    scale: ClassVar = Scale.NONE
+    prior_bits: ClassVar = 0
+    prior_mode: ClassVar = PriorMode.TABLE
+    stop: ClassVar = Stop.OWN
+    sensor_mode: ClassVar = SensorMode.COLUMN
+    counter_bits: ClassVar = 32
+    shared: ClassVar = True
+    replicas: ClassVar = 1
+    reads_lines: ClassVar = False
+    is_plain: ClassVar = True
+    is_divided: ClassVar = False
 
     @property
-    def interface_results(self) -> int:
-        """The number of results in the registers of a board."""
-        return parse_interface(self.interface)[1]
+    def results(self) -> int:
+        """The number of probabilities of a frame."""
+        return self.lines
+
+
+def _type_of(section: Any) -> Any:
+    return section.get("type", "BM1") if isinstance(section, dict) else getattr(section, "type", "BM1")
+
+
+MachineSection: TypeAlias = Annotated[
+    Annotated[BM1Section, Tag("BM1")] | Annotated[BM2Section, Tag("BM2")], Discriminator(_type_of)
+]
+"""`[machine]` of either kind, by its `type`, which is BM1 if it is omitted."""
 
 
 class WrittenPrior(Section):

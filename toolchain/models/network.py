@@ -127,7 +127,7 @@ def network_model(
     held = asked.union(*(term.scope for term in terms))
     used = tuple(each for each in symbols if each.name in held)
     for each in used:  # all of its factors were constants
-        if each.size > 1 and not any(each.name in term.scope for term in terms):
+        if not any(each.name in term.scope for term in terms):
             terms.append(Term((each.name,), np.ones(each.size)))
             titles.append(f"uniform({each.name})")
     return NetworkModel(

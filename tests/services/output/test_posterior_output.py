@@ -22,7 +22,7 @@ from services.output.master_output import print_json, sentence
 from services.output.posterior_file import open_result_file, record
 from services.output.posterior_output import ROWS, drawing, line, picture
 from services.sockets.records import Outcome, Published
-from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source
+from toolchain.deployment import BM1Section, BoardSection, Deployment, Dimension, Source
 
 HASH = "0" * 64
 
@@ -35,7 +35,7 @@ def deployment(*searched):
         name="test",
         source=[Source(uri="ws://robot:9090", topic="/t", type="a/B")],
         searched=list(searched),
-        machine=MachineSection(lines=lines),
+        machine=BM1Section(lines=lines),
         board=[BoardSection(image="boards/board0.bm", image_hash=HASH, line_offset=0, lines=lines)],
     )
 

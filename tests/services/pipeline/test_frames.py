@@ -7,7 +7,7 @@ import pytest
 
 from services.errors import VariableError
 from services.pipeline.frames import UNPAIRED_WARNING, FrameAssembler, StampGap
-from toolchain.deployment import BoardSection, Deployment, Dimension, MachineSection, Source, Variable
+from toolchain.deployment import BM1Section, BoardSection, Deployment, Dimension, Source, Variable
 from toolchain.deployment.sections import WrittenPrior
 
 HASH = "0" * 64
@@ -19,7 +19,7 @@ def deployment(*variables, sources=1, tolerance_s=0.05):
         source=[Source(uri="ws://robot:9090", topic=f"/t{at}", type="a/B") for at in range(sources)],
         variable=list(variables),
         searched=[Dimension(label="x", size=4)],
-        machine=MachineSection(lines=4),
+        machine=BM1Section(lines=4),
         board=[BoardSection(image="boards/board0.bm", image_hash=HASH, line_offset=0, lines=4)],
         tolerance_s=tolerance_s,
     )

@@ -16,7 +16,7 @@ from services.pipes import lines
 from services.pipes.pcie_app import reading_from_line
 from services.pipes.publisher import result_from_line
 from tests.command_runner import invoke
-from toolchain.deployment import MachineSection
+from toolchain.deployment import BM1Section
 
 BOAT = Path(__file__).parents[3] / "casestudies" / "boat"
 
@@ -53,7 +53,7 @@ def test_a_result_and_an_array():
 
 
 def of(lines, replicas=1):
-    return MachineSection(lines=lines, replicas=replicas)
+    return BM1Section(lines=lines, replicas=replicas)
 
 
 def board(counts, reason=1, **more):

@@ -4,6 +4,7 @@ build ──▶ deployment.toml ──▶ (a user edits it) ──▶ load_deplo
           boards/*.bm                              └─ one sentence: file, line, nearest right name
 """
 
+import hashlib
 import re
 import string
 
@@ -13,12 +14,14 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from machines.parameters import Sequencer
 from tests.toolchain.builders import boat, corridor
 from tests.toolchain.running import build_model
 from toolchain.deployment import (
+    BM1Section,
+    BM2Section,
     BoardSection,
     Dimension,
-    MachineSection,
     Output,
     Queue,
     Stop,
@@ -103,7 +106,7 @@ def deployments(draw):
             )
             for name in names
         ),
-        machine=MachineSection(lines=lines, stop=draw(st.sampled_from(list(Stop)))),
+        machine=BM1Section(lines=lines, stop=draw(st.sampled_from(list(Stop)))),
         boards=tuple(
             BoardSection(image=f"boards/{i}.bm", image_hash="a" * 64, line_offset=start, lines=end - start)
             for i, (start, end) in enumerate(zip(starts, [*cuts, lines], strict=True))
@@ -117,6 +120,65 @@ def test_any_deployment_survives_the_file(tmp_path_factory, deployment):
     written = write_deployment(folder, deployment)
     assert load_deployment(folder, images=False) == written
     assert deployment_text(written) == (folder / "deployment.toml").read_text(encoding="utf-8")
+
+
+def test_the_bytes_of_a_bm1_are_those_of_earlier_versions():
+    assert deployment_hash(boat()) == "33f1481aff21fa4f75077d6736ba5b4195f0aae19e807ac2f0991e92d8dc1dd9"
+    text = deployment_text(boat())
+    assert (
+        hashlib.sha256(text.encode()).hexdigest()
+        == "ac020ecb68d213ceb4322b7221b628db9098b01de5f9a4792b67c351514ddc3b"
+    )
+
+
+CHAINS = tuple(
+    BoardSection(image=f"boards/board{at}.bm", image_hash="a" * 64, line_offset=at, lines=1) for at in (0, 1)
+)
+
+
+def test_a_bm2_has_a_section_of_its_own(tmp_path):
+    machine = BM2Section(lines=12, sequencer=Sequencer.COLOURED, stream=4)
+    written = write_deployment(tmp_path, boat(machine=machine, boards=CHAINS))
+    read = load_deployment(tmp_path, images=False)
+    assert read == written
+    assert read.machine == machine
+    # what services ask of every machine
+    assert (read.machine.replicas, read.machine.results, read.machine.is_plain) == (1, 12, True)
+    assert (read.machine.reads_lines, read.machine.stop, read.machine.prior_mode) == (False, "own", "table")
+    assert read.result_dimensions == boat().searched
+    assert read.reading_shape(read.variables[0]) == ()
+    assert read.machine_addresses((7, None)) == ((7, None), 0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "words"),
+    [
+        ('sequencer = "linear"', 'sequencer = "liner"', 56, "did you mean 'linear'?"),
+        (
+            "burn_in = 1000",
+            "burn_out = 1000",
+            59,
+            "unknown key 'burn_out' in [machine]; did you mean 'burn_in'?",
+        ),
+        ("burn_in = 1000", "counter_bits = 8", 59, "unknown key 'counter_bits' in [machine]"),
+        (
+            'type = "BM2"',
+            'type = "BM3"',
+            52,
+            "type = 'BM3' in [machine] is not a valid value; did you mean 'BM2'?",
+        ),
+        (
+            "line_offset = 1\nlines = 1",
+            "line_offset = 1\nlines = 2",
+            None,
+            "every board of this machine has lines = 1",
+        ),
+    ],
+)
+def test_a_mistake_in_the_section_of_a_bm2_is_named_with_its_line(tmp_path, old, new, line, words):
+    write_deployment(tmp_path, boat(machine=BM2Section(lines=12), boards=CHAINS))
+    edit(tmp_path, old, new)
+    assert words in refused(tmp_path, line=line)
 
 
 def test_uris_and_endpoints_may_be_edited(folder):
