@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from machines.bm1 import BM1Machine
+    from machines.bm2 import BM2Machine
+    from machines.bm2_kernel import BM2Kernel
     from machines.kernel import BM1Kernel
     from machines.kind import MachineKind
 
@@ -29,6 +31,17 @@ def make_kernel(machine: "BM1Machine") -> "BM1Kernel":
     from machines.reference import ReferenceBM1
 
     return ReferenceBM1(machine)
+
+
+def make_bm2_kernel(machine: "BM2Machine") -> "BM2Kernel":
+    """Return the fastest kernel that can run the machine."""
+    if machine.parameters.rng.lfsr_bits is not None:
+        from machines.bm2_fast import FastBM2
+
+        return FastBM2(machine)
+    from machines.bm2_reference import ReferenceBM2
+
+    return ReferenceBM2(machine)
 
 
 def warm_up() -> None:

@@ -29,7 +29,7 @@ cgutils: Any = untyped_cgutils
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def _jit(function: _Function) -> _Function:
+def jit(function: _Function) -> _Function:
     """Compile a function, and cache it on disk if there is a writable folder."""
     try:
         return cast("_Function", njit(cache=True, nogil=True)(function))
@@ -253,7 +253,7 @@ def _popcount_code(_context: Any, _word: Any) -> Any:
 _popcount = cast("Callable[[np.uint64], int]", intrinsic(_popcount_code))
 
 
-@_jit
+@jit
 def _image(maps: Words, which: int, state: np.uint64) -> np.uint64:
     """Return the image of a state under one of several linear maps."""
     image = _0
@@ -263,7 +263,7 @@ def _image(maps: Words, which: int, state: np.uint64) -> np.uint64:
     return image
 
 
-@_jit
+@jit
 def jump(jumps: Words, states: Words, clocks: int, later: Words) -> None:
     """Write the states after `clocks` more clocks; `clocks` has at most as many bits as a state."""
     for column in range(states.shape[0]):
@@ -274,7 +274,7 @@ def jump(jumps: Words, states: Words, clocks: int, later: Words) -> None:
         later[column] = state
 
 
-@_jit
+@jit
 def _select(
     codes: npt.NDArray[np.uint16],
     ones: int,
@@ -331,7 +331,7 @@ def _select(
     return rows
 
 
-@_jit
+@jit
 def _show(generators: Generators, frame: _Frame, clocks: int) -> None:
     """Compute the inverted words of all output bits in the block that begins after `clocks` clocks."""
     jump(generators.jumps, frame.starts, clocks, frame.states)
@@ -347,7 +347,7 @@ def _show(generators: Generators, frame: _Frame, clocks: int) -> None:
                 state >>= _4
 
 
-@_jit
+@jit
 def fill_blocks(
     generators: Generators, store: _Store, frame: _Frame, first_slot: int, blocks: int, period: int
 ) -> None:
@@ -362,7 +362,7 @@ def fill_blocks(
                 filled[row] = True
 
 
-@_jit
+@jit
 def _mask(first: int, end: int, mask: Words) -> None:
     """Set the mask of a block to the cycles from `first` to `end` - 1."""
     for word in range(BLOCK_WORDS):
@@ -375,7 +375,7 @@ def _mask(first: int, end: int, mask: Words) -> None:
         mask[word] = ones
 
 
-@_jit
+@jit
 def _cycle_of(
     words: Words, places: npt.NDArray[np.uint32], width: int, mask: Words, line: int, nth: int
 ) -> int:
@@ -395,7 +395,7 @@ def _cycle_of(
     return word * WORD_BITS + _popcount(~made & (made - _1))
 
 
-@_jit
+@jit
 def _run(
     generators: Generators,
     store: _Store,
@@ -454,7 +454,7 @@ def _run(
         counts[lines[i]] = sums[i]
 
 
-@_jit
+@jit
 def begin(
     codes: npt.NDArray[np.uint16],
     ones: int,
@@ -484,7 +484,7 @@ def begin(
     return rows
 
 
-@_jit
+@jit
 def resume(
     generators: Generators,
     store: _Store,

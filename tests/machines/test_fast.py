@@ -182,4 +182,4 @@ def test_code_is_compiled_without_a_cache_where_none_can_be_written(monkeypatch)
         return lambda function: (function, nogil)
 
     monkeypatch.setattr(fast_code, "njit", njit)
-    assert fast_code._jit(abs) == (abs, True)
+    assert fast_code.jit(abs) == (abs, True)
