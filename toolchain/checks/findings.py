@@ -50,6 +50,12 @@ class Check(StrEnum):
     RNG_PERIOD = "rng-period"
     RNG_RELATION = "rng-relation"
     RNG_TABLE = "rng-table"
+    CLIPPED = "clipped-factors"
+    CODES_ERROR = "codes-error"
+    MIXING = "mixing"
+    OPPOSITE_CLIPS = "opposite-clips"
+    CONNECTION = "unconnected-states"
+    WIDE_FACTOR = "wide-factor"
 
 
 @dataclass(frozen=True, slots=True)

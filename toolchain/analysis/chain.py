@@ -1,0 +1,292 @@
+"""The Markov chain of a BM2, exactly: its law, its cycles and its correlations, for few unknown bits.
+
+With ideal random numbers, a try at a pointed bit agrees on 1 with the product of its CDEs' chances, and on 0 with the
+product of their complements. This gives the matrix of a sweep, from state to state, and with it everything that long
+runs approach. The codes are those of the machine, so all that quantising and clipping changed is included.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.bm2 import start_state
+from machines.parameters import SampleEvery, Sequencer
+from toolchain.errors import ModelError
+from toolchain.models.inference import eliminate, product
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from machines.bm2 import BM2Machine
+    from toolchain.models.network import NetworkModel
+
+MOST_BITS: Final = 9
+"""Maximum number of unknown bits: the matrix of a sweep has 2**bits rows and columns."""
+_MOST_READINGS: Final = 64
+_WORK: Final = 2**27
+"""Maximum number of products for one matrix product of all readings together: a few seconds in all."""
+
+
+def agreement(
+    machine: BM2Machine, bit: int, values: Mapping[int, NDArray[np.int64]]
+) -> list[tuple[int, NDArray[np.float64]]]:
+    """Return each CDE that a pointed bit concerns, and its chances of a 1, float64[states].
+
+    `values` are the other bits of these CDEs' factors in each state, int64[states], by bit.
+    """
+    p, found = machine.parameters, []
+    for cde, table in enumerate(machine.tables):
+        local = p.factor_bits(cde)
+        if bit in local:
+            j = local.index(bit)
+            places = np.zeros(next(iter(values.values())).shape if values else 1, dtype=np.int64)
+            for i, other in enumerate(local[:j] + local[j + 1 :]):
+                places |= values[other] << i
+            found.append((cde, table[(j << (len(local) - 1)) + places] / 2.0**p.prob_bits))
+    return found
+
+
+class ExactChain:
+    """The chain over the states of the unknown bits; bit i of a state's index is the i-th unknown bit.
+
+    Args:
+        machine: A machine with at most `MOST_BITS` unknown bits.
+        evidence: The values of the known variables, by variable.
+    """
+
+    def __init__(self, machine: BM2Machine, evidence: Mapping[int, int]) -> None:
+        p = self._parameters = machine.parameters
+        known = sum(p.masks[variable] for variable in evidence)
+        fixed = sum(value << p.offsets[variable] for variable, value in evidence.items())
+        self._unknown = [bit for bit in range(p.state_bits) if not known >> bit & 1]
+        self._moves = [[self._unknown.index(bit) for bit in move] for move in p.moves(known, p.sequencer)]
+        """The unknown bits at which each move of a sweep points."""
+        index = np.arange(1 << len(self._unknown))
+        self._values = {
+            bit: index >> self._unknown.index(bit) & 1
+            if bit in self._unknown
+            else np.full_like(index, fixed >> bit & 1)
+            for bit in range(p.state_bits)
+        }
+        self._one = np.ones((len(self._unknown), len(index)))
+        """The chance that all CDEs concerned say 1 in one try at each unknown bit."""
+        self._zero = np.ones_like(self._one)
+        for at, bit in enumerate(self._unknown):
+            concerned = agreement(machine, bit, self._values)
+            # the others agree by chance
+            start = 0.5 ** (p.cdes - len(concerned)) if p.literal else 1.0
+            self._one[at] = start * np.prod([chance for _, chance in concerned], axis=0)
+            self._zero[at] = start * np.prod([1 - chance for _, chance in concerned], axis=0)
+
+    def _moved(self, laws: NDArray[np.float64], move: Sequence[int]) -> NDArray[np.float64]:
+        """Return laws, float64[..., states], after a move."""
+        for at in move:
+            one, zero = (each.reshape(-1, 2, 1 << at)[:, :1] for each in (self._one[at], self._zero[at]))
+            split = laws.reshape(*laws.shape[:-1], -1, 2, 1 << at).sum(axis=-2, keepdims=True)
+            laws = (split * np.concatenate([zero, one], axis=1) / (zero + one)).reshape(laws.shape)
+        return laws
+
+    def _tries(self, move: Sequence[int]) -> NDArray[np.float64]:
+        """Return the mean number of cycles of a move in each state: until the last of its bits has agreed."""
+        agree = self._one[move] + self._zero[move]
+        total = np.zeros(agree.shape[1])
+        for count in range(1, len(move) + 1):
+            for chosen in itertools.combinations(range(len(move)), count):
+                # the mean of a maximum, by inclusion and exclusion: until one of the chosen agrees
+                total -= (-1) ** count / (1 - np.prod(1 - agree[list(chosen)], axis=0))
+        return total
+
+    @cached_property
+    def sweep(self) -> NDArray[np.float64]:
+        """float64[states, states]: the chance of each next state after a sweep."""
+        after = np.eye(self._one.shape[1])
+        if self._parameters.sequencer is Sequencer.RANDOM:
+            mean = np.mean([self._moved(after, move) for move in self._moves], axis=0)
+            return np.asarray(np.linalg.matrix_power(mean, len(self._moves)))
+        for move in self._moves:
+            after = self._moved(after, move)
+        return after
+
+    @cached_property
+    def law(self) -> NDArray[np.float64]:
+        """float64[states]: the stationary law after a sweep.
+
+        The elimination of Grassmann, Taksar and Heyman subtracts nothing, so it is exact even where clipped codes make
+        some states nearly inescapable.
+        """
+        left = self.sweep.copy()
+        for n in range(len(left) - 1, 0, -1):
+            left[:n, n] /= left[n, :n].sum()
+            left[:n, :n] += np.outer(left[:n, n], left[n, :n])
+        law = np.ones(len(left))
+        for n in range(1, len(left)):
+            law[n] = law[:n] @ left[:n, n]
+        return np.asarray(law / law.sum())
+
+    @cached_property
+    def sampled(self) -> NDArray[np.float64]:
+        """float64[states]: the stationary law of a sample."""
+        p = self._parameters
+        if p.sample_every is SampleEvery.SWEEP or p.sequencer is Sequencer.RANDOM:
+            return self.law
+        laws = [self.law]
+        for move in self._moves:
+            laws.append(self._moved(laws[-1], move))
+        return np.asarray(np.mean(laws[1:], axis=0))
+
+    @cached_property
+    def cycles(self) -> float:
+        """The mean number of cycles of a sweep."""
+        law, total = self.law, 0.0
+        for move in self._moves:
+            total += float(law @ self._tries(move))
+            if self._parameters.sequencer is not Sequencer.RANDOM:
+                law = self._moved(law, move)
+        return total
+
+    @cached_property
+    def _searched(self) -> NDArray[np.int64]:
+        """int64[states]: the place in the joint of the searched variables; -1 if any variable is at an unused code."""
+        p = self._parameters
+        index, unused = np.zeros((2, self._one.shape[1]), dtype=np.int64)
+        codes = [
+            sum((self._values[offset + k] << k for k in range(bits)), start=np.zeros_like(index))
+            for offset, bits in zip(p.offsets, p.bits, strict=True)
+        ]
+        for code, cardinality in zip(codes, p.cardinalities, strict=True):
+            unused |= code >= cardinality
+        for variable in p.searched:
+            index = index * p.cardinalities[variable] + codes[variable]
+        return np.where(unused, -1, index)
+
+    def posterior(self, law: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the posterior from samples with this law: float64[values of the searched variables together]."""
+        p, used = self._parameters, self._searched >= 0
+        size = int(np.prod([p.cardinalities[variable] for variable in p.searched]))
+        found = np.bincount(self._searched[used], law[used], size)
+        return np.asarray(found / found.sum())
+
+    def effective(self) -> NDArray[np.float64]:
+        """Return the number of independent samples that a sweep is worth, for each searched value: float64[values]."""
+        places = np.arange(len(self.posterior(self.law)))
+        values = (self._searched[:, np.newaxis] == places).astype(np.float64)
+        centred = values - self.law @ values
+        summed = np.linalg.solve(np.eye(len(self.law)) - self.sweep + self.law, centred)
+        own = self.law @ centred**2
+        total = self.law @ (centred * (2 * summed - centred))
+        return np.asarray(np.divide(own, total, out=np.ones_like(own), where=own > 0))
+
+    def frame(self, state: int, burn_in: int, sweeps: int) -> NDArray[np.float64]:
+        """Return the mean law after each sweep of a frame that starts in a packed state and burns in."""
+        law = np.zeros(len(self.sweep))
+        law[sum((state >> bit & 1) << at for at, bit in enumerate(self._unknown))] = 1
+        law = law @ np.linalg.matrix_power(self.sweep, burn_in + 1)
+        total = np.zeros_like(law)
+        block, power, left = np.eye(len(law)), self.sweep, sweeps
+        while left:  # `block` is the sum of the powers from 0 to 2**k - 1, and `power` the next one
+            if left & 1:
+                total += law @ block
+                law = law @ power
+            block = block + block @ power
+            power = power @ power
+            left >>= 1
+        return np.asarray(total / sweeps)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChainError:
+    """What a frame of some samples is expected to get wrong, in the mean over readings, without having run any.
+
+    Distances are total variations of the searched variables' posterior.
+    """
+
+    readings: int
+    """The number of readings, the likeliest ones."""
+    share: float
+    """Their probability among all readings."""
+    quantising: float
+    """Distance of the stationary law from exact inference."""
+    worst: float
+    """The largest of these distances."""
+    worst_reading: tuple[int, ...]
+    """The addresses where it occurs."""
+    start: float
+    """Distance of a frame's mean law from the stationary one: what its burn-in did not forget."""
+    sampling: float
+    """Mean distance of a frame's posterior from its mean law, because samples are finite and correlated."""
+    cycles: float
+    """Cycles of a sweep."""
+    effective: float
+    """Number of independent samples that a sweep is worth, for the reading and the searched value that mix most slowly."""
+
+
+def distance(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> float:
+    """Return the total variation of two distributions, 0 to 1."""
+    return float(np.abs(ours - theirs).sum() / 2)
+
+
+def chain_error(
+    machine: BM2Machine, model: NetworkModel, *, burn_in: int, samples: int, boards: int = 1
+) -> ChainError | None:
+    """Return the expected error of a frame in which all known variables have readings; None if it is too large.
+
+    The model must be that of the machine. All boards start in the same state here.
+    """
+    p = machine.parameters
+    unknown = p.state_bits - sum(p.bits[variable] for variable in p.known)
+    if unknown > MOST_BITS:
+        return None
+    sizes = dict(zip(model.names, model.cardinalities, strict=True))
+    hidden = [name for name in model.names if name not in model.known]
+    try:
+        weights = product(eliminate(model.factors, hidden, sizes), model.known, sizes).ravel()
+    except ModelError:  # a table above the limit
+        return None
+    most = min(_MOST_READINGS, max(1, _WORK >> 3 * unknown), int((weights > 0).sum()))
+    likeliest = np.argsort(-weights, kind="stable")[:most]
+    sweeps = samples if p.sample_every is SampleEvery.SWEEP else max(1, samples // unknown)
+    rows = []
+    readings = []
+    for place in likeliest.tolist():
+        addresses = tuple(int(at) for at in np.unravel_index(place, [sizes[name] for name in model.known]))
+        evidence = dict(zip(p.known, addresses, strict=True))
+        chain = ExactChain(machine, evidence)
+        start = start_state(machine, evidence)
+        if start is None:  # its probability is a rounding error
+            continue
+        stationary = chain.posterior(chain.sampled)
+        shares = chain.effective()
+        deviations = np.sqrt(stationary * (1 - stationary) / np.maximum(boards * sweeps * shares, 1))
+        readings.append(addresses)
+        rows.append(
+            (
+                weights[place],
+                distance(stationary, model.exact(addresses)),
+                distance(chain.posterior(chain.frame(start, burn_in, sweeps)), chain.posterior(chain.law)),
+                # half of the mean absolute values of normal deviations
+                deviations.sum() / np.sqrt(2 * np.pi),
+                chain.cycles,
+                shares.min(),
+            )
+        )
+    table = np.array(rows)
+    means = (table[:, :1] * table).sum(axis=0) / table[:, 0].sum()
+    worst = int(table[:, 1].argmax())
+    return ChainError(
+        readings=len(rows),
+        share=float(table[:, 0].sum() / weights.sum()),
+        quantising=float(means[1]),
+        worst=float(table[worst, 1]),
+        worst_reading=readings[worst],
+        start=float(means[2]),
+        sampling=float(means[3]),
+        cycles=float(means[4]),
+        effective=float(table[:, 5].min()),
+    )
