@@ -200,7 +200,7 @@ begin
           found := found or x"31304D42";
         end if;
         if (unsigned(word_i) = MAP_VERSION_ADDRESS / 4) then
-          found := found or x"00010001";
+          found := found or x"00010002";
         end if;
         if (unsigned(word_i) = LIVENESS_ADDRESS / 4) then
           found := found or liveness_i(31 downto 0);

@@ -13,7 +13,7 @@ package bm_register_map is
   constant BAR_ADDRESS_BITS : positive := 17;
 
   -- SHA-256 of the map's definition, first byte in the highest bits
-  constant MAP_SHA256 : std_logic_vector(255 downto 0) := x"1F815974F7E70A1D3204F266A1CBCC87FF954020F422129857E6F13AF5013786";
+  constant MAP_SHA256 : std_logic_vector(255 downto 0) := x"3E1197271F18778CF35434FBE02DFEBC8031433857203D65AC2C3A91A1EF4854";
 
   -- registers and memories: address in bytes, number of 32-bit words, what software may do
   constant ID_ADDRESS               : natural  := 16#00000#;
@@ -115,9 +115,36 @@ package bm_register_map is
   constant SENSORS_ADDRESS          : natural  := 16#00200#;
   constant SENSORS_WORDS            : positive := 64;
   constant SENSORS_WRITABLE         : boolean  := true;
+  constant KNOWN_MASK_ADDRESS       : natural  := 16#00300#;
+  constant KNOWN_MASK_WORDS         : positive := 64;
+  constant KNOWN_MASK_WRITABLE      : boolean  := true;
   constant PRIOR_SELECTS_ADDRESS    : natural  := 16#00400#;
   constant PRIOR_SELECTS_WORDS      : positive := 256;
   constant PRIOR_SELECTS_WRITABLE   : boolean  := true;
+  constant START_STATE_ADDRESS      : natural  := 16#00800#;
+  constant START_STATE_WORDS        : positive := 64;
+  constant START_STATE_WRITABLE     : boolean  := true;
+  constant BURN_IN_ADDRESS          : natural  := 16#00900#;
+  constant BURN_IN_WORDS            : positive := 1;
+  constant BURN_IN_WRITABLE         : boolean  := true;
+  constant OPS_TIMEOUT_ADDRESS      : natural  := 16#00904#;
+  constant OPS_TIMEOUT_WORDS        : positive := 1;
+  constant OPS_TIMEOUT_WRITABLE     : boolean  := true;
+  constant ORDER_ADDRESS            : natural  := 16#00908#;
+  constant ORDER_WORDS              : positive := 1;
+  constant ORDER_WRITABLE           : boolean  := true;
+  constant SAMPLES_DONE_ADDRESS     : natural  := 16#00940#;
+  constant SAMPLES_DONE_WORDS       : positive := 1;
+  constant SAMPLES_DONE_WRITABLE    : boolean  := false;
+  constant UNUSED_ADDRESS           : natural  := 16#00944#;
+  constant UNUSED_WORDS             : positive := 1;
+  constant UNUSED_WRITABLE          : boolean  := false;
+  constant TIMED_OUT_BIT_ADDRESS    : natural  := 16#00948#;
+  constant TIMED_OUT_BIT_WORDS      : positive := 1;
+  constant TIMED_OUT_BIT_WRITABLE   : boolean  := false;
+  constant STREAM_COUNT_ADDRESS     : natural  := 16#0094C#;
+  constant STREAM_COUNT_WORDS       : positive := 1;
+  constant STREAM_COUNT_WRITABLE    : boolean  := false;
   constant OUTCOMES_ADDRESS         : natural  := 16#01000#;
   constant OUTCOMES_WORDS           : positive := 1024;
   constant OUTCOMES_WRITABLE        : boolean  := false;
@@ -127,6 +154,9 @@ package bm_register_map is
   constant PRIOR_CODES_ADDRESS      : natural  := 16#08000#;
   constant PRIOR_CODES_WORDS        : positive := 4096;
   constant PRIOR_CODES_WRITABLE     : boolean  := true;
+  constant STREAM_ADDRESS           : natural  := 16#0C000#;
+  constant STREAM_WORDS             : positive := 4096;
+  constant STREAM_WRITABLE          : boolean  := false;
   constant INPUTS_ADDRESS           : natural  := 16#10000#;
   constant INPUTS_WORDS             : positive := 8192;
   constant INPUTS_WRITABLE          : boolean  := true;
@@ -142,7 +172,7 @@ package bm_register_map is
 
   type blocks_t is array (natural range <>) of block_t;
 
-  constant BLOCKS : blocks_t(0 to 37) := (
+  constant BLOCKS : blocks_t(0 to 47) := (
     0 => (ID_ADDRESS, ID_WORDS, ID_WRITABLE, false),
     1 => (MAP_VERSION_ADDRESS, MAP_VERSION_WORDS, MAP_VERSION_WRITABLE, false),
     2 => (LIVENESS_ADDRESS, LIVENESS_WORDS, LIVENESS_WRITABLE, false),
@@ -176,11 +206,21 @@ package bm_register_map is
     30 => (COMPUTE_NS_ADDRESS, COMPUTE_NS_WORDS, COMPUTE_NS_WRITABLE, false),
     31 => (HALT_ADDRESS, HALT_WORDS, HALT_WRITABLE, false),
     32 => (SENSORS_ADDRESS, SENSORS_WORDS, SENSORS_WRITABLE, true),
-    33 => (PRIOR_SELECTS_ADDRESS, PRIOR_SELECTS_WORDS, PRIOR_SELECTS_WRITABLE, true),
-    34 => (OUTCOMES_ADDRESS, OUTCOMES_WORDS, OUTCOMES_WRITABLE, true),
-    35 => (RESULTS_ADDRESS, RESULTS_WORDS, RESULTS_WRITABLE, true),
-    36 => (PRIOR_CODES_ADDRESS, PRIOR_CODES_WORDS, PRIOR_CODES_WRITABLE, true),
-    37 => (INPUTS_ADDRESS, INPUTS_WORDS, INPUTS_WRITABLE, true)
+    33 => (KNOWN_MASK_ADDRESS, KNOWN_MASK_WORDS, KNOWN_MASK_WRITABLE, true),
+    34 => (PRIOR_SELECTS_ADDRESS, PRIOR_SELECTS_WORDS, PRIOR_SELECTS_WRITABLE, true),
+    35 => (START_STATE_ADDRESS, START_STATE_WORDS, START_STATE_WRITABLE, true),
+    36 => (BURN_IN_ADDRESS, BURN_IN_WORDS, BURN_IN_WRITABLE, true),
+    37 => (OPS_TIMEOUT_ADDRESS, OPS_TIMEOUT_WORDS, OPS_TIMEOUT_WRITABLE, true),
+    38 => (ORDER_ADDRESS, ORDER_WORDS, ORDER_WRITABLE, true),
+    39 => (SAMPLES_DONE_ADDRESS, SAMPLES_DONE_WORDS, SAMPLES_DONE_WRITABLE, true),
+    40 => (UNUSED_ADDRESS, UNUSED_WORDS, UNUSED_WRITABLE, true),
+    41 => (TIMED_OUT_BIT_ADDRESS, TIMED_OUT_BIT_WORDS, TIMED_OUT_BIT_WRITABLE, true),
+    42 => (STREAM_COUNT_ADDRESS, STREAM_COUNT_WORDS, STREAM_COUNT_WRITABLE, true),
+    43 => (OUTCOMES_ADDRESS, OUTCOMES_WORDS, OUTCOMES_WRITABLE, true),
+    44 => (RESULTS_ADDRESS, RESULTS_WORDS, RESULTS_WRITABLE, true),
+    45 => (PRIOR_CODES_ADDRESS, PRIOR_CODES_WORDS, PRIOR_CODES_WRITABLE, true),
+    46 => (STREAM_ADDRESS, STREAM_WORDS, STREAM_WRITABLE, true),
+    47 => (INPUTS_ADDRESS, INPUTS_WORDS, INPUTS_WRITABLE, true)
   );
 
   -- fields of registers that have several: lowest and highest bit
@@ -200,6 +240,12 @@ package bm_register_map is
   constant CAP_MACHINE_PRIOR_WRITTEN_HIGH : natural := 18;
   constant CAP_MACHINE_SENSOR_MODE_LOW    : natural := 19;
   constant CAP_MACHINE_SENSOR_MODE_HIGH   : natural := 20;
+  constant CAP_MACHINE_LITERAL_LOW        : natural := 21;
+  constant CAP_MACHINE_LITERAL_HIGH       : natural := 21;
+  constant CAP_MACHINE_PER_MOVE_LOW       : natural := 22;
+  constant CAP_MACHINE_PER_MOVE_HIGH      : natural := 22;
+  constant CAP_MACHINE_STREAM_LOW         : natural := 23;
+  constant CAP_MACHINE_STREAM_HIGH        : natural := 23;
   constant CAP_PARTITION_INDEX_LOW        : natural := 0;
   constant CAP_PARTITION_INDEX_HIGH       : natural := 15;
   constant CAP_PARTITION_COUNT_LOW        : natural := 16;
@@ -236,6 +282,7 @@ package bm_register_map is
   -- machine kind
   constant MACHINE_KIND_NONE : natural := 0;
   constant MACHINE_KIND_BM1  : natural := 1;
+  constant MACHINE_KIND_BM2  : natural := 2;
 
   -- rng kind
   constant RNG_KIND_NONE   : natural := 0;
@@ -263,6 +310,8 @@ package bm_register_map is
   constant STOP_REASON_MAX_CYCLES : natural := 2;
   constant STOP_REASON_SLICE      : natural := 3;
   constant STOP_REASON_IMPOSSIBLE : natural := 4;
+  constant STOP_REASON_TIMEOUT    : natural := 5;
+  constant STOP_REASON_FULL       : natural := 6;
 
   -- error code
   constant ERROR_CODE_NONE       : natural := 0;

@@ -20,7 +20,7 @@ extern "C" {
 #define BM_REGISTERS__MAP_VERSION__MINOR_bm 0xffff
 #define BM_REGISTERS__MAP_VERSION__MINOR_bp 0
 #define BM_REGISTERS__MAP_VERSION__MINOR_bw 16
-#define BM_REGISTERS__MAP_VERSION__MINOR_reset 0x1
+#define BM_REGISTERS__MAP_VERSION__MINOR_reset 0x2
 #define BM_REGISTERS__MAP_VERSION__MAJOR_bm 0xffff0000
 #define BM_REGISTERS__MAP_VERSION__MAJOR_bp 16
 #define BM_REGISTERS__MAP_VERSION__MAJOR_bw 16
@@ -65,6 +65,15 @@ extern "C" {
 #define BM_REGISTERS__CAP_MACHINE__SENSOR_MODE_bm 0x180000
 #define BM_REGISTERS__CAP_MACHINE__SENSOR_MODE_bp 19
 #define BM_REGISTERS__CAP_MACHINE__SENSOR_MODE_bw 2
+#define BM_REGISTERS__CAP_MACHINE__LITERAL_bm 0x200000
+#define BM_REGISTERS__CAP_MACHINE__LITERAL_bp 21
+#define BM_REGISTERS__CAP_MACHINE__LITERAL_bw 1
+#define BM_REGISTERS__CAP_MACHINE__PER_MOVE_bm 0x400000
+#define BM_REGISTERS__CAP_MACHINE__PER_MOVE_bp 22
+#define BM_REGISTERS__CAP_MACHINE__PER_MOVE_bw 1
+#define BM_REGISTERS__CAP_MACHINE__STREAM_bm 0x800000
+#define BM_REGISTERS__CAP_MACHINE__STREAM_bp 23
+#define BM_REGISTERS__CAP_MACHINE__STREAM_bw 1
 
 // reg - bm_registers::CAP_LINES
 #define BM_REGISTERS__CAP_LINES__COUNT_bm 0xffffffff
@@ -229,10 +238,55 @@ typedef struct __attribute__ ((__packed__)) {
     uint32_t mem[64];
 } bm_registers__SENSORS_t;
 
+// mem - bm_registers::KNOWN_MASK
+typedef struct __attribute__ ((__packed__)) {
+    uint32_t mem[64];
+} bm_registers__KNOWN_MASK_t;
+
 // mem - bm_registers::PRIOR_SELECTS
 typedef struct __attribute__ ((__packed__)) {
     uint32_t mem[256];
 } bm_registers__PRIOR_SELECTS_t;
+
+// mem - bm_registers::START_STATE
+typedef struct __attribute__ ((__packed__)) {
+    uint32_t mem[64];
+} bm_registers__START_STATE_t;
+
+// mem - bm_registers::BURN_IN
+typedef struct __attribute__ ((__packed__)) {
+    uint32_t mem[1];
+} bm_registers__BURN_IN_t;
+
+// mem - bm_registers::OPS_TIMEOUT
+typedef struct __attribute__ ((__packed__)) {
+    uint32_t mem[1];
+} bm_registers__OPS_TIMEOUT_t;
+
+// mem - bm_registers::ORDER
+typedef struct __attribute__ ((__packed__)) {
+    uint32_t mem[1];
+} bm_registers__ORDER_t;
+
+// mem - bm_registers::SAMPLES_DONE
+typedef struct __attribute__ ((__packed__)) {
+    uint32_t mem[1];
+} bm_registers__SAMPLES_DONE_t;
+
+// mem - bm_registers::UNUSED
+typedef struct __attribute__ ((__packed__)) {
+    uint32_t mem[1];
+} bm_registers__UNUSED_t;
+
+// mem - bm_registers::TIMED_OUT_BIT
+typedef struct __attribute__ ((__packed__)) {
+    uint32_t mem[1];
+} bm_registers__TIMED_OUT_BIT_t;
+
+// mem - bm_registers::STREAM_COUNT
+typedef struct __attribute__ ((__packed__)) {
+    uint32_t mem[1];
+} bm_registers__STREAM_COUNT_t;
 
 // mem - bm_registers::OUTCOMES
 typedef struct __attribute__ ((__packed__)) {
@@ -248,6 +302,11 @@ typedef struct __attribute__ ((__packed__)) {
 typedef struct __attribute__ ((__packed__)) {
     uint32_t mem[4096];
 } bm_registers__PRIOR_CODES_t;
+
+// mem - bm_registers::STREAM
+typedef struct __attribute__ ((__packed__)) {
+    uint32_t mem[4096];
+} bm_registers__STREAM_t;
 
 // mem - bm_registers::INPUTS
 typedef struct __attribute__ ((__packed__)) {
@@ -295,14 +354,23 @@ typedef struct __attribute__ ((__packed__)) {
     uint32_t HALT[8];
     uint8_t RESERVED_1a0_1ff[0x60];
     bm_registers__SENSORS_t SENSORS;
-    uint8_t RESERVED_300_3ff[0x100];
+    bm_registers__KNOWN_MASK_t KNOWN_MASK;
     bm_registers__PRIOR_SELECTS_t PRIOR_SELECTS;
-    uint8_t RESERVED_800_fff[0x800];
+    bm_registers__START_STATE_t START_STATE;
+    bm_registers__BURN_IN_t BURN_IN;
+    bm_registers__OPS_TIMEOUT_t OPS_TIMEOUT;
+    bm_registers__ORDER_t ORDER;
+    uint8_t RESERVED_90c_93f[0x34];
+    bm_registers__SAMPLES_DONE_t SAMPLES_DONE;
+    bm_registers__UNUSED_t UNUSED;
+    bm_registers__TIMED_OUT_BIT_t TIMED_OUT_BIT;
+    bm_registers__STREAM_COUNT_t STREAM_COUNT;
+    uint8_t RESERVED_950_fff[0x6b0];
     bm_registers__OUTCOMES_t OUTCOMES;
     uint8_t RESERVED_2000_3fff[0x2000];
     bm_registers__RESULTS_t RESULTS;
     bm_registers__PRIOR_CODES_t PRIOR_CODES;
-    uint8_t RESERVED_c000_ffff[0x4000];
+    bm_registers__STREAM_t STREAM;
     bm_registers__INPUTS_t INPUTS;
 } bm_registers_t;
 

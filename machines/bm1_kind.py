@@ -25,6 +25,7 @@ from machines.kind import (
     HostMachine,
     Inference,
     MachineKind,
+    StoppedBoard,
     UsedRegisters,
 )
 from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
@@ -38,6 +39,7 @@ class BM1Kind(MachineKind):
     """Exact inference with approximate computations: a line of AND gates for each value (thesis 2.1.2)."""
 
     name = "BM1"
+    has_hardware = True
     parameters = BM1Parameters
     reasons: ClassVar = {
         StopReason.NONE: "not started",
@@ -82,6 +84,9 @@ class BM1Kind(MachineKind):
             written["PRIOR_SELECTS"] = parameters.replicas
         if parameters.prior_mode is PriorMode.WRITTEN:
             written["PRIOR_CODES"] = results
+        answer = {"RESULTS": results}
+        if parameters.replicas > 1:
+            answer["OUTCOMES"] = parameters.replicas * OUTCOME.itemsize // 4
         return UsedRegisters(
             lines=parameters.lines,
             replicas=parameters.replicas,
@@ -89,6 +94,7 @@ class BM1Kind(MachineKind):
             input_words=inputs,
             result_words=results,
             written=written,
+            answer=answer,
             # the encodings of hdl/bm_registers.rdl
             capabilities={
                 "CAP_MACHINE.KIND": 1,
@@ -135,7 +141,7 @@ class BM1Kind(MachineKind):
         joint = joint_reason([StopReason(reason) for reason in reasons], range(len(reasons)))
         return joint if joint is not StopReason.NONE else StopReason.SLICE
 
-    def infer(self, results: Sequence[BoardResult]) -> Inference:
+    def infer(self, results: Sequence[BoardResult], _: Sequence[str] = ()) -> Inference:
         """Return the joint posterior; each board has some lines of every replica, and its own number of cycles."""
         joint: npt.NDArray[np.float64] | None = None
         totals: list[int] = []
@@ -156,7 +162,9 @@ class BM1Kind(MachineKind):
             outcome = "no posterior: no line counted within max_cycles"
         return Inference(results, joint, totals, outcome)
 
-    def posterior(self, machines: Sequence[BM1Machine], frame: FrameInput) -> npt.NDArray[np.float64]:
+    def posterior(
+        self, machines: Sequence[BM1Machine], frame: FrameInput, _: Sequence[str] = ()
+    ) -> npt.NDArray[np.float64]:
         """Run the machines as `machines.posterior.posterior` does."""
         return posterior(
             machines,
@@ -276,6 +284,10 @@ class _OnBoard(BoardMachine):
         return self._kernel.reason is StopReason.SLICE
 
     @property
+    def resumable(self) -> bool:
+        return self.paused
+
+    @property
     def reason(self) -> int:
         return self._kernel.reason
 
@@ -288,9 +300,10 @@ class _Course(FrameCourse):
     """A frame on boards that share the lines of one model, or of its replicas."""
 
     def __init__(
-        self, starts: Sequence[tuple[FrameSettings, Blocks]], frame: FrameInput, replicas: int
+        self, starts: Sequence[Blocks], settings: FrameSettings, frame: FrameInput, replicas: int
     ) -> None:
         self.starts = starts
+        self.settings = settings
         self._max_cycles = frame.max_cycles
         self._replicas = replicas
         self.begun = 0
@@ -302,19 +315,20 @@ class _Course(FrameCourse):
         # the last slice ends with the frame
         self.end = 0 if end >= self._max_cycles else end
 
-    def proceed(self, reasons: Sequence[Sequence[int]]) -> tuple[Sequence[int], Blocks]:
+    def proceed(self, boards: Sequence[StoppedBoard]) -> tuple[Sequence[int], Blocks]:
         """With `slices`, a machine that has overflowed on a board ends on all; with `own`, there is one slice."""
         over = {
             replica
-            for of_board in reasons
-            for replica, reason in enumerate(of_board)
+            for board in boards
+            for replica, reason in enumerate(board.reasons)
             if reason == StopReason.OVERFLOW
         }
         running = [
-            board
-            for board, of_board in enumerate(reasons)
+            number
+            for number, board in enumerate(boards)
             if any(
-                reason == StopReason.SLICE and replica not in over for replica, reason in enumerate(of_board)
+                reason == StopReason.SLICE and replica not in over
+                for replica, reason in enumerate(board.reasons)
             )
         ]
         self.begun = self.end
@@ -360,8 +374,8 @@ class _OnHost(HostMachine):
                 blocks["PRIOR_SELECTS"] = selects
             if prior is not None:
                 blocks["PRIOR_CODES"] = prior
-            starts.append((settings, blocks))
-        return _Course(starts, frame, self._replicas)
+            starts.append(blocks)
+        return _Course(starts, settings, frame, self._replicas)
 
     def slowest(self) -> FrameInput:
         """Return a frame in which all readings are missing, so that all lines count."""

@@ -2,7 +2,7 @@
 
     host                                                     board
     begin(frame) ──── settings, blocks ────▶ start ──▶ step, step, ... ─┐
-    proceed(reasons) ─ end, blocks ────────▶ resume ─▶ step, step, ... ─┤ until `proceed` resumes no board
+    proceed(answers) ─ settings, blocks ───▶ resume ─▶ step, step, ... ─┤ until `proceed` resumes no board
     infer(results) ◀── results, cycles, reasons ────────────────────────┘
 
 Register words travel by the name of their block in the register map. This folder knows the names and what the
@@ -12,7 +12,8 @@ words mean to a machine; `pcie_shim` knows the addresses.
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, Literal, NamedTuple, Protocol, TypeAlias
 
 import msgspec
 import numpy as np
@@ -54,7 +55,7 @@ class FrameInput:
 
 
 class FrameSettings(NamedTuple):
-    """The registers that start a frame on every kind of machine, in the order of the map."""
+    """The registers that start or resume a frame on every kind of machine, in the order of the map."""
 
     target_count: int
     max_cycles: int
@@ -71,6 +72,7 @@ class BoardResult(msgspec.Struct, frozen=True, array_like=True, tag="board"):
         reason: Stop reason, a key of `MachineKind.reasons`; with replicas, their `joint_reason`.
         replica_cycles: Cycles of each replica; empty if the board has a single machine.
         replica_reasons: Stop reason of each replica; empty if the board has a single machine.
+        kept: What the course of the frame has kept for `MachineKind.infer`, in a form of the kind.
     """
 
     words: bytes
@@ -78,6 +80,7 @@ class BoardResult(msgspec.Struct, frozen=True, array_like=True, tag="board"):
     reason: int
     replica_cycles: tuple[int, ...] = ()
     replica_reasons: tuple[int, ...] = ()
+    kept: bytes = b""
 
     @property
     def counts(self) -> npt.NDArray[np.uint32]:
@@ -96,12 +99,18 @@ class Inference(NamedTuple):
             one; None if no replica has one.
         totals: The sum of the counts of each board.
         outcome: `posterior`, or the reason why there is none.
+        details: Further values for the report of the frame, by their keys.
+        samples: The machine's states that were sampled, one after the other; empty if the kind or the image has none.
+        sample_bytes: Length of each of them.
     """
 
     boards: Sequence[BoardResult]
     posterior: npt.NDArray[np.float64] | None
     totals: list[int]
     outcome: str
+    details: Mapping[str, str] = MappingProxyType({})
+    samples: bytes = b""
+    sample_bytes: int = 0
 
     @property
     def best(self) -> int:
@@ -120,6 +129,7 @@ class UsedRegisters:
         input_words: Inputs of all replicas, in words.
         result_words: Results of all replicas, in words of the block RESULTS.
         written: Words of the other blocks that a host may write, by name.
+        answer: Words of the blocks that a board sends when it has stopped, by name: RESULTS, then others.
         capabilities: Values of the capability registers (`CAP_LINES`) or their fields (`CAP_MACHINE.KIND`), by name.
         size: The size of the machine, described for a user.
     """
@@ -130,6 +140,7 @@ class UsedRegisters:
     input_words: int
     result_words: int
     written: Mapping[str, int] = field(default_factory=dict)
+    answer: Mapping[str, int]
     capabilities: Mapping[str, int]
     size: str
 
@@ -138,7 +149,7 @@ class BoardMachine(ABC):
     """The machine of a board, which reads its inputs from the board's registers and writes its results there.
 
     It runs only within calls: `start` and `resume` begin a slice after a doorbell, `step` continues the slice.
-    All three stop at cycle `end` at the latest (0: no such limit), with the results in RESULTS and OUTCOMES.
+    All three stop at cycle `end` at the latest (0: no such limit), with the results in `UsedRegisters.answer`.
     """
 
     @abstractmethod
@@ -164,7 +175,12 @@ class BoardMachine(ABC):
     @property
     @abstractmethod
     def paused(self) -> bool:
-        """True if the machine has stopped only because of `end`."""
+        """True if the machine has stopped only because of `end`, and `step` continues."""
+
+    @property
+    @abstractmethod
+    def resumable(self) -> bool:
+        """True if a host may resume the frame."""
 
     @property
     @abstractmethod
@@ -177,26 +193,40 @@ class BoardMachine(ABC):
         """Cycles of this frame."""
 
 
+class StoppedBoard(Protocol):
+    """The last answer of a board, as a driver has received it.
+
+    Attributes:
+        reasons: The stop reason of each replica.
+        answer: The words of `UsedRegisters.answer`, valid until the board is resumed.
+    """
+
+    reasons: tuple[int, ...]
+    answer: memoryview
+
+
 class FrameCourse(ABC):
     """A frame on all boards, from its start through its slices.
 
     Attributes:
-        starts: For each board its settings and the blocks to write before the start.
+        starts: For each board the blocks to write before the start.
+        settings: The settings of the slice, for all boards.
         begun: First cycle of the slice.
         end: Last cycle of the slice; 0 for that of the frame.
     """
 
-    starts: Sequence[tuple[FrameSettings, Blocks]]
+    starts: Sequence[Blocks]
+    settings: FrameSettings
     begun: int
     end: int
 
     @abstractmethod
-    def proceed(self, reasons: Sequence[Sequence[int]]) -> tuple[Sequence[int], Blocks]:
-        """Return the numbers of the boards to resume (none: the frame is over), and the blocks to write before that.
+    def proceed(self, boards: Sequence[StoppedBoard]) -> tuple[Sequence[int], Blocks]:
+        """Return the numbers of the boards to resume (none: the frame is over), and the blocks to write before that."""
 
-        Args:
-            reasons: The last stop reasons of each board's replicas.
-        """
+    def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:
+        """Return the results of the frame with what the course has kept of its slices."""
+        return results
 
 
 class HostMachine(ABC):
@@ -216,11 +246,13 @@ class MachineKind(ABC):
 
     Attributes:
         name: Its name in programming files and deployments.
+        has_hardware: True if there is VHDL of such machines.
         parameters: The type of its parameters: a dataclass.
         reasons: Its stop reasons by the number in the status register, in words for users; 0 is not started.
     """
 
     name: ClassVar[str]
+    has_hardware: ClassVar[bool]
     parameters: ClassVar[type]
     reasons: ClassVar[Mapping[int, str]]
 
@@ -267,11 +299,16 @@ class MachineKind(ABC):
         """Return one stop reason for the replicas of a board whose frame is over."""
 
     @abstractmethod
-    def infer(self, results: Sequence[BoardResult]) -> Inference:
-        """Return the posterior for the results of all boards."""
+    def infer(self, results: Sequence[BoardResult], variables: Sequence[str] = ()) -> Inference:
+        """Return the posterior for the results of all boards.
+
+        `variables` are the names of the machine's variables, for messages.
+        """
 
     @abstractmethod
-    def posterior(self, machines: Sequence[Any], frame: FrameInput) -> npt.NDArray[np.float64]:
+    def posterior(
+        self, machines: Sequence[Any], frame: FrameInput, variables: Sequence[str] = ()
+    ) -> npt.NDArray[np.float64]:
         """Run the machines of all boards in this process, each to its own stop, and return the posterior.
 
         Raises:

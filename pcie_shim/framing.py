@@ -28,7 +28,7 @@ READ: Final = 2
 WRITE: Final = 3
 """Host to board: write the payload from `address` on; acknowledged, unless posted."""
 IRQ: Final = 4
-"""Board to host: the machine has stopped; the payload is the block from DONE on, and the results."""
+"""Board to host: the machine has stopped; the payload is the block from DONE on, and the blocks that the image names."""
 ERROR: Final = 5
 """Board to host: the request of this sequence number was refused (`encode_error`)."""
 PROGRAM: Final = 6
@@ -46,8 +46,8 @@ END: Final = 8
 """Flag of PROGRAM: the file is complete; the reply follows when the board has loaded it."""
 
 PROTOCOL_VERSION: Final = 1
-MAX_PAYLOAD_WORDS: Final = 8192
-"""Maximum payload in words: the length of INPUTS, the longest block of the map."""
+MAX_PAYLOAD_WORDS: Final = 8448
+"""Maximum payload in words: more than INPUTS, the longest block, and than RESULTS and STREAM in one answer."""
 
 _MAGIC: Final = 0x4D42
 _HEAD: Final = struct.Struct("<HBBIII")

@@ -7,7 +7,7 @@ each register means is in docs/reference/registers.md.
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-MAP_SHA256: Final = "1f815974f7e70a1d3204f266a1cbcc87ff954020f422129857e6f13af5013786"
+MAP_SHA256: Final = "3e1197271f18778cf35434fbe02dfebc8031433857203d65ac2c3a91a1ef4854"
 BAR_SIZE: Final = 0x20000
 
 
@@ -50,7 +50,7 @@ class Block(NamedTuple):
 ID: Final = 0x0000
 ID_VALUE: Final = 0x31304d42
 MAP_VERSION: Final = 0x0004
-MAP_VERSION_VALUE: Final = 0x10001
+MAP_VERSION_VALUE: Final = 0x10002
 MAP_VERSION_MINOR_SHIFT: Final = 0
 MAP_VERSION_MINOR_MASK: Final = 0xffff
 MAP_VERSION_MAJOR_SHIFT: Final = 16
@@ -74,6 +74,12 @@ CAP_MACHINE_PRIOR_WRITTEN_SHIFT: Final = 18
 CAP_MACHINE_PRIOR_WRITTEN_MASK: Final = 0x40000
 CAP_MACHINE_SENSOR_MODE_SHIFT: Final = 19
 CAP_MACHINE_SENSOR_MODE_MASK: Final = 0x180000
+CAP_MACHINE_LITERAL_SHIFT: Final = 21
+CAP_MACHINE_LITERAL_MASK: Final = 0x200000
+CAP_MACHINE_PER_MOVE_SHIFT: Final = 22
+CAP_MACHINE_PER_MOVE_MASK: Final = 0x400000
+CAP_MACHINE_STREAM_SHIFT: Final = 23
+CAP_MACHINE_STREAM_MASK: Final = 0x800000
 CAP_LINES: Final = 0x0084
 CAP_TOTAL_LINES: Final = 0x0088
 CAP_LINE_OFFSET: Final = 0x008c
@@ -139,14 +145,27 @@ HALT: Final = 0x0180
 HALT_WORDS: Final = 8
 SENSORS: Final = 0x0200
 SENSORS_WORDS: Final = 64
+KNOWN_MASK: Final = 0x0300
+KNOWN_MASK_WORDS: Final = 64
 PRIOR_SELECTS: Final = 0x0400
 PRIOR_SELECTS_WORDS: Final = 256
+START_STATE: Final = 0x0800
+START_STATE_WORDS: Final = 64
+BURN_IN: Final = 0x0900
+OPS_TIMEOUT: Final = 0x0904
+ORDER: Final = 0x0908
+SAMPLES_DONE: Final = 0x0940
+UNUSED: Final = 0x0944
+TIMED_OUT_BIT: Final = 0x0948
+STREAM_COUNT: Final = 0x094c
 OUTCOMES: Final = 0x1000
 OUTCOMES_WORDS: Final = 1024
 RESULTS: Final = 0x4000
 RESULTS_WORDS: Final = 4096
 PRIOR_CODES: Final = 0x8000
 PRIOR_CODES_WORDS: Final = 4096
+STREAM: Final = 0xc000
+STREAM_WORDS: Final = 4096
 INPUTS: Final = 0x10000
 INPUTS_WORDS: Final = 8192
 
@@ -184,9 +203,19 @@ BLOCKS: Final = (
     Block("COMPUTE_NS", COMPUTE_NS, 2, writable=False),
     Block("HALT", HALT, 8, writable=True),
     Block("SENSORS", SENSORS, 64, writable=True),
+    Block("KNOWN_MASK", KNOWN_MASK, 64, writable=True),
     Block("PRIOR_SELECTS", PRIOR_SELECTS, 256, writable=True),
+    Block("START_STATE", START_STATE, 64, writable=True),
+    Block("BURN_IN", BURN_IN, 1, writable=True),
+    Block("OPS_TIMEOUT", OPS_TIMEOUT, 1, writable=True),
+    Block("ORDER", ORDER, 1, writable=True),
+    Block("SAMPLES_DONE", SAMPLES_DONE, 1, writable=False),
+    Block("UNUSED", UNUSED, 1, writable=False),
+    Block("TIMED_OUT_BIT", TIMED_OUT_BIT, 1, writable=False),
+    Block("STREAM_COUNT", STREAM_COUNT, 1, writable=False),
     Block("OUTCOMES", OUTCOMES, 1024, writable=False),
     Block("RESULTS", RESULTS, 4096, writable=False),
     Block("PRIOR_CODES", PRIOR_CODES, 4096, writable=True),
+    Block("STREAM", STREAM, 4096, writable=False),
     Block("INPUTS", INPUTS, 8192, writable=True),
 )

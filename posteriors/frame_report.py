@@ -1,7 +1,7 @@
 """`/bm/frame`: the report of each frame, written and read with the same keys."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from operator import attrgetter
 from typing import Annotated, Any, Final, Literal
 
@@ -62,11 +62,13 @@ class FrameReport:
     """Sending of the posterior."""
     stages: StageTimes = StageTimes()
     boards: tuple[BoardReport, ...] = ()
+    details: Mapping[str, str] = field(default_factory=dict)
+    """Further values, whose keys depend on the kind of machine."""
 
 
 # Keys of the message's values and their formats. The key of a number is the name of its field; that of a
 # stage has the suffix `_us`.
-_STAGES: Final = tuple(field.name for field in fields(StageTimes))
+_STAGES: Final = tuple(each.name for each in fields(StageTimes))
 _FRAME_KEYS: Final = {
     "number": "%d",
     "published": "%s",
@@ -104,6 +106,11 @@ def write_frame_report(report: FrameReport, ros_version: Literal[1, 2]) -> dict[
             *(report.number, published, *_numbers(report), *_times(report.stages)),
         )
     ]
+    if report.details:
+        pairs = [
+            f',{{"key":{_quoted(key)},"value":{_quoted(value)}}}' for key, value in report.details.items()
+        ]
+        statuses[0] = f"{statuses[0].removesuffix(']}')}{''.join(pairs)}]}}"
     for index, board in enumerate(report.boards):
         reason = _quoted(board.stopped)
         values = (index, reason, _quoted(board.name), board.cycles, board.counts_total, reason[1:-1])
@@ -167,6 +174,7 @@ def read_frame_report(message: dict[str, Any], heard_ns: int) -> FrameReport:
         "deployment": first.hardware_id,
         "stages": {stage: values[key] for stage in _STAGES if (key := f"{stage}_us") in values},
         "boards": [_board(each) for each in others],
+        "details": {key: value for key, value in values.items() if key not in _FRAME_KEYS},
     }
     return validated(_REPORT, report, FRAME_TOPIC, FRAME_TYPE)
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 RESULTS_TOPIC: Final = "/BMresults"
 RESULTS_TYPE: Final = "std_msgs/Float64MultiArray"
+SAMPLES_TOPIC: Final = "/bm/samples"
+SAMPLES_TYPE: Final = "std_msgs/UInt8MultiArray"
 MAX_RESULT: Final = 1 << 23
 """Maximum size of a posterior as JSON in bytes: 64 boards of 4096 lines, 26 bytes per number, and the rest
 of the message.
@@ -199,6 +201,17 @@ def posterior_layout(deployment: "Deployment") -> dict[str, Any]:
         dimensions.append({"label": dimension.label, "size": dimension.size, "stride": stride})
         stride //= dimension.size
     return {"dim": dimensions, "data_offset": 0}
+
+
+def samples_layout(samples: int, sample_bytes: int) -> dict[str, Any]:
+    """Return the `layout` of a message on `/bm/samples`: a row of bytes for each sampled state."""
+    rows = {"label": "sample", "size": samples, "stride": samples * sample_bytes}
+    words = {
+        "label": f"byte of {sample_bytes // 4} little-endian words",
+        "size": sample_bytes,
+        "stride": sample_bytes,
+    }
+    return {"dim": [rows, words], "data_offset": 0}
 
 
 class _Dimension(Part):

@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any, Final, NoReturn
 
 from machines.errors import MachineError, StartError
-from machines.kind import OUTCOME, BoardMachine, FrameSettings
+from machines.kind import BoardMachine, FrameSettings
 from machines.parameters import CYCLES_MAX
 from pcie_shim import register_map as rm
 from pcie_shim.errors import ImageError, PcieShimError
@@ -74,12 +74,12 @@ class EmulatedBoard:
         self._access = bytearray(rm.BAR_SIZE // 4)
 
         # The machine of the loaded image, None while blank, which reads and writes the blocks of the map; and the
-        # bytes of its results and of its replicas' outcomes.
+        # words that an interrupt carries: from DONE on, and those that the image names.
         self._machine: BoardMachine | None = None
         self._blocks = {
             block.name: self._view[block.address : block.address + 4 * block.words] for block in rm.BLOCKS
         }
-        self._results = self._outcomes = self._view[:0]
+        self._answer = [self._view[rm.DONE : rm.DONE + DONE_BLOCK.size]]
 
         # High words of 64-bit registers by address, from the read of the low word until they are read.
         self._latched: dict[int, bytes] = {}
@@ -171,12 +171,10 @@ class EmulatedBoard:
             self._put(address, value)
         for name, words in image.kind.contents(image.machine).items():
             self._blocks[name][: len(words)] = words
-        several = registers.replicas if registers.replicas > 1 else 0
-        self._results = self._blocks["RESULTS"][: 4 * registers.result_words]
-        self._outcomes = self._blocks["OUTCOMES"][: several * OUTCOME.itemsize]
+        self._answer[1:] = [self._blocks[name][: 4 * words] for name, words in registers.answer.items()]
         self._allow(BLOCKS[registers.inputs].address, image.interface_sensors, _READ_WRITE)
-        self._allow(rm.RESULTS, image.interface_results, _READ)
-        self._allow(rm.OUTCOMES, len(self._outcomes) // 4, _READ)
+        for name, count in {**registers.answer, "RESULTS": image.interface_results}.items():
+            self._allow(BLOCKS[name].address, count, _READ)
         for name, count in registers.written.items():
             self._allow(BLOCKS[name].address, count, _READ_WRITE)
 
@@ -186,12 +184,12 @@ class EmulatedBoard:
         It measures CPU time of the thread, so that load at this moment does not make the board appear slow for ever.
         """
         host = image.kind.on_host([image.machine])
-        settings, blocks = host.begin(host.slowest()).starts[0]
-        for name, words in blocks.items():
+        course = host.begin(host.slowest())
+        for name, words in course.starts[0].items():
             self._blocks[name][: len(words)] = words
-        machine.start(settings, 1)  # the first start of a kernel takes longer
+        machine.start(course.settings, 1)  # the first start of a kernel takes longer
         began = time.thread_time_ns()
-        machine.start(settings, 1)
+        machine.start(course.settings, 1)
         while machine.paused and machine.cycles < _ALIGNMENT:
             if time.thread_time_ns() - began > CHUNK_S * 1e8:
                 break
@@ -307,7 +305,7 @@ class EmulatedBoard:
                 ErrorCode.BAD_VALUE, f"a slice cannot end at cycle {run_until}: the maximum is {CYCLES_MAX}"
             )
         if doorbell == rm.RESUME:
-            if not machine.paused:
+            if not machine.resumable:
                 self._refuse(ErrorCode.DOORBELL, "there is no slice to resume")
             if 0 < run_until <= machine.cycles:
                 self._refuse(
@@ -374,8 +372,8 @@ class EmulatedBoard:
         DONE_BLOCK.pack_into(self._memory, rm.DONE, self.done, status, cycles, self._compute_ns)
 
     def interrupt_words(self) -> bytes:
-        """Return the payload of an interrupt: DONE to COMPUTE_NS, the results, replicas' outcomes."""
-        return b"".join((self._view[rm.DONE : rm.DONE + DONE_BLOCK.size], self._results, self._outcomes))
+        """Return the payload of an interrupt: DONE to COMPUTE_NS, and the blocks that the image names."""
+        return b"".join(self._answer)
 
     # ---- memory ---------------------------------------------------------------------------------------
 
@@ -390,7 +388,7 @@ class EmulatedBoard:
 _LONG_LOW: Final = frozenset({rm.CYCLES, rm.COMPUTE_NS})
 _DATA: Final = tuple(
     range(block.address, block.address + 4 * block.words)
-    for block in map(
-        BLOCKS.__getitem__, ("SENSORS", "INPUTS", "PRIOR_SELECTS", "OUTCOMES", "RESULTS", "PRIOR_CODES")
-    )
+    for block in rm.BLOCKS
+    if block.address >= rm.SENSORS
 )
+"""The blocks after the registers, of which a board has the words that its image uses."""

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from typing import Final, NoReturn
 
-from machines.kind import OUTCOME
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import CHUNK_S, EmulatedBoard, RefusedError
 from pcie_shim.board.simulation import MOST_WORDS, Simulation
@@ -219,15 +218,12 @@ class RtlBoard:
         self.running = status & rm.STATUS_STATE_MASK == BoardState.RUNNING << rm.STATUS_STATE_SHIFT
 
     def interrupt_words(self) -> bytes:
-        """Return the payload of an interrupt: DONE to COMPUTE_NS, the results, replicas' outcomes."""
+        """Return the payload of an interrupt: DONE to COMPUTE_NS, and the blocks that the image names."""
         words = self.read(rm.DONE, DONE_BLOCK.size // 4)
         if self._image is None:
             return words
-        registers = self._image.registers
-        words += self.read(rm.RESULTS, registers.result_words)
-        if registers.replicas > 1:
-            words += self.read(rm.OUTCOMES, registers.replicas * OUTCOME.itemsize // 4)
-        return words
+        blocks = self._image.registers.answer.items()
+        return words + b"".join(self.read(BLOCKS[name].address, count) for name, count in blocks)
 
     def release(self) -> None:
         """Stop a running machine and disable interrupts, because the host has disconnected."""
@@ -280,9 +276,9 @@ class _Preparation(threading.Thread):
 def _measure_speed(simulation: Simulation, image: Image) -> float:
     """Return the clocks per second of the slowest frame."""
     host = image.kind.on_host([image.machine])
-    settings, blocks = host.begin(host.slowest()).starts[0]
-    places = [(BLOCKS[name].address, words) for name, words in blocks.items()]
-    for address, words in [*places, (rm.TARGET_COUNT, SETTINGS.pack(*settings))]:
+    course = host.begin(host.slowest())
+    places = [(BLOCKS[name].address, words) for name, words in course.starts[0].items()]
+    for address, words in [*places, (rm.TARGET_COUNT, SETTINGS.pack(*course.settings))]:
         for at, (word,) in enumerate(WORD.iter_unpack(words)):
             simulation.write(address + 4 * at, word)
     simulation.write(rm.CONTROL, rm.CONTROL_INTERRUPT_ENABLE_MASK)

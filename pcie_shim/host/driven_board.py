@@ -44,13 +44,12 @@ class DrivenBoard:
         self.image = image
         self._reprogram = reprogram
 
-        # What follows from the image: the extent of a result, which every answer must have, and its reasons.
+        # What follows from the image: the extent of an answer, which begins with the results, and its reasons.
         self._kind = image.kind
         self._reasons = frozenset(image.kind.reasons) - {0}
         self.replicas = image.registers.replicas
         self._results_bytes = 4 * image.registers.result_words
-        outcomes = self.replicas if self.replicas > 1 else 0
-        self._answer_bytes = self._results_bytes + outcomes * OUTCOME.itemsize
+        self._answer_bytes = 4 * sum(image.registers.answer.values())
 
         # Either an open link, or None and the reason why.
         self.link: SocketLink | None = None
@@ -63,7 +62,7 @@ class DrivenBoard:
     def _forget(self) -> None:
         """Forget the contents of the registers, which another host may have written."""
         # Known contents of the board's blocks, empty if unknown: a frame writes only blocks that differ.
-        self.settings = b""
+        self.settings: FrameSettings | None = None
         self._blocks: dict[str, bytes] = {}
 
         # Number of the last doorbell, and whether its answer is still missing: then `done` is None.
@@ -71,7 +70,8 @@ class DrivenBoard:
         self.waiting = False
         self.done: Done | None = None
 
-        # Of the last answer: the stop reason of each replica, and with several their cycles.
+        # Of the last answer: its words, the stop reason of each replica, and with several their cycles.
+        self.answer = memoryview(b"")
         self.reasons: tuple[int, ...] = (0,) * self.replicas
         self._replica_cycles: tuple[int, ...] = ()
 
@@ -187,22 +187,11 @@ class DrivenBoard:
     def start(self, settings: FrameSettings, blocks: Blocks, end: int) -> None:
         """Post a new frame: the inputs and settings that changed, and the doorbell (figure 3.3)."""
         self.waiting = True  # from here on, abandoning the frame must interrupt the board
-        words, known = SETTINGS.pack(*settings), self.settings
-        # Settings, slice and doorbell are adjacent: write one burst from the first changed setting on.
-        if words == known:
-            at = len(words)
-        elif words[:_BANK_AT] != known[:_BANK_AT]:
-            at = 0
-        elif words[_BANK_AT:_PRIOR_AT] != known[_BANK_AT:_PRIOR_AT]:
-            at = _BANK_AT
-        else:
-            at = _PRIOR_AT
-        self.settings = words
-        self._ring(self._changed(blocks), rm.TARGET_COUNT + at, words[at:], _START, end)
+        self._ring(settings, blocks, _START, end)
 
-    def resume(self, blocks: Blocks, end: int) -> None:
-        """Post the writes of these blocks, and the start of the frame's next slice."""
-        self._ring(self._changed(blocks), rm.RUN_UNTIL, b"", _RESUME, end, 0)
+    def resume(self, settings: FrameSettings, blocks: Blocks, end: int) -> None:
+        """Post the frame's next slice: the blocks and settings that changed, and the doorbell."""
+        self._ring(settings, blocks, _RESUME, end, 0)
 
     def _changed(self, blocks: Blocks) -> list[RegisterWrite]:
         """Return the blocks whose contents must be written, and record them as known."""
@@ -213,15 +202,28 @@ class DrivenBoard:
                 self._blocks[name] = words
         return writes
 
-    def _ring(
-        self, writes: list[RegisterWrite], address: int, before: bytes, layout: struct.Struct, *words: int
-    ) -> None:
+    def _changed_settings(self, settings: FrameSettings) -> bytes:
+        """Return the settings to write, from the first changed one to the last, and record them as known."""
+        known = self.settings
+        if settings == known:
+            return b""
+        words = SETTINGS.pack(*settings)
+        self.settings = settings
+        if known is None or settings[:2] != known[:2]:
+            return words
+        return words[_BANK_AT if settings.bank != known.bank else _PRIOR_AT :]
+
+    def _ring(self, settings: FrameSettings, blocks: Blocks, layout: struct.Struct, *words: int) -> None:
         link = self.open_link
+        writes = self._changed(blocks)
+        # settings, slice and doorbell are adjacent, and so one burst
+        before = self._changed_settings(settings)
         # the board refuses any number but the next, so a repeated start does nothing
         self.number = next_doorbell(self.number)
         self.waiting = True
         self.done = None
-        link.post([*writes, (address, before + layout.pack(*words, self.number))])
+        writes.append((rm.RUN_UNTIL - len(before), before + layout.pack(*words, self.number)))
+        link.post(writes)
 
     def receive(self) -> bool:
         """Receive once, after a poll; return whether the board is done.
@@ -263,6 +265,7 @@ class DrivenBoard:
         else:
             self.reasons = (done.reason,)
         self.waiting = False
+        self.answer = done.results
         self.done = done
 
     def result(self) -> BoardResult:

@@ -197,9 +197,10 @@ class MiniCluster:
         self._make_ready()
         progress = self._progress = _Progress(frame.max_cycles, course, self._boards)
         try:
-            for board, (settings, blocks) in zip(self._boards, course.starts, strict=True):
+            settings, end = course.settings, course.end
+            for board, blocks in zip(self._boards, course.starts, strict=True):
                 try:
-                    board.start(settings, blocks, course.end)
+                    board.start(settings, blocks, end)
                 except LinkError as error:
                     self._fail(board, error)
             self._expect_done(progress)
@@ -288,19 +289,19 @@ class MiniCluster:
             board.done.compute_ns for board in progress.running if board.done is not None
         )
         course = progress.course
-        numbers, blocks = course.proceed([board.reasons for board in self._boards])
+        numbers, blocks = course.proceed(self._boards)
         if numbers:
             progress.running = [self._boards[number] for number in numbers]
             for board in progress.running:
                 try:
-                    board.resume(blocks, course.end)
+                    board.resume(course.settings, blocks, course.end)
                 except LinkError as error:
                     self._fail(board, error)
             self._expect_done(progress)
             return None
-        results = tuple(board.result() for board in self._boards)
+        results = course.conclude([board.result() for board in self._boards])
         return FrameOutput(
-            boards=results,
+            boards=tuple(results),
             register_writes_ns=progress.writes_ns,
             compute_ns=progress.waits_ns,
             reads_ns=time.perf_counter_ns() - progress.clock_ns,

@@ -61,6 +61,10 @@ class SimulatedHardware:
         return Simulation(found.command, found.folder)
 
     def _compiled(self, image: Image) -> Compiled:
+        if not image.kind.has_hardware:
+            raise SimulationError(
+                f"There is no hardware of a {image.kind.name}: use emulated boards (--engine emulated)"
+            )
         try:
             return compiled(image, self._simulator, self._folder, say)
         except HardwareToolError as error:

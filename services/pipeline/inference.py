@@ -9,7 +9,8 @@ from toolchain.deployment import Deployment
 
 def infer(result: FrameResult, deployment: Deployment) -> Inference:
     """Return the posterior for the results of all boards, computed by the kind of their machines."""
-    return deployment.machine.kind.infer(decode_boards(result))
+    machine = deployment.machine
+    return machine.kind.infer(decode_boards(result), machine.variables)
 
 
 def report_of(
@@ -62,4 +63,5 @@ def report_of(
             )
             for index, (board, total) in enumerate(zip(inference.boards, inference.totals, strict=True))
         ),
+        details=inference.details,
     )

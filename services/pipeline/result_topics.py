@@ -13,7 +13,7 @@ from bridge.client import Publication, Ros, State, Subscription
 from bridge.errors import BridgeError, DisconnectedError, NoMessageError, SlowPeerError
 from machines.kind import Inference
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, write_frame_report
-from posteriors.posterior import MAX_RESULT, posterior_layout
+from posteriors.posterior import MAX_RESULT, SAMPLES_TOPIC, SAMPLES_TYPE, posterior_layout, samples_layout
 from services.pipeline.connections import AdvertisedTopic, OnState, connect_all
 from services.pipeline.inference import infer, report_of
 from services.settings import Settings
@@ -52,9 +52,11 @@ class ResultTopics:
         self._ros_version: Literal[1, 2] = 2
         self._deployment = deployment
         self._layout = posterior_layout(deployment)
-        # From `opened` on: each output with its server, and the topic of reports on the first server.
+        # From `opened` on: each output with its server, and the topics of reports and, if the machine streams them,
+        # samples on the first server.
         self._outputs: list[tuple[Ros, Publication]] = []
         self._frames: Publication | None = None
+        self._samples: Publication | None = None
         # The subscription to the first output, in a run of one frame.
         self._watched: Subscription | None = None
         # A report precedes its result, so it contains how long the previous result took to send.
@@ -77,6 +79,8 @@ class ResultTopics:
             # reports go to one server only, because a listener of several would get each twice
             first = by_uri[uris[0]]
             self._frames = await first.advertise(FRAME_TOPIC, FRAME_TYPE)
+            if deployment.machine.stream:
+                self._samples = await first.advertise(SAMPLES_TOPIC, SAMPLES_TYPE)
             self._ros_version = await first.detect_ros_version() or 2
             self.reports = AdvertisedTopic(first, uris[0], FRAME_TOPIC, FRAME_TYPE)
             topics = ", ".join(output.topic for output in deployment.outputs)
@@ -165,6 +169,10 @@ class ResultTopics:
             reported = self._frames is not None and _sent(
                 self._frames, write_frame_report(report, self._ros_version)
             )
+            if self._samples is not None and inference.samples:
+                width = inference.sample_bytes
+                layout = samples_layout(len(inference.samples) // width, width)
+                _sent(self._samples, {"layout": layout, "data": inference.samples})
             if posterior is not None:
                 for _, publication in self._outputs:
                     missed += not _sent(publication, {"layout": self._layout, "data": posterior})

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -55,14 +56,18 @@ class OnBoard(BoardMachine):
 
     resume = step
 
+    @property
+    def resumable(self):
+        return self.paused
+
 
 class Course(FrameCourse):
-    def __init__(self, starts):
-        self.starts, self.begun, self.end = starts, 0, 2
+    def __init__(self, settings, starts):
+        self.settings, self.starts, self.begun, self.end = settings, starts, 0, 2
 
-    def proceed(self, reasons):
+    def proceed(self, boards):
         self.begun, self.end = self.end, 0
-        return [board for board, (reason,) in enumerate(reasons) if reason == 7], {}
+        return [at for at, board in enumerate(boards) if board.reasons == (7,)], {}
 
 
 class OnHost(HostMachine):
@@ -73,15 +78,16 @@ class OnHost(HostMachine):
         if frame.addresses[0] is None:
             raise StartError("this machine needs a reading.")
         words = np.array(frame.addresses, "<u4").tobytes()
-        start = FrameSettings(frame.target_count, frame.max_cycles, frame.bank, 0), {"SENSORS": words}
-        return Course([start] * len(self._machines))
+        settings = FrameSettings(frame.target_count, frame.max_cycles, frame.bank, 0)
+        return Course(settings, [{"SENSORS": words}] * len(self._machines))
 
     def slowest(self):
         return FrameInput(addresses=(1,), target_count=5, max_cycles=9)
 
 
 class Weighing(MachineKind):
-    name, parameters, reasons = "WEIGHING", Weights, {0: "not started", 7: "paused", 9: "weighed"}
+    name, has_hardware, parameters = "WEIGHING", False, Weights
+    reasons: ClassVar = {0: "not started", 7: "paused", 9: "weighed"}
 
     def sections(self, machine):
         return [("weights", machine.weights)]
@@ -100,6 +106,7 @@ class Weighing(MachineKind):
             inputs="SENSORS",
             input_words=1,
             result_words=parameters.lines,
+            answer={"RESULTS": parameters.lines},
             capabilities=capabilities,
             size="one input",
         )
@@ -112,11 +119,11 @@ class Weighing(MachineKind):
 
     on_board, on_host, joint_reason = staticmethod(OnBoard), staticmethod(OnHost), staticmethod(max)
 
-    def infer(self, results):
+    def infer(self, results, variables=()):
         counts = np.concatenate([board.counts for board in results])
         return Inference(results, counts / counts.sum(), [int(board.counts.sum()) for board in results], "")
 
-    def posterior(self, machines, frame):
+    def posterior(self, machines, frame, variables=()):
         raise NotImplementedError
 
 

@@ -49,6 +49,7 @@ REPORT = FrameReport(
             replica_stopped=("max cycles", "impossible"),
         ),
     ),
+    details={"samples": "9", 'of "b"': "100 % {x}"},
 )
 
 
@@ -65,7 +66,7 @@ def test_a_report_that_is_written_is_read_back_whole(ros_version):
     assert keys == [
         *("number", "published", "cycles", "counts_total", "received_ns", "sent_ns"),
         *("rosbridge_in_us", "local_hops_us", "waited_us", "register_writes_us", "compute_us"),
-        *("reads_us", "boards_compute_us", "rosbridge_out_us"),
+        *("reads_us", "boards_compute_us", "rosbridge_out_us", "samples", 'of "b"'),
     ]
 
 

@@ -300,6 +300,10 @@ class BM1Section(CommonSection):
     replicas: int = Field(default=1, ge=1, le=REPLICAS_MAX, exclude_if=lambda replicas: replicas == 1)
     is_divided: ClassVar[bool] = True
     """True if each board has a part of the lines, False if each has the whole machine."""
+    stream: ClassVar = 0
+    """States that a board buffers for the topic of samples; 0: there is none."""
+    variables: ClassVar[tuple[str, ...]] = ()
+    """Names of the machine's variables, if its results need them."""
 
     @model_validator(mode="after")
     def _target_fits(self) -> Self:
@@ -346,6 +350,7 @@ class BM2Section(CommonSection):
     target_count: int = Field(default=10_000, ge=1, le=_WORD_MAX)
     max_cycles: int = Field(default=2**32, ge=1, le=CYCLES_MAX)
     stream: int = Field(default=0, ge=0, le=_WORD_MAX)
+    variables: Sequence[Name] = ()
 
     # what a BM1 may have and a BM2 never has, so that nobody needs to ask which one it is
     scale: ClassVar = Scale.NONE

@@ -470,7 +470,7 @@ def write_what_is_refused(patch, cluster):
 
     def refused(frame):
         course = begin(frame)
-        course.starts = [(FrameSettings(0, 0, 0, 0), {})] * 2
+        course.settings, course.starts = FrameSettings(0, 0, 0, 0), [{}] * 2
         return course
 
     patch.setattr(cluster._machines, "begin", refused)
