@@ -57,7 +57,13 @@ def _bm1() -> "MachineKind":
     return BM1
 
 
-KINDS: Final[dict[str, Callable[[], "MachineKind"]]] = {"BM1": _bm1}
+def _bm2() -> "MachineKind":
+    from machines.bm2_kind import BM2
+
+    return BM2
+
+
+KINDS: Final[dict[str, Callable[[], "MachineKind"]]] = {"BM1": _bm1, "BM2": _bm2}
 """Functions that import and return the kinds of machines, by name; the subscriber must not import NumPy."""
 
 

@@ -1,173 +1,325 @@
-"""A second kind of machine, which nobody outside `machines` has heard of, from its programming file to a posterior."""
+"""The second kind of machine, BM2, from its programming file over emulated boards to a posterior.
 
-from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import ClassVar
+frame ──▶ on_host ── blocks ──▶ board 0, board 1 (chains) ── answers ──▶ course ──▶ infer
+                        the same blocks ──▶ a kernel in this process ── must be equal, to the bit
+"""
 
+import msgspec
 import numpy as np
 import pytest
 
 from machines import KINDS
-from machines.errors import StartError
-from machines.kind import (
-    BoardMachine,
-    FrameCourse,
-    FrameInput,
-    FrameSettings,
-    HostMachine,
-    Inference,
-    MachineKind,
-    UsedRegisters,
-)
+from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, SampleEvery, Sequencer
+from machines.bm2_kind import BATCHES, BM2, STREAM_BYTES_MAX, Kept
+from machines.errors import NoPosteriorError
+from machines.kind import FrameInput
+from pcie_shim import register_map as rm
+from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
+from pcie_shim.board.rtl_board import RtlBoard
 from pcie_shim.errors import FrameInputError, ImageMismatchError
 from pcie_shim.programming_file import Image, Partition, image_bytes, image_from_bytes
-from tests.pcie_shim.boards import opened
+from pcie_shim.register_map import ErrorCode
+from services.boards.hardware import Engine, SimulatedHardware
+from tests.pcie_shim.boards import image as bm1_image
+from tests.pcie_shim.boards import machine as bm1_machine
+from tests.pcie_shim.boards import opened, words
+
+FACTORS = (
+    np.array([0.8, 0.2]),
+    np.array([[0.6, 0.4], [0.99, 0.01]]),
+    np.array([[[1.0, 0.0], [0.1, 0.9]], [[0.2, 0.8], [0.01, 0.99]]]),
+)
+"""The sprinkler: rain, sprinkler given rain, wet grass given both."""
+RAIN_GIVEN_WET = 0.16038 / 0.44838
 
 
-@dataclass(frozen=True)
-class Weights:
-    """The parameters of a machine that multiplies its input by weights, one cycle for each unit of the target."""
-
-    lines: int
-
-
-class OnBoard(BoardMachine):
-    paused, reason, cycles = False, 0, 0
-
-    def __init__(self, machine, memory):
-        self._machine, self._memory = machine, memory
-
-    def reset(self):
-        self.paused, self.reason, self.cycles = False, 0, 0
-
-    prepare = reset
-
-    def start(self, settings, end):
-        self._target, self.cycles = settings.target_count, 0
-        self._memory["RESULTS"][: 4 * self._machine.parameters.lines] = (
-            self._machine.weights * np.frombuffer(self._memory["SENSORS"], "<u4", 1)
-        ).tobytes()
-        self.step(end)
-
-    def step(self, end):
-        self.cycles = min(self._target, end or self._target)
-        self.paused = self.cycles < self._target
-        self.reason = 7 if self.paused else 9
-
-    resume = step
-
-    @property
-    def resumable(self):
-        return self.paused
-
-
-class Course(FrameCourse):
-    def __init__(self, settings, starts):
-        self.settings, self.starts, self.begun, self.end = settings, starts, 0, 2
-
-    def proceed(self, boards):
-        self.begun, self.end = self.end, 0
-        return [at for at, board in enumerate(boards) if board.reasons == (7,)], {}
-
-
-class OnHost(HostMachine):
-    def __init__(self, machines):
-        self._machines = machines
-
-    def begin(self, frame):
-        if frame.addresses[0] is None:
-            raise StartError("this machine needs a reading.")
-        words = np.array(frame.addresses, "<u4").tobytes()
-        settings = FrameSettings(frame.target_count, frame.max_cycles, frame.bank, 0)
-        return Course(settings, [{"SENSORS": words}] * len(self._machines))
-
-    def slowest(self):
-        return FrameInput(addresses=(1,), target_count=5, max_cycles=9)
-
-
-class Weighing(MachineKind):
-    name, has_hardware, parameters = "WEIGHING", False, Weights
-    reasons: ClassVar = {0: "not started", 7: "paused", 9: "weighed"}
-
-    def sections(self, machine):
-        return [("weights", machine.weights)]
-
-    def due_sections(self, parameters):
-        yield "weights", "<u4", (parameters.lines,)
-
-    def machine(self, parameters, sections):
-        return SimpleNamespace(parameters=parameters, weights=sections["weights"])
-
-    def registers(self, parameters):
-        capabilities = {"CAP_MACHINE.KIND": 99, "CAP_LINES": parameters.lines, "CAP_REPLICAS": 1}
-        return UsedRegisters(
-            lines=parameters.lines,
-            replicas=1,
-            inputs="SENSORS",
-            input_words=1,
-            result_words=parameters.lines,
-            answer={"RESULTS": parameters.lines},
-            capabilities=capabilities,
-            size="one input",
-        )
-
-    def contents(self, machine):
-        return {}
-
-    def kernel(self, machine):
-        return machine
-
-    on_board, on_host, joint_reason = staticmethod(OnBoard), staticmethod(OnHost), staticmethod(max)
-
-    def infer(self, results, variables=()):
-        counts = np.concatenate([board.counts for board in results])
-        return Inference(results, counts / counts.sum(), [int(board.counts.sum()) for board in results], "")
-
-    def posterior(self, machines, frame, variables=()):
-        raise NotImplementedError
-
-
-KIND = Weighing()
-
-
-@pytest.fixture
-def parts(monkeypatch):
-    """The images of two boards, with the weights 1, 2 and 5."""
-    monkeypatch.setitem(KINDS, KIND.name, lambda: KIND)
-    images = []
-    for at, weights in enumerate(([1, 2], [5])):
-        machine = KIND.machine(Weights(len(weights)), {"weights": np.array(weights, "<u4")})
-        images.append(
-            Image(machine, Partition(at, 2, 2 * at, 3), 1, 3, "ab" * 32, "2026-01-02T03:04:05Z", "0")
-        )
-    return images
-
-
-def test_it_runs_on_boards_and_gives_a_posterior(parts):
-    with opened(parts) as cluster:
-        for reading, slices in ((3, 2), (8, 2)):
-            output = cluster.run(FrameInput(addresses=(reading,), target_count=5, max_cycles=9))
-            assert [board.counts.tolist() for board in output.boards] == [
-                [reading, 2 * reading],
-                [5 * reading],
-            ]
-            assert [(board.cycles, board.reason) for board in output.boards] == [(5, 9)] * 2
-            assert output.slices == slices
-            inference = parts[0].kind.infer(output.boards)
-            assert inference.posterior.tolist() == [1 / 8, 2 / 8, 5 / 8]
-            assert inference.best == 2
-        with pytest.raises(FrameInputError):
-            cluster.run(FrameInput(addresses=(None,), target_count=5, max_cycles=9))
-
-
-def test_a_programming_file_names_its_kind(parts, monkeypatch):
-    content = image_bytes(parts[0])
-    found = image_from_bytes(content)
-    assert (found.kind, found.machine.parameters, found.machine.weights.tolist()) == (
-        KIND,
-        Weights(2),
-        [1, 2],
+def sprinkler(chain=0, chains=1, **parameters):
+    built = BM2Parameters(
+        cardinalities=(2, 2, 2),
+        factors=((0,), (0, 1), (0, 1, 2)),
+        **({"searched": (0,), "known": (2,), "burn_in": 50, "chain": chain, "chains": chains} | parameters),
     )
-    monkeypatch.delitem(KINDS, KIND.name)
-    with pytest.raises(ImageMismatchError, match="WEIGHING"):
+    return BM2Machine.from_factors(built, FACTORS)
+
+
+def weather(**parameters):
+    """Three variables with unused codes; value 2 of the first is impossible."""
+    built = BM2Parameters(
+        cardinalities=(3, 5, 3),
+        factors=((0,), (0, 1), (1, 2)),
+        searched=(2, 1),
+        known=(0,),
+        **({"burn_in": 20} | parameters),
+    )
+    of_two = np.ones((5, 3))
+    of_two[4, 2] = 0
+    return BM2Machine.from_factors(built, (np.array([1.0, 2.0, 0.0]), np.arange(15.0).reshape(3, 5), of_two))
+
+
+def image(machine):
+    parameters = machine.parameters
+    partition = Partition(parameters.chain, parameters.chains, parameters.chain, parameters.chains)
+    return Image(machine, partition, 20, 1200, "ab" * 32, "2026-01-02T03:04:05Z", "0")
+
+
+def images(count=1, **parameters):
+    return [image(sprinkler(chain, count, **parameters)) for chain in range(count)]
+
+
+def frame(*addresses, samples=300, **settings):
+    return FrameInput(addresses=addresses, target_count=samples, **({"max_cycles": 2**32} | settings))
+
+
+def expected(machine, *, state, known, samples=300, bank=0, batches=BATCHES, max_cycles=2**32):
+    """The result words, cycles and reason, the samples and unused of each batch, and the stream of a kernel."""
+    parameters, kernel = machine.parameters, BM2.kernel(machine)
+    targets = [samples * (at + 1) // batches for at in range(batches)]
+    first = targets[0] if not parameters.stream else samples
+    kernel.start(
+        BM2Start(
+            state=state,
+            known=known,
+            samples=first,
+            burn_in=parameters.burn_in,
+            ops_timeout=parameters.ops_timeout,
+            max_cycles=max_cycles,
+            bank=bank,
+            sequencer=parameters.sequencer,
+        )
+    )
+    done, stream = [(kernel.samples, kernel.unused)], kernel.stream.tobytes()
+    while kernel.reason is BM2StopReason.FULL:
+        kernel.resume(samples)
+        stream += kernel.stream.tobytes()
+        done = [(kernel.samples, kernel.unused)]
+    for target in targets[1:] if not parameters.stream else ():
+        if kernel.reason is BM2StopReason.SAMPLES:
+            kernel.resume(target)
+            done.append((kernel.samples, kernel.unused))
+    return (kernel.results.tolist(), kernel.cycles, kernel.reason, done, stream)
+
+
+def found(result):
+    kept = msgspec.msgpack.decode(result.kept, type=Kept)
+    done = list(zip(kept.samples, kept.unused, strict=True))
+    return (result.counts.tolist(), result.cycles, result.reason, done, kept.stream)
+
+
+@pytest.mark.parametrize("sequencer", Sequencer)
+def test_two_boards_are_chains_equal_to_kernels(sequencer):
+    parts = images(2, sequencer=sequencer)
+    with opened(parts) as cluster:
+        for bank in (3, 4):
+            output = cluster.run(frame(1, bank=bank))
+            # the even board starts from the smallest state that has wet grass, the odd one from the largest
+            wanted = [
+                expected(part.machine, state=state, known=0b100, bank=bank)
+                for part, state in zip(parts, (0b110, 0b111), strict=True)
+            ]
+            assert [found(board) for board in output.boards] == wanted
+            assert output.slices == BATCHES
+    inference = BM2.infer(output.boards, ("rain", "sprinkler", "grass"))
+    assert (inference.outcome, inference.details["samples"]) == ("posterior", "600")
+    assert inference.posterior[1] == pytest.approx(RAIN_GIVEN_WET, abs=0.3)
+    assert float(inference.details["r_hat"]) > 0.9
+    assert 0 < float(inference.details["effective_samples"]) <= 600
+    assert (
+        inference.posterior.tolist()
+        == BM2.posterior([part.machine for part in parts], frame(1, bank=4)).tolist()
+    )
+
+
+@pytest.mark.parametrize("sample_every", SampleEvery)
+def test_a_stream_that_is_full_makes_the_board_wait_and_changes_nothing(sample_every):
+    streamed, plain = (images(stream=stream, sample_every=sample_every, burn_in=10)[0] for stream in (7, 0))
+    with opened([streamed]) as cluster:
+        output = cluster.run(frame(1, samples=100))
+    with opened([plain]) as cluster:
+        whole = cluster.run(frame(1, samples=100))
+    assert output.slices == -(-100 // 7)
+    assert found(output.boards[0]) == expected(streamed.machine, state=0b110, known=0b100, samples=100)
+    assert output.boards[0].counts.tolist() == whole.boards[0].counts.tolist()
+    inference = BM2.infer(output.boards)
+    assert (len(inference.samples), inference.sample_bytes) == (400, 4)
+    states = np.frombuffer(inference.samples, "<u4")
+    assert (states >> 2 == 1).all()
+    assert np.bincount(states & 1, minlength=2).tolist() == output.boards[0].counts[:2].tolist()
+    assert not BM2.infer(whole.boards).samples
+
+
+def test_readings_may_be_missing_and_codes_unused():
+    machine = weather()
+    with opened([image(machine)]) as cluster:
+        output = cluster.run(frame(None))
+    assert found(output.boards[0]) == expected(machine, state=0b00_001_00, known=0)
+    inference = BM2.infer(output.boards)
+    assert inference.posterior.sum() == pytest.approx(1)
+    posterior = inference.posterior.reshape(3, 5)
+    assert posterior[2, 4] == 0
+    assert posterior[0, 4] > posterior[0, 0] > 0
+    unused = int(inference.details["unused"])
+    assert inference.details["samples"] == "300"
+    assert inference.totals == [300 - unused]
+
+
+def test_impossible_readings_are_no_error():
+    machine = weather()
+    with opened([image(machine)]) as cluster:
+        for _ in range(2):
+            output = cluster.run(frame(2))
+            assert (output.boards[0].reason, output.boards[0].cycles) == (BM2StopReason.IMPOSSIBLE, 0)
+            inference = BM2.infer(output.boards)
+            assert inference.posterior is None
+            assert "impossible" in inference.outcome
+            assert cluster.run(frame(1, samples=5)).boards[0].reason == BM2StopReason.SAMPLES
+    with pytest.raises(NoPosteriorError):
+        BM2.posterior([machine], frame(2))
+
+
+def test_a_board_that_times_out_is_left_out_and_named():
+    names = ("rain", "sprinkler", "grass")
+    with opened(images()) as cluster:
+        good = cluster.run(frame(1)).boards[0]
+    with opened(images(ops_timeout=1)) as cluster:
+        late = cluster.run(frame(1)).boards[0]
+    assert late.reason == BM2StopReason.OPS_TIMEOUT
+    alone, both = BM2.infer([late], names), BM2.infer([good, late], names)
+    assert alone.posterior is None
+    (name,) = (name for name in names if name in alone.outcome)
+    for sentence, board in ((alone.outcome, "board0"), (both.details["left_out"], "board1")):
+        assert board in sentence
+        assert name in sentence
+        assert "--ops-timeout" in sentence
+    assert both.details["samples"] == "300"
+    assert both.posterior.tolist() == BM2.infer([good]).posterior.tolist()
+
+
+def test_a_result_that_ended_by_max_cycles_is_marked():
+    with opened(images()) as cluster:
+        inference = BM2.infer(cluster.run(frame(1, max_cycles=900)).boards)
+    assert "board0" in inference.details["ended_early"]
+    assert inference.posterior is not None
+
+
+@pytest.mark.parametrize(
+    ("given", "settings", "word"),
+    [
+        ((2,), {}, "address"),
+        ((-1,), {}, "address"),
+        ((1, 1), {}, "readings"),
+        ((1,), {"samples": 0}, "samples"),
+        ((1,), {"bank": 16}, "bank"),
+        ((1,), {"max_cycles": 0}, "cycles"),
+    ],
+)
+def test_a_frame_that_does_not_fit_is_refused_before_the_boards(given, settings, word):
+    with opened(images()) as cluster:
+        with pytest.raises(FrameInputError, match=word):
+            cluster.run(frame(*given, **settings))
+        assert cluster.run(frame(1, samples=5)).boards[0].reason == BM2StopReason.SAMPLES
+
+
+def test_frames_that_no_chain_can_run_are_refused():
+    with opened([image(sprinkler(known=(0, 1, 2), searched=()))]) as cluster, pytest.raises(FrameInputError):
+        cluster.run(frame(1, 1, 1))
+    with opened(images(stream=8)) as cluster, pytest.raises(FrameInputError):
+        cluster.run(frame(1, samples=STREAM_BYTES_MAX // 4 + 1))
+
+
+def board_with(machine):
+    board = EmulatedBoard()
+    board.load(image_bytes(image(machine)))
+    return board
+
+
+@pytest.mark.parametrize(
+    "writes",
+    [
+        {rm.RUN_UNTIL: words(256, 0)},
+        {rm.START_STATE: words(0b11), rm.KNOWN_MASK: words(0b11)},  # a code that is no value
+        {rm.START_STATE: words(1 << 7)},
+        {rm.KNOWN_MASK: words(0b1)},
+        {rm.KNOWN_MASK: words(0b1111111)},
+        {rm.ORDER: words(3)},
+        {rm.OPS_TIMEOUT: words(0)},
+        {rm.BANK: words(16)},
+        {rm.PRIOR_SELECT: words(1)},
+        {rm.MAX_CYCLES: words(0, 0)},
+    ],
+)
+def test_a_board_refuses_a_start_that_does_not_fit(writes):
+    board = board_with(weather())
+    board.write(rm.TARGET_COUNT, words(10, 1 << 20, 0, 0, 0, 0, 0))
+    for address, value in writes.items():
+        board.write(address, value)
+    with pytest.raises(RefusedError) as refused:
+        board.write(rm.START, words(1))
+    assert refused.value.code is ErrorCode.BAD_VALUE
+    assert not board.running
+    assert board.done == 0
+
+
+def test_a_board_has_the_registers_of_its_kind():
+    board = board_with(weather(stream=8))
+    for absent in (rm.SENSORS, rm.INPUTS, rm.PRIOR_CODES, rm.OUTCOMES):
+        with pytest.raises(RefusedError):
+            board.read(absent, 1)
+    for readable in (rm.SAMPLES_DONE, rm.UNUSED, rm.TIMED_OUT_BIT, rm.STREAM_COUNT, rm.STREAM + 28):
+        board.read(readable, 1)
+        with pytest.raises(RefusedError):
+            board.write(readable, words(1))
+    with pytest.raises(RefusedError):
+        board.read(rm.STREAM + 32, 1)
+    (machine,) = np.frombuffer(board.read(rm.CAP_MACHINE, 1), "<u4")
+    assert machine & rm.CAP_MACHINE_KIND_MASK == 2
+    assert machine & rm.CAP_MACHINE_STREAM_MASK
+    plain = EmulatedBoard()
+    plain.load(image_bytes(bm1_image(bm1_machine())))
+    for absent in (rm.START_STATE, rm.KNOWN_MASK, rm.BURN_IN, rm.SAMPLES_DONE, rm.STREAM):
+        with pytest.raises(RefusedError):
+            plain.read(absent, 1)
+
+
+def test_a_resume_needs_more_samples_and_a_run_to_resume():
+    board = board_with(weather())
+    board.write(rm.TARGET_COUNT, words(10, 1 << 30, 0, 0, 0, 0, 0))
+    with pytest.raises(RefusedError):
+        board.write(rm.RESUME, words(1))
+    board.write(rm.START_STATE, words(0b00100))
+    board.write(rm.START, words(1))
+    while board.running:
+        board.step()
+    with pytest.raises(RefusedError) as refused:
+        board.write(rm.RESUME, words(2))
+    assert refused.value.code is ErrorCode.BAD_VALUE
+    board.write(rm.TARGET_COUNT, words(12))
+    board.write(rm.RESUME, words(2))
+    while board.running:
+        board.step()
+    assert board.read(rm.SAMPLES_DONE, 1) == words(12)
+
+
+def test_either_image_replaces_the_other_on_an_emulated_board():
+    board = EmulatedBoard()
+    for content in (images()[0], bm1_image(bm1_machine()), images(stream=4)[0]):
+        board.load(image_bytes(content))
+        assert board.image_hash == content.image_hash
+
+
+def test_simulated_hardware_of_the_other_kind_refuses_it(monkeypatch, tmp_path):
+    monkeypatch.setattr("services.boards.hardware.check_tools", lambda _: None)
+    hardware = SimulatedHardware(Engine.GHDL, tmp_path, {})
+    board = RtlBoard(hardware._simulate)
+    with pytest.raises(RefusedError, match="BM2") as refused:
+        board.load(image_bytes(images()[0]))
+    assert refused.value.code is ErrorCode.BAD_IMAGE
+
+
+def test_a_programming_file_names_its_kind(monkeypatch):
+    part = images(stream=3, sequencer="coloured")[0]
+    content = image_bytes(part)
+    again = image_from_bytes(content)
+    assert (again.kind, again.machine) == (BM2, part.machine)
+    monkeypatch.delitem(KINDS, BM2.name)
+    with pytest.raises(ImageMismatchError, match="BM2"):
         image_from_bytes(content)
