@@ -45,10 +45,11 @@ def make_bm2_kernel(machine: "BM2Machine") -> "BM2Kernel":
 
 
 def warm_up() -> None:
-    """Load the fast kernel (the first time, compile it) before the first frame; forked processes share it."""
-    from machines import fast
+    """Load the fast kernels (the first time, compile them) before the first frame; forked processes share them."""
+    from machines import bm2_fast, fast
 
     fast.warm_up()
+    bm2_fast.warm_up()
 
 
 def _bm1() -> "MachineKind":

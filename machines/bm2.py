@@ -32,9 +32,6 @@ FACTOR_BITS_MAX: Final = 20
 RESULT_WORDS_MAX: Final = 4096
 """Maximum number of words of histograms and joint: the result memory of the register map."""
 
-STREAM_WORDS_MAX: Final = 4096
-"""Maximum number of words of the stream's buffer: the window of the register map."""
-
 CHAINS_MAX: Final = 65536
 """Maximum number of boards that run chains of one model."""
 
@@ -133,10 +130,10 @@ class BM2Parameters:
             ("ideal_seed", 0, 2**64 - 1),
             ("chains", 1, CHAINS_MAX),
             ("chain", 0, self.chains - 1),
+            ("stream", 0, SAMPLES_MAX),
         ):
             check_parameter(name, getattr(self, name), lowest, highest)
         self._check_variables()
-        check_parameter("stream", self.stream, 0, STREAM_WORDS_MAX // self.state_words)
         if self.literal and self.sequencer is Sequencer.COLOURED:
             raise ParameterError(
                 "sequencer = coloured is not possible with literal = true; use linear or random."

@@ -8,20 +8,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from machines.bm2 import (
-    SAMPLES_MAX,
-    BM2Machine,
-    BM2Parameters,
-    BM2Start,
-    BM2StopReason,
-    SampleEvery,
-    Sequencer,
-    start_state,
-)
+from machines import make_bm2_kernel
+from machines.bm2 import SAMPLES_MAX, BM2Machine, BM2Parameters, BM2Start, BM2StopReason, start_state
 from machines.bm2_estimate import Chain, estimate, searched_counts, searched_values
 from machines.bm2_kernel import BM2Kernel
-from machines.bm2_reference import ReferenceBM2
-from machines.errors import MachineError, NoPosteriorError, StartError
+from machines.errors import MachineError, NoPosteriorError, ParameterError, StartError
 from machines.kind import (
     Blocks,
     BoardMachine,
@@ -35,7 +26,10 @@ from machines.kind import (
     StoppedBoard,
     UsedRegisters,
 )
-from machines.parameters import CYCLES_MAX, RngKind, RngReset
+from machines.parameters import CYCLES_MAX, RngKind, RngReset, SampleEvery, Sequencer
+
+STREAM_WORDS_MAX: Final = 4096
+"""Maximum number of words of the stream's buffer: the window of the register map."""
 
 BATCHES: Final = 20
 """Parts of a frame without a stream, whose means tell how much the samples depend on each other."""
@@ -97,6 +91,10 @@ class BM2Kind(MachineKind):
     def registers(self, parameters: BM2Parameters) -> UsedRegisters:
         """Return the registers; the line of a board is its chain."""
         words = parameters.state_words
+        if parameters.stream * words > STREAM_WORDS_MAX:
+            raise ParameterError(
+                f"stream is {parameters.stream}; a board has room for {STREAM_WORDS_MAX // words} states of {words} words."
+            )
         answer = {"RESULTS": parameters.result_words} | dict.fromkeys(_ANSWER, 1)
         if parameters.stream:
             answer |= {"STREAM_COUNT": 1, "STREAM": parameters.stream * words}
@@ -133,7 +131,7 @@ class BM2Kind(MachineKind):
 
     def kernel(self, machine: BM2Machine) -> BM2Kernel:
         """Return the fastest kernel that runs the machine."""
-        return ReferenceBM2(machine)
+        return make_bm2_kernel(machine)
 
     def on_board(self, kernel: BM2Kernel, memory: Mapping[str, memoryview]) -> BoardMachine:
         """Return a kernel behind the registers of a board."""

@@ -1,7 +1,7 @@
 """The second kind of machine, BM2, from its programming file over emulated boards to a posterior.
 
 frame ──▶ on_host ── blocks ──▶ board 0, board 1 (chains) ── answers ──▶ course ──▶ infer
-                        the same blocks ──▶ a kernel in this process ── must be equal, to the bit
+                        the same start ──▶ the reference in this process ── must be equal, to the bit
 """
 
 import msgspec
@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from machines import KINDS
-from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, SampleEvery, Sequencer
+from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason
 from machines.bm2_kind import BATCHES, BM2, STREAM_BYTES_MAX, Kept
-from machines.errors import NoPosteriorError
+from machines.errors import NoPosteriorError, ParameterError
 from machines.kind import FrameInput
+from machines.parameters import SampleEvery, Sequencer
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.board.rtl_board import RtlBoard
@@ -222,6 +223,8 @@ def test_a_frame_that_does_not_fit_is_refused_before_the_boards(given, settings,
 def test_frames_that_no_chain_can_run_are_refused():
     with opened([image(sprinkler(known=(0, 1, 2), searched=()))]) as cluster, pytest.raises(FrameInputError):
         cluster.run(frame(1, 1, 1))
+    with pytest.raises(ParameterError):
+        images(stream=4097)
     with opened(images(stream=8)) as cluster, pytest.raises(FrameInputError):
         cluster.run(frame(1, samples=STREAM_BYTES_MAX // 4 + 1))
 
