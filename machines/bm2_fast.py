@@ -20,20 +20,11 @@ from numba import types
 from numba.core import cgutils as untyped_cgutils
 from numba.extending import intrinsic
 
-from machines.bm2 import (
-    BM2Machine,
-    BM2Parameters,
-    BM2Start,
-    BM2StopReason,
-    SampleEvery,
-    Sequencer,
-    pack,
-    unpack,
-)
+from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, pack, unpack
 from machines.bm2_kernel import BM2Kernel
 from machines.errors import MachineError
 from machines.fast_code import jit, jump
-from machines.parameters import CYCLES_MAX, RngKind, RngReset
+from machines.parameters import CYCLES_MAX, RngKind, RngReset, SampleEvery, Sequencer
 from machines.rng import LFSR, POLYNOMIALS, Words, jump_tables, random_numbers
 
 CHUNK: Final = 32
