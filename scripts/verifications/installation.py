@@ -74,6 +74,22 @@ def pip(folder: Path) -> tuple[str | Path, ...]:
     return folder / "venv" / "bin" / "python", "-m", "pip", "-q", "--disable-pip-version-check"
 
 
+def use_packages(name: str, lock: Path) -> Path:
+    """Make the packages of a lock file importable, from a folder of their own, which is returned.
+
+    They are installed once, without their dependencies.
+    """
+
+    def make(folder: Path) -> None:
+        options = ("--no-deps", "--require-hashes", "--only-binary", ":all:", "-r", lock)
+        command = (sys.executable, "-m", "pip", "-q", "--disable-pip-version-check", "install")
+        run(*command, *options, "--target", folder / "packages")
+
+    packages = cached(name, (lock,), make) / "packages"
+    sys.path.append(str(packages))  # last, so that all other packages come from this environment
+    return packages
+
+
 def install_roslibpy() -> Path:
     """Return the folder with roslibpy's environment (venv) and its source package (source), after installing them once."""
 

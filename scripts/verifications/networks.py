@@ -23,7 +23,7 @@ from machines.parameters import BM1Parameters, RngKind
 from machines.posterior import posterior
 from scripts.running.flags import ScriptParser
 from scripts.verifications.checks import Tally
-from scripts.verifications.installation import cached, run
+from scripts.verifications.installation import use_packages
 from services.errors import SettingsError
 from toolchain.building.quantise import quantise
 from toolchain.errors import ModelError
@@ -263,8 +263,7 @@ def check(tally: Tally, pyagrum: Any, path: Path) -> None:
 
 def verify(only: list[str]) -> int:
     """Install the library, and check all networks."""
-    packages = cached("networks", (LOCK,), install) / "packages"
-    sys.path.append(str(packages))  # last, so that all other packages come from this environment
+    packages = use_packages("networks", LOCK)
     import pyagrum
 
     tally, began = Tally(), time.monotonic()
@@ -278,13 +277,6 @@ def verify(only: list[str]) -> int:
                 path.write_bytes(gzip.decompress(archive.read_bytes()))
                 check(tally, pyagrum, path)
     return tally.end()
-
-
-def install(folder: Path) -> None:
-    """Install pyagrum and pgmpy, without their dependencies, in a folder that only this verification uses."""
-    options = ("--no-deps", "--require-hashes", "--only-binary", ":all:", "-r", LOCK)
-    pip = (sys.executable, "-m", "pip", "-q", "--disable-pip-version-check")
-    run(*pip, "install", *options, "--target", folder / "packages")
 
 
 def main() -> int:

@@ -1,0 +1,278 @@
+"""BM2 on published networks: distance of its marginals from exact inference, beside other Gibbs samplers.
+
+pgmpy's wheel --> *.bif.gz --> our reader --> BM2, linear and coloured --> marginals --> total variation, per variable
+                     └───────▶ pyagrum ─────▶ exact inference ───────────────────────────────────▲
+                                   └────────▶ its Gibbs sampler; THRML's, with --thrml ──────────┘
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any, Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from machines import make_bm2_kernel, warm_up
+from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, start_state, unpack
+from machines.bm2_estimate import batch_effective_samples
+from machines.bm2_kernel import BM2Kernel
+from machines.parameters import Sequencer
+from scripts.benches.samplers import CHAINS, THRML_LOCK, Factor, Known, Sampled, pyagrum_gibbs, thrml_gibbs
+from scripts.running.flags import ScriptParser
+from scripts.verifications.installation import use_packages
+from scripts.verifications.networks import LOCK, load
+from services.errors import SettingsError
+from toolchain.models.network import NetworkModel
+from toolchain.networks import read_network
+
+NETWORKS: Final = ("asia", "cancer", "earthquake", "survey", "sachs", "child", "alarm", "insurance")
+NO_ZEROS: Final = ("cancer", "earthquake", "survey", "sachs")
+"""Networks without a zero: any state leads to any other by changes of one variable."""
+AIM: Final = 0.01
+"""Maximum total variation of a marginal on these, after a million sweeps."""
+COLUMNS: Final = (
+    "known", "sampler", "largest TV", "mean TV", "effective", "sweeps", "cycles", "per sweep", "seconds", "stop",
+)  # fmt: skip
+SEQUENCERS: Final = (Sequencer.LINEAR, Sequencer.COLOURED)
+BURN_IN: Final = 1000
+BATCHES: Final = 64
+"""Resumes of a run, whose means give the effective samples."""
+MAX_CYCLES: Final = 2**32
+LEAVES: Final = 3
+"""The most known variables of an evidence."""
+POSSIBLE: Final = 1e-9
+"""Least probability of an unlikely state, far above the rounding of exact inference."""
+
+Marginals: TypeAlias = Mapping[int, NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """A network as our toolchain and as pyagrum read it. Its variables have the numbers of the machine."""
+
+    model: NetworkModel
+    zeros: int
+    """The number of zeros in the tables."""
+    pyagrum: Any
+    theirs: Any
+    """The network in pyagrum."""
+
+    @classmethod
+    def read(cls, pyagrum: Any, archive: Path) -> Network:
+        """Read a compressed BIF file twice."""
+        joint = read_network(archive)
+        zeros = sum(int(np.count_nonzero(factor.table == 0)) for factor in joint.factors)
+        model = joint.ask([symbol.name for symbol in joint.symbols], ()).network()
+        with tempfile.TemporaryDirectory(prefix="networks-rosbayes-") as folder:
+            path = Path(folder, archive.name.removesuffix(".gz"))
+            path.write_bytes(gzip.decompress(archive.read_bytes()))
+            return cls(model, zeros, pyagrum, load(pyagrum, path))
+
+    @property
+    def factors(self) -> list[Factor]:
+        """The variables of each factor, and its table."""
+        number = {name: at for at, name in enumerate(self.model.names)}
+        return [(tuple(number[name] for name in term.scope), term.table) for term in self.model.factors]
+
+    def exact(self, known: Known) -> Marginals:
+        """Return the exact marginals of the unknown variables."""
+        names = self.model.names
+        inference = self.pyagrum.LazyPropagation(self.theirs)
+        inference.setEvidence({names[variable]: value for variable, value in known.items()})
+        inference.makeInference()
+        unknown = [variable for variable in range(len(names)) if variable not in known]
+        return {variable: inference.posterior(names[variable]).toarray() for variable in unknown}
+
+    def evidences(self) -> dict[str, Known]:
+        """Return three evidences: none; the first leaves at their likeliest states; the same at the least likely ones.
+
+        Each leaf is set given those before it, so that the states are possible together.
+        """
+        leaves = [
+            variable
+            for variable, name in enumerate(self.model.names)
+            if not self.theirs.children(self.theirs.idFromName(name))
+        ]
+        likely: dict[int, int] = {}
+        unlikely: dict[int, int] = {}
+        for leaf in leaves[:LEAVES]:
+            likely[leaf] = int(self.exact(likely)[leaf].argmax())
+            chances = self.exact(unlikely)[leaf]
+            unlikely[leaf] = int(np.where(chances > POSSIBLE, chances, np.inf).argmin())
+        return {"none": {}, "likely": likely, "unlikely": unlikely}
+
+    def machine(self, sequencer: Sequencer) -> BM2Machine:
+        """Return the machine that holds the network."""
+        factors = self.factors
+        parameters = BM2Parameters(
+            cardinalities=self.model.cardinalities,
+            factors=tuple(scope for scope, _ in factors),
+            sequencer=sequencer,
+            burn_in=BURN_IN,
+        )
+        return BM2Machine.from_factors(parameters, [table for _, table in factors])
+
+
+def run(kernel: BM2Kernel, known: Known, sweeps: int, bank: int) -> Sampled:
+    """Run one chain in batches."""
+    parameters = kernel.machine.parameters
+    state = start_state(kernel.machine, known)
+    assert state is not None  # the evidence is possible
+    start = BM2Start(
+        state=state,
+        known=sum(parameters.masks[variable] for variable in known),
+        samples=sweeps // BATCHES,
+        burn_in=parameters.burn_in,
+        ops_timeout=parameters.ops_timeout,
+        max_cycles=MAX_CYCLES,
+        bank=bank,
+        sequencer=parameters.sequencer,
+    )
+    began = time.perf_counter()
+    kernel.start(start)
+    batches = [kernel.results]
+    while kernel.reason is BM2StopReason.SAMPLES and len(batches) < BATCHES:
+        kernel.resume(sweeps * (len(batches) + 1) // BATCHES)
+        batches.append(kernel.results)
+    seconds = time.perf_counter() - began
+    marginals, effective, word = {}, [], 0
+    for variable, (bits, size) in enumerate(zip(parameters.bits, parameters.cardinalities, strict=True)):
+        if variable not in known:
+            counts = np.array([each[word : word + size] for each in batches])
+            marginals[variable] = counts[-1] / max(1, counts[-1].sum())
+            effective.append(batch_effective_samples(counts).min())
+        word += 1 << bits
+    stop = "" if kernel.reason is BM2StopReason.SAMPLES else kernel.reason.name.lower()
+    return Sampled(marginals, kernel.samples, seconds, min(effective), kernel.cycles, stop)
+
+
+def variation(found: Marginals, exact: Marginals) -> list[float]:
+    """Return the total variation of each variable's marginal."""
+    return [float(np.abs(found[variable] - each).sum()) / 2 for variable, each in exact.items()]
+
+
+def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, float]:
+    """Print a table; return the machine's largest total variation: of the median banks, and of all banks."""
+    names, sweeps = network.model.names, arguments.sweeps
+    zeros = (
+        f"{network.zeros} zeros, which can keep Gibbs samplers from some states"
+        if network.zeros
+        else "no zeros"
+    )
+    table = Table(title=f"{network.model.name}: {len(names)} variables, {zeros}", title_justify="left")
+    for column in COLUMNS:
+        table.add_column(column, justify="left" if column in {"known", "sampler", "stop"} else "right")
+    kernels = {f"BM2 {each}": make_bm2_kernel(network.machine(each)) for each in SEQUENCERS}
+    median, largest = [], []
+    for title, known in network.evidences().items():
+        exact = network.exact(known)
+        runs = {}
+        for name, kernel in kernels.items():
+            found = [run(kernel, known, sweeps, bank) for bank in range(arguments.banks)]
+            found.sort(key=lambda each: max(variation(each.marginals, exact)))
+            runs[name] = found[len(found) // 2]
+            median.append(max(variation(runs[name].marginals, exact)))
+            largest.append(max(variation(found[-1].marginals, exact)))
+        theirs = (network.pyagrum, network.theirs, names, known)
+        runs["pyAgrum's Gibbs"] = pyagrum_gibbs(
+            *theirs, sweeps=sweeps, burn_in=BURN_IN, limit=arguments.seconds
+        )
+        if arguments.thrml:
+            machine = kernels["BM2 linear"].machine
+            start = unpack(machine.parameters, start_state(machine, known) or 0)
+            blocks = (network.factors, start, known, machine.parameters.colours)
+            runs[f"THRML, {CHAINS} chains"] = thrml_gibbs(*blocks, sweeps=sweeps, burn_in=BURN_IN)
+        for sampler, each in runs.items():
+            off = variation(each.marginals, exact)
+            figures = [
+                f"{max(off):.4f}",
+                f"{fmean(off):.4f}",
+                "",
+                str(each.sweeps),
+                "",
+                "",
+                f"{each.seconds:.2f}",
+            ]
+            if each.cycles:
+                # where fewer, the batches are too short to tell
+                figures[2] = f"< {2 * BATCHES}" if each.effective < 2 * BATCHES else f"{each.effective:.0f}"
+                figures[4:6] = str(each.cycles), f"{each.cycles / (each.sweeps + BURN_IN):.1f}"
+            table.add_row(f"{len(known)} {title}" if known else title, sampler, *figures, each.stop)
+        table.add_section()
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    return max(median), max(largest)
+
+
+def bench(arguments: argparse.Namespace) -> int:
+    """Compare all networks; with --check, return 1 if one missed the aim."""
+    packages = use_packages("networks", LOCK)
+    if arguments.thrml:
+        use_packages("thrml", THRML_LOCK)
+    import pyagrum
+
+    warm_up()
+    missed = False
+    for name in arguments.network:
+        archive = packages / "pgmpy" / "utils" / "example_models" / f"{name}.bif.gz"
+        median, largest = compare(Network.read(pyagrum, archive), arguments)
+        if arguments.check:
+            missed |= median > AIM
+            print(
+                f"{name}: total variation at most {median:.4f} from the median of {arguments.banks} banks "
+                f"({largest:.4f} from any); the aim of {AIM} is {'missed' if median > AIM else 'held'}\n"
+            )
+    return int(missed)
+
+
+def main() -> int:
+    """Parse the flags and compare."""
+    parser = ScriptParser(prog="scripts/bench networks", description=__doc__.splitlines()[0])
+    parser.add_argument("--network", action="append", choices=NETWORKS, help="only this one; repeat for more")
+    parser.add_argument(
+        "--sweeps",
+        type=int,
+        shown="20000, with --check 1000000",
+        help=f"samples, after {BURN_IN} sweeps of burn-in",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=5.0,
+        help="limit of each run of pyAgrum's sampler, which may do fewer sweeps",
+    )
+    parser.add_argument(
+        "--thrml",
+        action="store_true",
+        help="also compare THRML; installs it, in a folder of its own (530 MB)",
+    )
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help=f"run networks without zeros from 5 banks of seeds; exit 1 if a median total variation is above {AIM}",
+    )
+    arguments = parser.parse_args()
+    arguments.network = arguments.network or list(NO_ZEROS if arguments.check else NETWORKS)
+    arguments.sweeps = arguments.sweeps or (1_000_000 if arguments.check else 20_000)
+    arguments.banks = 5 if arguments.check else 1
+    if arguments.sweeps < BATCHES:
+        parser.error(f"--sweeps must be {BATCHES} or more")
+    try:
+        return bench(arguments)
+    except SettingsError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
