@@ -364,12 +364,22 @@ class Kept(msgspec.Struct, frozen=True, array_like=True):
 
 
 def _kept(board: BoardResult) -> Kept:
+    # a result may come from a pipe, into which anybody can write
     try:
-        return msgspec.msgpack.decode(board.kept, type=Kept)
+        kept = msgspec.msgpack.decode(board.kept, type=Kept)
     except msgspec.MsgspecError as error:
-        raise MachineError(
-            f"A board's result has no record of its chain ({error}): use the line of pcie-app as it is"
-        ) from error
+        raise MachineError(f"The result of a board has no record of its chain: {error}.") from error
+    parameters = kept.parameters
+    sizes = {len(words) for words in (*kept.batches, board.words)}
+    if (
+        sizes != {4 * parameters.result_words}
+        or len(kept.stream) % (4 * parameters.state_words)
+        or not len(kept.samples) == len(kept.unused) == len(kept.batches) + 1
+        or board.reason not in BM2.reasons
+        or not -1 <= kept.timed_out_bit < parameters.state_bits
+    ):
+        raise MachineError("The result of a board does not match the record of its chain.")
+    return kept
 
 
 def _why_left_out(number: int, reason: int, kept: Kept, variables: Sequence[str]) -> str:

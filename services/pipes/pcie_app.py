@@ -1,5 +1,6 @@
 """`pcie-app` without a master, which computes the readings of standard input and prints counts."""
 
+from base64 import b64encode
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -72,5 +73,7 @@ def _line(
         }
         if board.replica_cycles:
             values |= {"replica_cycles": board.replica_cycles, "replica_reasons": board.replica_reasons}
+        if board.kept:
+            values["kept"] = b64encode(board.kept).decode()
         boards.append(values)
     return {"number": number, "stamp_ns": stamp_ns, "boards": boards}

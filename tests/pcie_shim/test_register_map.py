@@ -3,6 +3,8 @@
 from machines import KINDS
 from machines.bm1 import StopReason
 from machines.bm1_kind import BM1
+from machines.bm2 import BM2Parameters
+from machines.bm2_kind import BM2
 from machines.parameters import BM1Parameters, RngKind, SensorMode
 from pcie_shim import register_map
 from pcie_shim.framing import MAX_PAYLOAD_WORDS
@@ -32,12 +34,16 @@ def test_the_encodings_are_the_machines_numbers():
         for encoding in RegisterMap(SOURCE).encodings
     }
     assert encodings["stop_reason"].items() >= {each.name: each.value for each in StopReason}.items()
+    assert set(encodings["stop_reason"].values()) == set(BM1.reasons) | set(BM2.reasons)
 
     def number(field, **parameters):
         used = BM1.registers(BM1Parameters(lines=1, sensor_bits=(8,), **parameters))
         return used.capabilities[f"CAP_MACHINE.{field}"]
 
-    assert encodings["machine_kind"] == {"NONE": 0} | {name: number("KIND") for name in KINDS} | {"BM2": 2}
+    of_bm2 = BM2.registers(BM2Parameters(cardinalities=(2,), factors=((0,),))).capabilities
+    kinds = {"BM1": number("KIND"), "BM2": of_bm2["CAP_MACHINE.KIND"]}
+    assert list(kinds) == list(KINDS)
+    assert encodings["machine_kind"] == {"NONE": 0} | kinds
     rngs = {each.name: number("RNG", rng=each, prob_bits=7) for each in RngKind}
     assert encodings["rng_kind"] == {"NONE": 0} | rngs
     modes = {each.name: number("SENSOR_MODE", sensor_mode=each) for each in SensorMode}
