@@ -38,8 +38,8 @@ CHAINS_MAX: Final = 65536
 SAMPLES_MAX: Final = 2**32 - 1
 """Maximum number of samples of a frame; no 32-bit histogram overflows."""
 
-SEARCH_MAX: Final = 20_000
-"""Maximum number of values that the search for a start state tries."""
+DEAD_ENDS_MAX: Final = 2000
+"""Maximum number of dead ends in the search for a start state, which takes about a second for them."""
 
 
 class BM2StopReason(IntEnum):
@@ -488,7 +488,7 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
     # One entry per variable on the path: the domains before it, and the values to try. The first complete
     # path is the answer, since variables and values are tried in order.
     path: list[tuple[list[npt.NDArray[np.bool_]], Iterator[int]]] = []
-    tried = 0
+    dead_ends = 0
     while len(path) < len(domains):
         values = np.flatnonzero(domains[len(path)]).tolist()
         path.append((domains, iter(values[::-1] if largest else values)))
@@ -498,12 +498,6 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
             if value is None:
                 path.pop()
                 continue
-            tried += 1
-            if tried > SEARCH_MAX:
-                raise StartError(
-                    f"No start state was found among the first {SEARCH_MAX} tries; the model has too many zeros: "
-                    "replace them by small probabilities."
-                )
             variable = len(path) - 1
             domains = list(before)
             domains[variable] = np.arange(len(before[variable])) == value
@@ -511,6 +505,12 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
                 domains, constraints.of_variable[variable]
             ):
                 break
+            dead_ends += 1
+            if dead_ends > DEAD_ENDS_MAX:
+                raise StartError(
+                    f"No start state was found before {DEAD_ENDS_MAX} dead ends; the model has too many zeros: "
+                    "replace some by small probabilities."
+                )
         else:
             return None
     return pack(parameters, [int(domain.argmax()) for domain in domains])
