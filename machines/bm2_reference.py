@@ -95,9 +95,9 @@ class ReferenceBM2(BM2Kernel):
     def _cycle(self) -> BM2StopReason:
         """Run one cycle: every pointed bit is written if its CDEs agree; then all generators step."""
         random = self._random_numbers.show(self._states).tolist()
-        before = self._state
         for bit in tuple(self._pending):
-            stochastic_bits = self._stochastic_bits(bit, before, random)
+            # no CDE of this bit sees another bit of the move
+            stochastic_bits = self._stochastic_bits(bit, random)
             if len(stochastic_bits) == 1:
                 self._state = self._state & ~(1 << bit) | stochastic_bits.pop() << bit
                 self._pending.remove(bit)
@@ -116,19 +116,19 @@ class ReferenceBM2(BM2Kernel):
             return BM2StopReason.MAX_CYCLES
         return reason
 
-    def _stochastic_bits(self, bit: int, state: int, random: list[int]) -> set[int]:
+    def _stochastic_bits(self, bit: int, random: list[int]) -> set[int]:
         """Return the different bits that the compared CDEs make for a pointed bit."""
         concerned = self._concerned[bit]
-        bits = {int(random[cde] < self._code(cde, bit, state)) for cde in concerned}
+        bits = {int(random[cde] < self._code(cde, bit)) for cde in concerned}
         if self._parameters.literal:
             half = 1 << (self._parameters.prob_bits - 1)
             bits |= {int(random[cde] < half) for cde in range(self._parameters.cdes) if cde not in concerned}
         return bits
 
-    def _code(self, cde: int, bit: int, state: int) -> int:
+    def _code(self, cde: int, bit: int) -> int:
         """Return the code in a CDE's table: at the pointed local bit, and at the values of the others."""
         local_bits = self._factor_bits[cde]
-        others = [state >> other & 1 for other in local_bits if other != bit]
+        others = [self._state >> other & 1 for other in local_bits if other != bit]
         address = local_bits.index(bit) << len(others) | sum(value << at for at, value in enumerate(others))
         return int(self._machine.tables[cde][address])
 

@@ -5,18 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from hypothesis import strategies as st
 
-from machines.bm2 import (
-    BM2Machine,
-    BM2Parameters,
-    BM2Start,
-    BM2StopReason,
-    SampleEvery,
-    Sequencer,
-    start_state,
-    unpack,
-)
+from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, start_state, unpack
 from machines.bm2_kernel import BM2Kernel
-from machines.parameters import RngKind, RngReset
+from machines.parameters import RngKind, RngReset, SampleEvery, Sequencer
 
 KINDS = (RngKind.LFSR24, RngKind.LFSR32, RngKind.TABLE, RngKind.IDEAL)
 LFSRS = (RngKind.LFSR24, RngKind.LFSR32)

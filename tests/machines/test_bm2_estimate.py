@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, Sequencer, start_state, unpack
+from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, start_state, unpack
 from machines.bm2_estimate import (
     BATCHES_MIN,
     Chain,
@@ -18,6 +18,7 @@ from machines.bm2_estimate import (
     split_r_hat,
 )
 from machines.bm2_reference import ReferenceBM2
+from machines.parameters import Sequencer
 
 SAMPLES, CYCLES, TIMEOUT = (BM2StopReason.SAMPLES, BM2StopReason.MAX_CYCLES, BM2StopReason.OPS_TIMEOUT)
 
@@ -54,6 +55,19 @@ def test_values_that_never_change_count_in_full():
     values = np.zeros(500, dtype=np.int64)
     assert effective_samples(values, 3).tolist() == [500] * 3
     assert batch_effective_samples(cumulative(values, 25, 3)).tolist() == [500] * 3
+
+
+def test_batch_means_are_the_formula():
+    """Batches of two sizes: the variance of the mean is that of the weighted batch means."""
+    random = np.random.default_rng(3)
+    sizes = np.tile([100, 60], 10)
+    ones = random.binomial(sizes, random.uniform(0.1, 0.5, 20))
+    mean, total = ones.sum() / sizes.sum(), sizes.sum()
+    variance = 20 / 19 * sum((n / total * (x / n - mean)) ** 2 for x, n in zip(ones, sizes, strict=True))
+    counts = np.cumsum(np.stack([sizes - ones, ones], axis=1), axis=0)
+    due = min(mean * (1 - mean) / variance, total)
+    assert due < total
+    assert batch_effective_samples(counts) == pytest.approx([due, due])
 
 
 def test_too_few_batches_tell_nothing():
@@ -167,6 +181,7 @@ def test_counts_and_stream_name_the_same_values(joint):
         searched=searched,
         sample_every="move",
         stream=1500,
+        prob_bits=4,  # unused codes come often
     )
     machine = BM2Machine.from_factors(parameters, [random.uniform(1, 2, size) for size in cardinalities])
     kernel = ReferenceBM2(machine)
@@ -193,4 +208,10 @@ def test_counts_and_stream_name_the_same_values(joint):
     counts = searched_counts(parameters, kernel.results)
     assert counts.tolist() == np.bincount(values[values >= 0], minlength=size).tolist()
     assert searched_counts(parameters, np.stack([kernel.results] * 2)).tolist() == [counts.tolist()] * 2
-    assert counts.sum() == kernel.samples - kernel.unused
+    assert counts.sum() == kernel.samples - kernel.unused < kernel.samples
+
+
+def test_counts_of_a_variable_whose_joint_does_not_fit():
+    parameters = BM2Parameters(cardinalities=(3, 2000), factors=((0,), (1,)), searched=(1,))
+    assert parameters.joint_words == 0
+    assert searched_counts(parameters, np.arange(4 + 2048)).tolist() == list(range(4, 2004))
