@@ -32,6 +32,11 @@ class ModelError(ToolchainError):
 class NotFusionError(ModelError):
     """A question that is not a naive fusion, so that a BM1 cannot compute it: two known symbols depend on each other."""
 
+    def __init__(self, why: str, advice: str) -> None:
+        """Compose the sentence; `why` names the two symbols and the path between them."""
+        super().__init__(f"{why}; {advice}")
+        self.why = why
+
 
 class NetworkFileError(ModelError):
     """A network file is damaged, hostile, or of another format; the sentence contains file and line."""

@@ -7,11 +7,11 @@ from dataclasses import asdict, fields
 
 import pytest
 
-from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
+from machines.parameters import PriorMode, RngKind, RngReset, SampleEvery, SensorMode, Sequencer
 from pcie_shim.programming_file import read_image
 from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.running import TARGET, TINY, assert_refused, done, toolchain
-from toolchain.building.options import BuildOptions, MachineOptions, TargetOptions
+from toolchain.building.options import BuildOptions, MachineChoice, MachineOptions, TargetOptions
 from toolchain.commands.request import BuildFlags, build_options
 from toolchain.deployment import Queue, Scale, Stop, load_deployment
 from toolchain.outputs.mif import read_mif
@@ -59,6 +59,13 @@ def test_mistakes(case, arguments, named):
 
 
 MACHINE = {
+    "machine": MachineChoice.BM1,
+    "sequencer": Sequencer.RANDOM,
+    "literal": True,
+    "sample_every": SampleEvery.MOVE,
+    "burn_in": 16,
+    "ops_timeout": 17,
+    "stream": 18,
     "partitions": 2,
     "scale": Scale.NONE,
     "prob_bits": 9,

@@ -24,8 +24,9 @@ from toolchain.analysis.readings import (
     sample_readings,
 )
 from toolchain.analysis.resources import ASSUMPTIONS, Energy, Estimate, energy, estimate
-from toolchain.building.build import loss_heading, many_sentence, read_images
+from toolchain.building.build import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
+from toolchain.building.report import loss_heading, many_sentence
 from toolchain.deployment import Deployment, Scale
 from toolchain.errors import BuildError
 from toolchain.models.model import Model

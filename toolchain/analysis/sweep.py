@@ -325,10 +325,10 @@ def tasks(model: Model, sweep: Sweep, readings: Readings, device: Device) -> lis
 def run_task(task: Task, readings: Readings, device: Device, banks: int) -> Point:
     """Measure one machine, or raise a ToolchainError if it cannot be built or run."""
     model, options, parameters = task.plan.model, task.plan.options, task.plan.parameters
-    quantised = quantise(model, prob_bits=options.prob_bits, scale=options.scaling)
+    quantised = quantise(model, prob_bits=task.plan.parameters.prob_bits, scale=options.scaling)
     machines = split(whole_machine(task.plan, quantised), options.partitions)
     boards = EmulatedBoards(
-        machines, target_count=task.plan.target_count, max_cycles=options.max_cycles, stop=options.stop
+        machines, target_count=task.plan.target_count, max_cycles=task.plan.max_cycles, stop=options.stop
     )
     accuracy = measure(boards, readings, model, banks=banks)
     machine, quantising = accuracy.machine, accuracy.quantising

@@ -1,5 +1,8 @@
 """The machine for a model: its plan, its lines on the boards, and the codes of all boards (thesis 3.4, 4.2)."""
 
+import math
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -7,19 +10,26 @@ import numpy as np
 
 from machines.bm1 import BM1Machine
 from machines.bm1_kind import BM1
+from machines.bm2 import BM2Parameters
 from machines.errors import ParameterError
-from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
+from machines.kind import UsedRegisters
+from machines.parameters import ADDRESS_BITS_MAX, BM1Parameters, PriorMode, RngKind, SensorMode
 from pcie_shim.register_layout import interface_room
 from toolchain.building.options import BuildOptions
 from toolchain.building.quantise import Quantised
 from toolchain.deployment import BM1Section, MachineSection, Scale
 from toolchain.errors import BuildError
+from toolchain.flags import key_values
 from toolchain.models.model import Model
-from toolchain.outputs.memories import generators
 from toolchain.outputs.mif import random_table
 
 _MOST_CODES: Final = 1 << 30
 """Maximum number of codes of all columns, which take 2 bytes each while they are computed."""
+
+_PROB_BITS: Final = 8
+"""Bits of a code of a BM1, unless others are asked for."""
+_MAX_CYCLES: Final = 2**17
+"""Maximum number of cycles of a BM1, unless another is asked for."""
 
 MACHINE_KEYS: Final = tuple(
     key for key in BM1Section.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
@@ -29,7 +39,8 @@ MACHINE_KEYS: Final = tuple(
 
 def machine_options(source: BuildOptions | MachineSection) -> dict[str, Any]:
     """Return the parameters of a machine with the same names in the build options and in `[machine]`."""
-    return {key: getattr(source, key) for key in MACHINE_KEYS if key != "prior_bits"}
+    found = {key: getattr(source, key) for key in MACHINE_KEYS if key != "prior_bits"}
+    return {key: value for key, value in found.items() if value is not None}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,6 +58,31 @@ class MachinePlan:
         """The count that stops a machine."""
         asked = self.options.target_count
         return self.parameters.target_count_max if asked is None else asked
+
+    @property
+    def max_cycles(self) -> int:
+        """The maximum number of cycles."""
+        asked = self.options.max_cycles
+        return _MAX_CYCLES if asked is None else asked
+
+
+def with_bits(model: Model, bits: Iterable[str]) -> Model:
+    """Return the model with address bits of some columns, given as `NAME=BITS`, or raise a BuildError."""
+    widths = key_values(bits, "--bits", "range=8")
+    names = [variable.name for variable in model.variables]
+    for name, text in widths.items():
+        if name not in names:
+            raise BuildError(
+                f"--bits {name}={text}: the model has no such variable; it has {', '.join(names) or 'none'}"
+            )
+        if not re.fullmatch(r"\d{1,3}", text, re.ASCII) or not 1 <= int(text) <= ADDRESS_BITS_MAX:
+            raise BuildError(f"--bits {name}={text}: expected 1 to {ADDRESS_BITS_MAX} bits")
+    select = model.prior_select
+    return replace(
+        model,
+        known=tuple(replace(known, bits=int(widths.get(known.name, known.bits))) for known in model.known),
+        prior_select=select and replace(select, bits=int(widths.get(select.name, select.bits))),
+    )
 
 
 def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
@@ -69,11 +105,12 @@ def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
         raise BuildError(
             f"the tables have {codes} codes, and a machine can have {_MOST_CODES}: use fewer lines, or fewer --bits"
         )
+    prob_bits = _PROB_BITS if options.prob_bits is None else options.prob_bits
     per_line_codes = options.sensor_mode is SensorMode.THRESHOLD
     try:
         parameters = BM1Parameters(
             lines=model.lines,
-            sensor_bits=tuple(options.prob_bits if per_line_codes else known.bits for known in model.known),
+            sensor_bits=tuple(prob_bits if per_line_codes else known.bits for known in model.known),
             prior_bits=0 if model.prior_select is None else model.prior_select.bits,
             **machine_options(options),
         )
@@ -168,34 +205,40 @@ def board_layout(
     """
     blocks = partition_lines(parameters.lines, partitions)
     board = replace(parameters, lines=blocks[0].lines)
-    _check_seeds(board)
+    check_seeds(board, "" if board.shared else ", or --shared")
     used = BM1.registers(board)
+    what = f"{board.sensors} known variables and {board.lines} lines on it"
+    if board.replicas > 1:
+        what += f", {board.replicas} times"
+    fitted, reason = fitted_interface(used, interface, what, _advice(parameters, interface_room(used)))
+    return BoardLayout(blocks=blocks, interface=fitted, reason=reason)
+
+
+def fitted_interface(
+    used: UsedRegisters, asked: tuple[int, int] | None, what: str, advice: str
+) -> tuple[tuple[int, int], str]:
+    """Return the interface of boards that use these registers, and why it is not the default; a BuildError if it doesn't fit."""
     needed, room = (used.input_words, used.result_words), interface_room(used)
-    sentence = (
-        f"a board needs {needed[0]} inputs and {needed[1]} results ({board.sensors} known variables and {board.lines} lines on it"
-        + (f", {board.replicas} times)" if board.replicas > 1 else ")")
-    )
+    sentence = f"a board needs {needed[0]} inputs and {needed[1]} results ({what})"
     if not _is_within(needed, room):
-        raise BuildError(
-            f"{sentence}, but the register map has room for {room[0]} and {room[1]}{_advice(parameters, room)}"
-        )
-    if interface is None:
+        raise BuildError(f"{sentence}, but the register map has room for {room[0]} and {room[1]}{advice}")
+    if asked is None:
         default = DEFAULT_INTERFACE
-        interface = (max(needed[0], default[0]), max(needed[1], default[1]))
-        reason = (
-            "" if interface == default else f", larger than the default {_size_text(default)}: {sentence}"
+        asked = (max(needed[0], default[0]), max(needed[1], default[1]))
+        return (
+            asked,
+            "" if asked == default else f", larger than the default {_size_text(default)}: {sentence}",
         )
-        return BoardLayout(blocks=blocks, interface=interface, reason=reason)
-    if not _is_within(interface, room):
+    if not _is_within(asked, room):
         raise BuildError(
-            f"the interface {_size_text(interface)} is larger than the register map's {_size_text(room)}"
+            f"the interface {_size_text(asked)} is larger than the register map's {_size_text(room)}"
         )
-    if not _is_within(needed, interface):
-        enough = (max(needed[0], interface[0]), max(needed[1], interface[1]))
+    if not _is_within(needed, asked):
+        enough = (max(needed[0], asked[0]), max(needed[1], asked[1]))
         raise BuildError(
-            f"the model is larger than the interface {_size_text(interface)}: {sentence}; use --interface {_size_text(enough)} or leave it out"
+            f"the model is larger than the interface {_size_text(asked)}: {sentence}; use --interface {_size_text(enough)} or leave it out"
         )
-    return BoardLayout(blocks=blocks, interface=interface, reason=", as asked for")
+    return asked, ", as asked for"
 
 
 def _size_text(size: tuple[int, int]) -> str:
@@ -218,10 +261,12 @@ def _advice(parameters: BM1Parameters, room: tuple[int, int]) -> str:
     return f": use {', or '.join(ways)}" if ways else ""
 
 
-def _check_seeds(board: BM1Parameters) -> None:
-    seeds = board.rng_banks * generators(board)
+def check_seeds(board: BM1Parameters | BM2Parameters, advice: str = "") -> None:
+    """Raise a BuildError if a board has too many seeds."""
+    generators = math.prod(board.generator_shape)
+    seeds = board.rng_banks * generators
     if seeds > _MOST_SEEDS and board.rng is not RngKind.IDEAL:
         raise BuildError(
-            f"--rng-banks {board.rng_banks} needs {seeds} seeds per board; use at most {_MOST_SEEDS // generators(board)}"
-            + ("" if board.shared else ", or --shared")
+            f"--rng-banks {board.rng_banks} needs {seeds} seeds per board; use at most {_MOST_SEEDS // generators}"
+            + advice
         )

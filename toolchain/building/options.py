@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from pydantic import Field, ValidationError
 
-from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
+from machines.parameters import PriorMode, RngKind, RngReset, SampleEvery, SensorMode, Sequencer
 from toolchain.bounded_files import TomlFile, nearest_name
 from toolchain.deployment import Output, Queue, Scale, Source, Stop, Variable, WrittenPrior
 from toolchain.deployment.sections import MessagePath, Name, Section, Sequence
 from toolchain.errors import BuildError, ToolchainError
-from toolchain.flags import MAX_CYCLES, STOP, MaxCycles, Partitions, StopWhen
+from toolchain.flags import MAX_CYCLES, STOP, Partitions, StopWhen
 
 if TYPE_CHECKING:
     import numpy as np
@@ -136,7 +136,7 @@ def read_sources(path: Path, uri: str | None) -> SourcesFile:
     return file
 
 
-_FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path"}
+_FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path", "shared": "--per-cell"}
 """Flags with other names than their fields."""
 
 
@@ -159,7 +159,12 @@ TOLERANCE: Final = typer.Option(
     help="Seconds within which readings from several topics belong together.",
     metavar="SECONDS",
 )
-TARGET_COUNT: Final = typer.Option(help="Count that stops a machine.", show_default="the counters' maximum")
+TARGET_COUNT: Final = typer.Option(
+    "--target-count",
+    "--samples",
+    help="Count that stops a BM1, or samples of a BM2.",
+    show_default="the counters' maximum; BM2: 10000",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,26 +204,33 @@ class DeploymentEdits:
     tolerance_s: Annotated[float | None, TOLERANCE] = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class MachineOptions:
-    """The flags of a build about the machine, except those that name a file or need parsing."""
+class MachineChoice(StrEnum):
+    """The machine for a model."""
 
-    partitions: Partitions = 1
-    scale: Annotated[
-        Scale | None,
+    AUTO = "auto"
+    """A BM1 if the question is a naive fusion, otherwise a BM2."""
+    BM1 = "bm1"
+    BM2 = "bm2"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommonOptions:
+    """The flags of a build about machines of every kind; None for the default of the kind."""
+
+    machine: Annotated[
+        MachineChoice,
         typer.Option(
-            help="Part of a table that is divided by its maximum before quantising.",
-            show_default="address; column if cells have their own readings",
+            help="auto: a BM1 if the known variables are independent given the searched ones, or a BM2."
         ),
+    ] = MachineChoice.AUTO
+    partitions: Partitions = 1
+    prob_bits: Annotated[
+        int | None, typer.Option(help="Bits of a code.", min=1, max=16, show_default="8; BM2: 16")
     ] = None
-    prob_bits: Annotated[int, typer.Option(help="Bits of a code.", min=1, max=16)] = 8
-    prior_mode: Annotated[
-        PriorMode, typer.Option(help="table: the prior is in the images; written: the host writes it.")
-    ] = PriorMode.TABLE
-    counter_bits: Annotated[int, typer.Option(help="Bits of a line's counter.", min=1, max=32)] = 8
     target_count: Annotated[int | None, TARGET_COUNT] = None
-    max_cycles: MaxCycles = 2**17
-    stop: StopWhen = Stop.SLICES
+    max_cycles: Annotated[
+        int | None, typer.Option(help="Maximum number of cycles.", show_default="131072; BM2: 4294967296")
+    ] = None
     rng: Annotated[
         RngKind,
         typer.Option(
@@ -231,15 +243,33 @@ class MachineOptions:
         RngReset,
         typer.Option(help="bank: each frame restarts the generators; free: never, as in the thesis."),
     ] = RngReset.BANK
-    shared: Annotated[
-        bool, typer.Option("--shared/--per-cell", help="One generator per column, or one per cell.")
-    ] = True
     steps_per_clock: Annotated[
         int,
         typer.Option(
             help="Steps of a generator per cycle; 1 as in the thesis; 0: as many as are needed for fresh bits."
         ),
     ] = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class BM1Options:
+    """The flags of a build about a BM1, except those that name a file or need parsing."""
+
+    scale: Annotated[
+        Scale | None,
+        typer.Option(
+            help="Part of a table that is divided by its maximum before quantising.",
+            show_default="address; column if cells have their own readings",
+        ),
+    ] = None
+    prior_mode: Annotated[
+        PriorMode, typer.Option(help="table: the prior is in the images; written: the host writes it.")
+    ] = PriorMode.TABLE
+    counter_bits: Annotated[int, typer.Option(help="Bits of a line's counter.", min=1, max=32)] = 8
+    stop: StopWhen = Stop.SLICES
+    shared: Annotated[
+        bool, typer.Option("--shared/--per-cell", help="One generator per column, or one per cell.")
+    ] = True
     sensor_mode: Annotated[
         SensorMode,
         typer.Option(
@@ -250,6 +280,35 @@ class MachineOptions:
         int,
         typer.Option(help="Number of machines on each board, which share the generators.", min=1, max=256),
     ] = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class BM2Options:
+    """The flags of a build about a BM2."""
+
+    sequencer: Annotated[Sequencer, typer.Option(help="Order in which a BM2 samples the bits.")] = (
+        Sequencer.LINEAR
+    )
+    literal: Annotated[
+        bool, typer.Option("--literal", help="All CDEs of a BM2 must agree, also those without the bit.")
+    ] = False
+    sample_every: Annotated[SampleEvery, typer.Option(help="A sample of a BM2 after each sweep or move.")] = (
+        SampleEvery.SWEEP
+    )
+    burn_in: Annotated[int, typer.Option(help="Sweeps of a BM2 before its first sample.", min=0)] = 1000
+    ops_timeout: Annotated[int, typer.Option(help="Maximum number of cycles of a BM2's move.", min=1)] = 2**20
+    stream: Annotated[int, typer.Option(help="Samples that a BM2 keeps for /bm/samples; 0: none.", min=0)] = 0
+
+
+def given_flags(options: object, group: type[BM1Options | BM2Options]) -> list[str]:
+    """Return the flags of a group that do not have their defaults."""
+    names = [each.name for each in fields(group) if getattr(options, each.name) != each.default]
+    return [_FLAGS.get(name, "--" + name.replace("_", "-")) for name in names]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineOptions(BM2Options, BM1Options, CommonOptions):
+    """The flags of a build about the machine, except those that name a file or need parsing."""
 
 
 @dataclass(frozen=True, kw_only=True)

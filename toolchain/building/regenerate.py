@@ -8,13 +8,33 @@ from pydantic import ValidationError
 
 from machines.parameters import SensorMode
 from pcie_shim.programming_file import Image
-from toolchain.building.build import REPORT_NAME, assemble, build_report, check_agreement, read_images
+from toolchain.building.bm2_machine import BM2Plan, bm2_options, chain_layout
+from toolchain.building.build import (
+    REPORT_NAME,
+    Built,
+    assemble,
+    assemble_bm2,
+    check_agreement,
+    dimensions_of,
+    read_images,
+)
+from toolchain.building.choice import plan_for
 from toolchain.building.machine import board_layout, machine_options, plan_machine
-from toolchain.building.options import BuildOptions, DeploymentEdits, refused_option
-from toolchain.deployment import FILE_NAME, Deployment, Variable, deployment_text, load_deployment
+from toolchain.building.options import BuildOptions, DeploymentEdits, MachineChoice, refused_option
+from toolchain.building.report import bm2_report, build_report
+from toolchain.deployment import (
+    FILE_NAME,
+    BM2Section,
+    Deployment,
+    Dimension,
+    Variable,
+    deployment_text,
+    load_deployment,
+)
 from toolchain.deployment.deployment import with_hash
 from toolchain.errors import BuildError, ModelError
 from toolchain.flags import key_values, names_in
+from toolchain.models.joint import Question
 from toolchain.models.model import Model
 from toolchain.outputs.output_files import (
     Change,
@@ -36,6 +56,8 @@ def edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
         )
     first_source, *sources = deployment.sources
     first_output, *outputs = deployment.outputs
+    if edits.stop is not None and not deployment.machine.is_divided:
+        raise BuildError(f"--stop is for a BM1, but this deployment is a {deployment.machine.type}")
     machine = _defined(target_count=edits.target_count, max_cycles=edits.max_cycles, stop=edits.stop)
     try:
         changed = deployment.replace(
@@ -91,8 +113,10 @@ def _with_paths(variables: tuple[Variable, ...], given: Sequence[str]) -> tuple[
 Changes = list[tuple[str, Change]]
 
 
-def regenerate_memories(directory: Path, model: Model | None = None, *, build_date: str = "") -> Changes:
-    """Write `bm1_parameters.vhd` and the memories again, from the images, or with new tables from a model.
+def regenerate_memories(
+    directory: Path, model: Model | Question | None = None, *, build_date: str = ""
+) -> Changes:
+    """Write the memories, and a BM1's `bm1_parameters.vhd`, again, from the images, or with new tables from a model.
 
     With a model, the images (with this date), the report and the hashes of `deployment.toml` are updated, and
     the columns get the order of the model; sizes, widths and everything about topics do not change.
@@ -105,10 +129,18 @@ def regenerate_memories(directory: Path, model: Model | None = None, *, build_da
     images = read_images(deployment)
     if model is None:
         return write_files(directory, memory_files(deployment, images))
-    model = _with_widths(model, deployment)
-    built = assemble(plan_machine(model, replace(_options(deployment, images[0]), build_date=build_date)))
-    new = _with_places(built.deployment, deployment)
-    report = build_report(model, new, built.quantised, built.interface_reason)
+    options = replace(_options(deployment, images[0]), build_date=build_date)
+    built: Built
+    if isinstance(deployment.machine, BM2Section):
+        plan = _same_chains(model, options, deployment, images[0])
+        built = assemble_bm2(plan)
+        new = _with_places(built.deployment, deployment)
+        report = bm2_report(plan.model, new, built.images[0].machine, plan.why, built.interface_reason)
+    else:
+        fusion = _with_widths(model.model() if isinstance(model, Question) else model, deployment)
+        built = assemble(plan_machine(fusion, options))
+        new = _with_places(built.deployment, deployment)
+        report = build_report(fusion, new, built.quantised, built.interface_reason)
     parts = [
         image_files(new, built.images),
         memory_files(new, built.images),
@@ -139,10 +171,14 @@ def regenerate_deployment(directory: Path, edits: DeploymentEdits) -> Changes:
 
 
 def _options(deployment: Deployment, image: Image) -> BuildOptions:
-    machine, source = deployment.machine, deployment.sources[0]
+    machine, source, parameters = deployment.machine, deployment.sources[0], image.machine.parameters
     partitions = len(deployment.boards)
-    whole = replace(image.machine.parameters, lines=machine.lines)
-    without_flag = board_layout(whole, partitions, None)
+    if isinstance(machine, BM2Section):
+        without_flag = chain_layout(parameters, None)
+        own = {"machine": MachineChoice.BM2} | bm2_options(machine)
+    else:
+        without_flag = board_layout(replace(parameters, lines=machine.lines), partitions, None)
+        own = {"scale": machine.scale, "stop": machine.stop} | machine_options(machine)
     interface = (machine.interface_sensors, machine.interface_results)
     return BuildOptions(
         uri=source.uri,
@@ -150,27 +186,48 @@ def _options(deployment: Deployment, image: Image) -> BuildOptions:
         type=source.type,
         partitions=partitions,
         interface=None if interface == without_flag.interface else interface,
-        scale=machine.scale,
         target_count=machine.target_count,
         max_cycles=machine.max_cycles,
-        stop=machine.stop,
         rng_table=image.machine.rng_table,
-        **machine_options(machine),
+        **own,
     )
 
 
-def _with_widths(model: Model, deployment: Deployment) -> Model:
-    """Return the model with the address widths of the deployment, or raise a BuildError if it needs another machine."""
-    sizes = [(each.label, each.size) for each in model.searched]
+def _same_chains(
+    model: Model | Question, options: BuildOptions, deployment: Deployment, image: Image
+) -> BM2Plan:
+    """Return the plan for a BM2, or raise a BuildError if it is another machine than the deployment's."""
+    plan, _ = plan_for(model, options)
+    _check_variables(plan.model.variables, dimensions_of(plan), deployment)
+    if not isinstance(plan, BM2Plan) or plan.parameters != image.machine.parameters:
+        raise BuildError(
+            "the model now has other variables or factors: this is another machine, so build it again with "
+            "'toolchain build'"
+        )
+    return plan
+
+
+def _check_variables(
+    variables: Sequence[Variable], searched: Sequence[Dimension], deployment: Deployment
+) -> None:
+    """Raise a BuildError if a model has other searched or known variables than the deployment."""
+    sizes = [(each.label, each.size) for each in searched]
     built_sizes = [(each.label, each.size) for each in deployment.searched]
-    kinds = {variable.name: variable.kind for variable in model.variables}
-    built_kinds = {variable.name: variable.kind for variable in deployment.variables}
-    for what, new, old in (("searches", sizes, built_sizes), ("knows", sorted(kinds), sorted(built_kinds))):
+    names = sorted(each.name for each in variables)
+    built_names = sorted(each.name for each in deployment.variables)
+    for what, new, old in (("searches", sizes, built_sizes), ("knows", names, built_names)):
         if new != old:
             raise BuildError(
                 f"the model {what} {_listed(new)}, but the deployment {_listed(old)}: this is another machine, so "
                 "build it again with 'toolchain build'"
             )
+
+
+def _with_widths(model: Model, deployment: Deployment) -> Model:
+    """Return the model with the address widths of the deployment, or raise a BuildError if it needs another machine."""
+    _check_variables(model.variables, model.searched, deployment)
+    kinds = {variable.name: variable.kind for variable in model.variables}
+    built_kinds = {variable.name: variable.kind for variable in deployment.variables}
     if kinds != built_kinds:
         raise BuildError("another variable now selects the prior: build it again with 'toolchain build'")
     bits = {variable.name: variable.bits for variable in deployment.variables}

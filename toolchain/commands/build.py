@@ -16,6 +16,7 @@ from toolchain.commands.request import (
     fit_to_device,
     model_file,
     read_model,
+    read_source,
 )
 from toolchain.errors import BuildError, ToolchainError
 from toolchain.networks import is_network
@@ -43,7 +44,7 @@ def build(
         ),
     ] = None,
 ) -> None:
-    """Build a deployment: programming files, deployment.toml, a report, and a hardware project.
+    """Build a deployment: programming files, deployment.toml, a report, and a BM1's hardware project.
 
     `toolchain build casestudies/boat -o build/boat --partitions 4 --uri ws://localhost:9090
     --topic /boat/sensors --type boat_msgs/Sensors`
@@ -54,15 +55,21 @@ def build(
     --topic /patient --type clinic_msgs/Patient`
     """
     from toolchain.building.build import REPORT_NAME, build_date, build_deployment
-    from toolchain.building.machine import plan_machine
+    from toolchain.building.choice import plan_for
+    from toolchain.building.machine import MachinePlan
 
     file = model_file(model)
     options = build_options(flags, target, sources)
     typer.echo(f"Reading {file}", err=True)
-    read = read_model(model, flags, flags.bits)
+    source = read_source(model, flags)
     dated = replace(options, build_date=build_date(file))
-    plan, why = fit_to_device(plan_machine(read, dated), flags.device)
-    typer.echo(f"Quantising {read.name} and writing its images", err=True)
+    plan, reason = plan_for(source, dated, flags.bits or (), flags.device)
+    why, kind = "", "BM2"
+    if isinstance(plan, MachinePlan):
+        plan, why = fit_to_device(plan, flags.device)
+        kind = "BM1"
+    typer.echo(f"Building a {kind}, since {reason}", err=True)
+    typer.echo(f"Quantising {plan.model.name} and writing its images", err=True)
     built = build_deployment(plan, directory, remark=why)
     typer.echo(built.report, nl=False)
     typer.echo(f"Wrote {built.deployment.path} and {directory / REPORT_NAME}", err=True)

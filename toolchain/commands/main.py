@@ -18,7 +18,7 @@ from toolchain.bounded_files import file_errors
 from toolchain.building.options import DeploymentEdits
 from toolchain.commands.build import build, check
 from toolchain.commands.explore import explore, inspect
-from toolchain.commands.request import ModelFlags, model_file, read_model
+from toolchain.commands.request import ModelFlags, model_file, read_source
 from toolchain.deployment import FILE_NAME
 from toolchain.errors import BuildError
 from toolchain.flags import Settings, add_commands
@@ -68,9 +68,9 @@ def memories(
     from toolchain.building.regenerate import regenerate_memories
 
     if model is not None:
-        read = read_model(model, flags)
+        source = read_source(model, flags)
         before = _lines(directory)
-        changes = regenerate_memories(directory, read, build_date=build_date(model_file(model)))
+        changes = regenerate_memories(directory, source, build_date=build_date(model_file(model)))
         _print_changes(changes, before, _lines(directory), verbose=verbose)
     elif flags.settings or flags.question:
         raise BuildError(f"{'--set' if flags.settings else flags.question[0]} is for a model: add --model")
@@ -84,11 +84,13 @@ def project(directory: Directory, verbose: Verbose = False) -> None:
     For example `toolchain regenerate project build/boat`.
     """
     from toolchain.building.regenerate import regenerate_project
+    from toolchain.deployment import load_deployment
+    from toolchain.outputs.output_files import only_emulated
 
     changes = regenerate_project(directory)
     _print_changes(changes, verbose=verbose)
-    if not changes:
-        typer.echo("rng = ideal exists only in emulation, so there is no project", err=True)
+    if reason := only_emulated(load_deployment(directory, images=False)):
+        typer.echo(f"{reason}, so there is no project", err=True)
 
 
 def deployment(directory: Directory, edits: DeploymentEdits, verbose: Verbose = False) -> None:

@@ -1,6 +1,5 @@
 """The model and the build options of a command line: their flags, and how they are read."""
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
-from machines.parameters import ADDRESS_BITS_MAX, RngKind
+from machines.parameters import RngKind
 from toolchain.bounded_files import open_regular
 from toolchain.building.options import BuildOptions, MachineOptions, OnMissing, TargetOptions, read_sources
 from toolchain.deployment import parse_interface
@@ -18,6 +17,7 @@ from toolchain.networks import is_network, read_network
 
 if TYPE_CHECKING:
     from toolchain.building.machine import MachinePlan
+    from toolchain.models.joint import Question
     from toolchain.models.model import Model
 
 ModelPath: TypeAlias = Annotated[
@@ -98,29 +98,22 @@ def model_file(path: Path) -> Path:
     return existing_model_path(path)
 
 
-def read_model(path: Path, flags: ModelFlags, bits: Iterable[str] | None = None) -> "Model":
-    """Return the model of a folder or network file; `bits` are `NAME=BITS`, the address bits of columns."""
+def read_source(path: Path, flags: ModelFlags) -> "Model | Question":
+    """Return the model or question of a folder, or the question to a network file."""
     settings = key_values(flags.settings or ())
-    model = (_network_model if is_network(path) else _case_model)(path, flags, settings)
-    widths = key_values(bits or (), "--bits", "range=8")
-    names = [variable.name for variable in model.variables]
-    for name, text in widths.items():
-        if name not in names:
-            raise BuildError(
-                f"--bits {name}={text}: the model has no such variable; it has {', '.join(names) or 'none'}"
-            )
-        if not re.fullmatch(r"\d{1,3}", text, re.ASCII) or not 1 <= int(text) <= ADDRESS_BITS_MAX:
-            raise BuildError(f"--bits {name}={text}: expected 1 to {ADDRESS_BITS_MAX} bits")
-    select = model.prior_select
-    return replace(
-        model,
-        known=tuple(replace(known, bits=int(widths.get(known.name, known.bits))) for known in model.known),
-        prior_select=select and replace(select, bits=int(widths.get(select.name, select.bits))),
-    )
+    return (_network_question if is_network(path) else _case_source)(path, flags, settings)
 
 
-def _network_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Model":
-    """Return the model for the question to a network file."""
+def read_model(path: Path, flags: ModelFlags, bits: Iterable[str] | None = None) -> "Model":
+    """Return the model for a BM1; `bits` are `NAME=BITS`, the address bits of columns."""
+    from toolchain.building.machine import with_bits
+    from toolchain.models.joint import Question
+
+    source = read_source(path, flags)
+    return with_bits(source.model() if isinstance(source, Question) else source, bits or ())
+
+
+def _network_question(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Question":
     if settings:
         raise BuildError(
             f"--set {next(iter(settings))}: a network file has no parameters; --given NAME=STATE fixes a variable"
@@ -129,26 +122,22 @@ def _network_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "
         raise BuildError(
             f"{path} is a network: give the searched and known variables, such as --searched A --known B,C"
         )
-    return (
-        read_network(path, on_missing=flags.on_missing.value)
-        .ask(
-            names_in("--searched", flags.searched),
-            names_in("--known", flags.known),
-            given=key_values(flags.given or (), "--given", "smoke=yes"),
-            prior_select=flags.prior_select or None,
-        )
-        .model()
+    return read_network(path, on_missing=flags.on_missing.value).ask(
+        names_in("--searched", flags.searched),
+        names_in("--known", flags.known),
+        given=key_values(flags.given or (), "--given", "smoke=yes"),
+        prior_select=flags.prior_select or None,
     )
 
 
-def _case_model(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Model":
-    from toolchain.models.case_study import load_model
+def _case_source(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Model | Question":
+    from toolchain.models.case_study import load_question
 
     if flags.question:
         raise BuildError(
             f"{flags.question[0]} is for a network file, but {path} is not one; model.py contains its own question"
         )
-    return load_model(path, settings)
+    return load_question(path, settings)
 
 
 def build_options(flags: BuildFlags, target: TargetOptions, sources: Path | None = None) -> BuildOptions:

@@ -23,7 +23,13 @@ _Result = TypeVar("_Result")
 
 
 def load_model(case: Path, settings: Mapping[str, str]) -> Model:
-    """Return the model of a case study's folder.
+    """Return the model of a case study's folder for a BM1; arguments and errors as for `load_question`."""
+    found = load_question(case, settings)
+    return found.model() if isinstance(found, Question) else found
+
+
+def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
+    """Return the model or the question of a case study's folder.
 
     Args:
         case: A folder with a `model.py`, or that file itself. It defines `model(...)`, which returns a
@@ -45,9 +51,7 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
             model = _guarded(path, "model()", lambda: function(**arguments))
     finally:
         sys.path.remove(folder)
-    if isinstance(model, Question):
-        return model.model()
-    if not isinstance(model, Model):
+    if not isinstance(model, Model | Question):
         raise ModelError(
             f"{path}: model() returned {type(model).__name__}, expected a toolchain.models.Model or a "
             "toolchain.models.Question"

@@ -160,8 +160,6 @@ class Question:
             ModelError: It is impossible, or needs a table above the limit.
         """
         observed = [symbol.name for symbol in self.observed]
-        active = [without_idle(factor) for factor in self.joint.factors]
-        factors, terms = self._factors(active, observed)
         searched = [symbol.name for symbol in self.searched]
         sizes = {symbol.name: symbol.size for symbol in self.joint.symbols}
         lines = math.prod(symbol.size for symbol in self.searched)
@@ -174,9 +172,10 @@ class Question:
             MAX_MODEL_ENTRIES,
             ": use fewer searched and known variables",
         )
+        if (refusal := self.refusal()) is not None:
+            raise refusal
+        factors, terms = self._factors([without_idle(factor) for factor in self.joint.factors], observed)
         links = Links(terms, factors, {*searched, *self.given})
-        if any(len(component.intersection(observed)) > 1 for component in links.components()):
-            raise self._refusal(active, observed)
         own: dict[str, list[Term]] = {symbol.name: [] for symbol in self.observed}
         common: list[Term] = []
         for component in links.components():
@@ -211,7 +210,17 @@ class Question:
         ]
         return factors, terms
 
-    def _refusal(self, active: Sequence[Factor], observed: Sequence[str]) -> ModelError:
+    def refusal(self) -> NotFusionError | None:
+        """Return why the question is not a naive fusion, or None if it is one."""
+        observed = [symbol.name for symbol in self.observed]
+        active = [without_idle(factor) for factor in self.joint.factors]
+        factors, terms = self._factors(active, observed)
+        links = Links(terms, factors, {*(symbol.name for symbol in self.searched), *self.given})
+        if any(len(component.intersection(observed)) > 1 for component in links.components()):
+            return self._refusal(active, observed)
+        return None
+
+    def _refusal(self, active: Sequence[Factor], observed: Sequence[str]) -> NotFusionError:
         """Return an error with two dependent observed symbols, the path between them, and advice.
 
         If the observed symbols are not all independent, two of them are dependent, regardless of the others (a property
@@ -244,8 +253,8 @@ class Question:
         way_out = f"search {path[1]} too, or leave {ends} out" if len(path) > 2 else f"leave {ends} out"
         names = ", ".join(each.name for each in self.searched)
         return NotFusionError(
-            f"{path[0]} and {path[-1]} are not independent given {names}: {drawn} joins them; {way_out} of the known "
-            "variables"
+            f"{path[0]} and {path[-1]} are not independent given {names}: {drawn} joins them",
+            f"{way_out} of the known variables",
         )
 
     def _fusion(

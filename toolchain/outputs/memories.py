@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machines.bm1 import BM1Machine
+from machines.bm2 import BM2Machine
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
 from machines.rng import LFSR, POLYNOMIALS, generator_numbers, random_numbers
 from pcie_shim.programming_file import Image
@@ -58,7 +59,7 @@ def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, .
         found += _seeds(images[0].machine, "")
     table = images[0].machine.rng_table
     if table is not None:
-        found.append(_rng_table(table, images[0].machine.parameters.prob_bits))
+        found.append(rng_table_memory(table, images[0].machine.parameters.prob_bits))
     return tuple(found)
 
 
@@ -78,7 +79,7 @@ def seed_words(machine: BM1Machine) -> NDArray[np.uint64]:
     return np.stack([numbers.restart(bank) for bank in range(parameters.rng_banks)])
 
 
-def seed_width(machine: BM1Machine) -> int:
+def seed_width(machine: BM1Machine | BM2Machine) -> int:
     """Return the bits of a seed: of an LFSR's state, or of an index into the table of random numbers."""
     if machine.rng_table is not None:
         return max(1, (machine.rng_table.size - 1).bit_length())
@@ -185,7 +186,8 @@ def generators(parameters: BM1Parameters) -> int:
     return parameters.columns * (1 if parameters.shared else parameters.lines)
 
 
-def _rng_table(table: NDArray[np.uint32], prob_bits: int) -> Memory:
+def rng_table_memory(table: NDArray[np.uint32], prob_bits: int) -> Memory:
+    """Return the memory of random numbers, whose low bits are used."""
     mask = (1 << prob_bits) - 1
     return Memory(
         name="rng_table.mif",

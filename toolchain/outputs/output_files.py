@@ -15,6 +15,7 @@ from pcie_shim.programming_file import Image, image_bytes
 from toolchain.bounded_files import file_errors, whole_file
 from toolchain.deployment import Deployment
 from toolchain.errors import BuildError
+from toolchain.outputs.bm2_memories import bm2_memories
 from toolchain.outputs.memories import MEMORIES_FOLDER, Memory, memories
 from toolchain.outputs.mif import printable
 from toolchain.outputs.vhdl_parameters import PARAMETERS_FILE, parameters_vhd
@@ -103,7 +104,7 @@ class OutputFiles:
 
 
 _MEMORIES: Final = re.compile(
-    rf"{re.escape(PARAMETERS_FILE)}|{re.escape(MEMORIES_FOLDER)}/(board\d+_(prior|column\d+|rng_seeds)|rng_(seeds|table))\.mif"
+    rf"{re.escape(PARAMETERS_FILE)}|{re.escape(MEMORIES_FOLDER)}/(cde\d+|board\d+_(prior|column\d+|(rng|sequencer)_seeds)|rng_(seeds|table))\.mif"
 )
 _COMMENT: Final = re.compile(rb"(--|#).*", re.DOTALL)
 _LONGEST_LINE: Final = 1 << 20
@@ -112,9 +113,14 @@ _PROJECT: Final = re.compile(rf"{PROJECT}\.(qpf|tcl)|{PROJECT}_board\d+\.qsf")
 
 
 def memory_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
-    """Return `bm1_parameters.vhd` and the MIFs (thesis 3.2)."""
-    contents: dict[str, Iterable[bytes]] = {PARAMETERS_FILE: [parameters_vhd(deployment, images).encode()]}
-    for memory in memories(deployment, images):
+    """Return the MIFs and, of a BM1, `bm1_parameters.vhd` (thesis 3.2)."""
+    contents: dict[str, Iterable[bytes]] = {}
+    if deployment.machine.type == "BM1":
+        contents[PARAMETERS_FILE] = [parameters_vhd(deployment, images).encode()]
+        found = memories(deployment, images)
+    else:
+        found = bm2_memories(images)
+    for memory in found:
         contents[f"{MEMORIES_FOLDER}/{memory.name}"] = _encoded(memory)
     return OutputFiles(contents, _MEMORIES)
 
@@ -124,9 +130,16 @@ def _encoded(memory: Memory) -> Iterator[bytes]:
         yield line.encode()
 
 
+def only_emulated(deployment: Deployment) -> str:
+    """Return why the machine exists only in emulation, as a clause; empty if there is hardware of it."""
+    if not deployment.machine.kind.has_hardware:
+        return f"the VHDL of a {deployment.machine.type} does not exist yet"
+    return "rng = ideal exists only in emulation" if deployment.machine.rng is RngKind.IDEAL else ""
+
+
 def quartus_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
-    """Return the Quartus project: `bm1.qpf`, a `.qsf` per board, `bm1.tcl`; none for emulated generators."""
-    if deployment.machine.rng is RngKind.IDEAL:
+    """Return the Quartus project: `bm1.qpf`, a `.qsf` per board, `bm1.tcl`; none if the machine exists only in emulation."""
+    if only_emulated(deployment):
         return OutputFiles({}, _PROJECT)
     names = [memory.name for memory in memories(deployment, images)]
     revisions = [f"{PROJECT}_board{board}" for board in range(len(deployment.boards))]

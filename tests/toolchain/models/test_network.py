@@ -95,7 +95,12 @@ def test_a_searched_variable_of_constant_factors_is_uniform():
     network = joint.ask(["B", "one"], ["A"]).network()
     assert network.names == ("one", "A", "B")
     assert network.exact([1]) == pytest.approx([1 / 3] * 3)
-    assert network.titles == ("P(A)", "uniform(one)", "uniform(B)")  # every variable is in a factor
+    assert network.titles == (
+        "P(A)",
+        "the potential of A",
+        "uniform(one)",
+        "uniform(B)",
+    )  # every variable is in a factor
 
 
 def test_a_naive_fusion_is_a_network_too():

@@ -1,0 +1,141 @@
+"""The BM2 for a model: its plan, the sizes of its tables and results, and the machine of each board, a chain (thesis 2.1.3)."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from machines import KINDS
+from machines.bm2 import CHAINS_MAX, FACTOR_BITS_MAX, BM2Machine, BM2Parameters, start_state
+from machines.errors import MachineError, ParameterError
+from machines.parameters import RngKind
+from pcie_shim.register_layout import BLOCKS
+from toolchain.building.machine import BoardLayout, LineBlock, check_seeds, fitted_interface
+from toolchain.building.options import BuildOptions
+from toolchain.deployment import BM2Section
+from toolchain.errors import BuildError
+from toolchain.models.network import NetworkModel
+from toolchain.outputs.mif import random_table
+
+_MOST_CODES: Final = 1 << 27
+"""Maximum number of codes of all CDEs, 2 bytes each."""
+
+BM2_KEYS: Final = tuple(key for key in BM2Section.model_fields if key in BM2Parameters.__dataclass_fields__)
+"""The parameters with the same names in `[machine]`."""
+_OPTIONS: Final = tuple(key for key in BM2_KEYS if key in BuildOptions.__dataclass_fields__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BM2Plan:
+    """The BM2 for a model, before any table is computed."""
+
+    model: NetworkModel
+    options: BuildOptions
+    """The options."""
+    parameters: BM2Parameters
+    """The parameters of the first board; the others differ only in their number."""
+    why: str = "it was asked for"
+    """The reason for a BM2, as a clause."""
+
+    @property
+    def target_count(self) -> int:
+        """The number of samples of each board."""
+        asked = self.options.target_count
+        return int(BM2Section.model_fields["target_count"].default) if asked is None else asked
+
+    @property
+    def max_cycles(self) -> int:
+        """The maximum number of cycles, a safety stop."""
+        asked = self.options.max_cycles
+        return int(BM2Section.model_fields["max_cycles"].default) if asked is None else asked
+
+
+def bm2_options(source: BuildOptions | BM2Section) -> dict[str, Any]:
+    """Return the parameters of a machine with the same names in the build options and in `[machine]`."""
+    return {key: value for key in _OPTIONS if (value := getattr(source, key)) is not None}
+
+
+def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was asked for") -> BM2Plan:
+    """Derive the parameters of the machine for a network, or raise a BuildError if it is too large for one."""
+    _check_sizes(model)
+    place = {name: at for at, name in enumerate(model.names)}
+    if not 1 <= options.partitions <= CHAINS_MAX:
+        raise BuildError(f"--partitions {options.partitions}: expected 1 to {CHAINS_MAX} chains")
+    try:
+        parameters = BM2Parameters(
+            cardinalities=model.cardinalities,
+            factors=tuple(tuple(place[name] for name in term.scope) for term in model.factors),
+            searched=tuple(place[name] for name in model.searched),
+            known=tuple(place[name] for name in model.known),
+            chains=options.partitions,
+            **bm2_options(options),
+        )
+    except ParameterError as reason:
+        raise BuildError(str(reason)) from reason
+    room = BLOCKS["STREAM"].words // parameters.state_words
+    if parameters.stream > room:
+        raise BuildError(
+            f"--stream {parameters.stream}: a sample of this model has {parameters.state_words} words, and the "
+            f"register map has room for {room} samples"
+        )
+    return BM2Plan(model=model, options=options, parameters=parameters, why=why)
+
+
+def _check_sizes(model: NetworkModel) -> None:
+    """Raise a BuildError, which names the largest part, for a model that does not fit tables or registers."""
+    bits = {each.name: (each.size - 1).bit_length() for each in model.symbols}
+    widths = [sum(bits[name] for name in term.scope) for term in model.factors]
+    codes = [width << width >> 1 for width in widths]
+    widest = max(range(len(codes)), key=codes.__getitem__)
+    too_wide = widths[widest] > FACTOR_BITS_MAX
+    if too_wide or sum(codes) > _MOST_CODES:
+        limit = (
+            f"{FACTOR_BITS_MAX} bits"
+            if too_wide
+            else f"{_MOST_CODES} codes of all CDEs, which need {sum(codes)}"
+        )
+        raise BuildError(
+            f"{model.titles[widest]} is over {widths[widest]} bits, so its CDE needs {codes[widest]} codes; the maximum "
+            f"is {limit}: give its variables fewer values, or fix one with --given"
+        )
+    room, words = BLOCKS["RESULTS"].words, sum(1 << width for width in bits.values())
+    joint = 1 << sum(bits[name] for name in model.searched)
+    if words + joint > room:
+        largest = max(model.symbols, key=lambda each: each.size)
+        raise BuildError(
+            f"the results of {model.name} are {words} words of histograms (of {largest.name} with {largest.size} values "
+            f"alone {1 << bits[largest.name]}) and {joint} for the searched variables together, but the register map has "
+            f"room for {room}: "
+            + (
+                "search fewer variables"
+                if joint > words
+                else f"give {largest.name} fewer values, or fix variables"
+            )
+        )
+
+
+def chain_machines(plan: BM2Plan) -> tuple[BM2Machine, ...]:
+    """Return the machine of each board: the same tables, and seeds of its own; a BuildError if no state is possible."""
+    parameters, table = plan.parameters, plan.options.rng_table
+    if table is None and parameters.rng is RngKind.TABLE:
+        table = random_table(parameters.prob_bits)
+    try:
+        first = BM2Machine.from_factors(parameters, [term.table for term in plan.model.factors], table)
+        if start_state(first, {}) is None:
+            raise BuildError(f"{plan.model.name}: the given values are impossible together")
+    except MachineError as reason:
+        raise BuildError(f"{plan.model.name}: {str(reason).rstrip('.')}") from reason
+    return tuple(
+        BM2Machine(replace(parameters, chain=chain), first.tables, first.supports, first.rng_table)
+        for chain in range(parameters.chains)
+    )
+
+
+def chain_layout(parameters: BM2Parameters, interface: tuple[int, int] | None) -> BoardLayout:
+    """Return the layout of the boards, each of which has a chain; a BuildError as for `fitted_interface`."""
+    check_seeds(parameters)
+    what = f"a state of {parameters.state_bits} bits, {parameters.histogram_words} words of histograms and {parameters.joint_words} of the searched variables"
+    fitted, reason = fitted_interface(KINDS["BM2"]().registers(parameters), interface, what, "")
+    return BoardLayout(
+        blocks=tuple(LineBlock(chain, 1) for chain in range(parameters.chains)),
+        interface=fitted,
+        reason=reason,
+    )

@@ -1,0 +1,54 @@
+"""The choice of a machine for a model: a BM1 for a naive fusion, a BM2 for every other question (thesis 2.1)."""
+
+from collections.abc import Sequence
+from typing import Final
+
+from toolchain.building.bm2_machine import BM2Plan, plan_bm2
+from toolchain.building.machine import MachinePlan, plan_machine, with_bits
+from toolchain.building.options import BM1Options, BM2Options, BuildOptions, MachineChoice, given_flags
+from toolchain.errors import BuildError
+from toolchain.models.joint import Question
+from toolchain.models.model import Model
+from toolchain.models.network import network_of
+
+_FUSION: Final = "the known variables are independent given the searched ones"
+
+
+def plan_for(
+    source: Model | Question, options: BuildOptions, bits: Sequence[str] = (), device: str | None = None
+) -> tuple[MachinePlan | BM2Plan, str]:
+    """Return the plan of the machine that the options ask for, and the reason for its kind, as a clause.
+
+    Args:
+        source: A naive fusion, or any question.
+        options: The options, with the choice of the machine.
+        bits: Address bits of a BM1's columns, as `NAME=BITS`.
+        device: FPGA of the boards of a BM1, or None.
+
+    Raises:
+        ToolchainError: The machine cannot be built, or a flag is for the other machine.
+    """
+    refusal = source.refusal() if isinstance(source, Question) else None
+    choice = options.machine
+    why = _FUSION if refusal is None else refusal.why
+    if choice is MachineChoice.BM1 or (choice is MachineChoice.AUTO and refusal is None):
+        _refuse(given_flags(options, BM2Options), "BM2", "BM1", choice, why)
+        model = source.model() if isinstance(source, Question) else source
+        return plan_machine(with_bits(model, bits), options), why
+    flags = given_flags(options, BM1Options)
+    flags += [flag for flag, given in (("--bits", bits), ("--device", device)) if given]
+    if options.written_prior is not None:
+        flags.append("--prior-path" if options.sources is None else "a prior in the file of --sources")
+    _refuse(flags, "BM1", "BM2", choice, why)
+    network = source.network() if isinstance(source, Question) else network_of(source)
+    why = why if refusal is not None else "it was asked for"
+    return plan_bm2(network, options, why), why
+
+
+def _refuse(flags: list[str], wanted: str, chosen: str, choice: MachineChoice, why: str) -> None:
+    """Raise a BuildError for flags of the machine that was not chosen."""
+    for flag in flags:
+        if choice is MachineChoice.AUTO:
+            way_out = f"leave it out, or add --machine {wanted.lower()}"
+            raise BuildError(f"{flag} is for a {wanted}, but this is a {chosen}, since {why}; {way_out}")
+        raise BuildError(f"{flag} is for a {wanted}, but this is a {chosen} (--machine {choice})")

@@ -1,0 +1,187 @@
+"""The report of a build: what was built and what was lost, in plain sentences (thesis 3.4).
+
+It has no dates or paths, so the same input gives the same bytes.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from machines.bm2 import BM2Machine
+from machines.parameters import PriorMode, SensorMode
+from toolchain.building.quantise import Quantised
+from toolchain.deployment import Deployment, Dimension, MachineSection, Variable
+from toolchain.models.model import Model
+from toolchain.models.network import NetworkModel
+
+
+def build_report(
+    model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str = ""
+) -> str:
+    """Return what was built and what was lost, in plain sentences, without dates or paths: same input, same bytes."""
+    machine = deployment.machine
+    grid = " x ".join(f"{d.label} {d.size}" for d in model.searched)
+    names = ", ".join(known.name for known in model.known)
+    count = f"{len(model.known)} known variable{'s' if len(model.known) != 1 else ''}"
+    machine_sentence = (
+        f"Machine: BM1, since the known variables are independent given the searched ones. Codes of {machine.prob_bits} bits (scale = {machine.scale}), counters of "
+        f"{machine.counter_bits} bits, stops at a count of {machine.target_count} or after {machine.max_cycles} "
+        f"cycles, stop = {machine.stop}; {machine.rng} with {machine.rng_banks} banks, rng_reset = "
+        f"{machine.rng_reset}, {machine.steps_per_clock} steps per clock."
+    )
+    machine_sentence += many_sentence(machine)
+    paragraphs = [
+        f"Model {model.name}: {model.lines} lines ({grid}), {count}"
+        + (
+            f", in the order of the columns: {names}."
+            if len(model.known) > 1
+            else f", {names}."
+            if names
+            else "."
+        ),
+        *_state_paragraph(model.searched, model.variables),
+        *_prior_paragraph(model, deployment),
+        machine_sentence,
+        f"Interface: {machine.interface}{interface_reason}.",
+        f"Boards: {len(deployment.boards)}.\n"
+        + "\n".join(
+            f"  {board.image}: lines {board.line_offset} to {board.line_offset + board.lines - 1}, "
+            f"image {board.image_hash[:16]}"
+            for board in deployment.boards
+        ),
+        loss_heading(machine.sensor_mode) + "\n" + _loss_table(quantised),
+    ]
+    paragraphs += [f"Warning: {warning}" for warning in quantised.warnings]
+    paragraphs.append(f"{_topics_sentence(deployment)} Deployment {deployment.hash[:16]}.")
+    return "\n\n".join(paragraphs) + "\n"
+
+
+def loss_heading(sensor_mode: SensorMode) -> str:
+    """Return the heading of the table of losses."""
+    posterior = "the column's own posterior"
+    if sensor_mode is SensorMode.CELL:
+        posterior += " where all lines read the same"
+    return f"Lost by quantising (mass: how often the true line has code 0; KL: of {posterior}, bits):"
+
+
+def many_sentence(machine: MachineSection) -> str:
+    """Describe a frame's readings and results, unless they are one number per variable and one posterior."""
+    sentence = {
+        SensorMode.COLUMN: "",
+        SensorMode.CELL: f" Each of the {machine.lines} lines has a reading of its own (sensor_mode = cell).",
+        SensorMode.THRESHOLD: (
+            f" Readings are probabilities, one for each of the {machine.lines} lines (sensor_mode = threshold); there are no "
+            "tables."
+        ),
+    }[machine.sensor_mode]
+    if machine.replicas > 1:
+        sentence += (
+            f" Each board holds {machine.replicas} of these machines around the same generators: a frame brings {machine.replicas} "
+            f"sets of readings and gives {machine.replicas} posteriors."
+        )
+    return sentence
+
+
+def _topics_sentence(deployment: Deployment) -> str:
+    """Name the sources of readings (with their variables, if there are several) and the topic of the posteriors."""
+    output = deployment.outputs[0]
+    places = [f"{source.uri}, topic {source.topic} ({source.type})" for source in deployment.sources]
+    if len(places) == 1:
+        return f"Readings come from {places[0]}; posteriors go to {output.topic}."
+    for at, place in enumerate(places):
+        names = [variable.name for variable in deployment.variables if variable.source == at]
+        if deployment.prior is not None and deployment.prior.source == at:
+            names.append("the prior")
+        places[at] = f"\n  {place}: {', '.join(names)}"
+    return (
+        f"Readings come from {len(places)} topics, together where their stamps are within "
+        f"{deployment.tolerance_s:g} s:{''.join(places)}\n"
+        f"Posteriors go to {output.topic} on {deployment.output_uri(output)}."
+    )
+
+
+def _state_paragraph(searched: Sequence[Dimension], known: Sequence[Variable]) -> list[str]:
+    named = [
+        f"  {name}: " + ", ".join(f"{offset + at * step:g} {state}" for at, state in enumerate(states))
+        for name, offset, step, states in (
+            *((each.label, each.offset, each.step, each.states) for each in searched),
+            *((each.name, each.offset, each.step, each.states) for each in known),
+        )
+        if states
+    ]
+    return ["States, as numbers; a reading may be either:\n" + "\n".join(named)] if named else []
+
+
+def _prior_paragraph(model: Model, deployment: Deployment) -> list[str]:
+    if (select := model.prior_select) is not None:
+        return [
+            f"Prior: selected by {select.name}, one of {select.values} rows; a missing reading takes the prior without it."
+        ]
+    if deployment.machine.prior_mode is not PriorMode.WRITTEN:
+        return []
+    if deployment.prior is None:
+        return ["Prior: written by the host; the model's own until it is."]
+    return [f"Prior: written every frame, from {deployment.prior.path} of the message."]
+
+
+def _loss_table(quantised: Quantised) -> str:
+    width = max(len(loss.name) for loss in quantised.losses)
+    rows = [f"  {'column':{max(width, 6)}}  bits  values       mass         KL"]
+    rows += [
+        f"  {loss.name:{max(width, 6)}}  {loss.bits:4d}  {loss.values:6d}  {loss.mass:9.2e}  {loss.kl_bits:9.2e}"
+        for loss in quantised.losses
+    ]
+    return "\n".join(rows)
+
+
+def bm2_report(
+    model: NetworkModel, deployment: Deployment, machine: BM2Machine, why: str, interface_reason: str
+) -> str:
+    """Return the report of a BM2; `why` is the reason for this kind of machine, as a clause."""
+    searched = ", ".join(f"{each.label} ({each.size})" for each in model.dimensions)
+    known = f"knows {', '.join(model.known)}" if model.known else "knows nothing"
+    parameters, limits = machine.parameters, deployment.machine
+    sentence = (
+        f"Machine: BM2, since {why}. Codes of {parameters.prob_bits} bits, sequencer = {parameters.sequencer}"
+        + (", literal" if parameters.literal else "")
+        + f"; each board draws {limits.target_count} samples, one per {parameters.sample_every}, after "
+        f"{parameters.burn_in} sweeps, or stops after {limits.max_cycles} cycles, or {parameters.ops_timeout} of one move; "
+        f"{parameters.rng} with {parameters.rng_banks} banks, rng_reset = {parameters.rng_reset}, "
+        f"{parameters.steps_per_clock} steps per clock."
+    )
+    if parameters.stream:
+        sentence += f" It keeps {parameters.stream} samples for /bm/samples."
+    first = (
+        f"Model {model.name}: {len(model.symbols)} variables in {parameters.state_bits} bits, {parameters.cdes} factors; "
+        f"it searches {searched}, and {known}."
+    )
+    paragraphs = [
+        first,
+        *_state_paragraph(model.dimensions, model.variables),
+        sentence,
+        f"Interface: {limits.interface}{interface_reason}.",
+        f"Boards: {len(deployment.boards)}, each with a chain of its own.\n"
+        + "\n".join(
+            f"  {board.image}: chain {board.line_offset}, image {board.image_hash[:16]}"
+            for board in deployment.boards
+        ),
+        "CDEs (clipped: codes of odds that are 0 or infinite, or too extreme for a code):\n"
+        + _cde_table(model.titles, machine),
+        "The VHDL of a BM2 does not exist yet, so there are memories, but no parameters and no project.",
+        f"{_topics_sentence(deployment)} Deployment {deployment.hash[:16]}.",
+    ]
+    return "\n\n".join(paragraphs) + "\n"
+
+
+def _cde_table(titles: Sequence[str], machine: BM2Machine) -> str:
+    width, most = max(map(len, titles)), machine.parameters.ones_code
+    rows = [f"  {'factor':{width}}  bits    codes  clipped"]
+    for at, (title, table) in enumerate(zip(titles, machine.tables, strict=True)):
+        bits = len(machine.parameters.factor_bits(at))
+        rows.append(f"  {title:{width}}  {bits:4d}  {table.size:7d}  {_clipped(table, most):7d}")
+    return "\n".join(rows)
+
+
+def _clipped(table: NDArray[np.uint16], most: int) -> int:
+    return int(np.count_nonzero((table == 1) | (table == most)))
