@@ -23,6 +23,11 @@ _COMMANDS: Final = {
     "boat-simulator": ("casestudies.boat.simulator", "Publish the readings of a simulated boat."),
     "boat-normaliser": ("casestudies.boat.normaliser", "Turn raw readings into whole numbers in range."),
     "boat-viewer": ("casestudies.boat.viewer", "Show posteriors beside the boat's true position."),
+    "sprinkler-garden": (
+        "casestudies.sprinkler.garden",
+        "Publish whether a simulated garden's grass is wet.",
+    ),
+    "sprinkler-viewer": ("casestudies.sprinkler.viewer", "Show how the estimate of rain converges."),
 }
 
 app = CommandLine(name="rosbayes")

@@ -177,8 +177,10 @@ class Screen:
         self._is_open = True
 
 
-async def build(case_study: str, deployment: Path, uri: str, topic: str, type_: str, *options: str) -> None:
-    """Build a case study's deployment for four boards; the report goes to DEPLOYMENT.log.
+async def build(
+    case_study: str, deployment: Path, uri: str, topic: str, type_: str, *options: str, boards: int = 4
+) -> None:
+    """Build a case study's deployment; the report goes to DEPLOYMENT.log.
 
     Raises:
         StackError: The toolchain failed.
@@ -186,7 +188,7 @@ async def build(case_study: str, deployment: Path, uri: str, topic: str, type_: 
     toolchain = Process("toolchain", deployment.with_name(deployment.name + ".log"))
     await toolchain.start(
         *("toolchain", "build", str(ROOT / "casestudies" / case_study), "-o", str(deployment)),
-        *("--partitions", "4", "--uri", uri, "--topic", topic, "--type", type_, *options),
+        *("--partitions", str(boards), "--uri", uri, "--topic", topic, "--type", type_, *options),
     )
     await toolchain.succeed()
 

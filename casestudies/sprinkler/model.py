@@ -1,0 +1,55 @@
+"""The sprinkler's network P(R) P(S | R) P(G | S, R), its question P(R | G), and its topics (thesis 2.1.3.1).
+
+R: it has rained; S: the sprinkler was on; G: the grass is wet.
+"""
+
+from functools import cache
+from typing import Final
+
+from toolchain.errors import ModelError
+from toolchain.models import JointDistribution, LabelType, Question, Symbol, table
+
+RAIN: Final = 0.2
+"""P(R = 1)."""
+ON: Final = (0.4, 0.01)
+"""P(S = 1 | R), for R = 0 and 1."""
+WET: Final = ((0.0, 0.8), (0.9, 0.99))
+"""P(G = 1 | S, R), a row for S = 0 and one for S = 1, each for R = 0 and 1."""
+
+GRASS_TOPIC: Final = "/sprinkler/grass"
+"""Topic of G, the reading."""
+TRUTH_TOPIC: Final = "/sprinkler/truth"
+"""Topic of the true state R + 2 S + 4 G, packed as the machine packs it."""
+TYPE: Final = "std_msgs/UInt8"
+"""Type of both topics, which every ROS server has installed."""
+
+
+def model(rain: float = RAIN) -> Question:
+    """Return the question P(R | G).
+
+    Args:
+        rain: P(R = 1).
+
+    Raises:
+        ModelError: `rain` is not between 0 and 1.
+    """
+    if not 0 < rain < 1:
+        raise ModelError(f"rain is {rain}, expected a probability between 0 and 1")
+    rained = Symbol("R", LabelType("no", "yes"))
+    sprinkler = Symbol("S", LabelType("off", "on"))
+    grass = Symbol("G", LabelType("dry", "wet"), path="data")
+    joint = JointDistribution(
+        "sprinkler",
+        (
+            table(rained, [1 - rain, rain]),
+            table(sprinkler, [[1 - p for p in ON], ON], given=[rained]),
+            table(grass, [[[1 - p for p in row] for row in WET], WET], given=[sprinkler, rained]),
+        ),
+    )
+    return joint.ask(searched=[rained], known=[grass])
+
+
+@cache
+def exact_rain(grass: int, rain: float = RAIN) -> float:
+    """Return P(R = 1 | G = grass) by exact inference: 0.3577 for wet grass."""
+    return float(model(rain).network().exact((grass,))[1])
