@@ -18,12 +18,13 @@ from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.board.rtl_board import RtlBoard
 from pcie_shim.errors import FrameInputError, ImageMismatchError
+from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, Partition, image_bytes, image_from_bytes
 from pcie_shim.register_map import ErrorCode
 from services.boards.hardware import Engine, SimulatedHardware
+from tests.pcie_shim.boards import board_fails, opened, words
 from tests.pcie_shim.boards import image as bm1_image
 from tests.pcie_shim.boards import machine as bm1_machine
-from tests.pcie_shim.boards import opened, words
 
 FACTORS = (
     np.array([0.8, 0.2]),
@@ -307,6 +308,19 @@ def test_either_image_replaces_the_other_on_an_emulated_board():
     for content in (images()[0], bm1_image(bm1_machine()), images(stream=4)[0]):
         board.load(image_bytes(content))
         assert board.image_hash == content.image_hash
+
+
+@pytest.mark.parametrize("is_first", [True, False])
+def test_a_host_refuses_a_board_with_the_image_of_the_other_kind(start_board, is_first):
+    endpoint = start_board().endpoint
+    other, ours = sorted(
+        (images()[0], bm1_image(bm1_machine())), key=lambda each: (each.kind is BM2) != is_first
+    )
+    with MiniCluster.open([endpoint], [other]):
+        pass
+    with board_fails(ImageMismatchError):
+        MiniCluster.open([endpoint], [ours])
+    MiniCluster.open([endpoint], [ours], reprogram=True).close()
 
 
 def test_simulated_hardware_of_the_other_kind_refuses_it(monkeypatch, tmp_path):
