@@ -100,15 +100,16 @@ def _check_sizes(model: NetworkModel) -> None:
     joint = 1 << sum(bits[name] for name in model.searched)
     if words + joint > room:
         largest = max(model.symbols, key=lambda each: each.size)
+        most = 1 << bits[largest.name]
+        if joint > words:
+            advice = "search fewer variables"
+        elif 2 * most > words:
+            advice = f"give {largest.name} fewer values"
+        else:
+            advice = f"ask about fewer than {len(bits)} variables, or fix some with --given"
         raise BuildError(
-            f"the results of {model.name} are {words} words of histograms (of {largest.name} with {largest.size} values "
-            f"alone {1 << bits[largest.name]}) and {joint} for the searched variables together, but the register map has "
-            f"room for {room}: "
-            + (
-                "search fewer variables"
-                if joint > words
-                else f"give {largest.name} fewer values, or fix variables"
-            )
+            f"the results of {model.name} are {words} words of histograms ({most} of {largest.name} with {largest.size} "
+            f"values) and {joint} for the searched variables together, but the register map has room for {room}: {advice}"
         )
 
 

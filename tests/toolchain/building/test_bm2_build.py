@@ -200,6 +200,42 @@ def test_a_naive_fusion_becomes_a_bm1_unless_a_bm2_is_asked_for(network, case):
     assert_refused(build(network, *GRASS, "--machine", "bm1"), "sprinkler", "grass", "joins them")
 
 
+MARKOV = """MARKOV
+3
+2 3 2
+2
+2 0 1
+2 1 2
+6
+1 2 3 4 5 6
+6
+1 2 3 4 5 6
+"""
+QUESTION = """
+from toolchain.models import *
+
+def model(searched: str = "inside") -> Question:
+    pressure, inside = Symbol("pressure", IntegerType(1, 3)), Symbol("inside", IntegerType(0, 3))
+    gauge, whistle = Symbol("gauge", IntervalType(0, 4, 8)), Symbol("whistle", LabelType("no", "yes"))
+    joint = JointDistribution("boiler", (
+        uniform(pressure), table(inside, [[0.1] * 3, [0.6, 0.1, 0.1], [0.2, 0.7, 0.1], [0.1, 0.1, 0.7]], given=[pressure]),
+        conditional_normal(gauge, [inside], mean=lambda bar: bar, sigma=0.4),
+        table(whistle, [[0.9, 0.9, 0.5, 0.1], [0.1, 0.1, 0.5, 0.9]], given=[inside])))
+    return joint.ask(searched=[searched], known=[gauge, whistle])
+"""
+
+
+def test_questions_of_other_files_are_built_too(tmp_path):
+    (tmp_path / "net.uai").write_text(MARKOV)
+    done(build(tmp_path / "net.uai", "--searched", "0", "--known", "1,2"))
+    assert load_deployment(tmp_path / "out").machine.variables == ("0", "1", "2")
+    (tmp_path / "boiler").mkdir()
+    (tmp_path / "boiler" / "model.py").write_text(QUESTION)
+    for searched, machine in (("inside", "BM1"), ("pressure", "BM2")):
+        done(build(tmp_path / "boiler", "--set", f"searched={searched}"))
+        assert load_deployment(tmp_path / "out").machine.type == machine
+
+
 BM1_FLAGS = (
     ("--scale", "none"), ("--prior-mode", "written"), ("--counter-bits", "9"), ("--stop", "own"), ("--per-cell",),
     ("--sensor-mode", "cell"), ("--replicas", "2"), ("--bits", "grass=3"), ("--prior-path", "data"),
@@ -268,12 +304,13 @@ def test_given_values_that_exclude_each_other_are_refused():
         chain_machines(plan_bm2(network, OPTIONS))
 
 
-def plan_of(*sizes, scope=None):
+def plan_of(*sizes, scope=None, searched=None):
     symbols = [Symbol(f"V{at}", IntegerType(0, size - 1)) for at, size in enumerate(sizes)]
     factors = [uniform(each) for each in symbols]
     if scope:
         factors.append(potential(symbols[:scope], np.random.default_rng(1).random(sizes[:scope])))
-    return plan_bm2(JointDistribution("wide", tuple(factors)).ask(symbols).network(), OPTIONS)
+    joint = JointDistribution("wide", tuple(factors))
+    return plan_bm2(joint.ask(symbols[:searched], symbols[searched or len(sizes) :]).network(), OPTIONS)
 
 
 def test_what_is_too_large_is_named():
@@ -282,12 +319,12 @@ def test_what_is_too_large_is_named():
         BuildError, match="the potential of V0, V1, V2 is over 21 bits, .* the maximum is 20 bits"
     ):
         plan_of(128, 128, 128, scope=3)
-    with pytest.raises(
-        BuildError, match="of V1 with 4096 values alone 4096.*room for 4096: give V1 fewer values"
-    ):
+    with pytest.raises(BuildError, match="4096 of V1 with 4096 values.*room for 4096: give V1 fewer values"):
         plan_of(1, 4096)
     with pytest.raises(BuildError, match="64 words of histograms .*4096: search fewer variables"):
         plan_of(16, 16, 16, 16)
+    with pytest.raises(BuildError, match="8194 words .* and 2 .*: ask about fewer than 65 variables"):
+        plan_of(2, *[128] * 64, searched=1)
 
 
 # One part again

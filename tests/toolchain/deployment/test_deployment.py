@@ -131,6 +131,12 @@ def test_the_bytes_of_a_bm1_are_those_of_earlier_versions():
     )
 
 
+def test_a_section_without_a_type_is_that_of_a_bm1(folder):
+    written = load_deployment(folder, images=False)
+    edit(folder, 'type = "BM1"\n', "")
+    assert load_deployment(folder, images=False) == written
+
+
 CHAINS = tuple(
     BoardSection(image=f"boards/board{at}.bm", image_hash="a" * 64, line_offset=at, lines=1) for at in (0, 1)
 )
