@@ -352,10 +352,10 @@ def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
     for name, language in (("garden.bif", "bif"), ("mymodel/walks.csv", "csv")):
         (text,) = blocks(language)
         (models / name).write_text(text)
-    boiler, _ = blocks("python")
+    boiler, *_ = blocks("python")
     (models / "boiler" / "model.py").write_text(boiler)
     commands = re.findall(r"^    (toolchain .*)$", MODELS, re.MULTILINE)
-    assert len(commands) == 8
+    assert len(commands) == 9
     for command in commands:
         if "fit=" in command:  # of a model that the reader has changed
             continue
