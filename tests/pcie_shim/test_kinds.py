@@ -58,6 +58,21 @@ def weather(**parameters):
     return BM2Machine.from_factors(built, (np.array([1.0, 2.0, 0.0]), np.arange(15.0).reshape(3, 5), of_two))
 
 
+def wide(**parameters):
+    """A chain of variables, whose state has two words."""
+    built = BM2Parameters(
+        cardinalities=(5,) * 12,
+        factors=((0,), *((at, at + 1) for at in range(11))),
+        searched=(0, 11),
+        known=(10,),  # its code is in both words
+        burn_in=3,
+        **parameters,
+    )
+    random = np.random.default_rng(5)
+    factors = [random.random(5), *(random.random((5, 5)) for _ in range(11))]
+    return BM2Machine.from_factors(built, factors)
+
+
 def image(machine):
     parameters = machine.parameters
     partition = Partition(parameters.chain, parameters.chains, parameters.chain, parameters.chains)
@@ -147,6 +162,16 @@ def test_a_stream_that_is_full_makes_the_board_wait_and_changes_nothing(sample_e
     assert (states >> 2 == 1).all()
     assert np.bincount(states & 1, minlength=2).tolist() == output.boards[0].counts[:2].tolist()
     assert not BM2.infer(whole.boards).samples
+
+
+def test_a_state_may_have_several_words():
+    machine = wide(stream=6)
+    with opened([image(machine)]) as cluster:
+        output = cluster.run(frame(4, samples=40))
+    assert found(output.boards[0]) == expected(machine, state=4 << 30, known=7 << 30, samples=40)
+    inference = BM2.infer(output.boards)
+    assert (inference.sample_bytes, len(inference.samples)) == (8, 320)
+    assert inference.posterior.shape == (25,)
 
 
 def test_readings_may_be_missing_and_codes_unused():
