@@ -1,0 +1,149 @@
+"""Many chains at a time against one kernel for each, to the bit, over random networks."""
+
+import dataclasses
+from unittest import mock
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from machines import bm2_chains, make_bm2_kernel
+from machines.bm2 import BM2Machine, BM2Parameters, BM2StopReason
+from machines.bm2_chains import ChainResult, Chains
+from machines.errors import ParameterError, StartError
+from machines.parameters import RngReset, SampleEvery, Sequencer
+from tests.machines.random_networks import LFSRS, runs
+from tests.machines.test_bm2_fast import network, start_of
+
+
+def boards(machine, count, **changes):
+    """The machines of the chains of a model."""
+    return [
+        BM2Machine(
+            dataclasses.replace(machine.parameters, chain=at, chains=count, **changes),
+            machine.tables,
+            machine.supports,
+        )
+        for at in range(count)
+    ]
+
+
+def shown(result):
+    """All that a result or a kernel shows."""
+    values = {field.name: getattr(result, field.name) for field in dataclasses.fields(ChainResult)}
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()
+    }
+
+
+def run_both(machines, starts):
+    """Run the chains together and one by one, see that they agree, and return the former."""
+    results = Chains(machines).run(starts)
+    for at, (machine, start, result) in enumerate(zip(machines, starts, results, strict=True)):
+        kernel = make_bm2_kernel(machine)
+        kernel.start(start)
+        assert shown(result) == shown(kernel), f"chain {at}"
+    return results
+
+
+@pytest.mark.parametrize("examples", [60, pytest.param(1000, marks=pytest.mark.thorough)])
+def test_equals_single_chains(examples):
+    """Small networks are sliced, unless a chain may have timed out."""
+    sliced = []
+
+    def compare(run, count, lengths, seed):
+        random = np.random.default_rng(seed)
+        changes = {"rng_reset": RngReset.BANK, "sample_every": SampleEvery.SWEEP, "stream": 0}
+        machines = boards(run.machine, count, **changes)
+        parameters = machines[0].parameters
+        samples, burn_in, max_cycles, ops_timeout = lengths
+        start = dataclasses.replace(
+            run.courses[0].start,
+            samples=samples,
+            burn_in=burn_in,
+            max_cycles=max_cycles,
+            ops_timeout=ops_timeout,
+            sequencer=Sequencer.LINEAR,
+        )
+        free = ~start.known & ((1 << parameters.state_bits) - 1)
+        starts = [
+            dataclasses.replace(
+                start,
+                state=start.state & start.known | int.from_bytes(random.bytes(8), "little") & free,
+                bank=int(random.integers(parameters.rng_banks)),
+            )
+            for _ in range(count)
+        ]
+        run_both(machines, starts)
+
+    lengths = st.tuples(
+        st.integers(1, 100),
+        st.sampled_from([0, 1, 15, 16, 40]),
+        st.integers(1, 4000),
+        st.sampled_from([32, 70, 2**20]),
+    )
+    search = given(runs(LFSRS, variables=4), st.sampled_from([2, 9]), lengths, st.integers(0, 2**32))(compare)
+    ran = bm2_chains.run_sliced
+    with mock.patch.multiple(
+        bm2_chains,
+        SLICED_MIN=2,
+        CONTEXTS_MAX=1000,
+        COUNTERS_MAX=1000,
+        run_sliced=lambda *given: sliced.append(ran(*given)) or sliced[-1],
+    ):
+        settings(max_examples=examples, suppress_health_check=list(HealthCheck))(search)()
+    assert True in sliced
+
+
+def test_chains_fill_several_vectors_and_know_different_things():
+    """The last vector is not full, and the known variable has a value of its own in each chain."""
+    machines = boards(network(searched=(0, 2)), 600)
+    known = machines[0].parameters.masks[2]
+    results = run_both(
+        machines, [start_of(state=at % 4 << 3, known=known, bank=at % 16) for at in range(600)]
+    )
+    assert {result.reason for result in results} == {BM2StopReason.SAMPLES}
+    assert len({tuple(result.rng_state.tolist()) for result in results}) == 600
+
+
+def contradiction(**changes):
+    """A variable of which one factor excludes a value, and another one the other: they agree in 2**-15 of the cycles."""
+    parameters = BM2Parameters(cardinalities=(2,), factors=((0,), (0,)), **changes)
+    return BM2Machine.from_factors(parameters, [[1, 0], [0, 1]])
+
+
+def test_a_chain_that_may_have_timed_out_is_run_again():
+    results = run_both(boards(contradiction(), 64), [start_of(samples=1, ops_timeout=2**14)] * 64)
+    assert {result.reason for result in results} == {BM2StopReason.SAMPLES, BM2StopReason.OPS_TIMEOUT}
+
+
+def test_long_moves_do_not_time_out():
+    results = run_both(boards(contradiction(), 32), [start_of(samples=1, ops_timeout=2**22)] * 32)
+    assert max(result.cycles for result in results) > 2**16
+
+
+def test_other_chains_run_one_by_one():
+    """Orders and settings that slices do not have; free generators go on from frame to frame."""
+    machines = boards(network(), 40, rng_reset=RngReset.FREE)
+    together, alone = Chains(machines), [make_bm2_kernel(machine) for machine in machines]
+    for sequencer in Sequencer:
+        starts = [start_of(sequencer=sequencer, samples=10 + at) for at in range(40)]
+        for result, kernel, start in zip(together.run(starts), alone, starts, strict=True):
+            kernel.start(start)
+            assert shown(result) == shown(kernel)
+
+
+def test_impossible_evidence():
+    results = run_both(boards(network(), 40), [start_of(samples=0)] * 40)
+    assert {result.reason for result in results} == {BM2StopReason.IMPOSSIBLE}
+
+
+def test_bad_chains_and_starts_are_refused():
+    with pytest.raises(ParameterError, match="machines of the chains differ"):
+        Chains([network(), network(prob_bits=8)])
+    chains = Chains(boards(network(), 2))
+    with pytest.raises(StartError, match="There are 1 starts for 2 chains"):
+        chains.run([start_of()])
+    with pytest.raises(StartError, match="bank is 16"):
+        chains.run([start_of(), start_of(bank=16)])
