@@ -482,8 +482,16 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
                 )
             domain = np.arange(cardinality) == given
         domains.append(domain)
-    constraints = _Constraints(machine)
-    if not constraints.propagate(domains, range(len(constraints.scopes))):
+    # the factors with zeros, and their numbers for each variable
+    zeros = [
+        (scope, support)
+        for scope, support in zip(parameters.factors, machine.supports, strict=True)
+        if not support.all()
+    ]
+    of_variable = [
+        [at for at, (scope, _) in enumerate(zeros) if variable in scope] for variable in range(len(domains))
+    ]
+    if not _propagate(zeros, of_variable, domains, range(len(zeros))):
         return None
     # One entry per variable on the path: the domains before it, and the values to try. The first complete
     # path is the answer, since variables and values are tried in order.
@@ -501,9 +509,7 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
             variable = len(path) - 1
             domains = list(before)
             domains[variable] = np.arange(len(before[variable])) == value
-            if before[variable].sum() == 1 or constraints.propagate(
-                domains, constraints.of_variable[variable]
-            ):
+            if before[variable].sum() == 1 or _propagate(zeros, of_variable, domains, of_variable[variable]):
                 break
             dead_ends += 1
             if dead_ends > DEAD_ENDS_MAX:
@@ -516,39 +522,32 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
     return pack(parameters, [int(domain.argmax()) for domain in domains])
 
 
-class _Constraints:
-    """The factors that have zeros, for the search of a start state."""
+def _propagate(
+    zeros: Sequence[tuple[tuple[int, ...], npt.NDArray[np.bool_]]],
+    of_variable: Sequence[Sequence[int]],
+    domains: list[npt.NDArray[np.bool_]],
+    changed: Sequence[int],
+) -> bool:
+    """Remove the values that a factor excludes, until nothing changes; return False if a domain becomes empty.
 
-    def __init__(self, machine: BM2Machine) -> None:
-        self.scopes: list[tuple[int, ...]] = []
-        self.of_variable: list[list[int]] = [[] for _ in machine.parameters.cardinalities]
-        self._supports = []
-        for scope, support in zip(machine.parameters.factors, machine.supports, strict=True):
-            if not support.all():
-                for variable in scope:
-                    self.of_variable[variable].append(len(self.scopes))
-                self.scopes.append(scope)
-                self._supports.append(support)
-
-    def propagate(self, domains: list[npt.NDArray[np.bool_]], changed: Sequence[int]) -> bool:
-        """Remove the values that a factor excludes, until nothing changes; return False if a domain becomes empty.
-
-        Args:
-            domains: The possible values of each variable, bool[cardinality].
-            changed: Numbers of the factors that have a variable whose domain has changed.
-        """
-        due = list(changed)
-        while due:
-            at = due.pop()
-            scope = self.scopes[at]
-            possible = self._supports[at][np.ix_(*(domains[variable] for variable in scope))]
-            for axis, variable in enumerate(scope):
-                kept = possible.any(axis=tuple(other for other in range(len(scope)) if other != axis))
-                if not kept.any():
-                    return False
-                if not kept.all():
-                    domain = np.zeros_like(domains[variable])
-                    domain[np.flatnonzero(domains[variable])[kept]] = True
-                    domains[variable] = domain
-                    due += [other for other in self.of_variable[variable] if other != at and other not in due]
-        return True
+    Args:
+        zeros: Variables and support of each factor with zeros.
+        of_variable: Numbers of the factors of each variable.
+        domains: The possible values of each variable, bool[cardinality].
+        changed: Numbers of the factors that have a variable whose domain has changed.
+    """
+    due = list(changed)
+    while due:
+        at = due.pop()
+        scope, support = zeros[at]
+        possible = support[np.ix_(*(domains[variable] for variable in scope))]
+        for axis, variable in enumerate(scope):
+            kept = possible.any(axis=tuple(other for other in range(len(scope)) if other != axis))
+            if not kept.any():
+                return False
+            if not kept.all():
+                domain = np.zeros_like(domains[variable])
+                domain[np.flatnonzero(domains[variable])[kept]] = True
+                domains[variable] = domain
+                due += [other for other in of_variable[variable] if other != at and other not in due]
+    return True

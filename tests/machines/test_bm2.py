@@ -432,9 +432,13 @@ def test_sizes():
     values = (2, 0, 1, 8)
     assert pack(parameters, values) == 0b1000_1_10
     assert unpack(parameters, pack(parameters, values)) == values
+
+
+def test_machines_are_equal_by_their_tables():
     assert sprinkler() == sprinkler()
     assert hash(sprinkler()) == hash(sprinkler())
     assert sprinkler() != sprinkler(prob_bits=12)
+    assert sprinkler() != replace(sprinkler(), tables=tuple(table // 2 + 1 for table in sprinkler().tables))
 
 
 # ---- start states ---------------------------------------------------------------------------------
