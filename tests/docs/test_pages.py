@@ -315,10 +315,11 @@ def test_the_notebook_of_readme_runs(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.startswith("('y', 'x') (32, 32)")
 
 
-def test_the_examples_of_machines():
+@pytest.mark.parametrize("page", ["machines.md", "bm2.md"])
+def test_the_examples_of_machines(page):
     # Fences would be taken for output.
-    text = PAGES["docs/reference/machines.md"].replace("```python\n", "\n").replace("```\n", "\n")
-    test = doctest.DocTestParser().get_doctest(text, {}, "machines.md", "machines.md", 0)
+    text = PAGES[f"docs/reference/{page}"].replace("```python\n", "\n").replace("```\n", "\n")
+    test = doctest.DocTestParser().get_doctest(text, {}, page, page, 0)
     assert len(test.examples) > 8
     report = []
     doctest.DocTestRunner(verbose=False).run(test, out=report.append)
