@@ -5,7 +5,8 @@ This module has their options: dataclasses of flags, without NumPy, so that `--h
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -21,6 +22,9 @@ from toolchain.flags import MaxCycles, Partitions, ReadingColumns, StopWhen
 
 MAX_POINTS: Final = 10_000
 CLOCK_MAX_HZ: Final = 1e12
+
+Progress: TypeAlias = Callable[[int], AbstractContextManager[Callable[[str], None]]]
+"""A bar for a number of steps, whose function is called with a text after each."""
 
 _Member = TypeVar("_Member", bound=StrEnum)
 _Numbers: TypeAlias = tuple[int, ...]
@@ -145,6 +149,22 @@ class Sweep:
             )
 
 
+@dataclass(frozen=True, kw_only=True)
+class AdviceOptions:
+    """The options of advice on machines."""
+
+    accuracy: Annotated[
+        float, typer.Option(help="Mean total variation from exact inference.", min=1e-4, max=0.5)
+    ] = 0.01
+    frames: Annotated[int, typer.Option(help="Number of readings.", min=1, max=1000)] = 20
+    seed: Annotated[int, typer.Option(help="Seed of the readings.", min=0)] = 1
+    clock_hz: Annotated[
+        float,
+        typer.Option("--clock", help="Clock frequency of the boards.", metavar="HERTZ", min=1, max=1e12),
+    ] = 100e6
+    device: Annotated[str, typer.Option(help="FPGA of the boards.", metavar="proce-v-d8")] = "proce-v-d8"
+
+
 def _numbers(flag: str, text: str) -> _Numbers:
     try:
         return tuple(dict.fromkeys(int(part) for part in text.split(",")))
@@ -161,3 +181,12 @@ def _members(flag: str, text: str, kind: type[_Member]) -> tuple[_Member, ...]:
         raise BuildError(
             f"{flag} {text}: expected some of {', '.join(kind)}, with commas between them"
         ) from None
+
+
+def with_unit(value: float, unit: str) -> str:
+    """Return a value with an SI prefix so that 1 to 999 precede the point."""
+    if value <= 0:
+        return f"0 {unit}"
+    prefixes = ("p", "n", "u", "m", "", "k", "M", "G")
+    power = max(-4, min(3, math.floor(math.log10(value) / 3 + 1e-12)))
+    return f"{value / 1000.0**power:.3g} {prefixes[power + 4]}{unit}"

@@ -207,10 +207,8 @@ class ChainError:
     Distances are total variations of the searched variables' posterior.
     """
 
-    readings: int
-    """The number of readings, the likeliest ones."""
     share: float
-    """Their probability among all readings."""
+    """The probability of the readings that were examined, the likeliest ones."""
     quantising: float
     """Distance of the stationary law from exact inference."""
     worst: float
@@ -232,30 +230,27 @@ def distance(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> float:
     return float(np.abs(ours - theirs).sum() / 2)
 
 
-def chain_error(
-    machine: BM2Machine, model: NetworkModel, *, burn_in: int, samples: int, boards: int = 1
-) -> ChainError | None:
+def chain_error(machine: BM2Machine, model: NetworkModel, *, samples: int) -> ChainError | None:
     """Return the expected error of a frame in which all known variables have readings; None if it is too large.
 
     The model must be that of the machine. All boards start in the same state here.
     """
     p = machine.parameters
     unknown = p.state_bits - sum(p.bits[variable] for variable in p.known)
-    if unknown > MOST_BITS:
+    if not 0 < unknown <= MOST_BITS:
         return None
     sizes = dict(zip(model.names, model.cardinalities, strict=True))
-    hidden = [name for name in model.names if name not in model.known]
     try:
-        weights = product(eliminate(model.factors, hidden, sizes), model.known, sizes).ravel()
+        left = eliminate(model.factors, [name for name in sizes if name not in model.known], sizes)
+        weights = product(left, model.known, sizes)
     except ModelError:  # a table above the limit
         return None
     most = min(_MOST_READINGS, max(1, _WORK >> 3 * unknown), int((weights > 0).sum()))
-    likeliest = np.argsort(-weights, kind="stable")[:most]
+    likeliest = np.argsort(-weights, axis=None, kind="stable")[:most]
     sweeps = samples if p.sample_every is SampleEvery.SWEEP else max(1, samples // unknown)
-    rows = []
-    readings = []
+    rows, readings = [], []
     for place in likeliest.tolist():
-        addresses = tuple(int(at) for at in np.unravel_index(place, [sizes[name] for name in model.known]))
+        addresses = tuple(int(at) for at in np.unravel_index(place, weights.shape))
         evidence = dict(zip(p.known, addresses, strict=True))
         chain = ExactChain(machine, evidence)
         start = start_state(machine, evidence)
@@ -263,13 +258,13 @@ def chain_error(
             continue
         stationary = chain.posterior(chain.sampled)
         shares = chain.effective()
-        deviations = np.sqrt(stationary * (1 - stationary) / np.maximum(boards * sweeps * shares, 1))
+        deviations = np.sqrt(stationary * (1 - stationary) / np.maximum(p.chains * sweeps * shares, 1))
         readings.append(addresses)
         rows.append(
             (
-                weights[place],
+                weights[addresses],
                 distance(stationary, model.exact(addresses)),
-                distance(chain.posterior(chain.frame(start, burn_in, sweeps)), chain.posterior(chain.law)),
+                distance(chain.posterior(chain.frame(start, p.burn_in, sweeps)), chain.posterior(chain.law)),
                 # half of the mean absolute values of normal deviations
                 deviations.sum() / np.sqrt(2 * np.pi),
                 chain.cycles,
@@ -280,7 +275,6 @@ def chain_error(
     means = (table[:, :1] * table).sum(axis=0) / table[:, 0].sum()
     worst = int(table[:, 1].argmax())
     return ChainError(
-        readings=len(rows),
         share=float(table[:, 0].sum() / weights.sum()),
         quantising=float(means[1]),
         worst=float(table[worst, 1]),

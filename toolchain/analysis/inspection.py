@@ -1,9 +1,6 @@
 """Inspection of a deployment: losses, accuracy, cycles, resources and energy, as text or as a JSON object."""
 
 import json
-import math
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from typing import Final
 
@@ -11,7 +8,7 @@ import numpy as np
 
 from machines.bm1 import BM1Machine
 from machines.parameters import SensorMode
-from toolchain.analysis import InspectOptions
+from toolchain.analysis import InspectOptions, Progress, with_unit
 from toolchain.analysis.accuracy import Accuracy, Interval, measure
 from toolchain.analysis.emulation import EmulatedBoards, joined, one_replica
 from toolchain.analysis.logic import device_named
@@ -31,8 +28,6 @@ from toolchain.deployment import Deployment, Scale
 from toolchain.errors import BuildError
 from toolchain.models.model import Model
 from toolchain.outputs.mif import table_length
-
-Progress = Callable[[int], AbstractContextManager[Callable[[str], None]]]
 
 FRAMES: Final = 200
 BANKS: Final = 4
@@ -227,7 +222,7 @@ def _loss_part(found: Inspection) -> str:
 def _time_part(found: Inspection) -> str:
     cycles = found.accuracy.cycles
     rows = [
-        f"Cycles of a frame, and time at {_with_unit(found.clock_hz, 'Hz')} (the boards' computing alone: no link, no ROS):",
+        f"Cycles of a frame, and time at {with_unit(found.clock_hz, 'Hz')} (the boards' computing alone: no link, no ROS):",
         "            cycles        time",
     ]
     for name, count in (
@@ -235,7 +230,7 @@ def _time_part(found: Inspection) -> str:
         ("95 %", cycles.percentile_95.value),
         ("worst", float(cycles.worst)),
     ):
-        rows.append(f"  {name:6}  {count:10,.0f}  {_with_unit(count / found.clock_hz, 's'):>10}")
+        rows.append(f"  {name:6}  {count:10,.0f}  {with_unit(count / found.clock_hz, 's'):>10}")
     counted = "posteriors" if found.deployment.machine.replicas > 1 else "frames"
     rows.append(
         f"  {found.accuracy.overflow:.0%} of runs end with an overflow; without a posterior: {found.accuracy.without:.1%} of "
@@ -314,8 +309,8 @@ def _energy_part(found: Inspection) -> str:
     dynamic, static = found.energy.frame_j(median, found.clock_hz)
     rows = [
         (
-            f"Energy of a frame of {median:,.0f} cycles, a toggle-count model, not a measurement: {_with_unit(dynamic, 'J')} for toggles "
-            f"({found.energy.toggles:,.0f} per cycle on all boards) and {_with_unit(static, 'J')} for leakage while it runs. It assumes:"
+            f"Energy of a frame of {median:,.0f} cycles, a toggle-count model, not a measurement: {with_unit(dynamic, 'J')} for toggles "
+            f"({found.energy.toggles:,.0f} per cycle on all boards) and {with_unit(static, 'J')} for leakage while it runs. It assumes:"
         )
     ]
     rows += [f"  - {assumption}" for assumption in ASSUMPTIONS]
@@ -351,12 +346,3 @@ def as_json(found: Inspection) -> str:
         "energy_model": {"toggles_a_cycle": found.energy.toggles, "dynamic_j": dynamic, "static_j": static},
     }
     return json.dumps(content) + "\n"
-
-
-def _with_unit(value: float, unit: str) -> str:
-    """Return a value with an SI prefix so that 1 to 999 precede the point."""
-    if value <= 0:
-        return f"0 {unit}"
-    prefixes = ("p", "n", "u", "m", "", "k", "M", "G")
-    power = max(-4, min(3, math.floor(math.log10(value) / 3 + 1e-12)))
-    return f"{value / 1000.0**power:.3g} {prefixes[power + 4]}{unit}"

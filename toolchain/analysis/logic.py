@@ -255,6 +255,11 @@ BLOCK_SHAPES: Final = ((512, 40), (1024, 20), (2048, 10), (4096, 5), (8192, 2), 
 """Words and bits of an M20K, in its possible shapes."""
 
 
+def blocks_of(words: int, width: int) -> int:
+    """Return the minimum number of M20Ks of a table."""
+    return min(math.ceil(words / deep) * math.ceil(width / wide) for deep, wide in BLOCK_SHAPES)
+
+
 @dataclass(frozen=True, slots=True, order=True)
 class _Memory:
     words: int
@@ -264,7 +269,7 @@ class _Memory:
     @property
     def blocks(self) -> int:
         """Minimum number of M20Ks for one table."""
-        return min(math.ceil(self.words / deep) * math.ceil(self.width / wide) for deep, wide in BLOCK_SHAPES)
+        return blocks_of(self.words, self.width)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

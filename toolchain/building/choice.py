@@ -9,7 +9,7 @@ from toolchain.building.options import BM1Options, BM2Options, BuildOptions, Mac
 from toolchain.errors import BuildError
 from toolchain.models.joint import Question
 from toolchain.models.model import Model
-from toolchain.models.network import network_of
+from toolchain.models.network import NetworkModel, network_of
 
 _FUSION: Final = "the known variables are independent given the searched ones"
 
@@ -17,7 +17,15 @@ _FUSION: Final = "the known variables are independent given the searched ones"
 def plan_for(
     source: Model | Question, options: BuildOptions, bits: Sequence[str] = (), device: str | None = None
 ) -> tuple[MachinePlan | BM2Plan, str]:
-    """Return the plan of the machine that the options ask for, and the reason for its kind, as a clause.
+    """Return the plan of the machine that the options ask for, and why; arguments and errors as for `model_for`."""
+    model, why = model_for(source, options, bits, device)
+    return (plan_machine(model, options) if isinstance(model, Model) else plan_bm2(model, options, why)), why
+
+
+def model_for(
+    source: Model | Question, options: BuildOptions, bits: Sequence[str] = (), device: str | None = None
+) -> tuple[Model | NetworkModel, str]:
+    """Return the model for the machine that the options ask for, and the reason for its kind, as a clause.
 
     Args:
         source: A naive fusion, or any question.
@@ -34,15 +42,20 @@ def plan_for(
     if choice is MachineChoice.BM1 or (choice is MachineChoice.AUTO and refusal is None):
         _refuse(given_flags(options, BM2Options), "BM2", "BM1", choice, why)
         model = source.model() if isinstance(source, Question) else source
-        return plan_machine(with_bits(model, bits), options), why
+        return with_bits(model, bits), why
     flags = given_flags(options, BM1Options)
     flags += [flag for flag, given in (("--bits", bits), ("--device", device)) if given]
     if options.written_prior is not None:
         flags.append("--prior-path" if options.sources is None else "a prior in the file of --sources")
     _refuse(flags, "BM1", "BM2", choice, why)
-    network = source.network() if isinstance(source, Question) else network_of(source)
+    network = network_for(source)
     why = why if refusal is not None else "it was asked for"
-    return plan_bm2(network, options, why), why
+    return network, why
+
+
+def network_for(source: Model | Question) -> NetworkModel:
+    """Return the network of any model or question, or raise a ModelError."""
+    return source.network() if isinstance(source, Question) else network_of(source)
 
 
 def _refuse(flags: list[str], wanted: str, chosen: str, choice: MachineChoice, why: str) -> None:

@@ -1,7 +1,7 @@
 """Findings about a BM2: clipped factors and their error, states that are not connected, wide factors, random numbers.
 
-Zeros of a factor are clipped to the smallest chance that a code can express, so that the chain can cross them, but
-rarely. What that costs is computed exactly where the states are few; elsewhere the finding says that it was not.
+Zeros of a factor are clipped to the smallest chance that a code can express, so the chain crosses them, but rarely.
+What that costs is computed exactly where the states are few; elsewhere a finding says that it was not.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from machines.bm2 import BM2Machine, unpack
-from machines.parameters import RngReset, Sequencer
+from machines.parameters import RngReset
 from machines.rng import LFSR
-from toolchain.analysis.chain import agreement, chain_error
-from toolchain.analysis.logic import BLOCK_SHAPES, device_named
+from toolchain.analysis.chain import ChainError, agreement, chain_error
+from toolchain.analysis.logic import BLOCK_SHAPES, blocks_of, device_named
 from toolchain.checks.findings import Check, Finding, Severity, error, note, reading, warning
 from toolchain.checks.generators import relations
 
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from toolchain.analysis.chain import ChainError
-    from toolchain.deployment import Variable
+    from toolchain.deployment import Deployment
     from toolchain.models.network import NetworkModel
 
 _LARGE_ERROR: Final = 0.01
 """Total variation from which an error is a warning."""
 _MOST_LISTED: Final = 5
-_MOST_STATES: Final = 2**20
-_MOST_PATTERN_STATES: Final = 2**24
-"""Maximum number of states over all patterns of missing readings."""
+_STATE_BITS: Final = 20
+"""Maximum number of bits of states whose connection is checked."""
+_PATTERN_BITS: Final = 24
+"""The same with a bit more for each known variable whose reading may be missing."""
 _BLANKET_BITS: Final = 16
 """Maximum number of bits that share a factor with a pointed bit, whose values are tried for clips."""
 _TIMEOUT_RISK: Final = 1e-6
@@ -43,40 +43,61 @@ _TIMEOUT_RISK: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedChain:
-    """A BM2 to check, as one of its boards has it."""
+    """A BM2 to check, as its first board has it; without a model, only known and searched variables have names."""
 
+    deployment: Deployment
     machine: BM2Machine
-    names: tuple[str, ...]
-    """The names of the machine's variables."""
-    titles: tuple[str, ...]
-    """The names of its factors."""
-    labels: tuple[tuple[str, ...], ...]
-    """The values of each variable in words."""
-    known: tuple[Variable, ...]
-    """The known variables."""
-    boards: int
-    samples: int
-    max_cycles: int
     model: NetworkModel | None
-    """The probabilities, if known."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the machine's variables."""
+        p = self.machine.parameters
+        named = dict(zip(p.known, (each.name for each in self.deployment.variables), strict=True))
+        named |= zip(p.searched, (each.label for each in self.deployment.searched), strict=True)
+        return (
+            tuple(named.get(at, f"variable {at}") for at in range(len(p.cardinalities)))
+            if self.model is None
+            else self.model.names
+        )
+
+    @property
+    def titles(self) -> tuple[str, ...]:
+        """The names of its factors."""
+        if self.model is not None:
+            return self.model.titles
+        names = self.names
+        return tuple(
+            f"the factor of {', '.join(names[at] for at in scope)}"
+            for scope in self.machine.parameters.factors
+        )
 
     def state(self, values: Sequence[int], variables: Sequence[int]) -> str:
         """Return values of some variables in words: `rain = yes, grass = wet`."""
-        return ", ".join(f"{self.names[each]} = {self.labels[each][values[each]]}" for each in variables)
+        labels = (
+            [()] * len(values) if self.model is None else [each.type.labels for each in self.model.symbols]
+        )
+        return ", ".join(
+            f"{self.names[each]} = {labels[each][values[each]] if labels[each] else values[each]}"
+            for each in variables
+        )
+
+    @property
+    def always_known(self) -> set[int]:
+        """The variables of the machine that have a reading in every frame."""
+        pairs = zip(self.machine.parameters.known, self.deployment.variables, strict=True)
+        return {at for at, variable in pairs if variable.on_missing != "missing"}
 
 
 def chain_findings(chain: CheckedChain) -> Iterator[Finding]:
-    """Find everything about a BM2 that can make its results wrong, slow, or impossible to build."""
+    """Find everything about a BM2 that can make its results wrong or slow, or does not fit a board."""
     yield from _clips(chain)
     yield from _opposite_clips(chain)
     yield from _connections(chain)
     yield from _memories(chain)
     found = None
     if chain.model is not None:
-        burn_in = chain.machine.parameters.burn_in
-        found = chain_error(
-            chain.machine, chain.model, burn_in=burn_in, samples=chain.samples, boards=chain.boards
-        )
+        found = chain_error(chain.machine, chain.model, samples=chain.deployment.machine.target_count)
         yield from _error(chain, found)
     yield from _numbers(chain, found)
 
@@ -86,19 +107,16 @@ def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]
 
     A CDE compares two values of a variable whose codes differ in one bit, the other variables being equal.
     """
-    least = 0.5 / 2**prob_bits
     clips = zeros = count = 0
     for axis, size in enumerate(factor.shape):
-        for bit in range((size - 1).bit_length()):
+        for bit in (1 << k for k in range((size - 1).bit_length())):
             low = np.array(
-                [code for code in range(size) if not code >> bit & 1 and code | 1 << bit < size],
-                dtype=np.intp,
+                [code for code in range(size) if not code & bit and code | bit < size], dtype=np.intp
             )
-            zero, one = np.take(factor, low, axis), np.take(factor, low | 1 << bit, axis)
+            zero, one = np.take(factor, low, axis), np.take(factor, low | bit, axis)
             both = zero + one
-            possible = both > 0
-            share = np.divide(np.minimum(zero, one), both, out=np.ones_like(both), where=possible)
-            clips += int((share < least).sum())
+            share = np.divide(np.minimum(zero, one), both, out=np.ones_like(both), where=both > 0)
+            clips += int((share < 0.5 / 2**prob_bits).sum())
             zeros += int((share == 0).sum())
             count += both.size
     return clips, zeros, count
@@ -106,201 +124,154 @@ def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]
 
 def _clips(chain: CheckedChain) -> Iterator[Finding]:
     """Name every clipped factor; without the model, those that are clipped because of zeros."""
-    width = chain.machine.parameters.prob_bits
+    width, model = chain.machine.parameters.prob_bits, chain.model
     tables = (
         [support.astype(np.float64) for support in chain.machine.supports]
-        if chain.model is None
-        else [term.table for term in chain.model.factors]
+        if model is None
+        else [term.table for term in model.factors]
     )
     for title, table in zip(chain.titles, tables, strict=True):
         clips, zeros, count = clipped(table, width)
         if clips:
+            why = f", {zeros} of them because of zeros" if zeros else ""
+            rarer = "more --prob-bits make crossing a zero rarer, and the samples less independent"
             yield note(
                 Check.CLIPPED,
                 title,
-                (
-                    f"{clips} of its {count} odds are clipped to 1 in {2**width}"
-                    + (f", {zeros} of them because of zeros" if zeros else "")
-                ),
-                "more --prob-bits make crossing a zero rarer, and the samples less independent"
-                if zeros
-                else "use more --prob-bits",
+                f"{clips} of its {count} odds are clipped to 1 in {2**width}{why}",
+                rarer if zeros else "use more --prob-bits",
             )
 
 
 def _error(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
-    """Find what the codes, the start state and the samples cost."""
-    machine = chain.machine
+    """Find what the codes, the start state and the number of samples cost."""
+    p = chain.machine.parameters
     if found is None:
-        yield note(
-            Check.CODES_ERROR,
-            "the codes",
-            "the error that they cause was not computed, because the machine has too many unknown bits",
-            "use 'toolchain inspect' with --model, which runs it",
-        )
+        what = "the error that they cause was not computed, because too many bits are unknown"
+        yield note(Check.CODES_ERROR, "the codes", what, "build it, and use 'toolchain inspect' with --model")
         return
-    about = "" if found.share > 0.9995 else f" ({found.readings} readings, {found.share:.0%} of all)"
-    where = ", ".join(
-        reading(variable, address) if not variable.name else f"{variable.name} = {reading(variable, address)}"
-        for variable, address in zip(chain.known, found.worst_reading, strict=True)
-    )
-    large = max(found.quantising, found.worst) > _LARGE_ERROR
-    if large or not all(support.all() for support in machine.supports):
+    of_all = "" if found.share > 0.9995 else f" over {found.share:.0%} of the readings"
+    pairs = zip(chain.deployment.variables, found.worst_reading, strict=True)
+    where = ", ".join(f"{variable.name} = {reading(variable, address)}" for variable, address in pairs)
+    large = found.worst > _LARGE_ERROR
+    if large or not all(support.all() for support in chain.machine.supports):
         yield Finding(
             Severity.WARNING if large else Severity.NOTE,
             Check.CODES_ERROR,
             "the codes",
-            (
-                f"quantising and clipping change the posterior by a total variation of {found.quantising:.2g} in the "
-                f"mean{about}" + (f", {found.worst:.2g} at worst ({where})" if where else "")
-            ),
-            "use more --prob-bits" if large else "",
+            f"quantising and clipping change the posterior by a total variation of {found.quantising:.2g} in the mean{of_all}"
+            + (f", {found.worst:.2g} at worst ({where})" if where else ""),
+            "use more --prob-bits, unless odds of two zeros are at fault" if large else "",
         )
-    slow = found.start + found.sampling
-    if slow > _LARGE_ERROR:
-        burn_in, samples = machine.parameters.burn_in, chain.samples * chain.boards
+    if found.start + found.sampling > _LARGE_ERROR:
+        samples, stuck = chain.deployment.machine.target_count * p.chains, found.start > _LARGE_ERROR / 10
         yield Finding(
-            Severity.WARNING if found.start > _LARGE_ERROR or slow > 5 * _LARGE_ERROR else Severity.NOTE,
+            Severity.WARNING if max(found.start, found.sampling / 5) > _LARGE_ERROR else Severity.NOTE,
             Check.MIXING,
             "the samples",
             (
-                f"{samples} of them are worth {max(1.0, samples * found.effective):.0f} independent ones at worst, so a "
-                f"total variation of {found.sampling:.2g} is left in the mean"
+                f"{samples} of them are worth {max(1.0, samples * found.effective):.0f} independent ones at worst, so a total "
+                f"variation of {found.sampling:.2g} is left in the mean"
                 + (
-                    f", and the start state adds {found.start:.2g} in spite of {burn_in} sweeps of burn-in"
-                    if found.start > _LARGE_ERROR / 10
+                    f", and {p.burn_in} sweeps of burn-in leave {found.start:.2g} of the start state"
+                    if stuck
                     else ""
                 )
             ),
-            "use more --samples"
-            + (" and a longer --burn-in" if found.start > _LARGE_ERROR / 10 else "")
-            + ("" if machine.parameters.sequencer is not Sequencer.RANDOM else ", or another --sequencer"),
+            "use more --samples" + (" and a longer --burn-in" if stuck else ""),
         )
-
-
-def _always_known(chain: CheckedChain) -> set[int]:
-    pairs = zip(chain.machine.parameters.known, chain.known, strict=True)
-    return {at for at, variable in pairs if variable.on_missing != "missing"}
 
 
 def _opposite_clips(chain: CheckedChain) -> Iterator[Finding]:
     """Find bits at which factors clip in opposite directions, so that the move takes long."""
-    p = chain.machine.parameters
-    always, wide, found = _always_known(chain), [], []
-    for variable, (offset, bits) in enumerate(zip(p.offsets, p.bits, strict=True)):
-        if variable in always:
-            continue
-        worst = (0.0, -1, -1)
-        for bit in range(offset, offset + bits):
-            blanket = sorted(
-                {other for cde in range(p.cdes) for other in p.factor_bits(cde) if bit in p.factor_bits(cde)}
-                - {bit}
-            )
+    p, wide, found = chain.machine.parameters, [], []
+    for variable in sorted(set(range(len(p.cardinalities))) - chain.always_known):
+        worst = (0.0, 0, 0)
+        for bit in range(p.offsets[variable], p.offsets[variable] + p.bits[variable]):
+            scopes = [set(p.factor_bits(cde)) for cde in range(p.cdes) if bit in p.factor_bits(cde)]
+            blanket = sorted(set().union(*scopes) - {bit})
             if len(blanket) > _BLANKET_BITS:
                 wide.append(chain.names[variable])
                 break
             worst = max(worst, _slowest(chain.machine, bit, blanket))
-        if worst[1] >= 0:
+        if worst[0]:
             found.append((*worst, variable))
     found.sort(reverse=True)
-    for cycles, low, high, variable in found[:_MOST_LISTED]:
-        first, second = sorted((low, high))
+    for cycles, one, other, variable in found[:_MOST_LISTED]:
         risky = p.ops_timeout < -cycles * math.log(_TIMEOUT_RISK)
         yield warning(
             Check.OPPOSITE_CLIPS,
             chain.names[variable],
-            (
-                f"{chain.titles[first]} and {chain.titles[second]} can clip one of its bits in opposite directions; such a "
-                f"move takes {cycles:,.0f} cycles in the mean"
-                + (f", and may exceed the {p.ops_timeout} of ops_timeout" if risky else "")
-            ),
+            f"{chain.titles[one]} and {chain.titles[other]} can clip one of its bits in opposite directions; such a move takes "
+            f"{cycles:,.0f} cycles in the mean"
+            + (f", and may exceed the {p.ops_timeout} of ops_timeout" if risky else ""),
             "use fewer --prob-bits" + (", or a larger --ops-timeout" if risky else ""),
         )
-    if len(found) > _MOST_LISTED:
-        names = ", ".join(chain.names[variable] for *_, variable in found[_MOST_LISTED:])
-        yield warning(
-            Check.OPPOSITE_CLIPS, names, "factors can clip bits of these variables in opposite directions too"
-        )
+    if rest := ", ".join(chain.names[variable] for *_, variable in found[_MOST_LISTED:]):
+        yield warning(Check.OPPOSITE_CLIPS, rest, "factors can clip their bits in opposite directions, too")
     if wide:
-        yield note(
-            Check.OPPOSITE_CLIPS,
-            ", ".join(wide),
-            f"not checked: more than {_BLANKET_BITS} bits share a factor with one of theirs",
-        )
+        what = f"not checked: more than {_BLANKET_BITS} bits share a factor with one of theirs"
+        yield note(Check.OPPOSITE_CLIPS, ", ".join(wide), what)
 
 
 def _slowest(machine: BM2Machine, bit: int, blanket: Sequence[int]) -> tuple[float, int, int]:
-    """Return the longest mean time of a move at a bit where two CDEs clip in opposite directions, and which these are.
+    """Return the longest mean time of a move at a bit that two CDEs clip in opposite directions, and these two.
 
-    All values of the bits that share a factor with it are tried, without unused codes; (0, -1, -1) if there are none.
+    All used codes are tried for the bits that share a factor with it; the time is 0 if there are no such clips.
     """
-    p = machine.parameters
-    index = np.arange(1 << len(blanket))
+    p, index = machine.parameters, np.arange(1 << len(blanket))
     values = {other: index >> at & 1 for at, other in enumerate(blanket)}
-    legal = np.ones(len(index), dtype=bool)
-    whole = values | {bit: np.ones_like(index)}
+    legal, whole = np.ones(len(index), dtype=bool), values | {bit: np.ones_like(index)}
     for offset, bits, cardinality in zip(p.offsets, p.bits, p.cardinalities, strict=True):
-        if bits and cardinality != 1 << bits and offset in whole:
+        if bits and offset in whole:
             legal &= (
                 sum((whole[offset + k] << k for k in range(bits)), start=np.zeros_like(index)) < cardinality
             )
     concerned = agreement(machine, bit, values)
     chances = np.array([np.broadcast_to(chance, index.shape) for _, chance in concerned])
-    limit = 1 / 2.0**p.prob_bits
-    low, high = chances <= limit, chances >= 1 - limit
+    low, high = chances <= 0.5**p.prob_bits, chances >= 1 - 0.5**p.prob_bits
     places = np.flatnonzero(low.any(axis=0) & high.any(axis=0) & legal)
     if not places.size:
-        return 0.0, -1, -1
+        return 0.0, 0, 0
     cycles = 1 / (np.prod(chances[:, places], axis=0) + np.prod(1 - chances[:, places], axis=0))
-    worst = int(cycles.argmax())
-    at = places[worst]
-    return float(cycles[worst]), concerned[low[:, at].argmax()][0], concerned[high[:, at].argmax()][0]
+    at = places[cycles.argmax()]
+    one, other = sorted(concerned[clips[:, at].argmax()][0] for clips in (low, high))
+    return float(cycles.max()), one, other
 
 
 def _connections(chain: CheckedChain) -> Iterator[Finding]:
-    """Find legal states that single-bit moves do not connect, whichever readings are there or missing."""
+    """Find possible states that single-bit moves do not connect, whichever readings are there or missing."""
     p = chain.machine.parameters
-    optional = [at for at in p.known if at not in _always_known(chain)]
-    if 1 << p.state_bits > _MOST_STATES or 1 << (p.state_bits + len(optional)) > _MOST_PATTERN_STATES:
-        yield note(
-            Check.CONNECTION,
-            "the states",
-            f"whether single-bit moves connect them was not checked: there are 2^{p.state_bits}",
-        )
+    optional = [at for at in p.known if at not in chain.always_known]
+    if p.state_bits > _STATE_BITS or p.state_bits + len(optional) > _PATTERN_BITS:
+        what = f"whether single-bit moves connect them was not checked: there are 2^{p.state_bits}"
+        yield note(Check.CONNECTION, "the states", what)
         return
     legal = legal_states(chain.machine)
-    for count in range(len(optional) + 1):
-        for missing in combinations(optional, count):
-            known = [at for at in p.known if at not in missing]
-            pair = unconnected(chain.machine, legal, known)
-            if pair is None:
-                continue
+    for missing in (each for count in range(len(optional) + 1) for each in combinations(optional, count)):
+        known = [at for at in p.known if at not in missing]
+        pair = unconnected(chain.machine, legal, known)
+        if pair is not None:
             one, other = (unpack(p, state) for state in pair)
             differing = [at for at in range(len(one)) if one[at] != other[at]]
             reason = f"with {chain.state(one, known)}, " if known else ""
-            gone = ", ".join(chain.names[at] for at in missing)
+            reason += f"without {', '.join(chain.names[at] for at in missing)}, " if missing else ""
             yield warning(
                 Check.CONNECTION,
                 "the states",
-                (
-                    f"{reason}{f'without {gone}, ' if gone else ''}no path of possible states that change one bit at a "
-                    f"time leads from {chain.state(one, differing)} to {chain.state(other, differing)}, so samples cross "
-                    "by clipped zeros alone, which is rare"
-                ),
-                "do not trust its posterior without comparing it; search or know fewer of the variables of factors with "
-                "zeros, or use a small probability instead of each zero",
+                f"{reason}no path of possible states that change one bit at a time leads from {chain.state(one, differing)} to "
+                f"{chain.state(other, differing)}, so samples cross by clipped zeros alone, which is rare",
+                "compare its posterior with exact inference before you trust it, or replace zeros by small probabilities",
             )
             return
 
 
 def legal_states(machine: BM2Machine) -> NDArray[np.bool_]:
     """Return which states are possible, bool[2**state_bits]."""
-    p = machine.parameters
-    index = np.arange(1 << p.state_bits)
+    p, index = machine.parameters, np.arange(1 << machine.parameters.state_bits)
     codes = [index >> offset & (1 << bits) - 1 for offset, bits in zip(p.offsets, p.bits, strict=True)]
-    legal: NDArray[np.bool_] = np.ones(len(index), dtype=np.bool_)
-    for code, cardinality in zip(codes, p.cardinalities, strict=True):
-        legal &= code < cardinality
+    used = [code < cardinality for code, cardinality in zip(codes, p.cardinalities, strict=True)]
+    legal: NDArray[np.bool_] = np.all(used, axis=0)
     for scope, support in zip(p.factors, machine.supports, strict=True):
         places = np.flatnonzero(legal)
         legal[places] = support[tuple(codes[variable][places] for variable in scope)]
@@ -311,133 +282,95 @@ def unconnected(
     machine: BM2Machine, legal: NDArray[np.bool_], known: Sequence[int]
 ) -> tuple[int, int] | None:
     """Return two legal states with the same values of the known variables and no path between them, or None."""
-    p = machine.parameters
+    p, index = machine.parameters, np.arange(len(legal))
     mask = sum(p.masks[variable] for variable in known)
-    index = np.arange(len(legal))
-    # The label of a state is the smallest one that it is connected to; illegal states never pass on theirs.
+    # the label of a state is the smallest one that it is connected to; illegal states never pass on theirs
     labels = np.where(legal, index, len(legal))
-    while True:
+    before = labels + 1
+    while not np.array_equal(labels, before):
         before = labels.copy()
-        for bit in range(p.state_bits):
-            if not mask >> bit & 1:
-                halves = labels.reshape(-1, 2, 1 << bit)
-                own = legal.reshape(halves.shape)
-                both = own[:, :1] & own[:, 1:]
-                halves[:] = np.where(both, np.minimum(halves[:, :1], halves[:, 1:]), halves)
-        # a label's own label is at least as small
+        for bit in (bit for bit in range(p.state_bits) if not mask >> bit & 1):
+            halves, own = labels.reshape(-1, 2, 1 << bit), legal.reshape(-1, 2, 1 << bit)
+            least = np.minimum(halves[:, :1], halves[:, 1:])
+            halves[:] = np.where(own[:, :1] & own[:, 1:], least, halves)
+        # a label's own label is at most as large
         labels = np.where(legal, np.append(labels, len(legal))[labels], labels)
-        if np.array_equal(labels, before):
-            break
     places = np.flatnonzero(legal)
     evidence = index[places] & mask
     first = np.full(len(legal), len(legal))
     np.minimum.at(first, evidence, labels[places])
     wrong = np.flatnonzero(labels[places] != first[evidence])
-    if not wrong.size:
-        return None
-    return int(first[evidence[wrong[0]]]), int(labels[places[wrong[0]]])
-
-
-def blocks_of(words: int, width: int) -> int:
-    """Return the number of memory blocks of one table."""
-    return min(math.ceil(words / deep) * math.ceil(width / wide) for deep, wide in BLOCK_SHAPES)
+    return (int(first[evidence[wrong[0]]]), int(labels[places[wrong[0]]])) if wrong.size else None
 
 
 def _memories(chain: CheckedChain) -> Iterator[Finding]:
     """Find factors whose tables do not fit the memory of a board's FPGA."""
     width, device = chain.machine.parameters.prob_bits, device_named("proce-v-d8")
     room = math.floor(device.usable * device.blocks)
-    blocks = [blocks_of(table.size, width) if table.size else 0 for table in chain.machine.tables]
     limit = max(deep * (room // math.ceil(width / wide)) for deep, wide in BLOCK_SHAPES)
-    advice = "give it fewer variables or fewer values, fix one of them with --given, or use fewer --prob-bits"
-    for title, table, each in zip(chain.titles, chain.machine.tables, blocks, strict=True):
-        if each > room:
-            yield warning(
-                Check.WIDE_FACTOR,
-                title,
-                (
-                    f"its table has {table.size:,} words of {width} bits, and the memory of a {device.title} holds "
-                    f"{limit:,}, so this machine runs in emulation only"
-                ),
-                advice,
-            )
-    if max(blocks, default=0) <= room < sum(blocks):
-        widest = blocks.index(max(blocks))
-        yield warning(
-            Check.WIDE_FACTOR,
-            chain.titles[widest],
-            (
-                f"all tables take {sum(blocks):,} memory blocks, of which a {device.title} has {room:,} for them; this one "
-                f"is the widest, with {chain.machine.tables[widest].size:,} words"
-            ),
-            advice,
-        )
+    blocks = [blocks_of(table.size, width) for table in chain.machine.tables]
+    widest = blocks.index(max(blocks))
+    for at, (title, table) in enumerate(zip(chain.titles, chain.machine.tables, strict=True)):
+        what = f"its table has {table.size:,} words of {width} bits, and the memory of a {device.title} holds {limit:,}"
+        if at == widest and blocks[at] <= room < sum(blocks):
+            what += f", but all tables together take {sum(blocks):,} of {room:,} memory blocks"
+        elif blocks[at] <= room:
+            continue
+        advice = "give it fewer variables or values, or fix one with --given; until then the machine is only emulated"
+        yield warning(Check.WIDE_FACTOR, title, what, advice)
 
 
 def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
     """Find random numbers that are shared between boards, banks or CDEs, related, repeated, or not fresh."""
-    p = chain.machine.parameters
-    width = p.rng.lfsr_bits
+    p, about = chain.machine.parameters, f"rng = {chain.machine.parameters.rng}"
+    width, boards, sets = p.rng.lfsr_bits, p.chains, p.rng_banks * p.chains
     if p.rng_banks == 1 and p.rng_reset is RngReset.BANK:
-        yield warning(
-            Check.RNG_BANKS,
-            "rng_banks = 1",
-            "every frame uses the same random numbers, so averaging over frames does not remove their error",
-            "use --rng-banks 16, or --rng-reset free",
+        what = (
+            "every frame uses the same random numbers, so averaging over frames does not remove their error"
         )
+        yield warning(Check.RNG_BANKS, "rng_banks = 1", what, "use --rng-banks 16, or --rng-reset free")
     if width is None:
         return
     if p.steps_per_clock < p.prob_bits:
-        yield warning(
-            Check.RNG_STEPS,
-            f"steps_per_clock = {p.steps_per_clock}",
-            (
-                f"numbers of {p.prob_bits} bits share bits with those of the next cycle, which biases the samples (the "
-                "sprinkler's by 0.02 to 0.05), however many there are"
-            ),
-            "omit --steps-per-clock",
+        what = (
+            f"numbers of {p.prob_bits} bits share bits with those of the next cycle, which biases all samples"
         )
-    sets = p.rng_banks * chain.boards
+        yield warning(
+            Check.RNG_STEPS, f"steps_per_clock = {p.steps_per_clock}", what, "omit --steps-per-clock"
+        )
     seeds = LFSR(p.rng).seeds(np.arange(sets * p.cdes, dtype=np.uint64))
     own, counts = np.unique(seeds, return_counts=True)
     if own.size < seeds.size:
-        numbers = np.flatnonzero(seeds == own[counts.argmax()])[:2].tolist()
         one, other = (
-            f"{chain.titles[at % p.cdes]} (board {at // p.cdes % chain.boards}, bank {at // p.cdes // chain.boards})"
-            for at in numbers
+            f"{chain.titles[at % p.cdes]} (board {at // p.cdes % boards}, bank {at // p.cdes // boards})"
+            for at in np.flatnonzero(seeds == own[counts.argmax()])[:2].tolist()
         )
-        yield error(
-            Check.RNG_RELATION,
-            f"rng = {p.rng}",
-            f"the generators of {one} and {other} have the same seed",
-            "use a wider --rng, or fewer --rng-banks",
-        )
+        what = f"the generators of {one} and {other} have the same seed"
+        yield error(Check.RNG_RELATION, about, what, "use a wider --rng, or fewer --rng-banks")
     related, groups = relations(p.rng, seeds.reshape(sets, p.cdes), p.prob_bits)
     for size, finding in ((2, error), (3, warning), (4, note)):
         those = [relation for relation in related if len(relation.bits) == size]
         if those:
-            first = those[0]
-            bank, board = divmod(first.group, chain.boards)
-            bits = " and ".join(f"bit {bit} of {chain.titles[cde]}" for cde, bit in first.bits)
+            bank, board = divmod(those[0].group, boards)
+            bits = " and ".join(f"bit {bit} of {chain.titles[cde]}" for cde, bit in those[0].bits)
             yield finding(
                 Check.RNG_RELATION,
-                f"rng = {p.rng}",
-                (
-                    f"in {len(those)} of {groups} banks of boards {size} random bits "
-                    f"{'are the same' if size == 2 else 'XOR to 0'} in every cycle (bank {bank}, board {board}: {bits})"
-                ),
-                "use --rng lfsr32 or fewer --prob-bits",
+                about,
+                f"in {len(those)} of {groups} banks of boards {size} random bits {'are the same' if size == 2 else 'XOR to 0'} in "
+                f"every cycle (bank {bank}, board {board}: {bits})",
+                "use --rng lfsr32, or fewer --prob-bits",
             )
-    if found is not None:
-        sweeps = p.burn_in + chain.samples
-        cycles = min(chain.max_cycles, sweeps * found.cycles) * chain.boards
-        if cycles > 2**width / 10:
-            yield warning(
-                Check.RNG_PERIOD,
-                f"rng = {p.rng}",
-                (
-                    f"a frame takes about {cycles:.2g} cycles on all boards, more than a tenth of the generators' period of "
-                    f"{2**width - 1}, so that boards and CDEs see each other's numbers"
-                ),
-                "use a wider --rng, fewer --samples or fewer --partitions",
-            )
+    cycles = (
+        0.0
+        if found is None
+        else min(
+            chain.deployment.machine.max_cycles,
+            (p.burn_in + chain.deployment.machine.target_count) * found.cycles,
+        )
+        * boards
+    )
+    if cycles > 2**width / 10:
+        what = f"a frame takes about {cycles:.2g} cycles on all boards, more than a tenth of the generators' period of {2**width - 1}"
+        yield warning(
+            Check.RNG_PERIOD, about, what, "use a wider --rng, fewer --samples or fewer --partitions"
+        )

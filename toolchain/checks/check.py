@@ -8,12 +8,15 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
+from machines.bm2 import BM2Machine
 from pcie_shim.errors import PcieShimError
 from pcie_shim.programming_file import Image
 from toolchain.analysis.emulation import joined
-from toolchain.building.build import assemble, check_agreement, read_images
+from toolchain.building.bm2_machine import plan_bm2
+from toolchain.building.build import assemble, assemble_bm2, check_agreement, read_images
 from toolchain.building.machine import MachinePlan, partition_lines, plan_machine
 from toolchain.building.options import BuildOptions
+from toolchain.checks.chain_findings import CheckedChain, chain_findings
 from toolchain.checks.findings import (
     Check,
     CheckedMachine,
@@ -29,13 +32,18 @@ from toolchain.checks.generators import generator_findings
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 from toolchain.models.model import Model
+from toolchain.models.network import NetworkModel
 from toolchain.outputs.output_files import Change, compare_files, memory_files, quartus_files
 
 
 def check_model(
-    model: Model, options: BuildOptions, fit: Callable[[MachinePlan], MachinePlan] = lambda plan: plan
+    model: Model | NetworkModel,
+    options: BuildOptions,
+    fit: Callable[[MachinePlan], MachinePlan] = lambda plan: plan,
 ) -> list[Finding]:
-    """Return the findings about a model and the machine for it, the worst first; `fit` may increase the number of boards of the plan."""
+    """Return the findings about a model and its machine, the worst first; `fit` may increase the number of boards of a BM1."""
+    if isinstance(model, NetworkModel):
+        return _check_network(model, options)
     refused: list[Finding] = []
     try:  # besides, so that both mistakes are found at once
         partition_lines(model.lines, options.partitions)
@@ -48,8 +56,16 @@ def check_model(
         built = assemble(fit(plan))
     except ToolchainError as reason:
         return [*refused, refusal(reason, "the machine")]
-    machine = _machine(built.deployment, built.images, model)
-    return _sorted([*_check(machine), *loss_findings(built.quantised, options)])
+    findings = _check(built.deployment, built.images, model)
+    return _sorted([*findings, *loss_findings(built.quantised, options)])
+
+
+def _check_network(model: NetworkModel, options: BuildOptions) -> list[Finding]:
+    try:
+        built = assemble_bm2(plan_bm2(model, options))
+    except ToolchainError as reason:
+        return [refusal(reason, "the machine")]
+    return _sorted(_check(built.deployment, built.images, model))
 
 
 def check_deployment(directory: Path) -> list[Finding]:
@@ -60,7 +76,7 @@ def check_deployment(directory: Path) -> list[Finding]:
         check_agreement(deployment, images)
     except (ToolchainError, PcieShimError) as reason:
         return [refusal(reason, "the deployment")]
-    return _sorted([*_files(directory, deployment, images), *_check(_machine(deployment, images, None))])
+    return _sorted([*_files(directory, deployment, images), *_check(deployment, images, None)])
 
 
 def refusal(reason: Exception, about: str) -> Finding:
@@ -68,17 +84,22 @@ def refusal(reason: Exception, about: str) -> Finding:
     return error(Check.CANNOT_BE_BUILT, about, str(reason).rstrip("."))
 
 
-def _machine(deployment: Deployment, images: Sequence[Image], model: Model | None) -> CheckedMachine:
-    whole = joined([image.machine for image in images])
-    return CheckedMachine(deployment, images[0].machine, whole.prior, whole.tables, model)
-
-
-def _check(machine: CheckedMachine) -> Iterator[Finding]:
-    yield from code_findings(machine)
-    yield from _same_readings(machine.deployment)
-    yield from _ranges(machine.deployment)
-    yield from source_findings(machine.deployment)
-    yield from generator_findings(machine)
+def _check(
+    deployment: Deployment, images: Sequence[Image], model: Model | NetworkModel | None
+) -> Iterator[Finding]:
+    machines, machine = [image.machine for image in images], None
+    if isinstance(machines[0], BM2Machine):
+        network = model if isinstance(model, NetworkModel) else None
+        yield from chain_findings(CheckedChain(deployment, machines[0], network))
+    else:
+        whole, fusion = joined(machines), model if isinstance(model, Model) else None
+        machine = CheckedMachine(deployment, machines[0], whole.prior, whole.tables, fusion)
+        yield from code_findings(machine)
+    yield from _same_readings(deployment)
+    yield from _ranges(deployment)
+    yield from source_findings(deployment)
+    if machine is not None:
+        yield from generator_findings(machine)
 
 
 def _files(directory: Path, deployment: Deployment, images: Sequence[Image]) -> Iterator[Finding]:

@@ -15,7 +15,6 @@ from toolchain.commands.request import (
     build_options,
     fit_to_device,
     model_file,
-    read_model,
     read_source,
 )
 from toolchain.errors import BuildError, ToolchainError
@@ -128,11 +127,12 @@ def _model_flags(context: typer.Context) -> list[str]:
 
 
 def _of_model(path: Path, flags: BuildFlags) -> "list[Finding]":
+    from toolchain.building.choice import model_for
     from toolchain.checks.check import check_model, refusal
 
     try:
         options = build_options(flags, _NO_ROBOT)
-        model = read_model(path, flags, flags.bits)
+        model, _ = model_for(read_source(path, flags), options, flags.bits or (), flags.device)
     except ToolchainError as reason:
         return [refusal(reason, "the model")]
 

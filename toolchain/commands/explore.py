@@ -1,4 +1,4 @@
-"""The commands of analyses: `toolchain inspect` explains a deployment, `toolchain explore` compares machines."""
+"""The commands of analyses: `inspect` explains a deployment, `advise` and `explore` compare machines."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from toolchain.analysis import InspectOptions, ReadingOptions, Sweep
-from toolchain.commands.request import ModelFlags, read_model
+from toolchain.analysis import AdviceOptions, InspectOptions, ReadingOptions, Sweep
+from toolchain.commands.request import ModelFlags, ModelPath, read_model, read_source
 from toolchain.flags import Bits
 
 
@@ -53,9 +53,33 @@ def inspect(
     from toolchain.deployment import load_deployment
 
     deployment = load_deployment(directory)
+    if not deployment.machine.is_divided:
+        from toolchain.analysis.chain_inspection import inspect_chain
+        from toolchain.building.choice import network_for
+
+        network = None if model is None else network_for(read_source(model, flags))
+        chain = inspect_chain(deployment, network, options, progress)
+        typer.echo(chain.as_json() if json else chain.report(), nl=False)
+        return
     read = None if model is None else read_model(model, flags, bits)
     found = inspect_deployment(deployment, read, options, progress)
     typer.echo(as_json(found) if json else inspection_report(found), nl=False)
+
+
+def advise(
+    model: ModelPath,
+    flags: ModelFlags,
+    options: AdviceOptions,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
+) -> None:
+    """Compare the machines for a model at the same accuracy with exact inference on this host, and recommend one.
+
+    For example `toolchain advise asia.bif --searched bronc --known smoke,dysp --accuracy 0.01`
+    """
+    from toolchain.analysis.advice import advise as compare
+
+    found = compare(read_source(model, flags), options)
+    typer.echo(found.as_json() if json else found.report(), nl=False)
 
 
 def explore(

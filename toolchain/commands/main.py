@@ -17,7 +17,7 @@ from terminal.command_line import CommandLine
 from toolchain.bounded_files import file_errors
 from toolchain.building.options import DeploymentEdits
 from toolchain.commands.build import build, check
-from toolchain.commands.explore import explore, inspect
+from toolchain.commands.explore import advise, explore, inspect
 from toolchain.commands.request import ModelFlags, model_file, read_source
 from toolchain.deployment import FILE_NAME
 from toolchain.errors import BuildError
@@ -212,4 +212,4 @@ Then change model.py, build it again, and point --uri at the robot.
 
 
 add_commands(regeneration, memories, project, deployment)
-add_commands(app, build, check, inspect, explore, fit, new)
+add_commands(app, build, check, inspect, advise, explore, fit, new)

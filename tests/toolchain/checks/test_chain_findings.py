@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,10 @@ from hypothesis import strategies as st
 
 from machines.bm2 import BM2Machine, BM2Parameters, pack, unpack
 from machines.rng import LFSR
-from tests.toolchain.chains import machine_of, network, sprinkler
+from tests.toolchain.chains import network, sprinkler
+from tests.toolchain.running import OPTIONS
+from toolchain.building.bm2_machine import plan_bm2
+from toolchain.building.build import assemble_bm2
 from toolchain.checks.chain_findings import CheckedChain, chain_findings, clipped, legal_states, unconnected
 from toolchain.checks.findings import Check, Severity
 
@@ -18,20 +22,10 @@ OR = [[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 1.0]]]
 """P(C | A, B) of a deterministic or, by C, A, B."""
 
 
-def checked(model, *, samples=10_000, max_cycles=2**32, known_model=True, **parameters):
-    """The findings about the BM2 of a network."""
-    machine = machine_of(model, **parameters)
-    chain = CheckedChain(
-        machine=machine,
-        names=model.names,
-        titles=model.titles,
-        labels=tuple(each.type.labels for each in model.symbols),
-        known=model.variables,
-        boards=machine.parameters.chains,
-        samples=samples,
-        max_cycles=max_cycles,
-        model=model if known_model else None,
-    )
+def checked(model, *, samples=10_000, known_model=True, **options):
+    """The findings about the BM2 of a network, or about its deployment, which does not have the model."""
+    built = assemble_bm2(plan_bm2(model, replace(OPTIONS, target_count=samples, **options)))
+    chain = CheckedChain(built.deployment, built.images[0].machine, model if known_model else None)
     return list(chain_findings(chain))
 
 
@@ -68,9 +62,12 @@ def test_clipped_odds_are_counted():
 
 def test_a_clipped_factor_is_named_with_and_without_the_model():
     model = sprinkler()
-    for known_model in (True, False):
+    for known_model, title in (
+        (True, "P(grass | sprinkler, rain)"),
+        (False, "the factor of rain, variable 1, grass"),
+    ):
         finding = only(checked(model, known_model=known_model), Check.CLIPPED)
-        assert finding.about == "P(grass | sprinkler, rain)"
+        assert finding.about == title
         assert "3 of its 12 odds are clipped to 1 in 65536, 3 of them because of zeros" in finding.what
     small = network({"A": [1, 1e-4], "AB": [[1, 2], [3, 1]]})
     assert "1 of its 1 odds are clipped to 1 in 256" in only(checked(small, prob_bits=8), Check.CLIPPED).what
@@ -92,10 +89,10 @@ def test_an_error_that_cannot_be_computed_is_said():
 
 def test_samples_that_are_worth_few():
     assert "10000 of them are worth 97 independent ones" in only(checked(sprinkler()), Check.MIXING).what
-    assert "20000 of them are worth 193" in only(checked(sprinkler(), chains=2), Check.MIXING).what
+    assert "20000 of them are worth 193" in only(checked(sprinkler(), partitions=2), Check.MIXING).what
     finding = only(checked(gate()), Check.MIXING)
     assert finding.severity is Severity.WARNING
-    assert "in spite of 1000 sweeps of burn-in" in finding.what
+    assert "1000 sweeps of burn-in leave" in finding.what
     assert not found(checked(sprinkler(), samples=10**6), Check.MIXING)
 
 
@@ -198,7 +195,7 @@ RANDOM = np.random.default_rng(2)
 def test_a_factor_that_is_too_wide_is_named():
     model = network({"ABC": RANDOM.random((64, 64, 64)), "A": np.arange(1, 65)})
     finding = only(checked(model, known_model=False), Check.WIDE_FACTOR)
-    assert finding.about == "the potential of A, B, C"
+    assert finding.about == "the factor of A, variable 1, variable 2"
     assert "2,359,296 words of 16 bits" in finding.what
     assert "holds 2,102,272" in finding.what
     assert not found(checked(model, known_model=False, prob_bits=10), Check.WIDE_FACTOR)
@@ -207,7 +204,7 @@ def test_a_factor_that_is_too_wide_is_named():
 def test_factors_that_fit_only_alone():
     tables = {"AB": RANDOM.random((256, 512)), "BC": RANDOM.random((512, 256))}
     finding = only(checked(network(tables), known_model=False), Check.WIDE_FACTOR)
-    assert "all tables take 2,176 memory blocks" in finding.what
+    assert "all tables together take 2,176 of 2,053" in finding.what
     assert "1,114,112 words" in finding.what
     del tables["BC"]
     assert not found(checked(network(tables), known_model=False), Check.WIDE_FACTOR)
@@ -219,18 +216,18 @@ def test_factors_that_fit_only_alone():
 def test_few_banks_and_few_steps():
     assert only(checked(sprinkler(), rng_banks=1), Check.RNG_BANKS)
     assert not found(checked(sprinkler(), rng_banks=1, rng_reset="free"), Check.RNG_BANKS)
-    assert "biases the samples" in only(checked(sprinkler(), steps_per_clock=8), Check.RNG_STEPS).what
+    assert "biases all samples" in only(checked(sprinkler(), steps_per_clock=8), Check.RNG_STEPS).what
     assert not found(checked(sprinkler(), prob_bits=8, steps_per_clock=8), Check.RNG_STEPS)
 
 
 def test_seeds_that_are_equal_on_two_boards(monkeypatch):
     monkeypatch.setattr(LFSR, "seeds", lambda _, numbers: numbers % np.uint64(7) + np.uint64(1))
-    findings = checked(sprinkler(), chains=4)
+    findings = checked(sprinkler(), partitions=4)
     finding = next(each for each in found(findings, Check.RNG_RELATION) if "have the same seed" in each.what)
     assert finding.severity is Severity.ERROR
     assert "P(rain) (board 0, bank 0) and P(sprinkler | rain) (board 2, bank 0)" in finding.what
     monkeypatch.undo()
-    assert not found(checked(sprinkler(), chains=4), Check.RNG_RELATION)
+    assert not found(checked(sprinkler(), partitions=4), Check.RNG_RELATION)
 
 
 def test_bits_that_are_related():
@@ -244,5 +241,5 @@ def test_a_frame_that_is_long_for_its_period():
     assert not found(checked(sprinkler(), rng="lfsr24", samples=200_000), Check.RNG_PERIOD)
     finding = only(checked(sprinkler(), rng="lfsr24", samples=300_000), Check.RNG_PERIOD)
     assert "more than a tenth of the generators' period of 16777215" in finding.what
-    assert found(checked(sprinkler(), rng="lfsr24", samples=150_000, chains=2), Check.RNG_PERIOD)
-    assert not found(checked(sprinkler(), rng="lfsr24", samples=10**9, max_cycles=10**6), Check.RNG_PERIOD)
+    assert found(checked(sprinkler(), rng="lfsr24", samples=150_000, partitions=2), Check.RNG_PERIOD)
+    assert not found(checked(sprinkler(), rng="lfsr24", samples=10**8, max_cycles=10**6), Check.RNG_PERIOD)

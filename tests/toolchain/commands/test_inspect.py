@@ -5,7 +5,7 @@ import json
 import pytest
 
 from tests.toolchain.running import TARGET, assert_refused, done, toolchain
-from toolchain.analysis.inspection import _with_unit
+from toolchain.analysis import with_unit
 from toolchain.deployment import load_deployment
 
 
@@ -94,5 +94,5 @@ def test_a_build_on_a_device_takes_its_own_number_of_boards(case):
 
 def test_units():
     values = {20.48e-6: "20.5 us", 1e-3: "1 ms", 1.0: "1 s", 0.0: "0 s", 3e-15: "0.003 ps"}
-    assert {value: _with_unit(value, "s") for value in values} == values
-    assert _with_unit(100e6, "Hz") == "100 MHz"
+    assert {value: with_unit(value, "s") for value in values} == values
+    assert with_unit(100e6, "Hz") == "100 MHz"

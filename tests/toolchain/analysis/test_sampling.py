@@ -1,0 +1,75 @@
+"""Runs of a BM2 on drawn readings: they follow the model, approach exact inference, and say why boards stopped."""
+
+import math
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from tests.toolchain.chains import machine_of, network, sprinkler
+from toolchain.analysis.chain import ExactChain
+from toolchain.analysis.logic import device_named
+from toolchain.analysis.sampling import SampledBoards, chain_resources, drawn_readings
+from toolchain.errors import BuildError
+
+DEVICE = device_named("proce-v-d8")
+
+
+def test_readings_are_drawn_from_their_joint_distribution():
+    weights = np.array([[[4.0, 0], [1, 2]], [[0, 3], [5, 1]]])  # A, B, C
+    drawn = Counter(drawn_readings(network({"ABC": weights}, known=("C", "B")), 4000, seed=1))
+    expected = weights.sum(axis=0).T / weights.sum()
+    for (c, b), count in drawn.items():
+        assert count / 4000 == pytest.approx(expected[c, b], abs=0.03)
+    assert drawn_readings(sprinkler(), 5, seed=3) == drawn_readings(sprinkler(), 5, seed=3)
+    with pytest.raises(BuildError, match="--frames is 0"):
+        drawn_readings(sprinkler(), 0, seed=1)
+
+
+def test_runs_approach_exact_inference():
+    model = sprinkler()
+    machine = machine_of(model)
+    found = SampledBoards([machine], 2**40).measure([(0,), (1,)], 200_000, model)
+    assert found.frames == 2
+    assert found.total_variation.value < 0.02
+    assert found.map_agreement.value == 1
+    cycles = [ExactChain(machine, {2: grass}).cycles for grass in (0, 1)]
+    assert found.sweep_cycles == pytest.approx(np.mean(cycles), rel=0.03)
+    assert found.effective_samples[1] == pytest.approx(200_000 * 0.0097, rel=0.5)
+    assert (math.isnan(found.r_hat), found.reasons) == (True, {"samples": 2})
+
+
+def test_two_boards_start_apart_and_are_compared():
+    model = network({"AB": [[1, 0], [0, 1]], "BC": [[1, 0], [0, 1]]}, searched=("A",))
+    machines = [machine_of(model, chain=chain, chains=2, stream=8) for chain in (0, 1)]
+    found = SampledBoards(machines, 2**40).measure([()], 100, model)
+    assert found.total_variation.value < 0.05  # each is stuck where it started, at 0 and at 1
+    assert found.r_hat == math.inf
+    assert found.effective_samples[1] <= 200
+
+
+def test_boards_that_do_not_finish():
+    model = sprinkler()
+    boards = SampledBoards([machine_of(model)], 20_000)
+    assert boards.measure([(1,)], 10**6, model).reasons == {"max_cycles": 1}
+    timed_out = SampledBoards([machine_of(model, ops_timeout=1)], 2**40)
+    with pytest.raises(BuildError, match="none of the readings gives a posterior"):
+        timed_out.measure([(1,)], 100, model)
+    impossible = network({"AB": [[1, 0], [1, 0]]}, known=("B",), searched=("A",))
+    found = SampledBoards([machine_of(impossible)], 2**40).measure([(0,), (1,)], 100, None)
+    assert (found.frames, found.total_variation) == (1, None)
+    assert found.reasons == {"samples": 1, "impossible": 1}
+
+
+def test_resources():
+    model = sprinkler()
+    small, literal = (chain_resources(machine_of(model, prob_bits=bits), DEVICE) for bits in (8, 16))
+    assert small.fits
+    assert small.memories.table_bits == 8 * (1 + 4 + 12)
+    assert literal.memories.table_bits == 16 * (1 + 4 + 12)
+    assert literal.alms > small.alms
+    wide = network({"ABC": np.random.default_rng(1).random((64, 64, 64)), "A": np.arange(1, 65)})
+    estimate = chain_resources(machine_of(wide), DEVICE)
+    assert estimate.memories.blocks > 18 * 2**17 / 1024
+    assert not estimate.fits
+    assert "memory blocks" in estimate.why_not

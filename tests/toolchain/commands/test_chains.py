@@ -1,0 +1,116 @@
+"""`toolchain check`, `inspect` and `advise` for questions that a BM2 answers."""
+
+import json
+
+import pytest
+
+from tests.toolchain.running import TARGET, assert_refused, done, toolchain
+from toolchain.analysis.advice import Candidate, _recommendation, _run_until
+
+QUESTION = ("--searched", "rain", "--known", "sprinkler,grass")
+"""A BM1 cannot answer it: both are causes of the grass."""
+
+
+@pytest.fixture
+def deployment(network, tmp_path):
+    folder = tmp_path / "built"
+    done(
+        toolchain(
+            "build", network, *QUESTION, "-o", folder, *TARGET, "--samples", "2000", "--partitions", "2"
+        )
+    )
+    return folder
+
+
+def test_check_names_factors_of_a_network_and_of_a_deployment(network, deployment):
+    said = done(toolchain("check", network, *QUESTION)).stdout
+    assert "note: P(grass | sprinkler, rain): 3 of its 12 odds are clipped" in said
+    refused = toolchain("check", network, *QUESTION, "--machine", "bm1")
+    assert (
+        refused.exit_code,
+        refused.stdout.startswith("error: the model: sprinkler and grass are not"),
+    ) == (2, True)
+    findings = [
+        json.loads(line) for line in done(toolchain("check", deployment, "--json")).stdout.splitlines()
+    ]
+    assert {each["check"] for each in findings} == {"clipped-factors"}
+    (
+        deployment / "bm_arch" / "Memory_MIFs" / next((deployment / "bm_arch" / "Memory_MIFs").iterdir()).name
+    ).unlink()
+    assert "is not there" in done(toolchain("check", deployment)).stdout
+
+
+def test_inspect(network, deployment):
+    said = done(toolchain("inspect", deployment, "--model", network, *QUESTION, "--frames", "4")).stdout
+    assert "a BM2, 2 boards with a chain each" in said
+    assert "3 variables in 3 bits; 3 CDEs with 17 codes of 16 bits, at most 12." in said
+    assert "Total variation from exact inference: 0.0" in said
+    found = json.loads(done(toolchain("inspect", deployment, "--json", "--frames", "4")).stdout)
+    assert (found["state_bits"], found["table_words"], found["exact"]) == (3, [1, 4, 12], None)
+    assert found["sampled"]["total_variation"] is None
+    assert found["sampled"]["cycles"]["worst"] >= 3000
+    assert found["resources"]["fits"]
+
+
+def test_inspect_refuses_what_it_cannot_do(network, deployment):
+    question = ("--searched", "rain", "--known", "grass")
+    assert_refused(
+        toolchain("inspect", deployment, "--model", network, *question), "garden", "its codes differ"
+    )
+    assert_refused(toolchain("inspect", deployment, "--readings", "a.csv"), "--readings a.csv")
+
+
+def test_advice_about_both_machines(network):
+    question = ("--searched", "rain", "--known", "grass", "--accuracy", "0.03", "--frames", "5")
+    found = json.loads(done(toolchain("advise", network, *question, "--json")).stdout)
+    assert found["question"] == "P(rain | grass)"
+    one, two = found["machines"]
+    assert (one["machine"], two["machine"], one["refused"], two["refused"]) == ("BM1", "BM2", "", "")
+    assert max(one["total_variation"], two["total_variation"]) <= 0.03
+    assert one["cycles"] < two["cycles"]
+    assert one["seconds"] == pytest.approx(one["cycles"] / 100e6)
+    assert found["exact_seconds"] > 0
+    said = done(toolchain("advise", network, *question, "--clock", "1e3")).stdout
+    assert "time at 1 kHz" in said
+    assert said.splitlines()[-1].startswith("Use a CPU: exact inference on a CPU takes ")
+
+
+def test_advice_says_why_a_bm1_cannot_answer(network):
+    said = done(toolchain("advise", network, *QUESTION, "--accuracy", "0.05", "--frames", "5")).stdout
+    assert "BM1: sprinkler and grass are not independent given rain" in said
+    assert "BM2" in said.splitlines()[1]
+    assert_refused(toolchain("advise", network), "give the searched and known variables")
+    assert_refused(toolchain("advise", network, *QUESTION, "--device", "x"), "--device x")
+
+
+FAST = Candidate(machine="BM1", total_variation=0.01, seconds=1e-6)
+SLOW = Candidate(machine="BM2", total_variation=0.01, seconds=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("machines", "exact", "words"),
+    [
+        ((FAST, SLOW), 1e-4, "Use a BM1: a BM1 takes 1 us, and exact inference on a CPU takes 100 us"),
+        ((FAST, SLOW), 1e-7, "Use a CPU: exact inference on a CPU takes 100 ns, and a BM1 takes 1 us"),
+        (
+            (Candidate(machine="BM1", refused="no"), SLOW),
+            None,
+            "Use a BM2: a BM2 takes 1 ms, and exact inference needs",
+        ),
+        ((Candidate(machine="BM1", refused="no"),), 1e-4, "and no machine can answer this question"),
+        ((Candidate(machine="BM1", total_variation=0.02),), 1e-4, "and no machine is as accurate"),
+        ((Candidate(machine="BM1", total_variation=0.01, unfit="too large"),), 1e-4, "no machine can answer"),
+        ((Candidate(machine="BM1", refused="no"),), None, "Neither a machine nor exact inference"),
+    ],
+)
+def test_the_recommendation(machines, exact, words):
+    assert words in _recommendation(machines, exact, 0.01)
+
+
+def test_a_machine_runs_until_it_is_accurate_enough():
+    found = _run_until(lambda setting: (setting**-0.5, 10.0 * setting), 100, 0.01)
+    assert 0.008 <= found[1] <= 0.01
+    assert found[2] == 10 * found[0]
+    assert _run_until(lambda setting: (setting**-0.5, setting), 10**6, 0.01)[0] < 20_000  # fewer are enough
+    floor = _run_until(lambda setting: (0.1, 1e6 * setting), 1, 0.01)
+    assert floor == (1, 0.1, 1e6)  # never enough, and no more than 3e7 cycles

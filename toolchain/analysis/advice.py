@@ -1,0 +1,284 @@
+"""Advice on the machine for a question: BM1 and BM2 at the same accuracy, and exact inference on this host (thesis 5.2).
+
+Both machines are emulated on readings drawn from the model, and run longer until the mean total variation from exact
+inference is as asked. A machine that does not reach it within `MOST_CYCLES` says how near it came.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from statistics import median
+from time import perf_counter
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.parameters import SensorMode
+from toolchain.analysis import with_unit
+from toolchain.analysis.accuracy import Accuracy, measure
+from toolchain.analysis.emulation import EmulatedBoards
+from toolchain.analysis.logic import device_named
+from toolchain.analysis.readings import sample_readings
+from toolchain.analysis.resources import Estimate, boards_needed, estimate
+from toolchain.analysis.sampling import Addresses, SampledBoards, chain_resources, drawn_readings
+from toolchain.building.bm2_machine import chain_machines, plan_bm2
+from toolchain.building.choice import network_for
+from toolchain.building.machine import partition_lines, plan_machine, whole_machine
+from toolchain.building.options import BuildOptions
+from toolchain.building.quantise import quantise
+from toolchain.deployment import Scale, Stop
+from toolchain.errors import ModelError, ToolchainError
+from toolchain.models.joint import Question
+
+if TYPE_CHECKING:
+    from machines.bm1 import BM1Machine
+    from toolchain.analysis import AdviceOptions
+    from toolchain.analysis.logic import Device
+    from toolchain.models.model import Model
+    from toolchain.models.network import NetworkModel
+
+MOST_CYCLES: Final = 30_000_000
+"""Maximum number of cycles of a frame, because their emulation takes time."""
+_NEAR: Final = 0.8
+"""A machine is not much better than asked below this share of the accuracy."""
+_ATTEMPTS: Final = 8
+_WIDTHS: Final = (8, 12, 16)
+_NO_ROBOT: Final = BuildOptions(uri="ws://nowhere:9090", topic="/readings", type="std_msgs/Float64")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate:
+    """A machine for a question; without numbers if it is refused.
+
+    Attributes:
+        machine: BM1 or BM2.
+        refused: The reason why it cannot answer the question; empty if it can.
+        prob_bits: Bits of its codes.
+        setting: Its target count (BM1) or samples (BM2).
+        total_variation: Mean distance from exact inference with this setting.
+        cycles: Cycles of a frame, in the median.
+        seconds: The time of these cycles at the clock.
+        boards: Number of boards that hold it.
+        alms: Estimated logic of one board.
+        blocks: Estimated memory blocks of one board.
+        unfit: The reason why a board of this device cannot hold it; empty if it can.
+    """
+
+    machine: str
+    refused: str = ""
+    prob_bits: int = 0
+    setting: int = 0
+    total_variation: float = 1.0
+    cycles: float = 0.0
+    seconds: float = 0.0
+    boards: int = 1
+    alms: float = 0.0
+    blocks: int = 0
+    unfit: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Advice:
+    """The machines for a question, the median time of exact inference (None if it is impossible), and a sentence."""
+
+    model: str
+    question: str
+    accuracy: float
+    frames: int
+    clock_hz: float
+    device: str
+    machines: tuple[Candidate, ...]
+    exact_seconds: float | None
+    recommendation: str
+
+    def as_json(self) -> str:
+        """Return the advice as one JSON object."""
+        return json.dumps(asdict(self)) + "\n"
+
+    def report(self) -> str:
+        """Return the advice as a table and sentences."""
+        exact = (
+            "needs tables above the limit"
+            if self.exact_seconds is None
+            else with_unit(self.exact_seconds, "s")
+        )
+        columns = [
+            (
+                each.machine,
+                f"{each.prob_bits}",
+                f"{each.setting:,}",
+                f"{each.total_variation:.4f}",
+                f"{each.cycles:,.0f}",
+                with_unit(each.seconds, "s"),
+                f"{each.boards}",
+                f"{each.alms:,.0f}",
+                f"{each.blocks:,}",
+            )
+            for each in self.machines
+            if not each.refused
+        ]
+        names = (
+            "",
+            "bits of a code",
+            "target count, samples",
+            "total variation",
+            "cycles of a frame",
+            f"time at {with_unit(self.clock_hz, 'Hz')}",
+            "boards",
+            "ALMs of a board",
+            "its memory blocks",
+        )
+        rows = [
+            f"{name:22}" + "".join(f"{cell:>14}" for cell in cells)
+            for name, *cells in zip(names, *columns, strict=True)
+        ]
+        for each in self.machines:
+            if each.refused or each.unfit:
+                rows.append(f"{each.machine}: {each.refused or f'on a {self.device} {each.unfit}'}.")
+            elif each.total_variation > self.accuracy:
+                rows.append(f"{each.machine}: it comes no nearer in {MOST_CYCLES:,} cycles.")
+        heading = f"{self.model}: {self.question}, to a mean total variation of {self.accuracy:g} over {self.frames} readings"
+        return (
+            "\n".join([heading, *rows, f"Exact inference on this host: {exact}.", self.recommendation]) + "\n"
+        )
+
+
+def advise(source: Model | Question, options: AdviceOptions) -> Advice:
+    """Compare the machines for a model or a question, or raise a ToolchainError if no readings can be drawn."""
+    device = device_named(options.device)
+    network = network_for(source)
+    readings = drawn_readings(network, options.frames, options.seed)
+    times: list[float] = []
+    for addresses in readings:
+        began = perf_counter()
+        with suppress(ModelError):  # a table above the limit
+            network.exact(addresses)
+            times.append(perf_counter() - began)
+    machines = (
+        _candidate("BM1", options, lambda: _bm1(source, options, device)),
+        _candidate("BM2", options, lambda: _bm2(network, readings, options, device)),
+    )
+    exact = median(times) if times else None
+    known = f" | {', '.join(network.known)}" if network.known else ""
+    return Advice(
+        model=network.name,
+        question=f"P({', '.join(network.searched)}{known})",
+        accuracy=options.accuracy,
+        frames=options.frames,
+        clock_hz=options.clock_hz,
+        device=device.title,
+        machines=machines,
+        exact_seconds=exact,
+        recommendation=_recommendation(machines, exact, options.accuracy),
+    )
+
+
+def _candidate(
+    machine: str,
+    options: AdviceOptions,
+    run: Callable[[], tuple[int, tuple[int, float, float], int, Estimate]],
+) -> Candidate:
+    """Return a machine from a function that runs it: bits of a code, the run, boards, and resources of one of them."""
+    try:
+        prob_bits, (setting, variation, cycles), boards, resources = run()
+    except ToolchainError as reason:
+        return Candidate(machine=machine, refused=str(reason).rstrip("."))
+    return Candidate(
+        machine=machine,
+        prob_bits=prob_bits,
+        setting=setting,
+        total_variation=variation,
+        cycles=cycles,
+        seconds=cycles / options.clock_hz,
+        boards=boards,
+        alms=resources.alms,
+        blocks=resources.memories.blocks,
+        unfit=resources.why_not,
+    )
+
+
+def _bm1(
+    source: Model | Question, options: AdviceOptions, device: Device
+) -> tuple[int, tuple[int, float, float], int, Estimate]:
+    """Run a BM1 with the narrowest codes that are exact enough, on as many boards as its lines need."""
+    model = source.model() if isinstance(source, Question) else source
+    readings = sample_readings(model, options.frames, seed=options.seed)
+
+    def measured(machine: BM1Machine, target: int) -> Accuracy:
+        boards = EmulatedBoards([machine], target_count=target, max_cycles=4 * MOST_CYCLES, stop=Stop.SLICES)
+        return measure(boards, readings, model, banks=1)
+
+    for prob_bits in _WIDTHS:
+        plan = plan_machine(model, replace(_NO_ROBOT, prob_bits=prob_bits, counter_bits=32))
+        codes = quantise(model, prob_bits=prob_bits, scale=Scale.ADDRESS, sensor_mode=SensorMode.COLUMN)
+        machine = whole_machine(plan, codes)
+        lost = measured(machine, 1).quantising
+        if lost is not None and lost.total_variation.value <= options.accuracy / 2:
+            break
+
+    def run(target: int) -> tuple[float, float]:
+        found = measured(machine, target)
+        return found.machine.total_variation.value if found.machine else 1.0, found.cycles.median.value
+
+    best = _run_until(run, 255, options.accuracy)
+    parameters = replace(machine.parameters, counter_bits=best[0].bit_length())
+    boards, _ = boards_needed(parameters, device)
+    lines = partition_lines(parameters.lines, boards)[0].lines
+    return prob_bits, best, boards, estimate(replace(parameters, lines=lines), device)
+
+
+def _bm2(
+    network: NetworkModel, readings: Sequence[Addresses], options: AdviceOptions, device: Device
+) -> tuple[int, tuple[int, float, float], int, Estimate]:
+    """Run a BM2 with the default options on one board."""
+    plan = plan_bm2(network, _NO_ROBOT)
+    machines = chain_machines(plan)
+    boards = SampledBoards(machines, plan.max_cycles)
+
+    def run(samples: int) -> tuple[float, float]:
+        found = boards.measure(readings, samples, network)
+        return found.total_variation.value if found.total_variation else 1.0, found.cycles.median.value
+
+    best = _run_until(run, 1000, options.accuracy)
+    return plan.parameters.prob_bits, best, 1, chain_resources(machines[0], device)
+
+
+def _run_until(
+    run: Callable[[int], tuple[float, float]], setting: int, accuracy: float
+) -> tuple[int, float, float]:
+    """Return the setting for an accuracy, with the total variation and the cycles; the most accurate one if none is enough.
+
+    The error falls with the root of the setting, so every run predicts the next setting.
+    """
+    tried: dict[int, tuple[float, float]] = {}
+    while len(tried) < _ATTEMPTS and setting not in tried:
+        variation, cycles = tried[setting] = run(setting)
+        if _NEAR * accuracy <= variation <= accuracy:
+            break
+        growth = min((variation / (0.9 * accuracy)) ** 2, MOST_CYCLES / max(cycles, 1))
+        setting = max(1, round(setting * float(np.clip(growth, 1 / 8, 8))))
+    enough = {each: tv for each, (tv, _) in tried.items() if tv <= accuracy}
+    best = min(enough) if enough else min(tried, key=lambda each: tried[each][0])
+    return (best, *tried[best])
+
+
+def _recommendation(machines: Sequence[Candidate], exact: float | None, accuracy: float) -> str:
+    possible = [each for each in machines if not each.refused and not each.unfit]
+    useful = [each for each in possible if each.total_variation <= accuracy]
+    best = min(useful, key=lambda each: each.seconds, default=None)
+    cpu = "" if exact is None else f"exact inference on a CPU takes {with_unit(exact, 's')}"
+    if best is None:
+        if exact is None:
+            return (
+                "Neither a machine nor exact inference answers this question: search or know other variables."
+            )
+        return f"Use a CPU: {cpu}, and no machine {'is as accurate' if possible else 'can answer this question'}."
+    ours = f"a {best.machine} takes {with_unit(best.seconds, 's')}"
+    if exact is None:
+        return f"Use a {best.machine}: {ours}, and exact inference needs tables above the limit."
+    if best.seconds < exact:
+        return f"Use a {best.machine}: {ours}, and {cpu}, each without the way from and to ROS."
+    return f"Use a CPU: {cpu}, and {ours}."

@@ -1,0 +1,149 @@
+"""Inspection of a BM2's deployment: sizes, cycles, accuracy and resources, as text or as a JSON object."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from machines.bm2 import BM2Machine
+from toolchain.analysis import with_unit
+from toolchain.analysis.chain import ChainError, chain_error
+from toolchain.analysis.logic import device_named
+from toolchain.analysis.resources import Estimate
+from toolchain.analysis.sampling import Sampled, SampledBoards, chain_resources, drawn_readings
+from toolchain.building.build import read_images
+from toolchain.errors import BuildError
+
+if TYPE_CHECKING:
+    from toolchain.analysis import InspectOptions, Progress
+    from toolchain.deployment import Deployment
+    from toolchain.models.network import NetworkModel
+
+_FRAMES: Final = 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChainInspection:
+    """Results of an inspection; `exact` is what runs approach, None without a model or with too many unknown bits."""
+
+    deployment: Deployment
+    machine: BM2Machine
+    readings: str
+    sampled: Sampled
+    exact: ChainError | None
+    resources: Estimate
+    clock_hz: float
+
+    def as_json(self) -> str:
+        """Return the inspection as one JSON object."""
+        p, sampled = self.machine.parameters, asdict(self.sampled)
+        content = {
+            "deployment": self.deployment.name,
+            "hash": self.deployment.hash,
+            "boards": p.chains,
+            "variables": len(p.cardinalities),
+            "state_bits": p.state_bits,
+            "table_words": [table.size for table in self.machine.tables],
+            "result_words": p.result_words,
+            "readings": self.readings,
+            "clock_hz": self.clock_hz,
+            "sampled": sampled | {"r_hat": None if math.isnan(self.sampled.r_hat) else self.sampled.r_hat},
+            "exact": None if self.exact is None else asdict(self.exact),
+            "resources": {
+                "alms": self.resources.alms,
+                "registers": self.resources.logic.registers,
+                "table_bits": self.resources.memories.table_bits,
+                "blocks": self.resources.memories.blocks,
+                "memory_labs": self.resources.memories.mlabs,
+                "fits": self.resources.fits,
+            },
+        }
+        return json.dumps(content) + "\n"
+
+    def report(self) -> str:
+        """Return the inspection as sentences."""
+        p, ran, cost, count = (
+            self.machine.parameters,
+            self.sampled,
+            self.resources,
+            self.deployment.machine.target_count,
+        )
+        sizes = [table.size for table in self.machine.tables]
+        cycles = ", ".join(
+            f"{each:,.0f} {name} ({with_unit(each / self.clock_hz, 's')})"
+            for name, each in (
+                ("in the median", ran.cycles.median.value),
+                ("at 95 %", ran.cycles.percentile_95.value),
+                ("at worst", float(ran.cycles.worst)),
+            )
+        )
+        resources = f"{cost.alms:,.0f} ALMs ({cost.alm_share:.1%}), {cost.memories.blocks:,} memory blocks ({cost.block_share:.1%}); "
+        resources += "it fits" if cost.fits else f"it does not fit: {cost.why_not}"
+        accuracy = "Give the model with --model for the accuracy."
+        if (tv := ran.total_variation) is not None and (same := ran.map_agreement) is not None:
+            accuracy = f"Total variation from exact inference: {tv.value:.4f} ({tv.low:.4f}..{tv.high:.4f}); same MAP: {same.value:.0%}."
+        if (e := self.exact) is not None:
+            accuracy += f" Computed: {e.quantising:.2g} by the codes, {e.start:.2g} by the start state, {e.sampling:.2g} by too few samples."
+        rows = (
+            f"Deployment {self.deployment.name} ({self.deployment.hash[:16]}): a BM2, {p.chains} board{'s' * (p.chains > 1)} with a chain each.",
+            f"{len(p.cardinalities)} variables in {p.state_bits} bits; {p.cdes} CDEs with {sum(sizes):,} codes of {p.prob_bits} bits, at most {max(sizes):,}.",
+            f"{count:,} samples after {p.burn_in:,} sweeps, {p.sequencer} order, {p.rng} ({p.steps_per_clock} steps per clock, {p.rng_banks} banks).",
+            f"Readings: {self.readings}. Boards stopped by: {', '.join(f'{name} {n}' for name, n in sorted(ran.reasons.items()))}.",
+            f"Cycles of a frame, and time at {with_unit(self.clock_hz, 'Hz')} (no link, no ROS): {cycles}; {ran.sweep_cycles:.2f} per sweep.",
+            f"Its samples are worth {ran.effective_samples[0]:,.0f} independent ones in the median, {ran.effective_samples[1]:,.0f} at least; R-hat {ran.r_hat:.3f}.",
+            accuracy,
+            f"Resources of a {cost.device.title}, estimated from the units of a BM1: {resources}.",
+        )
+        return "\n".join(rows) + "\n"
+
+
+def inspect_chain(
+    deployment: Deployment, model: NetworkModel | None, options: InspectOptions, progress: Progress
+) -> ChainInspection:
+    """Run a deployment's chains on readings, and estimate their costs, or raise a ToolchainError."""
+    machines = [image.machine for image in read_images(deployment)]
+    machine, limits, frames = machines[0], deployment.machine, options.frames or _FRAMES
+    if options.readings is not None:
+        raise BuildError(f"--readings {options.readings}: the readings of a BM2 are drawn; omit it")
+    if model is None:
+        source = f"{frames} frames of values drawn uniformly (seed {options.seed})"
+        sizes = [each.values for each in deployment.variables]
+        drawn = np.random.default_rng(options.seed).integers(0, sizes, (frames, len(sizes)))
+        readings, exact = [tuple(each) for each in drawn.tolist()], None
+    else:
+        _check_same(deployment, machine, model)
+        source = f"{frames} frames drawn from the model (seed {options.seed})"
+        readings = drawn_readings(model, frames, options.seed)
+        exact = chain_error(machine, model, samples=limits.target_count)
+    boards = SampledBoards(machines, limits.max_cycles)
+    with progress(len(readings)) as advance:
+        sampled = boards.measure(readings, limits.target_count, model, lambda: advance("frames"))
+    return ChainInspection(
+        deployment=deployment,
+        machine=machine,
+        readings=source,
+        sampled=sampled,
+        exact=exact,
+        resources=chain_resources(machine, device_named(options.device)),
+        clock_hz=options.clock_hz,
+    )
+
+
+def _check_same(deployment: Deployment, machine: BM2Machine, model: NetworkModel) -> None:
+    """Raise a BuildError if the codes of the model are not those of the deployment."""
+    p = machine.parameters
+    place = {name: at for at, name in enumerate(model.names)}.__getitem__
+    scopes = tuple(tuple(map(place, term.scope)) for term in model.factors)
+    asked = (tuple(map(place, model.searched)), tuple(map(place, model.known)))
+    if (model.cardinalities, scopes, asked) == (p.cardinalities, p.factors, (p.searched, p.known)):
+        tables = [term.table for term in model.factors]
+        if BM2Machine.from_factors(p, tables, machine.rng_table) == machine:
+            return
+    raise BuildError(
+        f"{deployment.directory} was not built from the model {model.name} with these settings: its codes differ; give "
+        "the same --set and question as for the build, or build it again"
+    )

@@ -1,0 +1,210 @@
+"""Runs of a BM2 on drawn readings, as the host runs its boards, beside exact inference; and what it takes on an FPGA."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from machines import make_bm2_kernel
+from machines.bm2 import BM2Machine, BM2Start, BM2StopReason, start_state
+from machines.bm2_estimate import BATCHES_MIN, Chain, estimate, searched_counts
+from machines.parameters import SampleEvery
+from toolchain.analysis.accuracy import Cycles, Interval, bootstrap, share_of_frames
+from toolchain.analysis.chain import distance
+from toolchain.analysis.logic import (
+    MLAB_ALMS,
+    MLAB_SHAPE,
+    WORD_BITS,
+    Logic,
+    LogicPart,
+    Memories,
+    Of,
+    blocks_of,
+)
+from toolchain.analysis.readings import check_frames
+from toolchain.analysis.resources import Estimate
+from toolchain.deployment import Dimension
+from toolchain.errors import BuildError
+
+if TYPE_CHECKING:
+    from toolchain.analysis.logic import Device
+    from toolchain.models.network import NetworkModel
+
+Addresses = tuple[int, ...]
+"""A frame's readings: an address per known variable."""
+
+
+def drawn_readings(model: NetworkModel, frames: int, seed: int) -> list[Addresses]:
+    """Draw readings of all known variables from the model, each one given those before it."""
+    check_frames(frames)
+    random = np.random.default_rng(seed)
+    given_earlier = [
+        replace(
+            model, dimensions=(Dimension(label=each.name, size=each.values),), variables=model.variables[:at]
+        )
+        for at, each in enumerate(model.variables)
+    ]
+    readings = []
+    for _ in range(frames):
+        drawn: list[int] = []
+        for part in given_earlier:
+            chances = part.exact(drawn)
+            drawn.append(int(random.choice(len(chances), p=chances)))
+        readings.append(tuple(drawn))
+    return readings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sampled:
+    """What a BM2 did on some readings; intervals are of 95 %, over frames.
+
+    Attributes:
+        frames: Frames with a posterior.
+        total_variation: Mean distance of the posteriors from exact inference; None without a model.
+        map_agreement: Share of frames with the same most probable value; None without a model.
+        cycles: Cycles of the longest-running board.
+        sweep_cycles: Cycles of a sweep, in the mean; 0 if samples are taken after every move.
+        effective_samples: Independent samples that those of a frame are worth, in the median and at least.
+        r_hat: The median of frames; NaN for one board.
+        reasons: How often boards stopped for each reason; `impossible` for readings without a possible state.
+    """
+
+    frames: int
+    total_variation: Interval | None
+    map_agreement: Interval | None
+    cycles: Cycles
+    sweep_cycles: float
+    effective_samples: tuple[float, float]
+    r_hat: float
+    reasons: Mapping[str, int]
+
+
+class SampledBoards:
+    """Boards that each run a chain of the same machine."""
+
+    def __init__(self, machines: Sequence[BM2Machine], max_cycles: int) -> None:
+        # a stream changes nothing but the way of the samples to the host
+        self.machines = [
+            replace(machine, parameters=replace(machine.parameters, stream=0)) for machine in machines
+        ]
+        self._kernels = [make_bm2_kernel(machine) for machine in self.machines]
+        self._max_cycles = max_cycles
+
+    def run(self, addresses: Addresses, bank: int, samples: int) -> tuple[list[Chain], int]:
+        """Run a frame in batches like the host; return the chains and the cycles of the longest-running board."""
+        machine = self.machines[0]
+        p = machine.parameters
+        evidence = dict(zip(p.known, addresses, strict=True))
+        ends = sorted({max(1, samples * batch // BATCHES_MIN) for batch in range(1, BATCHES_MIN + 1)})
+        chains = []
+        for board, kernel in enumerate(self._kernels):
+            state = start_state(machine, evidence, largest=board % 2 == 1)
+            start = BM2Start(
+                state=state or 0,
+                known=sum(p.masks[variable] for variable in evidence),
+                samples=0 if state is None else ends[0],
+                burn_in=p.burn_in,
+                ops_timeout=p.ops_timeout,
+                max_cycles=self._max_cycles,
+                bank=bank % p.rng_banks,
+                sequencer=p.sequencer,
+            )
+            reason = kernel.start(start)
+            counts = [searched_counts(p, kernel.results)]
+            for end in ends[1:]:
+                if reason is BM2StopReason.SAMPLES:
+                    reason = kernel.resume(end)
+                    counts.append(searched_counts(p, kernel.results))
+            chains.append(Chain(reason, np.array(counts)))
+        return chains, max(kernel.cycles for kernel in self._kernels)
+
+    def measure(
+        self,
+        readings: Sequence[Addresses],
+        samples: int,
+        model: NetworkModel | None,
+        advance: Callable[[], None] = lambda: None,
+    ) -> Sampled:
+        """Run every reading and compare with the model; a BuildError if no reading gives a posterior."""
+        p = self.machines[0].parameters
+        rows, lengths, reasons = [], [], Counter[str]()
+        for frame, addresses in enumerate(readings):
+            chains, cycles = self.run(addresses, frame, samples)
+            reasons.update(chain.reason.name.lower() for chain in chains)
+            found = estimate(chains)
+            if found.posterior is not None:
+                exact = found.posterior if model is None else model.exact(addresses)
+                same = exact[found.posterior.argmax()] >= exact.max() - 1e-9
+                rows.append((distance(found.posterior, exact), same, found.effective_samples, found.r_hat))
+                lengths.append(cycles)
+            advance()
+        if not rows:
+            raise BuildError("none of the readings gives a posterior; see 'toolchain check'")
+        table, cycles_of = np.array(rows, dtype=np.float64), np.array(lengths)
+        sweeps = p.burn_in + samples if p.sample_every is SampleEvery.SWEEP else 0
+        effective = np.nan_to_num(table[:, 2])
+        return Sampled(
+            frames=len(rows),
+            total_variation=None if model is None else bootstrap(table[:, 0], np.mean),
+            map_agreement=None if model is None else share_of_frames(float(table[:, 1].mean()), len(rows)),
+            cycles=Cycles(
+                median=bootstrap(cycles_of, np.median),
+                percentile_95=bootstrap(cycles_of, lambda a, **k: np.quantile(a, 0.95, **k)),
+                worst=int(cycles_of.max()),
+            ),
+            sweep_cycles=float(cycles_of.mean() / sweeps) if sweeps else 0.0,
+            effective_samples=(float(np.median(effective)), float(effective.min())),
+            r_hat=float(np.median(table[:, 3])),
+            reasons=dict(reasons),
+        )
+
+
+def chain_resources(machine: BM2Machine, device: Device) -> Estimate:
+    """Return what a board takes, by the units of a BM1, of which a BM2 consists as well; there is no VHDL to compare."""
+    p = machine.parameters
+    state = p.rng.lfsr_bits or 16
+    moved = sum(len(p.factor_bits(cde)) for cde in range(p.cdes))
+    counters = (
+        len([bits for bits in p.bits if bits]) + 1
+    )  # an adder for each histogram, and one for the joint
+    parts = (
+        # a code is compared, and each local bit moves by one place in the address if the pointer is below it
+        LogicPart(name="CDEs", counts={Of.CODE_BIT: p.cdes * p.prob_bits, Of.STATE_BIT: moved}),
+        LogicPart(
+            name="histograms", counts={Of.COUNTER_BIT: counters * WORD_BITS}, registers=counters * WORD_BITS
+        ),
+        LogicPart(
+            name="generators",
+            counts={Of.STATE_BIT: p.cdes * state + 16, Of.STEP: p.cdes * p.steps_per_clock + 16},
+            registers=p.cdes * state + 16,
+        ),
+        LogicPart(
+            name="inputs",
+            counts={Of.WORD: 2 * p.state_words, Of.MEMORY: 2, Of.STATE_BIT: 2 * p.state_bits},
+            registers=3 * p.state_bits,
+        ),
+        LogicPart(name="control", counts={Of.BOARD: 1}, registers=1032),
+    )
+    small = [table for table in machine.tables if 0 < table.size <= MLAB_SHAPE[0]]
+    labs = len(small) * math.ceil(p.prob_bits / MLAB_SHAPE[1])
+    others = [
+        (p.rng_banks * p.cdes, state),
+        (p.result_words, WORD_BITS),
+        (p.stream * p.state_words, WORD_BITS),
+    ]
+    memories = Memories(
+        table_bits=sum(table.size for table in machine.tables) * p.prob_bits,
+        blocks=sum(
+            blocks_of(table.size, p.prob_bits) for table in machine.tables if table.size > MLAB_SHAPE[0]
+        )
+        + sum(blocks_of(words, width) for words, width in others if words),
+        logic_tables=len(small),
+        mlabs=labs,
+        alms=float(MLAB_ALMS * labs),
+    )
+    return Estimate(device=device, logic=Logic(parts), memories=memories)
