@@ -33,6 +33,8 @@ from scripts.running.flags import ScriptParser
 from scripts.verifications.installation import use_packages
 from scripts.verifications.networks import LOCK, load
 from services.errors import SettingsError
+from toolchain.checks.chain_findings import CheckedChain, chain_findings
+from toolchain.checks.findings import Finding, Severity
 from toolchain.models.network import NetworkModel
 from toolchain.networks import read_network
 
@@ -123,6 +125,21 @@ class Network:
         )
         return BM2Machine.from_factors(parameters, [table for _, table in factors])
 
+    def warnings(self, machine: BM2Machine) -> list[Finding]:
+        """Return the warnings that a check gives before the machine is used."""
+        chain = CheckedChain(
+            machine=machine,
+            names=self.model.names,
+            titles=self.model.titles,
+            labels=tuple(symbol.type.labels for symbol in self.model.symbols),
+            known=(),
+            boards=1,
+            samples=1,
+            max_cycles=MAX_CYCLES,
+            model=None,
+        )
+        return [finding for finding in chain_findings(chain) if finding.severity is Severity.WARNING]
+
 
 def run(kernel: BM2Kernel, known: Known, sweeps: int, bank: int) -> Sampled:
     """Run one chain in batches."""
@@ -165,11 +182,7 @@ def variation(found: Marginals, exact: Marginals) -> list[float]:
 def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, float]:
     """Print a table; return the machine's largest total variation: of the median banks, and of all banks."""
     names, sweeps = network.model.names, arguments.sweeps
-    zeros = (
-        f"{network.zeros} zeros, which can keep Gibbs samplers from some states"
-        if network.zeros
-        else "no zeros"
-    )
+    zeros = f"{network.zeros} zeros, which limit Gibbs samplers" if network.zeros else "no zeros"
     table = Table(title=f"{network.model.name}: {len(names)} variables, {zeros}", title_justify="left")
     for column in COLUMNS:
         table.add_column(column, justify="left" if column in {"known", "sampler", "stop"} else "right")
@@ -210,7 +223,9 @@ def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, flo
                 figures[4:6] = str(each.cycles), f"{each.cycles / (each.sweeps + BURN_IN):.1f}"
             table.add_row(f"{len(known)} {title}" if known else title, sampler, *figures, each.stop)
         table.add_section()
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    Console(width=None if sys.stdout.isatty() else 130).print(table)
+    for warning in network.warnings(kernels["BM2 linear"].machine):
+        print(f"toolchain check: {warning.about}: {warning.what}")
     return max(median), max(largest)
 
 
