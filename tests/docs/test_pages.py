@@ -356,7 +356,7 @@ def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
     boiler, *_ = blocks("python")
     (models / "boiler" / "model.py").write_text(boiler)
     commands = re.findall(r"^    (toolchain .*)$", MODELS, re.MULTILINE)
-    assert len(commands) == 9
+    assert len(commands) == 11
     for command in commands:
         if "fit=" in command:  # of a model that the reader has changed
             continue
