@@ -33,7 +33,8 @@ from scripts.running.flags import ScriptParser
 from scripts.verifications.installation import use_packages
 from scripts.verifications.networks import LOCK, load
 from services.errors import SettingsError
-from toolchain.checks.chain_findings import CheckedChain, chain_findings
+from toolchain.building.options import BuildOptions
+from toolchain.checks.check import check_model
 from toolchain.checks.findings import Finding, Severity
 from toolchain.models.network import NetworkModel
 from toolchain.networks import read_network
@@ -66,6 +67,8 @@ class Network:
     model: NetworkModel
     zeros: int
     """The number of zeros in the tables."""
+    warnings: list[Finding]
+    """What `toolchain check` warns of."""
     pyagrum: Any
     theirs: Any
     """The network in pyagrum."""
@@ -73,13 +76,20 @@ class Network:
     @classmethod
     def read(cls, pyagrum: Any, archive: Path) -> Network:
         """Read a compressed BIF file twice."""
-        joint = read_network(archive)
+        joint = read_network(archive, on_missing="missing")
         zeros = sum(int(np.count_nonzero(factor.table == 0)) for factor in joint.factors)
-        model = joint.ask([symbol.name for symbol in joint.symbols], ()).network()
+        names = [symbol.name for symbol in joint.symbols]
+        model = joint.ask(names, ()).network()
+        options = BuildOptions(
+            uri="ws://127.0.0.1:9090", topic="/readings", type="std_msgs/Float64MultiArray"
+        )
+        # a question in which any variable but one may be known or not
+        found = check_model(joint.ask(names[:1], names[1:]).network(), options)
+        warnings = [each for each in found if each.severity is Severity.WARNING]
         with tempfile.TemporaryDirectory(prefix="networks-rosbayes-") as folder:
             path = Path(folder, archive.name.removesuffix(".gz"))
             path.write_bytes(gzip.decompress(archive.read_bytes()))
-            return cls(model, zeros, pyagrum, load(pyagrum, path))
+            return cls(model, zeros, warnings, pyagrum, load(pyagrum, path))
 
     @property
     def factors(self) -> list[Factor]:
@@ -124,21 +134,6 @@ class Network:
             burn_in=BURN_IN,
         )
         return BM2Machine.from_factors(parameters, [table for _, table in factors])
-
-    def warnings(self, machine: BM2Machine) -> list[Finding]:
-        """Return the warnings that a check gives before the machine is used."""
-        chain = CheckedChain(
-            machine=machine,
-            names=self.model.names,
-            titles=self.model.titles,
-            labels=tuple(symbol.type.labels for symbol in self.model.symbols),
-            known=(),
-            boards=1,
-            samples=1,
-            max_cycles=MAX_CYCLES,
-            model=None,
-        )
-        return [finding for finding in chain_findings(chain) if finding.severity is Severity.WARNING]
 
 
 def run(kernel: BM2Kernel, known: Known, sweeps: int, bank: int) -> Sampled:
@@ -224,7 +219,7 @@ def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, flo
             table.add_row(f"{len(known)} {title}" if known else title, sampler, *figures, each.stop)
         table.add_section()
     Console(width=None if sys.stdout.isatty() else 130).print(table)
-    for warning in network.warnings(kernels["BM2 linear"].machine):
+    for warning in network.warnings:
         print(f"toolchain check: {warning.about}: {warning.what}")
     return max(median), max(largest)
 
