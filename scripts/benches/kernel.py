@@ -1,0 +1,302 @@
+"""Speed of the fast kernels on one core: BM1, and BM2 as one chain and as many, beside other Gibbs samplers.
+
+sprinkler (a text) ──┬──▶ our reader ──▶ BM2: one chain, many chains; a plain Gibbs sampler in numba
+alarm (pgmpy's) ─────┴──▶ pyagrum ─────▶ its Gibbs sampler; THRML's, with --thrml
+"""
+
+from __future__ import annotations
+
+import argparse
+import gzip
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from machines.bm1 import BM1Machine, Start
+from machines.bm2 import BM2Machine, BM2Start, start_state, unpack
+from machines.bm2_chains import Chains
+from machines.bm2_fast import FastBM2
+from machines.fast import FastBM1
+from machines.parameters import BM1Parameters, Sequencer
+from scripts.benches.networks import Network
+from scripts.benches.samplers import CHAINS, THRML_LOCK, Factor, Known, pyagrum_gibbs, thrml_gibbs
+from scripts.running.flags import ScriptParser
+from scripts.verifications.installation import use_packages
+from scripts.verifications.networks import LOCK
+from services.errors import SettingsError
+
+SPRINKLER: Final = """network sprinkler { }
+variable R { type discrete [ 2 ] { no, yes }; }
+variable S { type discrete [ 2 ] { off, on }; }
+variable G { type discrete [ 2 ] { dry, wet }; }
+probability ( R ) { table 0.8, 0.2; }
+probability ( S | R ) { (no) 0.6, 0.4; (yes) 0.99, 0.01; }
+probability ( G | S, R ) {
+  (off, no) 1.0, 0.0; (on, no) 0.1, 0.9; (off, yes) 0.2, 0.8; (on, yes) 0.01, 0.99;
+}
+"""
+WET: Final = 2, 1
+"""The known variable of the sprinkler, and its value."""
+SINGLE_AIMS: Final = {"sprinkler": 6e7, "alarm": 2e7}
+"""Cycles a second of one chain."""
+RATIO_AIMS: Final = {"sprinkler": 10, "alarm": 2}
+"""Cycles a second of many chains, over those of one."""
+MANY: Final = {"sprinkler": 512, "alarm": 32}
+"""Number of chains."""
+TURNS: Final = 3
+"""Times that each alternative is measured; the fastest counts, because other processes only slow it down."""
+BURN_IN: Final = 100
+
+
+@dataclass(frozen=True, slots=True)
+class Speed:
+    """A measured run; cycles and sweeps are those of all chains."""
+
+    cycles: int
+    sweeps: int
+    seconds: float
+    """Time of the processor."""
+
+
+def bm1(cycles: int) -> Speed:
+    """Run a BM1 of 1024 lines and 7 columns, from another bank each time, for some cycles."""
+    random = np.random.default_rng(1)
+    codes = [random.integers(0, 255, (4, 1024), dtype=np.uint16) for _ in range(6)]
+    for table in codes:
+        table[-1] = 255
+    parameters = BM1Parameters(lines=1024, sensor_bits=(2,) * 6, counter_bits=32)
+    kernel = FastBM1(
+        BM1Machine(parameters, np.full((1, 1024), 255, dtype=np.uint16), tuple(codes)), kept_bytes=0
+    )
+    began = time.process_time()
+    kernel.start(Start(addresses=(0,) * 6, target_count=2**32 - 1, max_cycles=cycles))
+    return Speed(kernel.cycles, 0, time.process_time() - began)
+
+
+def _sweep(
+    values: NDArray[np.int64],
+    unknown: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    first: NDArray[np.int64],
+    held: NDArray[np.int64],
+    tables: NDArray[np.float64],
+    counts: NDArray[np.int64],
+    sweeps: int,
+) -> None:
+    """Draw each unknown variable in turn, from the product of its factors."""
+    weights = np.empty(sizes.max())
+    for _ in range(sweeps):
+        for variable in unknown:
+            total = 0.0
+            for value in range(sizes[variable]):
+                values[variable] = value
+                weight = 1.0
+                for factor in range(first[variable], first[variable + 1]):
+                    place = held[factor, 0]
+                    for i in range(held[factor, 1]):
+                        place += held[factor, 2 + 2 * i] * values[held[factor, 3 + 2 * i]]
+                    weight *= tables[place]
+                total += weight
+                weights[value] = total
+            drawn = np.random.random() * total  # noqa: NPY002 - numba's own generator
+            value = 0
+            while weights[value] <= drawn:
+                value += 1
+            values[variable] = value
+        for variable in unknown:
+            counts[variable, values[variable]] += 1
+
+
+_compiled_sweep = cast("Callable[..., None]", njit(_sweep))
+
+
+def numba_gibbs(factors: Sequence[Factor], start: Sequence[int], known: Known, sweeps: int) -> Speed:
+    """Run a plain Gibbs sampler over the variables' values, as one would write it in numba."""
+    sizes = {each: size for scope, table in factors for each, size in zip(scope, table.shape, strict=True)}
+    bases = np.cumsum([0, *(table.size for _, table in factors)])
+    first, held = [0], []
+    for variable in range(len(sizes)):
+        for base, (scope, table) in zip(bases, factors, strict=False):
+            if variable in scope:
+                steps = [np.prod(table.shape[axis + 1 :], dtype=int) for axis in range(table.ndim)]
+                held.append([base, len(scope), *(n for pair in zip(steps, scope, strict=True) for n in pair)])
+        first.append(len(held))
+    rows = np.zeros((len(held), max(map(len, held))), dtype=np.int64)
+    for at, row in enumerate(held):
+        rows[at, : len(row)] = row
+    arguments = (
+        np.array(start, dtype=np.int64),
+        np.array([variable for variable in range(len(sizes)) if variable not in known], dtype=np.int64),
+        np.array([sizes[variable] for variable in range(len(sizes))], dtype=np.int64),
+        np.array(first, dtype=np.int64),
+        rows,
+        np.concatenate([table.ravel() for _, table in factors]).astype(np.float64),
+        np.zeros((len(sizes), max(sizes.values())), dtype=np.int64),
+    )
+    _compiled_sweep(*arguments, 1)
+    began = time.process_time()
+    _compiled_sweep(*arguments, sweeps)
+    return Speed(0, sweeps, time.process_time() - began)
+
+
+def alternatives(
+    network: Network, known: Known, arguments: argparse.Namespace
+) -> dict[str, Callable[[], Speed]]:
+    """Return functions that run each alternative once."""
+    name, sweeps = network.model.name, arguments.sweeps
+    machine = network.machine(Sequencer.LINEAR)
+    parameters = machine.parameters
+    state = start_state(machine, known)
+    assert state is not None  # the evidence is possible
+    start = BM2Start(
+        state=state,
+        known=sum(parameters.masks[variable] for variable in known),
+        samples=sweeps,
+        burn_in=BURN_IN,
+        ops_timeout=parameters.ops_timeout,
+        max_cycles=2**40,
+    )
+    kernel = FastBM2(machine)
+    many = MANY[name]
+    chains = Chains(
+        [
+            BM2Machine(replace(parameters, chain=at, chains=many), machine.tables, machine.supports)
+            for at in range(many)
+        ]
+    )
+    # as many moves in all for both networks
+    short = replace(
+        start,
+        samples=1
+        + 2 * arguments.chain_sweeps // (many * len(parameters.moves(start.known, start.sequencer))),
+    )
+    values = unpack(parameters, state)
+
+    def single() -> Speed:
+        began = time.process_time()
+        kernel.start(start)
+        return Speed(kernel.cycles, kernel.samples, time.process_time() - began)
+
+    def together() -> Speed:
+        began = time.process_time()
+        results = chains.run([short] * many)
+        seconds = time.process_time() - began
+        return Speed(sum(each.cycles for each in results), sum(each.samples for each in results), seconds)
+
+    def others(run: Callable[..., Any], *given: Any, **options: Any) -> Callable[[], Speed]:
+        def once() -> Speed:
+            began = time.process_time()
+            sampled = run(*given, burn_in=BURN_IN, **options)
+            # their seconds exclude compilation, and those of the processor what other processes took
+            return Speed(0, sampled.sweeps, min(sampled.seconds, time.process_time() - began))
+
+        return once
+
+    theirs = (network.pyagrum, network.theirs, network.model.names, known)
+    runs = {
+        "BM2, one chain": single,
+        f"BM2, {many} chains": together,
+        "Gibbs in numba": lambda: numba_gibbs(network.factors, values, known, sweeps),
+        "pyAgrum's Gibbs": others(pyagrum_gibbs, *theirs, sweeps=sweeps, limit=arguments.seconds),
+    }
+    if arguments.thrml:
+        blocks = (network.factors, values, known, parameters.colours)
+        runs[f"THRML, {CHAINS} chains"] = others(thrml_gibbs, *blocks, sweeps=sweeps)
+    return runs
+
+
+def measure(runs: dict[str, Callable[[], Speed]]) -> dict[str, Speed]:
+    """Run all in turns, and return the fastest run of each; the first turn, which compiles, does not count."""
+    best: dict[str, Speed] = {}
+    for turn in range(1 + TURNS):
+        for name, run in runs.items():
+            speed = run()
+            if turn and (name not in best or speed.seconds < best[name].seconds):
+                best[name] = speed
+    return best
+
+
+def show(title: str, speeds: dict[str, Speed]) -> None:
+    """Print a table; the ratios are those of sweeps a second to one chain."""
+    table = Table(title=title, title_justify="left")
+    for column in ("kernel or sampler", "cycles/s", "sweeps/s", "ratio"):
+        table.add_column(column, justify="left" if column.startswith("kernel") else "right")
+    single = next(iter(speeds.values()))
+    for name, each in speeds.items():
+        per_second = [f"{n / each.seconds:.2e}" if n else "" for n in (each.cycles, each.sweeps)]
+        ratio = each.sweeps / each.seconds * single.seconds / single.sweeps if single.sweeps else 0
+        table.add_row(name, *per_second, f"{ratio:.3g}" if ratio else "")
+    Console(width=None if sys.stdout.isatty() else 100).print(table)
+
+
+def bench(arguments: argparse.Namespace) -> int:
+    """Measure everything on one core; return 1 if an aim is missed and --check is given."""
+    packages = use_packages("networks", LOCK)
+    if arguments.thrml:
+        use_packages("thrml", THRML_LOCK)
+    import pyagrum
+
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    show("BM1, 1024 lines x 7 columns", measure({"BM1, nothing kept": lambda: bm1(arguments.sweeps)}))
+    missed = False
+    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
+        sprinkler = Path(folder, "sprinkler.bif.gz")
+        sprinkler.write_bytes(gzip.compress(SPRINKLER.encode()))
+        alarm = packages / "pgmpy" / "utils" / "example_models" / "alarm.bif.gz"
+        for archive, known in ((sprinkler, dict([WET])), (alarm, {})):
+            network = Network.read(pyagrum, archive)
+            name = network.model.name
+            speeds = measure(alternatives(network, known, arguments))
+            show(f"{name}, {len(known)} known", speeds)
+            single, many = (each.cycles / each.seconds for each in list(speeds.values())[:2])
+            single_aim, ratio_aim = SINGLE_AIMS[name], RATIO_AIMS[name]
+            missed |= single < single_aim or many < ratio_aim * single
+            print(
+                f"{name}: one chain {single:.2e} cycles/s (aim {single_aim:.0e}); many chains {many / single:.1f} times "
+                f"that (aim {ratio_aim})\n"
+            )
+    return int(missed and arguments.check)
+
+
+def main() -> int:
+    """Parse the flags and measure."""
+    parser = ScriptParser(prog="scripts/bench kernel", description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--sweeps", type=int, default=200_000, help="samples of one chain, and cycles of the BM1"
+    )
+    parser.add_argument(
+        "--chain-sweeps",
+        type=int,
+        default=20_000_000,
+        help="samples of all of many chains, fewer if they are long",
+    )
+    parser.add_argument("--seconds", type=float, default=3.0, help="limit of each run of pyAgrum's sampler")
+    parser.add_argument(
+        "--thrml",
+        action="store_true",
+        help="also compare THRML; installs it, in a folder of its own (530 MB)",
+    )
+    parser.add_argument("--check", action="store_true", help="exit 1 if an aim is missed")
+    arguments = parser.parse_args()
+    if min(arguments.sweeps, arguments.chain_sweeps) < 1:
+        parser.error("--sweeps and --chain-sweeps must be 1 or more")
+    try:
+        return bench(arguments)
+    except SettingsError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
