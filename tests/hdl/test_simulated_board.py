@@ -204,12 +204,12 @@ def test_accesses_are_answered_and_refused_alike(parameters, compiled_into):
     ]
     refused = set()
     with contextlib.closing(simulated):
-        for turn in range(120):
-            if turn % 12 == 0:
+        for turn in range(240):
+            if turn % 24 == 0:
                 drawn = random.integers(0, 1 << min(of.parameters.sensor_bits), words)
                 frame = [
                     (inputs, drawn.tolist()),
-                    (rm.TARGET_COUNT, [int(random.integers(1, 100)), 400, 0, turn // 12, 0]),
+                    (rm.TARGET_COUNT, [int(random.integers(1, 100)), 400, 0, turn // 24, 0]),
                     (rm.RUN_UNTIL, [0, 0, next_doorbell(emulated.done), 0]),
                 ]
                 accesses = [("write", at, struct.pack(f"<{len(row)}I", *row)) for at, row in frame]
