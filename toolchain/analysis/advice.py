@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from statistics import median
 from time import perf_counter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from toolchain.building.machine import partition_lines, plan_machine, whole_mach
 from toolchain.building.options import BuildOptions
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Stop
-from toolchain.errors import ModelError, ToolchainError
+from toolchain.errors import ToolchainError
 from toolchain.models.joint import Question
 
 if TYPE_CHECKING:
@@ -49,7 +48,11 @@ _WIDTHS: Final = (8, 12, 16)
 _NO_ROBOT: Final = BuildOptions(uri="ws://nowhere:9090", topic="/readings", type="std_msgs/Float64")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+_Run: TypeAlias = tuple[int, tuple[int, float, float], int, Estimate]
+"""Bits of a code; setting, total variation and cycles; boards, and the resources of one of them."""
+
+
+@dataclass(frozen=True, slots=True)
 class Candidate:
     """A machine for a question; without numbers if it is refused.
 
@@ -82,7 +85,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Advice:
-    """The machines for a question, the median time of exact inference (None if it is impossible), and a sentence."""
+    """The machines for a question, the median time of exact inference, and a sentence."""
 
     model: str
     question: str
@@ -91,7 +94,7 @@ class Advice:
     clock_hz: float
     device: str
     machines: tuple[Candidate, ...]
-    exact_seconds: float | None
+    exact_seconds: float
     recommendation: str
 
     def as_json(self) -> str:
@@ -100,40 +103,18 @@ class Advice:
 
     def report(self) -> str:
         """Return the advice as a table and sentences."""
-        exact = (
-            "needs tables above the limit"
-            if self.exact_seconds is None
-            else with_unit(self.exact_seconds, "s")
-        )
-        columns = [
-            (
-                each.machine,
-                f"{each.prob_bits}",
-                f"{each.setting:,}",
-                f"{each.total_variation:.4f}",
-                f"{each.cycles:,.0f}",
-                with_unit(each.seconds, "s"),
-                f"{each.boards}",
-                f"{each.alms:,.0f}",
-                f"{each.blocks:,}",
-            )
-            for each in self.machines
-            if not each.refused
-        ]
-        names = (
-            "",
-            "bits of a code",
-            "target count, samples",
-            "total variation",
-            "cycles of a frame",
-            f"time at {with_unit(self.clock_hz, 'Hz')}",
-            "boards",
-            "ALMs of a board",
-            "its memory blocks",
-        )
+        exact = f"Exact inference on this host: {with_unit(self.exact_seconds, 's')}."
+        time = f"time at {with_unit(self.clock_hz, 'Hz')}"
+        names = f"|bits of a code|target count or samples|total variation|cycles of a frame|{time}|boards|ALMs of a board|its memory blocks"
+        columns = [names.split("|")]
+        for each in self.machines:
+            if not each.refused:
+                cells = f"{each.machine}|{each.prob_bits}|{each.setting:,}|{each.total_variation:.4f}|{each.cycles:,.0f}|"
+                cells += f"{with_unit(each.seconds, 's')}|{each.boards}|{each.alms:,.0f}|{each.blocks:,}"
+                columns.append(cells.split("|"))
         rows = [
-            f"{name:22}" + "".join(f"{cell:>14}" for cell in cells)
-            for name, *cells in zip(names, *columns, strict=True)
+            f"{name:23}" + "".join(f"{cell:>14}" for cell in cells)
+            for name, *cells in zip(*columns, strict=True)
         ]
         for each in self.machines:
             if each.refused or each.unfit:
@@ -141,27 +122,24 @@ class Advice:
             elif each.total_variation > self.accuracy:
                 rows.append(f"{each.machine}: it comes no nearer in {MOST_CYCLES:,} cycles.")
         heading = f"{self.model}: {self.question}, to a mean total variation of {self.accuracy:g} over {self.frames} readings"
-        return (
-            "\n".join([heading, *rows, f"Exact inference on this host: {exact}.", self.recommendation]) + "\n"
-        )
+        return "\n".join([heading, *rows, exact, self.recommendation]) + "\n"
 
 
 def advise(source: Model | Question, options: AdviceOptions) -> Advice:
-    """Compare the machines for a model or a question, or raise a ToolchainError if no readings can be drawn."""
+    """Compare the machines for a model or a question, or raise a ToolchainError if exact inference is impossible."""
     device = device_named(options.device)
     network = network_for(source)
     readings = drawn_readings(network, options.frames, options.seed)
-    times: list[float] = []
+    times = []
     for addresses in readings:
         began = perf_counter()
-        with suppress(ModelError):  # a table above the limit
-            network.exact(addresses)
-            times.append(perf_counter() - began)
+        network.exact(addresses)
+        times.append(perf_counter() - began)
     machines = (
-        _candidate("BM1", options, lambda: _bm1(source, options, device)),
-        _candidate("BM2", options, lambda: _bm2(network, readings, options, device)),
+        _candidate("BM1", options.clock_hz, lambda: _bm1(source, options, device)),
+        _candidate("BM2", options.clock_hz, lambda: _bm2(network, readings, options, device)),
     )
-    exact = median(times) if times else None
+    exact = median(times)
     known = f" | {', '.join(network.known)}" if network.known else ""
     return Advice(
         model=network.name,
@@ -176,33 +154,19 @@ def advise(source: Model | Question, options: AdviceOptions) -> Advice:
     )
 
 
-def _candidate(
-    machine: str,
-    options: AdviceOptions,
-    run: Callable[[], tuple[int, tuple[int, float, float], int, Estimate]],
-) -> Candidate:
-    """Return a machine from a function that runs it: bits of a code, the run, boards, and resources of one of them."""
+def _candidate(machine: str, clock_hz: float, run: Callable[[], _Run]) -> Candidate:
+    """Return a machine from the function that runs it."""
     try:
-        prob_bits, (setting, variation, cycles), boards, resources = run()
+        prob_bits, (setting, variation, cycles), boards, cost = run()
     except ToolchainError as reason:
-        return Candidate(machine=machine, refused=str(reason).rstrip("."))
+        return Candidate(machine, str(reason).rstrip("."))
+    seconds, blocks = cycles / clock_hz, cost.memories.blocks
     return Candidate(
-        machine=machine,
-        prob_bits=prob_bits,
-        setting=setting,
-        total_variation=variation,
-        cycles=cycles,
-        seconds=cycles / options.clock_hz,
-        boards=boards,
-        alms=resources.alms,
-        blocks=resources.memories.blocks,
-        unfit=resources.why_not,
+        machine, "", prob_bits, setting, variation, cycles, seconds, boards, cost.alms, blocks, cost.why_not
     )
 
 
-def _bm1(
-    source: Model | Question, options: AdviceOptions, device: Device
-) -> tuple[int, tuple[int, float, float], int, Estimate]:
+def _bm1(source: Model | Question, options: AdviceOptions, device: Device) -> _Run:
     """Run a BM1 with the narrowest codes that are exact enough, on as many boards as its lines need."""
     model = source.model() if isinstance(source, Question) else source
     readings = sample_readings(model, options.frames, seed=options.seed)
@@ -232,7 +196,7 @@ def _bm1(
 
 def _bm2(
     network: NetworkModel, readings: Sequence[Addresses], options: AdviceOptions, device: Device
-) -> tuple[int, tuple[int, float, float], int, Estimate]:
+) -> _Run:
     """Run a BM2 with the default options on one board."""
     plan = plan_bm2(network, _NO_ROBOT)
     machines = chain_machines(plan)
@@ -265,20 +229,14 @@ def _run_until(
     return (best, *tried[best])
 
 
-def _recommendation(machines: Sequence[Candidate], exact: float | None, accuracy: float) -> str:
+def _recommendation(machines: Sequence[Candidate], exact: float, accuracy: float) -> str:
     possible = [each for each in machines if not each.refused and not each.unfit]
     useful = [each for each in possible if each.total_variation <= accuracy]
-    best = min(useful, key=lambda each: each.seconds, default=None)
-    cpu = "" if exact is None else f"exact inference on a CPU takes {with_unit(exact, 's')}"
-    if best is None:
-        if exact is None:
-            return (
-                "Neither a machine nor exact inference answers this question: search or know other variables."
-            )
+    cpu = f"exact inference on a CPU takes {with_unit(exact, 's')}"
+    if not useful:
         return f"Use a CPU: {cpu}, and no machine {'is as accurate' if possible else 'can answer this question'}."
+    best = min(useful, key=lambda each: each.seconds)
     ours = f"a {best.machine} takes {with_unit(best.seconds, 's')}"
-    if exact is None:
-        return f"Use a {best.machine}: {ours}, and exact inference needs tables above the limit."
     if best.seconds < exact:
         return f"Use a {best.machine}: {ours}, and {cpu}, each without the way from and to ROS."
     return f"Use a CPU: {cpu}, and {ours}."

@@ -2,7 +2,8 @@
 
 With ideal random numbers, a try at a pointed bit agrees on 1 with the product of its CDEs' chances, and on 0 with the
 product of their complements. This gives the matrix of a sweep, from state to state, and with it everything that long
-runs approach. The codes are those of the machine, so all that quantising and clipping changed is included.
+runs approach. The codes are those of the machine, so all that quantising and clipping changed is included. A
+sample is taken as the state after a sweep, also where a machine takes one after every move.
 """
 
 from __future__ import annotations
@@ -131,17 +132,6 @@ class ExactChain:
         return np.asarray(law / law.sum())
 
     @cached_property
-    def sampled(self) -> NDArray[np.float64]:
-        """float64[states]: the stationary law of a sample."""
-        p = self._parameters
-        if p.sample_every is SampleEvery.SWEEP or p.sequencer is Sequencer.RANDOM:
-            return self.law
-        laws = [self.law]
-        for move in self._moves:
-            laws.append(self._moved(laws[-1], move))
-        return np.asarray(np.mean(laws[1:], axis=0))
-
-    @cached_property
     def cycles(self) -> float:
         """The mean number of cycles of a sweep."""
         law, total = self.law, 0.0
@@ -253,34 +243,27 @@ def chain_error(machine: BM2Machine, model: NetworkModel, *, samples: int) -> Ch
         addresses = tuple(int(at) for at in np.unravel_index(place, weights.shape))
         evidence = dict(zip(p.known, addresses, strict=True))
         chain = ExactChain(machine, evidence)
-        start = start_state(machine, evidence)
-        if start is None:  # its probability is a rounding error
+        state = start_state(machine, evidence)
+        if state is None:  # its probability is a rounding error
             continue
-        stationary = chain.posterior(chain.sampled)
+        stationary = chain.posterior(chain.law)
         shares = chain.effective()
         deviations = np.sqrt(stationary * (1 - stationary) / np.maximum(p.chains * sweeps * shares, 1))
         readings.append(addresses)
-        rows.append(
-            (
-                weights[addresses],
-                distance(stationary, model.exact(addresses)),
-                distance(chain.posterior(chain.frame(start, p.burn_in, sweeps)), chain.posterior(chain.law)),
-                # half of the mean absolute values of normal deviations
-                deviations.sum() / np.sqrt(2 * np.pi),
-                chain.cycles,
-                shares.min(),
-            )
-        )
+        quantising = distance(stationary, model.exact(addresses))
+        begun = distance(chain.posterior(chain.frame(state, p.burn_in, sweeps)), stationary)
+        sampling = deviations.sum() / np.sqrt(2 * np.pi)  # half of the mean absolute values
+        rows.append((weights[addresses], quantising, begun, sampling, chain.cycles, shares.min()))
     table = np.array(rows)
-    means = (table[:, :1] * table).sum(axis=0) / table[:, 0].sum()
+    _, quantising, start, sampling, cycles, _ = (table[:, :1] * table).sum(axis=0) / table[:, 0].sum()
     worst = int(table[:, 1].argmax())
     return ChainError(
         share=float(table[:, 0].sum() / weights.sum()),
-        quantising=float(means[1]),
+        quantising=float(quantising),
         worst=float(table[worst, 1]),
         worst_reading=readings[worst],
-        start=float(means[2]),
-        sampling=float(means[3]),
-        cycles=float(means[4]),
+        start=float(start),
+        sampling=float(sampling),
+        cycles=float(cycles),
         effective=float(table[:, 5].min()),
     )

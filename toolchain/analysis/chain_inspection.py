@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -40,52 +39,34 @@ class ChainInspection:
 
     def as_json(self) -> str:
         """Return the inspection as one JSON object."""
-        p, sampled = self.machine.parameters, asdict(self.sampled)
+        p, cost = self.machine.parameters, self.resources
         content = {
             "deployment": self.deployment.name,
             "hash": self.deployment.hash,
             "boards": p.chains,
-            "variables": len(p.cardinalities),
             "state_bits": p.state_bits,
             "table_words": [table.size for table in self.machine.tables],
             "result_words": p.result_words,
             "readings": self.readings,
             "clock_hz": self.clock_hz,
-            "sampled": sampled | {"r_hat": None if math.isnan(self.sampled.r_hat) else self.sampled.r_hat},
+            "sampled": asdict(self.sampled),
             "exact": None if self.exact is None else asdict(self.exact),
-            "resources": {
-                "alms": self.resources.alms,
-                "registers": self.resources.logic.registers,
-                "table_bits": self.resources.memories.table_bits,
-                "blocks": self.resources.memories.blocks,
-                "memory_labs": self.resources.memories.mlabs,
-                "fits": self.resources.fits,
-            },
+            "resources": {"alms": cost.alms, "blocks": cost.memories.blocks, "fits": cost.fits},
         }
         return json.dumps(content) + "\n"
 
     def report(self) -> str:
         """Return the inspection as sentences."""
-        p, ran, cost, count = (
-            self.machine.parameters,
-            self.sampled,
-            self.resources,
-            self.deployment.machine.target_count,
-        )
-        sizes = [table.size for table in self.machine.tables]
-        cycles = ", ".join(
-            f"{each:,.0f} {name} ({with_unit(each / self.clock_hz, 's')})"
-            for name, each in (
-                ("in the median", ran.cycles.median.value),
-                ("at 95 %", ran.cycles.percentile_95.value),
-                ("at worst", float(ran.cycles.worst)),
-            )
-        )
+        p, ran, cost = self.machine.parameters, self.sampled, self.resources
+        count, sizes = self.deployment.machine.target_count, [table.size for table in self.machine.tables]
+        lengths = (ran.cycles.median.value, ran.cycles.percentile_95.value, float(ran.cycles.worst))
+        shown = [f"{each:,.0f} ({with_unit(each / self.clock_hz, 's')})" for each in lengths]
+        cycles = f"{shown[0]} in the median, {shown[1]} at 95 %, {shown[2]} at worst"
         resources = f"{cost.alms:,.0f} ALMs ({cost.alm_share:.1%}), {cost.memories.blocks:,} memory blocks ({cost.block_share:.1%}); "
         resources += "it fits" if cost.fits else f"it does not fit: {cost.why_not}"
         accuracy = "Give the model with --model for the accuracy."
-        if (tv := ran.total_variation) is not None and (same := ran.map_agreement) is not None:
-            accuracy = f"Total variation from exact inference: {tv.value:.4f} ({tv.low:.4f}..{tv.high:.4f}); same MAP: {same.value:.0%}."
+        if (tv := ran.total_variation) is not None:
+            accuracy = f"Total variation from exact inference: {tv.value:.4f} ({tv.low:.4f}..{tv.high:.4f})."
         if (e := self.exact) is not None:
             accuracy += f" Computed: {e.quantising:.2g} by the codes, {e.start:.2g} by the start state, {e.sampling:.2g} by too few samples."
         rows = (
@@ -94,7 +75,7 @@ class ChainInspection:
             f"{count:,} samples after {p.burn_in:,} sweeps, {p.sequencer} order, {p.rng} ({p.steps_per_clock} steps per clock, {p.rng_banks} banks).",
             f"Readings: {self.readings}. Boards stopped by: {', '.join(f'{name} {n}' for name, n in sorted(ran.reasons.items()))}.",
             f"Cycles of a frame, and time at {with_unit(self.clock_hz, 'Hz')} (no link, no ROS): {cycles}; {ran.sweep_cycles:.2f} per sweep.",
-            f"Its samples are worth {ran.effective_samples[0]:,.0f} independent ones in the median, {ran.effective_samples[1]:,.0f} at least; R-hat {ran.r_hat:.3f}.",
+            f"Its samples are worth {ran.effective_samples[0]:,.0f} independent ones in the median, {ran.effective_samples[1]:,.0f} at least; R-hat {ran.r_hat:.4g}.",
             accuracy,
             f"Resources of a {cost.device.title}, estimated from the units of a BM1: {resources}.",
         )

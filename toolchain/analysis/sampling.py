@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from machines import make_bm2_kernel
 from machines.bm2 import BM2Machine, BM2Start, BM2StopReason, start_state
 from machines.bm2_estimate import BATCHES_MIN, Chain, estimate, searched_counts
 from machines.parameters import SampleEvery
-from toolchain.analysis.accuracy import Cycles, Interval, bootstrap, share_of_frames
+from toolchain.analysis.accuracy import Cycles, Interval, bootstrap
 from toolchain.analysis.chain import distance
 from toolchain.analysis.logic import (
     MLAB_ALMS,
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from toolchain.analysis.logic import Device
     from toolchain.models.network import NetworkModel
 
+_INFINITE: Final = 1e9
 Addresses = tuple[int, ...]
 """A frame's readings: an address per known variable."""
 
@@ -66,17 +67,15 @@ class Sampled:
     Attributes:
         frames: Frames with a posterior.
         total_variation: Mean distance of the posteriors from exact inference; None without a model.
-        map_agreement: Share of frames with the same most probable value; None without a model.
         cycles: Cycles of the longest-running board.
         sweep_cycles: Cycles of a sweep, in the mean; 0 if samples are taken after every move.
         effective_samples: Independent samples that those of a frame are worth, in the median and at least.
-        r_hat: The median of frames; NaN for one board.
+        r_hat: The median of frames; 0 for one board, 1e9 if it is infinite.
         reasons: How often boards stopped for each reason; `impossible` for readings without a possible state.
     """
 
     frames: int
     total_variation: Interval | None
-    map_agreement: Interval | None
     cycles: Cycles
     sweep_cycles: float
     effective_samples: tuple[float, float]
@@ -132,34 +131,31 @@ class SampledBoards:
     ) -> Sampled:
         """Run every reading and compare with the model; a BuildError if no reading gives a posterior."""
         p = self.machines[0].parameters
-        rows, lengths, reasons = [], [], Counter[str]()
+        rows, reasons = [], Counter[str]()
         for frame, addresses in enumerate(readings):
             chains, cycles = self.run(addresses, frame, samples)
             reasons.update(chain.reason.name.lower() for chain in chains)
             found = estimate(chains)
-            if found.posterior is not None:
-                exact = found.posterior if model is None else model.exact(addresses)
-                same = exact[found.posterior.argmax()] >= exact.max() - 1e-9
-                rows.append((distance(found.posterior, exact), same, found.effective_samples, found.r_hat))
-                lengths.append(cycles)
+            if (posterior := found.posterior) is not None:
+                exact = posterior if model is None else model.exact(addresses)
+                rows.append((distance(posterior, exact), found.effective_samples, found.r_hat, cycles))
             advance()
         if not rows:
             raise BuildError("none of the readings gives a posterior; see 'toolchain check'")
-        table, cycles_of = np.array(rows, dtype=np.float64), np.array(lengths)
+        distances, effective, r_hat, lengths = np.nan_to_num(
+            np.array(rows, dtype=np.float64), posinf=_INFINITE
+        ).T
+        percentile = bootstrap(lengths, lambda a, **k: np.quantile(a, 0.95, **k))
         sweeps = p.burn_in + samples if p.sample_every is SampleEvery.SWEEP else 0
-        effective = np.nan_to_num(table[:, 2])
         return Sampled(
             frames=len(rows),
-            total_variation=None if model is None else bootstrap(table[:, 0], np.mean),
-            map_agreement=None if model is None else share_of_frames(float(table[:, 1].mean()), len(rows)),
+            total_variation=None if model is None else bootstrap(distances, np.mean),
             cycles=Cycles(
-                median=bootstrap(cycles_of, np.median),
-                percentile_95=bootstrap(cycles_of, lambda a, **k: np.quantile(a, 0.95, **k)),
-                worst=int(cycles_of.max()),
+                median=bootstrap(lengths, np.median), percentile_95=percentile, worst=int(lengths.max())
             ),
-            sweep_cycles=float(cycles_of.mean() / sweeps) if sweeps else 0.0,
+            sweep_cycles=float(lengths.mean() / sweeps) if sweeps else 0.0,
             effective_samples=(float(np.median(effective)), float(effective.min())),
-            r_hat=float(np.median(table[:, 3])),
+            r_hat=float(np.median(r_hat)),
             reasons=dict(reasons),
         )
 
@@ -167,42 +163,31 @@ class SampledBoards:
 def chain_resources(machine: BM2Machine, device: Device) -> Estimate:
     """Return what a board takes, by the units of a BM1, of which a BM2 consists as well; there is no VHDL to compare."""
     p = machine.parameters
-    state = p.rng.lfsr_bits or 16
-    moved = sum(len(p.factor_bits(cde)) for cde in range(p.cdes))
-    counters = (
-        len([bits for bits in p.bits if bits]) + 1
-    )  # an adder for each histogram, and one for the joint
-    parts = (
-        # a code is compared, and each local bit moves by one place in the address if the pointer is below it
-        LogicPart(name="CDEs", counts={Of.CODE_BIT: p.cdes * p.prob_bits, Of.STATE_BIT: moved}),
-        LogicPart(
-            name="histograms", counts={Of.COUNTER_BIT: counters * WORD_BITS}, registers=counters * WORD_BITS
+    seed, adders = p.rng.lfsr_bits or 16, len([bits for bits in p.bits if bits]) + 1
+    # each local bit of a CDE moves by one place in the address if the pointer is below it
+    moved, state = sum(len(p.factor_bits(cde)) for cde in range(p.cdes)), p.cdes * seed + 16
+    counts: dict[str, tuple[dict[Of, float], int]] = {
+        "CDEs": ({Of.CODE_BIT: p.cdes * p.prob_bits, Of.STATE_BIT: moved}, 0),
+        "histograms": ({Of.COUNTER_BIT: adders * WORD_BITS}, adders * WORD_BITS),
+        "generators": ({Of.STATE_BIT: state, Of.STEP: p.cdes * p.steps_per_clock + 16}, state),
+        "inputs": (
+            {Of.WORD: 2 * p.state_words, Of.MEMORY: 2, Of.STATE_BIT: 2 * p.state_bits},
+            3 * p.state_bits,
         ),
-        LogicPart(
-            name="generators",
-            counts={Of.STATE_BIT: p.cdes * state + 16, Of.STEP: p.cdes * p.steps_per_clock + 16},
-            registers=p.cdes * state + 16,
-        ),
-        LogicPart(
-            name="inputs",
-            counts={Of.WORD: 2 * p.state_words, Of.MEMORY: 2, Of.STATE_BIT: 2 * p.state_bits},
-            registers=3 * p.state_bits,
-        ),
-        LogicPart(name="control", counts={Of.BOARD: 1}, registers=1032),
-    )
+        "control": ({Of.BOARD: 1}, 1032),
+    }
+    parts = tuple(LogicPart(name=name, counts=of, registers=own) for name, (of, own) in counts.items())
     small = [table for table in machine.tables if 0 < table.size <= MLAB_SHAPE[0]]
     labs = len(small) * math.ceil(p.prob_bits / MLAB_SHAPE[1])
-    others = [
-        (p.rng_banks * p.cdes, state),
+    blocks = [(table.size, p.prob_bits) for table in machine.tables if table.size > MLAB_SHAPE[0]]
+    blocks += [
+        (p.rng_banks * p.cdes, seed),
         (p.result_words, WORD_BITS),
         (p.stream * p.state_words, WORD_BITS),
     ]
     memories = Memories(
         table_bits=sum(table.size for table in machine.tables) * p.prob_bits,
-        blocks=sum(
-            blocks_of(table.size, p.prob_bits) for table in machine.tables if table.size > MLAB_SHAPE[0]
-        )
-        + sum(blocks_of(words, width) for words, width in others if words),
+        blocks=sum(blocks_of(words, width) for words, width in blocks),
         logic_tables=len(small),
         mlabs=labs,
         alms=float(MLAB_ALMS * labs),

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 _LARGE_ERROR: Final = 0.01
 """Total variation from which an error is a warning."""
-_MOST_LISTED: Final = 5
 _STATE_BITS: Final = 20
 """Maximum number of bits of states whose connection is checked."""
 _PATTERN_BITS: Final = 24
@@ -52,35 +51,25 @@ class CheckedChain:
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the machine's variables."""
-        p = self.machine.parameters
-        named = dict(zip(p.known, (each.name for each in self.deployment.variables), strict=True))
-        named |= zip(p.searched, (each.label for each in self.deployment.searched), strict=True)
-        return (
-            tuple(named.get(at, f"variable {at}") for at in range(len(p.cardinalities)))
-            if self.model is None
-            else self.model.names
-        )
+        if self.model is not None:
+            return self.model.names
+        p, deployment = self.machine.parameters, self.deployment
+        own = [*(each.name for each in deployment.variables), *(each.label for each in deployment.searched)]
+        named = dict(zip((*p.known, *p.searched), own, strict=True))
+        return tuple(named.get(at, f"variable {at}") for at in range(len(p.cardinalities)))
 
     @property
     def titles(self) -> tuple[str, ...]:
         """The names of its factors."""
-        if self.model is not None:
-            return self.model.titles
-        names = self.names
-        return tuple(
-            f"the factor of {', '.join(names[at] for at in scope)}"
-            for scope in self.machine.parameters.factors
-        )
+        cdes = range(self.machine.parameters.cdes)
+        return tuple(f"CDE {at}" for at in cdes) if self.model is None else self.model.titles
 
     def state(self, values: Sequence[int], variables: Sequence[int]) -> str:
         """Return values of some variables in words: `rain = yes, grass = wet`."""
-        labels = (
-            [()] * len(values) if self.model is None else [each.type.labels for each in self.model.symbols]
-        )
-        return ", ".join(
-            f"{self.names[each]} = {labels[each][values[each]] if labels[each] else values[each]}"
-            for each in variables
-        )
+        symbols = None if self.model is None else self.model.symbols
+        labels = [symbols[at].type.labels if symbols else () for at in range(len(values))]
+        words = [own[value] if own else str(value) for own, value in zip(labels, values, strict=True)]
+        return ", ".join(f"{self.names[each]} = {words[each]}" for each in variables)
 
     @property
     def always_known(self) -> set[int]:
@@ -110,10 +99,8 @@ def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]
     clips = zeros = count = 0
     for axis, size in enumerate(factor.shape):
         for bit in (1 << k for k in range((size - 1).bit_length())):
-            low = np.array(
-                [code for code in range(size) if not code & bit and code | bit < size], dtype=np.intp
-            )
-            zero, one = np.take(factor, low, axis), np.take(factor, low | bit, axis)
+            low = [code for code in range(size) if not code & bit and code | bit < size]
+            zero, one = np.take(factor, low, axis), np.take(factor, [code | bit for code in low], axis)
             both = zero + one
             share = np.divide(np.minimum(zero, one), both, out=np.ones_like(both), where=both > 0)
             clips += int((share < 0.5 / 2**prob_bits).sum())
@@ -125,22 +112,15 @@ def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]
 def _clips(chain: CheckedChain) -> Iterator[Finding]:
     """Name every clipped factor; without the model, those that are clipped because of zeros."""
     width, model = chain.machine.parameters.prob_bits, chain.model
-    tables = (
-        [support.astype(np.float64) for support in chain.machine.supports]
-        if model is None
-        else [term.table for term in model.factors]
-    )
-    for title, table in zip(chain.titles, tables, strict=True):
-        clips, zeros, count = clipped(table, width)
+    for at, (title, support) in enumerate(zip(chain.titles, chain.machine.supports, strict=True)):
+        clips, zeros, count = clipped(
+            support.astype(np.float64) if model is None else model.factors[at].table, width
+        )
         if clips:
-            why = f", {zeros} of them because of zeros" if zeros else ""
+            what = f"{clips} of its {count} odds are clipped to 1 in {2**width}"
+            what += f", {zeros} of them because of zeros" if zeros else ""
             rarer = "more --prob-bits make crossing a zero rarer, and the samples less independent"
-            yield note(
-                Check.CLIPPED,
-                title,
-                f"{clips} of its {count} odds are clipped to 1 in {2**width}{why}",
-                rarer if zeros else "use more --prob-bits",
-            )
+            yield note(Check.CLIPPED, title, what, rarer if zeros else "use more --prob-bits")
 
 
 def _error(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
@@ -155,60 +135,42 @@ def _error(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
     where = ", ".join(f"{variable.name} = {reading(variable, address)}" for variable, address in pairs)
     large = found.worst > _LARGE_ERROR
     if large or not all(support.all() for support in chain.machine.supports):
-        yield Finding(
-            Severity.WARNING if large else Severity.NOTE,
-            Check.CODES_ERROR,
-            "the codes",
-            f"quantising and clipping change the posterior by a total variation of {found.quantising:.2g} in the mean{of_all}"
-            + (f", {found.worst:.2g} at worst ({where})" if where else ""),
-            "use more --prob-bits, unless odds of two zeros are at fault" if large else "",
-        )
+        severity, advice = (Severity.WARNING, "use more --prob-bits") if large else (Severity.NOTE, "")
+        what = f"quantising and clipping change the posterior by a total variation of {found.quantising:.2g} in the mean{of_all}"
+        what += f", {found.worst:.2g} at worst ({where})" if where else ""
+        yield Finding(severity, Check.CODES_ERROR, "the codes", what, advice)
     if found.start + found.sampling > _LARGE_ERROR:
-        samples, stuck = chain.deployment.machine.target_count * p.chains, found.start > _LARGE_ERROR / 10
-        yield Finding(
-            Severity.WARNING if max(found.start, found.sampling / 5) > _LARGE_ERROR else Severity.NOTE,
-            Check.MIXING,
-            "the samples",
-            (
-                f"{samples} of them are worth {max(1.0, samples * found.effective):.0f} independent ones at worst, so a total "
-                f"variation of {found.sampling:.2g} is left in the mean"
-                + (
-                    f", and {p.burn_in} sweeps of burn-in leave {found.start:.2g} of the start state"
-                    if stuck
-                    else ""
-                )
-            ),
-            "use more --samples" + (" and a longer --burn-in" if stuck else ""),
+        stuck, samples = found.start > _LARGE_ERROR / 10, chain.deployment.machine.target_count * p.chains
+        severity = Severity.WARNING if max(found.start, found.sampling / 5) > _LARGE_ERROR else Severity.NOTE
+        what = f"{samples} of them are worth {max(1.0, samples * found.effective):.0f} independent ones at worst, so a total variation "
+        what += f"of {found.sampling:.2g} is left in the mean"
+        what += (
+            f", and {p.burn_in} sweeps of burn-in leave {found.start:.2g} of the start state" if stuck else ""
         )
+        advice = "use more --samples" + (" and a longer --burn-in" if stuck else "")
+        yield Finding(severity, Check.MIXING, "the samples", what, advice)
 
 
 def _opposite_clips(chain: CheckedChain) -> Iterator[Finding]:
     """Find bits at which factors clip in opposite directions, so that the move takes long."""
-    p, wide, found = chain.machine.parameters, [], []
+    p, wide = chain.machine.parameters, []
     for variable in sorted(set(range(len(p.cardinalities))) - chain.always_known):
-        worst = (0.0, 0, 0)
+        cycles, one, other = 0.0, 0, 0
         for bit in range(p.offsets[variable], p.offsets[variable] + p.bits[variable]):
             scopes = [set(p.factor_bits(cde)) for cde in range(p.cdes) if bit in p.factor_bits(cde)]
             blanket = sorted(set().union(*scopes) - {bit})
             if len(blanket) > _BLANKET_BITS:
                 wide.append(chain.names[variable])
                 break
-            worst = max(worst, _slowest(chain.machine, bit, blanket))
-        if worst[0]:
-            found.append((*worst, variable))
-    found.sort(reverse=True)
-    for cycles, one, other, variable in found[:_MOST_LISTED]:
-        risky = p.ops_timeout < -cycles * math.log(_TIMEOUT_RISK)
-        yield warning(
-            Check.OPPOSITE_CLIPS,
-            chain.names[variable],
-            f"{chain.titles[one]} and {chain.titles[other]} can clip one of its bits in opposite directions; such a move takes "
-            f"{cycles:,.0f} cycles in the mean"
-            + (f", and may exceed the {p.ops_timeout} of ops_timeout" if risky else ""),
-            "use fewer --prob-bits" + (", or a larger --ops-timeout" if risky else ""),
-        )
-    if rest := ", ".join(chain.names[variable] for *_, variable in found[_MOST_LISTED:]):
-        yield warning(Check.OPPOSITE_CLIPS, rest, "factors can clip their bits in opposite directions, too")
+            cycles, one, other = max((cycles, one, other), _slowest(chain.machine, bit, blanket))
+        if cycles:
+            risky = p.ops_timeout < -cycles * math.log(_TIMEOUT_RISK)
+            what = f"{chain.titles[one]} and {chain.titles[other]} can clip one of its bits in opposite directions; such a move takes "
+            what += f"{cycles:,.0f} cycles in the mean" + (
+                f", and may exceed the {p.ops_timeout} of ops_timeout" if risky else ""
+            )
+            advice = "use fewer --prob-bits" + (", or a larger --ops-timeout" if risky else "")
+            yield warning(Check.OPPOSITE_CLIPS, chain.names[variable], what, advice)
     if wide:
         what = f"not checked: more than {_BLANKET_BITS} bits share a factor with one of theirs"
         yield note(Check.OPPOSITE_CLIPS, ", ".join(wide), what)
@@ -221,16 +183,15 @@ def _slowest(machine: BM2Machine, bit: int, blanket: Sequence[int]) -> tuple[flo
     """
     p, index = machine.parameters, np.arange(1 << len(blanket))
     values = {other: index >> at & 1 for at, other in enumerate(blanket)}
-    legal, whole = np.ones(len(index), dtype=bool), values | {bit: np.ones_like(index)}
+    whole, legal = values | {bit: np.ones_like(index)}, np.ones_like(index)
     for offset, bits, cardinality in zip(p.offsets, p.bits, p.cardinalities, strict=True):
         if bits and offset in whole:
-            legal &= (
-                sum((whole[offset + k] << k for k in range(bits)), start=np.zeros_like(index)) < cardinality
-            )
+            code = np.sum([whole[offset + k] << k for k in range(bits)], axis=0)
+            legal &= code < cardinality
     concerned = agreement(machine, bit, values)
     chances = np.array([np.broadcast_to(chance, index.shape) for _, chance in concerned])
     low, high = chances <= 0.5**p.prob_bits, chances >= 1 - 0.5**p.prob_bits
-    places = np.flatnonzero(low.any(axis=0) & high.any(axis=0) & legal)
+    places = np.flatnonzero(low.any(axis=0) & high.any(axis=0) & (legal > 0))
     if not places.size:
         return 0.0, 0, 0
     cycles = 1 / (np.prod(chances[:, places], axis=0) + np.prod(1 - chances[:, places], axis=0))
@@ -256,13 +217,10 @@ def _connections(chain: CheckedChain) -> Iterator[Finding]:
             differing = [at for at in range(len(one)) if one[at] != other[at]]
             reason = f"with {chain.state(one, known)}, " if known else ""
             reason += f"without {', '.join(chain.names[at] for at in missing)}, " if missing else ""
-            yield warning(
-                Check.CONNECTION,
-                "the states",
-                f"{reason}no path of possible states that change one bit at a time leads from {chain.state(one, differing)} to "
-                f"{chain.state(other, differing)}, so samples cross by clipped zeros alone, which is rare",
-                "compare its posterior with exact inference before you trust it, or replace zeros by small probabilities",
-            )
+            what = f"{reason}no path of possible states that change one bit at a time leads from {chain.state(one, differing)} to "
+            what += f"{chain.state(other, differing)}, so samples cross by clipped zeros alone, which is rare"
+            advice = "compare its posterior with exact inference before you trust it, or replace zeros by small probabilities"
+            yield warning(Check.CONNECTION, "the states", what, advice)
             return
 
 
@@ -353,24 +311,12 @@ def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]
         if those:
             bank, board = divmod(those[0].group, boards)
             bits = " and ".join(f"bit {bit} of {chain.titles[cde]}" for cde, bit in those[0].bits)
-            yield finding(
-                Check.RNG_RELATION,
-                about,
-                f"in {len(those)} of {groups} banks of boards {size} random bits {'are the same' if size == 2 else 'XOR to 0'} in "
-                f"every cycle (bank {bank}, board {board}: {bits})",
-                "use --rng lfsr32, or fewer --prob-bits",
-            )
-    cycles = (
-        0.0
-        if found is None
-        else min(
-            chain.deployment.machine.max_cycles,
-            (p.burn_in + chain.deployment.machine.target_count) * found.cycles,
-        )
-        * boards
-    )
+            what = f"in {len(those)} of {groups} banks of boards {size} random bits {'are the same' if size == 2 else 'XOR to 0'} in "
+            what += f"every cycle (bank {bank}, board {board}: {bits})"
+            yield finding(Check.RNG_RELATION, about, what, "use --rng lfsr32, or fewer --prob-bits")
+    limits, sweep = chain.deployment.machine, p.state_bits if found is None else found.cycles
+    cycles = min(limits.max_cycles, (p.burn_in + limits.target_count) * sweep) * boards
     if cycles > 2**width / 10:
-        what = f"a frame takes about {cycles:.2g} cycles on all boards, more than a tenth of the generators' period of {2**width - 1}"
-        yield warning(
-            Check.RNG_PERIOD, about, what, "use a wider --rng, fewer --samples or fewer --partitions"
-        )
+        what = f"a frame takes {cycles:.2g} cycles on all boards, more than a tenth of the generators' period of {2**width - 1}"
+        advice = "use a wider --rng, fewer --samples or fewer --partitions"
+        yield warning(Check.RNG_PERIOD, about, what, advice)

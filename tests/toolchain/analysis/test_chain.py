@@ -68,8 +68,8 @@ def test_a_long_run_approaches_it(options, known):
     assert kernel.cycles / (20 + SAMPLES) == pytest.approx(chain.cycles, rel=0.06)
     counts = kernel.results[p.histogram_words :]  # A alone, whose last code is unused
     if not known:
-        assert distance(counts[:3] / counts.sum(), chain.posterior(chain.sampled)) < 0.05
-        assert kernel.unused / samples == pytest.approx(1 - chain.sampled[_used(machine)].sum(), abs=0.002)
+        assert distance(counts[:3] / counts.sum(), chain.posterior(chain.law)) < 0.05
+        assert kernel.unused / samples == pytest.approx(1 - chain.law[_used(machine)].sum(), abs=0.002)
 
 
 def _used(machine):

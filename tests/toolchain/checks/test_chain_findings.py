@@ -62,10 +62,7 @@ def test_clipped_odds_are_counted():
 
 def test_a_clipped_factor_is_named_with_and_without_the_model():
     model = sprinkler()
-    for known_model, title in (
-        (True, "P(grass | sprinkler, rain)"),
-        (False, "the factor of rain, variable 1, grass"),
-    ):
+    for known_model, title in ((True, "P(grass | sprinkler, rain)"), (False, "CDE 2")):
         finding = only(checked(model, known_model=known_model), Check.CLIPPED)
         assert finding.about == title
         assert "3 of its 12 odds are clipped to 1 in 65536, 3 of them because of zeros" in finding.what
@@ -195,7 +192,7 @@ RANDOM = np.random.default_rng(2)
 def test_a_factor_that_is_too_wide_is_named():
     model = network({"ABC": RANDOM.random((64, 64, 64)), "A": np.arange(1, 65)})
     finding = only(checked(model, known_model=False), Check.WIDE_FACTOR)
-    assert finding.about == "the factor of A, variable 1, variable 2"
+    assert finding.about == "CDE 0"
     assert "2,359,296 words of 16 bits" in finding.what
     assert "holds 2,102,272" in finding.what
     assert not found(checked(model, known_model=False, prob_bits=10), Check.WIDE_FACTOR)
