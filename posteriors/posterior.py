@@ -206,12 +206,9 @@ def posterior_layout(deployment: "Deployment") -> dict[str, Any]:
 def samples_layout(samples: int, sample_bytes: int) -> dict[str, Any]:
     """Return the `layout` of a message on `/bm/samples`: a row of bytes for each sampled state."""
     rows = {"label": "sample", "size": samples, "stride": samples * sample_bytes}
-    words = {
-        "label": f"byte of {sample_bytes // 4} little-endian words",
-        "size": sample_bytes,
-        "stride": sample_bytes,
-    }
-    return {"dim": [rows, words], "data_offset": 0}
+    words = "one little-endian word" if sample_bytes == 4 else f"{sample_bytes // 4} little-endian words"
+    state = {"label": f"byte of {words}", "size": sample_bytes, "stride": sample_bytes}
+    return {"dim": [rows, state], "data_offset": 0}
 
 
 class _Dimension(Part):
