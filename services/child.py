@@ -92,6 +92,8 @@ class _Pipe:
             if len(self._pending) >= LONGEST_LINE:
                 lines, self._pending = [*lines, self._pending], b""
             self._pass_on(lines)
+            if not last:
+                return  # a child that prints without a pause must not keep the loop from its other work
         if last:
             self._pass_on([self._pending])
             self._pending = b""
