@@ -2,8 +2,9 @@
 
 from bridge.client.actions import Goal, GoalRequest
 from bridge.client.handles import Publication, Service, Subscription
+from bridge.client.protocol.events import Message
 from bridge.client.ros import Ros, connect
-from bridge.client.session import Message, State
+from bridge.client.session import State
 from bridge.qos import Qos
 
 __all__ = [

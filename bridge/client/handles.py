@@ -12,9 +12,9 @@ from collections.abc import Awaitable, Callable, Mapping
 from math import inf
 from typing import Any, Final, Self
 
-from bridge.client.protocol.events import ServiceRequested
+from bridge.client.protocol.events import Message, ServiceRequested
 from bridge.client.protocol.subscriptions import Delivery
-from bridge.client.session import Message, Session, State
+from bridge.client.session import Session, State
 from bridge.codecs.message_check import MessageCheck
 from bridge.errors import (
     BridgeError,
@@ -151,18 +151,20 @@ class Subscription(Handle):
         self._register()
         session.watch_silence()
 
-    def receive(self, message: Message) -> None:
-        """Queue a message."""
+    def receive(self, messages: list[Message]) -> None:
+        """Queue messages."""
         queue = self._queue
-        # Every message passes here, so the two rare cases cost one comparison each.
-        if self._blind:
-            message = message._replace(blind_seconds=self._blind)
-            self._blind = 0.0
-        if len(queue) == self._size:
-            self.lost += 1
-            if queue[0].blind_seconds:
-                message = self._pass_on_blind_seconds(message)
-        queue.append(message)
+        if not self._blind and len(queue) + len(messages) <= self._size:
+            queue.extend(messages)  # the usual case
+        else:
+            for each in messages:
+                message = each._replace(blind_seconds=self._blind) if self._blind else each
+                self._blind = 0.0
+                if len(queue) == self._size:
+                    self.lost += 1
+                    if queue[0].blind_seconds:
+                        message = self._pass_on_blind_seconds(message)
+                queue.append(message)
         if self._waiter is not None:
             self._wake()
 

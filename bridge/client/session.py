@@ -9,7 +9,7 @@ from collections.abc import Callable, Coroutine, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from enum import StrEnum
 from threading import get_ident
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, Protocol
 
 from websockets.uri import WebSocketURI
 
@@ -21,6 +21,7 @@ from bridge.client.protocol.events import (
     GoalEnded,
     GoalFeedback,
     GoalRequested,
+    Message,
     MessageDiscarded,
     MessageReceived,
     ServiceRequested,
@@ -32,7 +33,6 @@ from bridge.client.websocket import CLOSE_TIMEOUT, Limits, Loss, WebSocket, open
 from bridge.codecs.json_codec import topic_in
 from bridge.errors import (
     BridgeError,
-    DecodeError,
     DisconnectedError,
     NoAnswerError,
     ServiceError,
@@ -81,8 +81,8 @@ Server = Callable[[ServiceRequested], Coroutine[Any, Any, None]]
 class Reader(Protocol):
     """One subscription."""
 
-    def receive(self, message: "Message") -> None:
-        """Queue a message."""
+    def receive(self, messages: list[Message]) -> None:
+        """Queue messages."""
 
     def discard(self) -> None:
         """Count a message above the topic's limit."""
@@ -112,40 +112,6 @@ class GoalExecutor(Protocol):
 
     def lost(self) -> None:
         """Give up the goals of a lost connection."""
-
-
-class Message(NamedTuple):
-    """One message of a topic.
-
-    Attributes:
-        topic: Name of the topic in the server's spelling.
-        msg: The ROS message; shared by all subscriptions of the topic, so do not modify it.
-        received_ns: `time.time_ns()` at its arrival, the same for all messages that arrive together.
-        received_monotonic_ns: `time.monotonic_ns()` at the same time.
-        blind_seconds: Time without a connection just before this message; 0 except in the first message after
-            a reconnection.
-    """
-
-    topic: str
-    msg: dict[str, Any]
-    received_ns: int
-    received_monotonic_ns: int
-    blind_seconds: float = 0.0
-
-    @property
-    def raw(self) -> bytes:
-        """The serialised bytes of a message of a `cbor-raw` subscription.
-
-        Raises:
-            DecodeError: There are none, because the subscription or the server does not use cbor-raw.
-        """
-        data = self.msg.get("bytes")
-        if type(data) is not bytes:
-            raise DecodeError(
-                f"a message of {self.topic} has no serialised bytes: was it subscribed with "
-                "compression='cbor-raw', and does the server support that?"
-            )
-        return data
 
 
 class Session:
@@ -592,21 +558,21 @@ class Session:
 
     def _take(self, messages: list[bytes]) -> None:
         # One time for all messages that arrived together: their order in the socket says nothing about their age.
-        received_ns, received_monotonic_ns = time.time_ns(), time.monotonic_ns()
-        now = received_monotonic_ns * 1e-9
-        receive_known, readers = self.core.receive_known, self.readers
-        for data in messages:
-            received: Any = receive_known(data)
-            if received is None:
-                received = self.core.receive(data, now)
-                if type(received) is not MessageReceived:
-                    self._take_other(received)
+        received_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
+        receive_known, readers, at = self.core.receive_known, self.readers, 0
+        while at < len(messages):
+            received, subscriptions = receive_known(messages, at, received_ns, monotonic_ns)
+            if not received:
+                event = self.core.receive(messages[at], monotonic_ns * 1e-9)
+                if type(event) is not MessageReceived:
+                    self._take_other(event)
+                    at += 1
                     continue
-            topic, msg, subscriptions = received
-            # The constructor of a named tuple takes three times as long.
-            message = tuple.__new__(Message, (topic, msg, received_ns, received_monotonic_ns, 0.0))
+                received = [Message(event.topic, event.msg, received_ns, monotonic_ns)]
+                subscriptions = event.subscriptions
+            at += len(received)
             for number in subscriptions:
-                readers[number].receive(message)
+                readers[number].receive(received)
 
     def _take_other(self, event: Event | None) -> None:
         match event:

@@ -10,6 +10,7 @@ is refused before it is decoded. NaN and infinities are numbers here, as in ROS.
 NumPy is imported when the first array is requested.
 """
 
+import struct
 from array import array
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -37,7 +38,7 @@ TYPED_ARRAYS: Final = {
     85: ("<f4", "f"),
     86: ("<f8", "d"),
 }
-"""Element types by tag, in the notation of NumPy and in that of the module `array`."""
+"""Element types by tag, in the notation of NumPy and in that of the modules `array` and `struct`."""
 _BYTES_TAG: Final = 64
 _TAGS: Final = {name[1:]: tag for tag, (name, _code) in TYPED_ARRAYS.items()}
 _TEXT: Final = frozenset({str})
@@ -144,7 +145,7 @@ def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
             kind = type(value)
             if kind in _LEAVES:
                 continue
-            if kind is dict or kind is list:
+            if (kind is dict or kind is list) and value:
                 inner.append(value)
             elif kind is bytes:
                 if from_bytes is not None:
@@ -201,12 +202,11 @@ def typed_array(values: Any, elements: str) -> cbor2.CBORTag:
             f"{elements!r} is not an element type of typed arrays, expected one of {' '.join(_TAGS)}"
         )
     try:
-        numbers = array(TYPED_ARRAYS[tag][1], values)
-    except (TypeError, OverflowError, ValueError) as error:
+        numbers = tuple(values)
+        packed = struct.pack(f"<{len(numbers)}{TYPED_ARRAYS[tag][1]}", *numbers)
+    except (TypeError, OverflowError, struct.error) as error:
         raise EncodeError(f"the values do not fit a typed array of {elements}: {error}") from None
-    if byteorder == "big":
-        numbers.byteswap()
-    return cbor2.CBORTag(tag, numbers.tobytes())
+    return cbor2.CBORTag(tag, packed)
 
 
 def _prepare(value: Any, levels: int, pack_floats: bool) -> Any:

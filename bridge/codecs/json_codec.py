@@ -46,7 +46,9 @@ _NO_BRACKETS: Final = bytes(byte for byte in range(256) if byte not in b"[]{}")
 _BRACKETS: Final = bytes.maketrans(b"{}", b"[]")
 _STEPS: Final = bytes.maketrans(b"[]", b"\x01\xff")
 
+# What precedes a message in JSON and in CBOR.
 _KEY: Final = b'"msg":'
+_CBOR_KEY: Final = b"cmsg"
 _JSON_TOPIC: Final = re.compile(rb'"topic":\s*"([^"]+)"')
 # The key `topic` and the header of the text after it: its length is in the low bits, or in a byte of its
 # own.
@@ -290,9 +292,10 @@ def _all_finite(value: Any) -> bool:
 
 
 def envelope_of(data: bytes) -> bytes:
-    """Return what may be the envelope of an operation: everything up to its first `"msg":`, or nothing."""
-    at = data.find(_KEY, 0, LONGEST)
-    return data[: at + len(_KEY)] if at > 0 else b""
+    """Return what may be the envelope of an operation: everything up to its first key `msg`, or nothing."""
+    key = _KEY if data[:1] < b"\x80" else _CBOR_KEY
+    at = data.find(key, 0, LONGEST)
+    return data[: at + len(key)] if at > 0 else b""
 
 
 def topic_of(envelope: bytes) -> str | None:

@@ -83,13 +83,13 @@ class ClientCore:
         It is None for requests that were refused here, and for messages of topics or calls that no longer
         exist.
         """
+        # The usual case: a message of a topic that had one before.
+        known, subscriptions = self.receive_known((data,), 0, 0, 0)
+        if known:
+            return MessageReceived(known[0].topic, known[0].msg, subscriptions)
         # A CBOR map begins like this, and JSON does not; it is expected only if a subscription requests CBOR.
         if self.subscriptions.binary and data[:1] >= b"\x80":
             return self._receive_cbor(data, now)
-        # The usual case: a message of a topic that had one before.
-        known = self.receive_known(data)
-        if known is not None:
-            return MessageReceived(*known)
         discarded = self.subscriptions.discard_known(data)
         if discarded is not None:
             return discarded

@@ -4,17 +4,19 @@ Some servers deliver a first message twice, or not at all, to a client that subs
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 import orjson
 
-from bridge.client.protocol.events import MessageDiscarded, MessageReceived, UnusableReceived
+from bridge.client.protocol.events import Message, MessageDiscarded, MessageReceived, UnusableReceived
 from bridge.client.protocol.wire import Wire, check_fragment_size
+from bridge.codecs import cbor_codec
 from bridge.codecs.cbor_codec import Arrays, with_arrays, with_lists
 from bridge.codecs.json_codec import BRACE, envelope_of, excerpt, is_deeper, topic_of
-from bridge.errors import OptionError, TypeConflictError
+from bridge.errors import DecodeError, OptionError, TypeConflictError
 from bridge.names import RosVersion, absolute, check_name, same_type, split_type
 from bridge.qos import Qos
 from bridge.stamps import ros_version_of_message
@@ -161,7 +163,6 @@ class Subscriptions:
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
-        self._inner_depth = wire.max_depth - 1  # of a message inside its operation
         # By absolute name, and by the number from `subscribe`; all subscriptions of a topic share an entry.
         self._subscribed: dict[str, _Subscribed] = {}
         self._subscriptions: dict[int, _Subscribed] = {}
@@ -337,49 +338,49 @@ class Subscriptions:
         self._send_subscribe(subscribed)
         return gives_up_cbor
 
-    def receive_known(self, data: bytes) -> tuple[str, dict[str, Any], tuple[int, ...]] | None:
-        """Return the fields of `MessageReceived` for a message with a known envelope.
+    def receive_known(
+        self, messages: Sequence[bytes], first: int, received_ns: int, monotonic_ns: int
+    ) -> tuple[list[Message], tuple[int, ...]]:
+        """Return the messages with one known envelope, from index `first` to another, and their subscriptions.
 
-        None if `ClientCore.receive` has to handle it. The fields are a plain tuple, because a named one would add a
-        tenth to the time of a small message.
+        There are none if `ClientCore.receive` has to handle the first one.
         """
         envelope, size, topic, subscribed = self._known
-        if not data.startswith(envelope):
-            found = self.envelopes.get(envelope_of(data))
-            if found is None:
-                return None
-            self._known = found
-            envelope, size, topic, subscribed = found
-        if len(data) > subscribed.largest:
-            if len(data) > subscribed.max_size:
-                return None
-            subscribed.largest = len(data)
-        if data[-1] != BRACE or subscribed.has_throttled:
-            return None
-        message = data[size:-1]
-        try:
-            msg = orjson.loads(message)
-        except orjson.JSONDecodeError:
-            return None
-        if type(msg) is not dict or is_deeper(message, self._inner_depth):
-            return None
-        if self.numpy and subscribed.delivery.arrays == "numpy":
-            msg = with_arrays(msg)
-        return topic, msg, subscribed.all_numbers
+        depth = self._wire.max_depth - 1  # of a message inside its operation
+        received: list[Message] = []
+        new = tuple.__new__  # the constructor of a named tuple takes three times as long
+        for data in messages[first:] if first else messages:
+            if not data.startswith(envelope):
+                found = None if received else self.envelopes.get(envelope_of(data))
+                if found is None or found.subscribed.has_throttled:
+                    break
+                self._known = envelope, size, topic, subscribed = found
+            if len(data) > subscribed.largest:
+                if len(data) > subscribed.max_size:
+                    break
+                subscribed.largest = len(data)
+            arrays = subscribed.delivery.arrays
+            try:
+                if envelope >= b"\x80":
+                    msg = cbor_codec.decode(data[size:], max_size=len(data), max_depth=depth, arrays=arrays)
+                else:
+                    msg = orjson.loads(data[size:-1])
+                    # For small messages, the first condition of `is_deeper` without its call.
+                    large = len(data) > 5 * depth or len(data) + 3 * data.count(b"[") > 5 * depth
+                    if data[-1] != BRACE or type(msg) is not dict or (large and is_deeper(data, depth + 1)):
+                        break
+                    if arrays == "numpy":
+                        msg = with_arrays(msg)
+            except (orjson.JSONDecodeError, DecodeError):
+                break
+            received.append(new(Message, (topic, msg, received_ns, monotonic_ns, 0.0)))
+        return received, subscribed.all_numbers
 
     def discard_known(self, data: bytes) -> MessageDiscarded | None:
         """Discard a message with a known envelope without parsing it, if it is above its topic's limit."""
         known = self.envelopes.get(envelope_of(data))
         is_usable = len(data) <= self._wire.max_size
         return known.subscribed.measure(known.topic, len(data)) if known is not None and is_usable else None
-
-    def _learn_envelope(self, data: bytes, topic: str, subscribed: _Subscribed) -> None:
-        """Remember the envelope of a topic's messages if it identifies the next one."""
-        envelope = envelope_of(data)
-        if envelope not in self.envelopes:
-            subscribed.envelopes_tried += 1
-            if topic_of(envelope) == topic:
-                self.envelopes[envelope] = _Known(envelope, len(envelope), topic, subscribed)
 
     def forget_envelopes(self) -> None:
         """Forget the known envelopes, because subscriptions or the server have changed."""
@@ -402,21 +403,21 @@ class Subscriptions:
         if not subscribed.has_messages:
             subscribed.has_messages = True
             self.seen_version = self.seen_version or ros_version_of_message(msg)
-        # A message from CBOR, fragments or a PNG has no envelope in `data`.
-        if (
-            type(data) is bytes
-            and len(operation) == _OF_ENVELOPE
-            and not from_cbor
-            and subscribed.envelopes_tried < _ENVELOPES
-        ):
-            self._learn_envelope(data, topic, subscribed)
+        # A message from fragments or a PNG has no envelope in `data`.
+        if type(data) is bytes and len(operation) == _OF_ENVELOPE and subscribed.envelopes_tried < _ENVELOPES:
+            envelope, empty = envelope_of(data), {"op": "publish", "topic": topic, "msg": {}}
+            if envelope not in self.envelopes:
+                subscribed.envelopes_tried += 1
+                # In CBOR, a map that announces three entries: nothing can follow the message.
+                if envelope == cbor_codec.encode(empty)[:-1] if from_cbor else topic_of(envelope) == topic:
+                    self.envelopes[envelope] = _Known(envelope, len(envelope), topic, subscribed)
         discarded = subscribed.measure(topic, len(data))
         if discarded is not None:
             return discarded
         receivers = subscribed.receivers(now)
         if not receivers:
             return None
-        # CBOR is decoded with arrays for all topics if one wants them, because the topic is not known before.
+        # CBOR without a known envelope is decoded with arrays if any topic wants them.
         if self.numpy:
             if subscribed.delivery.arrays == "list":
                 msg = with_lists(msg) if from_cbor else msg

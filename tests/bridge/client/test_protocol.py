@@ -299,3 +299,44 @@ def test_what_is_unusable_says_so(data):
     event = core.receive(data, 0.0)
     assert isinstance(event, UnusableReceived)
     assert 10 < len(event.reason) < 300
+
+
+def nested(levels):
+    return {"a": nested(levels - 1)} if levels else 1
+
+
+# In an operation, 63 levels are the most.
+CONTENTS = [{}, {"a": [1.5, None]}, {"a": {"msg": "cmsg"}}, nested(62), nested(63), nested(64), [1], 1]
+
+
+@pytest.mark.parametrize("arrays", ["list", "numpy"])
+@pytest.mark.parametrize("encode", [lambda operation: json.dumps(operation).encode(), cbor2.dumps])
+def test_messages_with_a_known_envelope_are_read_like_the_first_one(encode, arrays):
+    received = [encode({"op": "publish", "topic": "/a", "msg": msg}) for msg in CONTENTS]
+    received += [received[1] + b"\0", received[1][:-1], received[1] + received[1]]
+
+    def core():
+        core = connected()
+        core.subscriptions.subscribe("/a", delivery=Delivery(compression="cbor", arrays=arrays))
+        return core
+
+    learnt = core()
+    learnt.receive(received[0], 0.0)
+    for data in received:
+        first = core().receive(data, 0.0)
+        assert repr(learnt.receive(data, 0.0)) == repr(first)
+        known, _subscriptions = learnt.receive_known((data,), 0, 1, 2)
+        assert bool(known) is isinstance(first, MessageReceived)
+
+
+def test_messages_that_arrive_together_are_read_up_to_another_topic_or_an_unusable_one():
+    core = connected()
+    numbers = {topic: core.subscriptions.subscribe(topic) for topic in ("/a", "/b")}
+    a, b = (b'{"op":"publish","topic":"%b","msg":{}}' % topic.encode() for topic in numbers)
+    for data in (a, b):
+        core.receive(data, 0.0)
+    together = [a, a, b, a[:-1], a]
+    for first, topic, count in (0, "/a", 2), (1, "/a", 1), (2, "/b", 1), (3, "/a", 0), (4, "/a", 1):
+        messages, subscriptions = core.receive_known(together, first, 1, 2)
+        assert messages == [(topic, {}, 1, 2, 0.0)] * count
+        assert not count or subscriptions == (numbers[topic],)
