@@ -43,9 +43,13 @@ class BM2Plan:
 
     @property
     def max_cycles(self) -> int:
-        """The maximum number of cycles, a safety stop."""
-        asked = self.options.max_cycles
-        return int(BM2Section.model_fields["max_cycles"].default) if asked is None else asked
+        """The maximum number of cycles: a safety stop, and the limit of the wait for a board."""
+        asked, parameters = self.options.max_cycles, self.parameters
+        if asked is not None:
+            return asked
+        # a move takes 3 to 6 cycles in the mean, unless zeros are clipped
+        moves = (parameters.burn_in + self.target_count) * parameters.state_bits
+        return max(int(BM2Section.model_fields["max_cycles"].default), 64 * moves)
 
 
 def bm2_options(source: BuildOptions | BM2Section) -> dict[str, Any]:

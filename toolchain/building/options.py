@@ -229,7 +229,7 @@ class CommonOptions:
     ] = None
     target_count: Annotated[int | None, TARGET_COUNT] = None
     max_cycles: Annotated[
-        int | None, typer.Option(help="Maximum number of cycles.", show_default="131072; BM2: 4294967296")
+        int | None, typer.Option(help="Maximum number of cycles.", show_default="131072; BM2: 2^28 or more")
     ] = None
     rng: Annotated[
         RngKind,

@@ -348,7 +348,7 @@ class BM2Section(CommonSection):
     rng_reset: Choice[RngReset] = RngReset.BANK
     steps_per_clock: int = Field(default=16, ge=1)
     target_count: int = Field(default=10_000, ge=1, le=_WORD_MAX)
-    max_cycles: int = Field(default=2**32, ge=1, le=CYCLES_MAX)
+    max_cycles: int = Field(default=2**28, ge=1, le=CYCLES_MAX)
     stream: int = Field(default=0, ge=0, le=_WORD_MAX)
     variables: Sequence[Name] = ()
 

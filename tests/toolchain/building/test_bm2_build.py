@@ -110,7 +110,7 @@ def test_a_network_becomes_chains_with_the_tables_of_its_factors(network):
     assert result.stdout == (out / "report.txt").read_text()
     deployment = load_deployment(out)
     machine = deployment.machine
-    assert (machine.type, machine.lines, machine.target_count, machine.max_cycles) == ("BM2", 2, 70, 2**32)
+    assert (machine.type, machine.lines, machine.target_count, machine.max_cycles) == ("BM2", 2, 70, 2**28)
     assert (machine.sequencer, machine.burn_in, machine.stream) == (Sequencer.COLOURED, 5, 9)
     assert machine.variables == ("rain", "sprinkler", "grass")  # nobody asks for the shoes
     assert [board.line_offset for board in deployment.boards] == [0, 1, 2]
