@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from machines.bm2 import BM2Machine
+    from machines.bm2 import BM2Machine, BM2Parameters
     from toolchain.models.network import NetworkModel
 
 MOST_BITS: Final = 9
@@ -33,6 +33,12 @@ MOST_BITS: Final = 9
 _MOST_READINGS: Final = 64
 _WORK: Final = 2**27
 """Maximum number of products for one matrix product of all readings together: a few seconds in all."""
+
+
+@lru_cache(1)
+def factor_bits(p: BM2Parameters) -> tuple[tuple[int, ...], ...]:
+    """Return the state bits of each factor's variables, which take long to compute for hundreds of factors."""
+    return tuple(p.factor_bits(cde) for cde in range(p.cdes))
 
 
 def agreement(
@@ -43,9 +49,9 @@ def agreement(
     `values` are the other bits of these CDEs' factors in each state, int64[states], by bit.
     """
     p, found = machine.parameters, []
-    for cde, table in enumerate(machine.tables):
-        local = p.factor_bits(cde)
+    for cde, local in enumerate(factor_bits(p)):
         if bit in local:
+            table = machine.tables[cde]
             j = local.index(bit)
             places = np.zeros(next(iter(values.values())).shape if values else 1, dtype=np.int64)
             for i, other in enumerate(local[:j] + local[j + 1 :]):
@@ -163,31 +169,27 @@ class ExactChain:
         found = np.bincount(self._searched[used], law[used], size)
         return np.asarray(found / found.sum())
 
+    @cached_property
+    def _fundamental(self) -> NDArray[np.float64]:
+        """float64[states, states]: sums of the deviations of all later laws from the stationary one."""
+        return np.asarray(np.linalg.inv(np.eye(len(self.law)) - self.sweep + self.law))
+
     def effective(self) -> NDArray[np.float64]:
         """Return the number of independent samples that a sweep is worth, for each searched value: float64[values]."""
         places = np.arange(len(self.posterior(self.law)))
         values = (self._searched[:, np.newaxis] == places).astype(np.float64)
         centred = values - self.law @ values
-        summed = np.linalg.solve(np.eye(len(self.law)) - self.sweep + self.law, centred)
         own = self.law @ centred**2
-        total = self.law @ (centred * (2 * summed - centred))
+        total = self.law @ (centred * (2 * self._fundamental @ centred - centred))
         return np.asarray(np.divide(own, total, out=np.ones_like(own), where=own > 0))
 
     def frame(self, state: int, burn_in: int, sweeps: int) -> NDArray[np.float64]:
         """Return the mean law after each sweep of a frame that starts in a packed state and burns in."""
-        law = np.zeros(len(self.sweep))
-        law[sum((state >> bit & 1) << at for at, bit in enumerate(self._unknown))] = 1
-        law = law @ np.linalg.matrix_power(self.sweep, burn_in + 1)
-        total = np.zeros_like(law)
-        block, power, left = np.eye(len(law)), self.sweep, sweeps
-        while left:  # `block` is the sum of the powers from 0 to 2**k - 1, and `power` the next one
-            if left & 1:
-                total += law @ block
-                law = law @ power
-            block = block + block @ power
-            power = power @ power
-            left >>= 1
-        return np.asarray(total / sweeps)
+        first = np.linalg.matrix_power(self.sweep, burn_in + 1)[
+            sum((state >> bit & 1) << at for at, bit in enumerate(self._unknown))
+        ]
+        after = first @ np.linalg.matrix_power(self.sweep, sweeps)
+        return np.asarray(self.law + (first - after) @ self._fundamental / sweeps)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

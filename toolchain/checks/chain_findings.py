@@ -16,7 +16,7 @@ import numpy as np
 from machines.bm2 import BM2Machine, unpack
 from machines.parameters import RngReset
 from machines.rng import LFSR
-from toolchain.analysis.chain import ChainError, agreement, chain_error
+from toolchain.analysis.chain import ChainError, agreement, chain_error, factor_bits
 from toolchain.analysis.logic import BLOCK_SHAPES, blocks_of, device_named
 from toolchain.checks.findings import Check, Finding, Severity, error, note, reading, warning
 from toolchain.checks.generators import relations
@@ -37,6 +37,8 @@ _PATTERN_BITS: Final = 24
 """The same with a bit more for each known variable whose reading may be missing."""
 _BLANKET_BITS: Final = 16
 """Maximum number of bits that share a factor with a pointed bit, whose values are tried for clips."""
+_RELATED_BITS: Final = 2048
+"""Maximum number of bits of random numbers of a board whose relations are searched, because all pairs are kept."""
 _TIMEOUT_RISK: Final = 1e-6
 
 
@@ -157,8 +159,7 @@ def _opposite_clips(chain: CheckedChain) -> Iterator[Finding]:
     for variable in sorted(set(range(len(p.cardinalities))) - chain.always_known):
         cycles, one, other = 0.0, 0, 0
         for bit in range(p.offsets[variable], p.offsets[variable] + p.bits[variable]):
-            scopes = [set(p.factor_bits(cde)) for cde in range(p.cdes) if bit in p.factor_bits(cde)]
-            blanket = sorted(set().union(*scopes) - {bit})
+            blanket = sorted(set().union(*(scope for scope in factor_bits(p) if bit in scope)) - {bit})
             if len(blanket) > _BLANKET_BITS:
                 wide.append(chain.names[variable])
                 break
@@ -305,7 +306,12 @@ def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]
         )
         what = f"the generators of {one} and {other} have the same seed"
         yield error(Check.RNG_RELATION, about, what, "use a wider --rng, or fewer --rng-banks")
-    related, groups = relations(p.rng, seeds.reshape(sets, p.cdes), p.prob_bits)
+    related, groups = relations(
+        p.rng, seeds.reshape(sets, p.cdes)[:, : _RELATED_BITS // p.prob_bits], p.prob_bits
+    )
+    if p.cdes * p.prob_bits > _RELATED_BITS:
+        what = f"relations were searched among {_RELATED_BITS // p.prob_bits} of {p.cdes} CDEs, to save time"
+        yield note(Check.RNG_RELATION, about, what)
     for size, finding in ((2, error), (3, warning), (4, note)):
         those = [relation for relation in related if len(relation.bits) == size]
         if those:

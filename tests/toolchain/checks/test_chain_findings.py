@@ -231,6 +231,9 @@ def test_bits_that_are_related():
     ring = {f"{a}{b}": [[1, 2], [3, 1]] for a, b in zip("ABCDEFGH", "BCDEFGHA", strict=True)}
     finding = only(checked(network(ring), rng="lfsr24"), Check.RNG_RELATION)
     assert "4 random bits XOR to 0 in every cycle" in finding.what
+    many = network({f"{a}{b}": [[1, 2], [3, 1]] for a in "ABCDEFGHIJKL" for b in "MNOPQRSTUVWX"})
+    finding = only(checked(many), Check.RNG_RELATION)
+    assert "searched among 128 of 144 CDEs" in finding.what
     assert not found(checked(network(ring)), Check.RNG_RELATION)
 
 
