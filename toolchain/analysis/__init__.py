@@ -156,7 +156,7 @@ class AdviceOptions:
     accuracy: Annotated[
         float, typer.Option(help="Mean total variation from exact inference.", min=1e-4, max=0.5)
     ] = 0.01
-    frames: Annotated[int, typer.Option(help="Number of readings.", min=1, max=1000)] = 20
+    frames: Annotated[int, typer.Option(help="Number of readings.", min=1, max=1000)] = 50
     seed: Annotated[int, typer.Option(help="Seed of the readings.", min=0)] = 1
     clock_hz: Annotated[
         float,

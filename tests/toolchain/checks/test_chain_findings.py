@@ -232,8 +232,9 @@ def test_bits_that_are_related():
     finding = only(checked(network(ring), rng="lfsr24"), Check.RNG_RELATION)
     assert "4 random bits XOR to 0 in every cycle" in finding.what
     many = network({f"{a}{b}": [[1, 2], [3, 1]] for a in "ABCDEFGHIJKL" for b in "MNOPQRSTUVWX"})
-    finding = only(checked(many), Check.RNG_RELATION)
-    assert "searched among 128 of 144 CDEs" in finding.what
+    assert any(
+        "searched among 128 of 144 CDEs" in each.what for each in found(checked(many), Check.RNG_RELATION)
+    )
     assert not found(checked(network(ring)), Check.RNG_RELATION)
 
 
