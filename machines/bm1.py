@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,8 +14,28 @@ from machines.parameters import BM1Parameters, RngKind, SensorMode
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
+class MachineContents:
+    """Parameters and tables of a machine, equal to those with the same contents."""
+
+    __slots__: tuple[str, ...] = ()
+    parameters: Any
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        pairs = [(getattr(self, name), getattr(other, name)) for name in self.__slots__]
+        return all(
+            all(map(np.array_equal, one, its)) if isinstance(one, tuple) else np.array_equal(one, its)
+            for one, its in pairs
+        )
+
+    def __hash__(self) -> int:
+        # equal machines have equal ones
+        return hash(self.parameters)
+
+
 @dataclass(frozen=True, eq=False, slots=True)
-class BM1Machine:
+class BM1Machine(MachineContents):
     """A complete machine: parameters and the codes of every cell. Arrays are stored as read-only copies.
 
     Attributes:
@@ -68,21 +88,6 @@ class BM1Machine:
         object.__setattr__(self, "prior", prior)
         object.__setattr__(self, "tables", tuple(tables))
         object.__setattr__(self, "rng_table", checked_rng_table(self.rng_table, parameters.rng))
-
-    def __eq__(self, other: object) -> bool:
-        """Compare parameters and codes."""
-        if not isinstance(other, BM1Machine):
-            return NotImplemented
-        return (
-            self.parameters == other.parameters
-            and np.array_equal(self.prior, other.prior)
-            and all(map(np.array_equal, self.tables, other.tables))
-            and (self.rng_table is None or np.array_equal(self.rng_table, np.asarray(other.rng_table)))
-        )
-
-    def __hash__(self) -> int:
-        """Hash the parameters, which are equal for equal machines."""
-        return hash(self.parameters)
 
 
 SHORTEST_SLICE: Final = 256

@@ -27,6 +27,7 @@ from machines.kind import (
     MachineKind,
     StoppedBoard,
     UsedRegisters,
+    check_frame_value,
 )
 from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
 from machines.posterior import joint_posterior, posterior, posterior_of_lines
@@ -207,8 +208,7 @@ class _OnBoard(BoardMachine):
     """A kernel that reads SENSORS or INPUTS, PRIOR_SELECTS and PRIOR_CODES, and writes RESULTS and OUTCOMES."""
 
     def __init__(self, kernel: BM1Kernel, memory: Mapping[str, memoryview]) -> None:
-        self._kernel = kernel
-        self._memory = memory
+        super().__init__(kernel, memory)
         parameters = self._parameters = kernel.machine.parameters
         self._is_plain = _is_plain(parameters)
         self._sensors = struct.Struct(f"<{parameters.sensors}I")
@@ -283,18 +283,6 @@ class _OnBoard(BoardMachine):
     def paused(self) -> bool:
         return self._kernel.reason is StopReason.SLICE
 
-    @property
-    def resumable(self) -> bool:
-        return self.paused
-
-    @property
-    def reason(self) -> int:
-        return self._kernel.reason
-
-    @property
-    def cycles(self) -> int:
-        return self._kernel.cycles
-
 
 class _Course(FrameCourse):
     """A frame on boards that share the lines of one model, or of its replicas."""
@@ -359,8 +347,12 @@ class _OnHost(HostMachine):
     def begin(self, frame: FrameInput) -> FrameCourse:
         """Return the course of a frame, checked against the whole machine."""
         select, selects = self._prior_selects(frame)
+        parameters = self._parameters
+        check_frame_value("The target count", frame.target_count, 1, parameters.target_count_max)
+        check_frame_value("The most cycles", frame.max_cycles, 1, CYCLES_MAX)
+        check_frame_value("The RNG bank", frame.bank, 0, parameters.rng_banks - 1)
+        check_frame_value("The prior's address", select, 0, parameters.prior_addresses - 1)
         settings = FrameSettings(frame.target_count, frame.max_cycles, frame.bank, select)
-        self._check(settings)
         if frame.stop not in {"slices", "own"}:
             raise StartError(f"The stop rule '{frame.stop}' is unknown: use slices or own")
         if self._is_plain:
@@ -386,17 +378,6 @@ class _OnHost(HostMachine):
             target_count=parameters.target_count_max,
             max_cycles=CYCLES_MAX,
         )
-
-    def _check(self, settings: FrameSettings) -> None:
-        parameters = self._parameters
-        for name, value, lowest, highest in (
-            ("The target count", settings.target_count, 1, parameters.target_count_max),
-            ("The most cycles", settings.max_cycles, 1, CYCLES_MAX),
-            ("The RNG bank", settings.bank, 0, parameters.rng_banks - 1),
-            ("The prior's address", settings.prior_select, 0, parameters.prior_addresses - 1),
-        ):
-            if not lowest <= value <= highest:
-                raise StartError(f"{name} is {value}; this machine takes {lowest} to {highest}")
 
     def _plain_words(self, frame: FrameInput) -> bytes:
         """Return the words of SENSORS, which are the same on every board."""

@@ -1,6 +1,6 @@
 """The data of a BM2: its parameters, tables, the start of a frame, and its stop reasons (thesis 2.1.3)."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from itertools import accumulate
@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from machines.bm1 import checked_codes, checked_rng_table, frozen
+from machines.bm1 import MachineContents, checked_codes, checked_rng_table, frozen
 from machines.errors import ParameterError, StartError
 from machines.parameters import (
     PROB_BITS_MAX,
@@ -20,7 +20,7 @@ from machines.parameters import (
     SampleEvery,
     Sequencer,
     check_parameter,
-    checked_choice,
+    set_choices,
 )
 
 STATE_BITS_MAX: Final = 2048
@@ -111,13 +111,7 @@ class BM2Parameters:
 
     def __post_init__(self) -> None:
         """Check every parameter, convert strings to enum members, and set the default of `steps_per_clock`."""
-        for name, kind in (
-            ("sequencer", Sequencer),
-            ("sample_every", SampleEvery),
-            ("rng", RngKind),
-            ("rng_reset", RngReset),
-        ):
-            object.__setattr__(self, name, checked_choice(name, getattr(self, name), kind))
+        set_choices(self, sequencer=Sequencer, sample_every=SampleEvery, rng=RngKind, rng_reset=RngReset)
         for name in ("cardinalities", "searched", "known"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         object.__setattr__(self, "factors", tuple(map(tuple, self.factors)))
@@ -239,15 +233,6 @@ class BM2Parameters:
         """Shape of the generators' states: [CDEs]."""
         return (self.cdes,)
 
-    @property
-    def seed_sets(self) -> int:
-        """Number of sets of seeds, over all banks and boards."""
-        return self.rng_banks * self.chains
-
-    def seed_set(self, bank: int) -> int:
-        """Return the set of seeds of a bank on this board; no other board has it in any bank."""
-        return bank * self.chains + self.chain
-
     def factor_bits(self, factor: int) -> tuple[int, ...]:
         """Return the state bits of a factor's variables, in rising order: its local bits."""
         bits, offsets = self.bits, self.offsets
@@ -280,13 +265,15 @@ class BM2Parameters:
         """
         if sequencer is not Sequencer.COLOURED:
             return tuple((bit,) for bit in range(self.state_bits) if not known >> bit & 1)
-        members = list(zip(self.colours, self.bits, self.offsets, self.masks, strict=True))
-        moves = (
-            tuple(
-                offset + k
-                for own, bits, offset, mask in members
-                if own == colour and k < bits and not known & mask
+        unknown = [
+            (colour, range(offset, offset + bits))
+            for colour, bits, offset, mask in zip(
+                self.colours, self.bits, self.offsets, self.masks, strict=True
             )
+            if not known & mask
+        ]
+        moves = (
+            tuple(own[k] for own_colour, own in unknown if own_colour == colour and k < len(own))
             for colour in range(max(self.colours) + 1)
             for k in range(max(self.bits))
         )
@@ -294,7 +281,7 @@ class BM2Parameters:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class BM2Machine:
+class BM2Machine(MachineContents):
     """A complete machine: parameters and the tables of its CDEs. Arrays are stored as read-only copies.
 
     Attributes:
@@ -354,21 +341,6 @@ class BM2Machine:
         tables = tuple(cde_table(array, parameters.prob_bits) for array in arrays)
         return cls(parameters, tables, tuple(array > 0 for array in arrays), rng_table)
 
-    def __eq__(self, other: object) -> bool:
-        """Compare parameters, codes and supports."""
-        if not isinstance(other, BM2Machine):
-            return NotImplemented
-        return (
-            self.parameters == other.parameters
-            and all(map(np.array_equal, self.tables, other.tables))
-            and all(map(np.array_equal, self.supports, other.supports))
-            and (self.rng_table is None or np.array_equal(self.rng_table, np.asarray(other.rng_table)))
-        )
-
-    def __hash__(self) -> int:
-        """Hash the parameters, which are equal for equal machines."""
-        return hash(self.parameters)
-
 
 def _check_shape(parameters: BM2Parameters, factor: int, shape: tuple[int, ...]) -> None:
     due = tuple(parameters.cardinalities[variable] for variable in parameters.factors[factor])
@@ -414,30 +386,18 @@ def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np
     Returns:
         uint16[n * 2**(n - 1)] for n bits.
     """
-    bits = [(cardinality - 1).bit_length() for cardinality in factor.shape]
-    n = sum(bits)
-    local = np.arange(1 << n)
-    offsets = list(accumulate(bits, initial=0))
-    codes = [local >> offset & (1 << width) - 1 for offset, width in zip(offsets, bits, strict=False)]
-    used = [code < cardinality for code, cardinality in zip(codes, factor.shape, strict=True)]
-    indices = tuple(np.where(legal, code, 0) for code, legal in zip(codes, used, strict=True))
-    values = factor[indices]
-    others = np.arange(1 << n >> 1)
-    half = 1 << (prob_bits - 1)
-    tables = []
-    for variable, width in enumerate(bits):
-        rest = np.all(used[:variable] + used[variable + 1 :], axis=0) if len(used) > 1 else np.array(True)
-        for j in range(offsets[variable], offsets[variable] + width):
-            zero = others >> j << (j + 1) | others & (1 << j) - 1
-            one = zero | 1 << j
-            with np.errstate(invalid="ignore"):
-                code = np.floor((1 << prob_bits) * (values[one] / (values[one] + values[zero])) + 0.5)
-            code = np.clip(np.where(np.isnan(code), half, code), 1, (1 << prob_bits) - 1)
-            # a code with the bit set is the larger one, so it alone can be the unused one of the two
-            code = np.where(used[variable][one], code, 1)
-            comparable = used[variable][zero] & np.broadcast_to(rest, local.shape)[zero]
-            tables.append(np.where(comparable, code, half))
-    return np.concatenate([*tables, np.empty(0)]).astype(np.uint16)
+    # NaN at unused codes: what is computed with one is NaN, too
+    unused = [(0, (1 << (cardinality - 1).bit_length()) - cardinality) for cardinality in factor.shape]
+    values = np.pad(factor, unused, constant_values=np.nan).ravel(order="F")
+    tables = [np.empty(0)]
+    for j in range(values.size.bit_length() - 1):
+        zero, one = values.reshape(-1, 2, 1 << j).swapaxes(0, 1).reshape(2, -1)
+        with np.errstate(invalid="ignore"):
+            code = np.floor((1 << prob_bits) * (one / (one + zero)) + 0.5)
+        code = np.where(np.isnan(code), 1 << (prob_bits - 1), np.clip(code, 1, (1 << prob_bits) - 1))
+        # a code with the bit set is the larger one, so it alone can be the unused one of the two
+        tables.append(np.where(np.isnan(one) & ~np.isnan(zero), 1, code))
+    return np.concatenate(tables).astype(np.uint16)
 
 
 def pack(parameters: BM2Parameters, values: Sequence[int]) -> int:
@@ -493,23 +453,22 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
     ]
     if not _propagate(zeros, of_variable, domains, range(len(zeros))):
         return None
-    # One entry per variable on the path: the domains before it, and the values to try. The first complete
-    # path is the answer, since variables and values are tried in order.
-    path: list[tuple[list[npt.NDArray[np.bool_]], Iterator[int]]] = []
-    dead_ends = 0
-    while len(path) < len(domains):
-        values = np.flatnonzero(domains[len(path)]).tolist()
-        path.append((domains, iter(values[::-1] if largest else values)))
-        while path:
-            before, left = path[-1]
-            value = next(left, None)
-            if value is None:
-                path.pop()
-                continue
-            variable = len(path) - 1
+    # Values that are still to try, the next one last: the domains, a variable before which all have one value, and
+    # its value. The first complete state is the answer, since variables and values are tried in order.
+    due: list[tuple[list[npt.NDArray[np.bool_]], int, int]] = []
+    variable = dead_ends = 0
+    while True:
+        while variable < len(domains) and domains[variable].sum() == 1:
+            variable += 1
+        if variable == len(domains):
+            return pack(parameters, [int(domain.argmax()) for domain in domains])
+        values = np.flatnonzero(domains[variable]).tolist()
+        due += [(domains, variable, value) for value in (values if largest else reversed(values))]
+        while due:
+            before, variable, value = due.pop()
             domains = list(before)
             domains[variable] = np.arange(len(before[variable])) == value
-            if before[variable].sum() == 1 or _propagate(zeros, of_variable, domains, of_variable[variable]):
+            if _propagate(zeros, of_variable, domains, of_variable[variable]):
                 break
             dead_ends += 1
             if dead_ends > DEAD_ENDS_MAX:
@@ -519,7 +478,6 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
                 )
         else:
             return None
-    return pack(parameters, [int(domain.argmax()) for domain in domains])
 
 
 def _propagate(

@@ -26,8 +26,8 @@ from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, pac
 from machines.bm2_kernel import BM2Kernel
 from machines.errors import MachineError
 from machines.fast_code import jit, jump
-from machines.parameters import CYCLES_MAX, RngKind, RngReset, SampleEvery, Sequencer
-from machines.rng import LFSR, POLYNOMIALS, Words, jump_tables, random_numbers
+from machines.parameters import CYCLES_MAX, RngKind, SampleEvery, Sequencer
+from machines.rng import LFSR, POLYNOMIALS, Words, jump_tables, sequencer_seed
 
 CHUNK: Final = 32
 """Number of cycles that are looked at together: the bits of a mask."""
@@ -111,13 +111,11 @@ class FastBM2(BM2Kernel):
             raise MachineError(
                 f"The fast kernel supports only LFSRs; this machine has rng = {parameters.rng}; use the reference kernel."
             )
-        self._random_numbers = random_numbers(machine)
         self._jumps = jump_tables(parameters.rng, parameters.steps_per_clock).copy()
         self._wiring = wiring_of(machine)
         self._kept_moves: dict[tuple[int, Sequencer], Moves] = {}
-        # Those of the frame, and the generators' states in its cycle 0.
-        self._moves = moves_of(parameters, 0, Sequencer.LINEAR)
         self._settings = np.zeros(7, dtype=np.int64)
+        # the generators' states in cycle 0 of the frame
         self._starts = np.zeros(parameters.cdes, dtype=np.uint64)
         self._chain = Chain(
             control=np.zeros(13, dtype=np.int64),
@@ -125,7 +123,7 @@ class FastBM2(BM2Kernel):
             addresses=np.zeros(parameters.cdes + 1, dtype=np.uint64),
             pending=np.zeros(parameters.state_bits, dtype=np.uint64),
             numbers=aligned((parameters.cdes, row_size(parameters)), np.uint16),
-            results=np.zeros(parameters.result_words, dtype=np.int64),
+            results=self._results,
             stream=np.zeros((min(parameters.stream, STREAM_ROOM), parameters.state_words), dtype=np.uint32),
         )
         self.reset()
@@ -133,12 +131,7 @@ class FastBM2(BM2Kernel):
     @property
     def state(self) -> int:
         """The packed state after the last cycle."""
-        return pack(self._machine.parameters, self._chain.values.tolist())
-
-    @property
-    def results(self) -> npt.NDArray[np.uint32]:
-        """A copy of the result words: uint32[result_words], histograms, then the joint."""
-        return np.array(self._chain.results, dtype=np.uint32)
+        return pack(self._parameters, self._chain.values.tolist())
 
     @property
     def rng_state(self) -> Words:
@@ -146,7 +139,7 @@ class FastBM2(BM2Kernel):
         # `start` sets the public number of cycles to 0 before free generators go on
         cycles = int(self._chain.control[ORIGIN] + self._chain.control[AT])
         states = np.empty_like(self._starts)
-        jump(self._jumps, self._starts, cycles % LFSR(self._machine.parameters.rng).period, states)
+        jump(self._jumps, self._starts, cycles % LFSR(self._parameters.rng).period, states)
         return states
 
     @property
@@ -159,28 +152,17 @@ class FastBM2(BM2Kernel):
         """A copy of the stream's buffer: uint32[samples since the last start or resume, state_words]."""
         return self._chain.stream[: self._chain.control[STREAMED]].copy()
 
-    def _reset(self) -> None:
-        self._chain.control[:] = 0
-        self._chain.values[:] = 0
-        self._chain.results[:] = 0
-        self._restart(0)
-
     def _restart(self, bank: int) -> None:
-        parameters = self._machine.parameters
         self._starts = self._random_numbers.restart(bank)
-        number = np.array([parameters.seed_set(bank)], dtype=np.uint64)
-        self._chain.control[ORDER] = LFSR(RngKind.LFSR16).seeds(number)[0]
+        self._chain.control[:] = 0
+        self._chain.control[ORDER] = sequencer_seed(self._parameters, bank)
 
     def _load(self, start: BM2Start) -> None:
-        parameters, chain = self._machine.parameters, self._chain
+        parameters, chain = self._parameters, self._chain
         control = chain.control
-        if parameters.rng_reset is RngReset.BANK:
-            self._restart(start.bank)
-        else:
-            self._starts = self.rng_state
+        self._starts = self.rng_state
         control[:ORDER] = 0
         control[BURN_IN], control[TIMED_OUT] = start.burn_in, -1
-        chain.results[:] = 0
         load_state(parameters, start.state, chain.values, chain.addresses)
         fill(self._wiring, chain.numbers, self._starts, parameters.ones_code)
 
@@ -209,7 +191,7 @@ class FastBM2(BM2Kernel):
         self._settings[PAUSE_AT] = pause_at or CYCLES_MAX
         control[REASON] = ROOM
         while control[REASON] == ROOM:
-            stream, size = self._chain.stream, self._machine.parameters.stream
+            stream, size = self._chain.stream, self._parameters.stream
             if control[STREAMED] == len(stream) < size:
                 larger = np.zeros_like(stream, shape=(min(2 * len(stream), size), stream.shape[1]))
                 larger[: len(stream)] = stream

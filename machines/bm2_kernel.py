@@ -8,7 +8,8 @@ import numpy.typing as npt
 from machines.bm2 import SAMPLES_MAX, BM2Machine, BM2Parameters, BM2Start, BM2StopReason, unpack
 from machines.errors import StartError
 from machines.kernel import check_start_value
-from machines.parameters import CYCLES_MAX, Sequencer
+from machines.parameters import CYCLES_MAX, RngReset, Sequencer
+from machines.rng import random_numbers
 
 
 class BM2Kernel(ABC):
@@ -18,8 +19,10 @@ class BM2Kernel(ABC):
     """
 
     def __init__(self, machine: BM2Machine) -> None:
-        self._machine = machine
-        self._clear()
+        self.machine = machine
+        self._parameters = machine.parameters
+        self._random_numbers = random_numbers(machine)
+        self._results = np.zeros(machine.parameters.result_words, dtype=np.int64)
 
     def _clear(self) -> None:
         # Set by each kernel's `_run`; counted since the frame's start.
@@ -31,14 +34,6 @@ class BM2Kernel(ABC):
         self.reason = BM2StopReason.NONE
         self.timed_out_bit = -1
         """After `OPS_TIMEOUT`: the lowest-numbered bit of the move that was not written."""
-        # The registers of the frame; `resume` changes the samples.
-        self._samples_due = 0
-        self._max_cycles = 1
-
-    @property
-    def machine(self) -> BM2Machine:
-        """The machine that this kernel runs."""
-        return self._machine
 
     @property
     @abstractmethod
@@ -46,9 +41,9 @@ class BM2Kernel(ABC):
         """The packed state after the last cycle."""
 
     @property
-    @abstractmethod
     def results(self) -> npt.NDArray[np.uint32]:
         """A copy of the result words: uint32[result_words], histograms, then the joint."""
+        return self._results.astype(np.uint32)
 
     @property
     @abstractmethod
@@ -67,12 +62,19 @@ class BM2Kernel(ABC):
 
     def reset(self) -> None:
         """Set state, results and cycles to 0, and restart the generators from bank 0."""
-        self._clear()
-        self._reset()
+        self._begin(
+            BM2Start(state=0, known=0, samples=0, burn_in=0, ops_timeout=1, max_cycles=1), restarts=True
+        )
 
-    def prepare(self) -> None:
-        """Do in advance the work that would slow down the first frames, and reset the machine."""
-        self.reset()
+    def _begin(self, start: BM2Start, *, restarts: bool) -> None:
+        self._clear()
+        self._samples_due = start.samples
+        self._max_cycles = start.max_cycles
+        self._results[:] = 0
+        self._empty_stream()
+        if restarts:
+            self._restart(start.bank)
+        self._load(start)
 
     def start(self, start: BM2Start, pause_at: int = 0) -> BM2StopReason:
         """Run a new frame, from its start state to a stop.
@@ -84,12 +86,9 @@ class BM2Kernel(ABC):
         Raises:
             StartError: The start does not fit the machine; nothing has changed.
         """
-        check_bm2_start(self._machine.parameters, start)
+        check_bm2_start(self._parameters, start)
         check_start_value("pause_at", pause_at, 0, CYCLES_MAX)
-        self._clear()
-        self._samples_due = start.samples
-        self._max_cycles = start.max_cycles
-        self._load(start)
+        self._begin(start, restarts=self._parameters.rng_reset is RngReset.BANK)
         if start.samples:
             self._run(pause_at)
         else:
@@ -142,12 +141,12 @@ class BM2Kernel(ABC):
         return self.reason
 
     @abstractmethod
-    def _reset(self) -> None:
-        """Set state and results to 0, empty the stream's buffer, and restart the generators from bank 0."""
+    def _restart(self, bank: int) -> None:
+        """Restart all generators from a bank, also that of the sequencer."""
 
     @abstractmethod
     def _load(self, start: BM2Start) -> None:
-        """Clear the results, empty the stream's buffer, load state and sequencer; restart the generators unless free."""
+        """Load state and sequencer; results and stream's buffer are empty."""
 
     @abstractmethod
     def _empty_stream(self) -> None:

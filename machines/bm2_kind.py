@@ -1,6 +1,7 @@
 """BM2 as a machine kind: its sections, registers, the batches or the stream of a frame, and its posterior (thesis 2.1.3)."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, ClassVar, Final
 
@@ -25,6 +26,7 @@ from machines.kind import (
     MachineKind,
     StoppedBoard,
     UsedRegisters,
+    check_frame_value,
 )
 from machines.parameters import CYCLES_MAX, RngKind, RngReset, SampleEvery, Sequencer
 
@@ -157,7 +159,7 @@ class BM2Kind(MachineKind):
                 stream = np.frombuffer(kept.stream, "<u4").reshape(-1, parameters.state_words)
                 values = searched_values(parameters, stream)
             chains.append(Chain(BM2StopReason(board.reason), counts, values))
-        totals = [kept.samples[-1] - kept.unused[-1] for kept in every]
+        totals = [kept.samples - kept.unused for kept in every]
         found = estimate(chains)
         left_out = "; ".join(
             _why_left_out(number, results[number].reason, every[number], variables)
@@ -169,8 +171,8 @@ class BM2Kind(MachineKind):
             return Inference(results, None, totals, f"no posterior: {why}")
         counted = [kept for number, kept in enumerate(every) if number not in found.left_out]
         details = {
-            "samples": str(sum(kept.samples[-1] for kept in counted)),
-            "unused": str(sum(kept.unused[-1] for kept in counted)),
+            "samples": str(sum(kept.samples for kept in counted)),
+            "unused": str(sum(kept.unused for kept in counted)),
             "effective_samples": f"{found.effective_samples:.0f}",
             "standard_error": f"{0.0 if found.error is None else found.error.max():.4g}",
         }
@@ -199,14 +201,19 @@ class BM2Kind(MachineKind):
         self, machines: Sequence[BM2Machine], frame: FrameInput, variables: Sequence[str] = ()
     ) -> npt.NDArray[np.float64]:
         """Run the chains one after the other in this process, as boards run them."""
-        boards = [_InProcess(machine) for machine in machines]
-        course = self.on_host(machines).begin(frame)
-        for board, blocks in zip(boards, course.starts, strict=True):
-            board.start(course.settings, blocks)
-        while going := course.proceed(boards)[0]:
-            for number in going:
-                boards[number].resume(course.settings)
-        inference = self.infer(course.conclude([board.result() for board in boards]), variables)
+        starts, settings = _OnHost(machines).starts(frame)
+        results = []
+        for machine, blocks in zip(machines, starts, strict=True):
+            # a stream changes nothing but the way of the samples to the host
+            parameters = replace(machine.parameters, stream=0)
+            kernel = make_bm2_kernel(replace(machine, parameters=parameters))
+            kernel.start(_start_of(parameters, blocks, settings))
+            kept = Kept(parameters, kernel.samples, kernel.unused, kernel.timed_out_bit)
+            words = kernel.results.astype("<u4").tobytes()
+            results.append(
+                BoardResult(words, kernel.cycles, kernel.reason, kept=msgspec.msgpack.encode(kept))
+            )
+        inference = self.infer(results, variables)
         if inference.posterior is None:
             raise NoPosteriorError(f"There is {inference.outcome}.")
         return inference.posterior
@@ -224,16 +231,32 @@ def _settings_blocks(parameters: BM2Parameters) -> Blocks:
     return dict(zip(_SETTINGS, map(_word, (parameters.burn_in, parameters.ops_timeout, order)), strict=True))
 
 
+def _start_of(
+    parameters: BM2Parameters, blocks: Mapping[str, bytes | memoryview], settings: FrameSettings
+) -> BM2Start:
+    """Return the start that a host writes to the blocks of a board, some of which have room for a larger state."""
+
+    def value(block: str) -> int:
+        # a frame without a start state has no words for it
+        return int.from_bytes(blocks.get(block, b"")[: 4 * parameters.state_words], "little")
+
+    order = value("ORDER")
+    if settings.prior_select or order >= len(_ORDERS):
+        raise StartError(f"the order is {order} and the prior's address {settings.prior_select}")
+    return BM2Start(
+        state=value("START_STATE"),
+        known=value("KNOWN_MASK"),
+        samples=settings.target_count,
+        burn_in=value("BURN_IN"),
+        ops_timeout=value("OPS_TIMEOUT"),
+        max_cycles=settings.max_cycles,
+        bank=settings.bank,
+        sequencer=_ORDERS[order],
+    )
+
+
 class _OnBoard(BoardMachine):
     """A kernel that reads state, mask and settings from their blocks, and writes the blocks of its answer."""
-
-    def __init__(self, kernel: BM2Kernel, memory: Mapping[str, memoryview]) -> None:
-        self._kernel = kernel
-        self._memory = memory
-        self._state_bytes = 4 * kernel.machine.parameters.state_words
-
-    def prepare(self) -> None:
-        self._kernel.prepare()
 
     def reset(self) -> None:
         self._kernel.reset()
@@ -241,25 +264,12 @@ class _OnBoard(BoardMachine):
 
     def start(self, settings: FrameSettings, end: int) -> None:
         self._check_run_until()
-        order = self._value("ORDER")
-        if settings.prior_select or order >= len(_ORDERS):
-            raise StartError(f"the order is {order} and the prior's address {settings.prior_select}")
-        start = BM2Start(
-            state=self._state("START_STATE"),
-            known=self._state("KNOWN_MASK"),
-            samples=settings.target_count,
-            burn_in=self._value("BURN_IN"),
-            ops_timeout=self._value("OPS_TIMEOUT"),
-            max_cycles=settings.max_cycles,
-            bank=settings.bank,
-            sequencer=_ORDERS[order],
-        )
-        self._kernel.start(start, end)
+        self._kernel.start(_start_of(self._kernel.machine.parameters, self._memory, settings), end)
         self._show()
 
     def resume(self, end: int) -> None:
         self._check_run_until()
-        self._kernel.resume(self._value("TARGET_COUNT"), end)
+        self._kernel.resume(int.from_bytes(self._memory["TARGET_COUNT"], "little"), end)
         self._show()
 
     def step(self, end: int) -> None:
@@ -269,12 +279,6 @@ class _OnBoard(BoardMachine):
     def _check_run_until(self) -> None:
         if any(self._memory["RUN_UNTIL"]):
             raise StartError("this machine has no slices: RUN_UNTIL must be 0")
-
-    def _state(self, block: str) -> int:
-        return int.from_bytes(self._memory[block][: self._state_bytes], "little")
-
-    def _value(self, block: str) -> int:
-        return int.from_bytes(self._memory[block], "little")
 
     def _show(self) -> None:
         """Copy the results to the registers."""
@@ -296,71 +300,35 @@ class _OnBoard(BoardMachine):
     def resumable(self) -> bool:
         return self._kernel.reason in {BM2StopReason.SAMPLES, BM2StopReason.FULL}
 
-    @property
-    def reason(self) -> int:
-        return self._kernel.reason
 
-    @property
-    def cycles(self) -> int:
-        return self._kernel.cycles
-
-
-class _InProcess:
-    """A machine whose registers are blocks of this process."""
-
-    def __init__(self, machine: BM2Machine) -> None:
-        used = BM2.registers(machine.parameters)
-        words = {
-            used.inputs: used.input_words,
-            "TARGET_COUNT": 1,
-            "RUN_UNTIL": 2,
-            **used.written,
-            **used.answer,
-        }
-        self._memory = {name: memoryview(bytearray(4 * count)) for name, count in words.items()}
-        self._board = _OnBoard(BM2.kernel(machine), self._memory)
-        self._used = used
-        # those of `StoppedBoard`
-        self.reasons: tuple[int, ...] = ()
-        self.answer = memoryview(b"")
-
-    def start(self, settings: FrameSettings, blocks: Blocks) -> None:
-        for name, words in blocks.items():
-            self._memory[name][:] = words
-        self._board.start(settings, 0)
-        self._stop()
-
-    def resume(self, settings: FrameSettings) -> None:
-        self._memory["TARGET_COUNT"][:] = _word(settings.target_count)
-        self._board.resume(0)
-        self._stop()
-
-    def _stop(self) -> None:
-        self.reasons = (self._board.reason,)
-        self.answer = memoryview(b"".join(self._memory[name] for name in self._used.answer))
-
-    def result(self) -> BoardResult:
-        return BoardResult(bytes(self._memory["RESULTS"]), self._board.cycles, self._board.reason)
-
-
-class Kept(msgspec.Struct, frozen=True, array_like=True):
+class Kept(msgspec.Struct, array_like=True):
     """What a frame leaves of one board, beside its last results.
 
     Attributes:
         parameters: The parameters of its machine.
-        samples: Samples drawn at the end of each batch; with a stream, at the end of the frame.
+        samples: Samples drawn so far.
         unused: Those of them that are in no histogram.
-        batches: The result words at the end of each batch but the last, whose are `BoardResult.words`.
         timed_out_bit: The bit on which the CDEs did not agree; -1: none.
+        batches: The result words at the end of each batch without a stream; in a `BoardResult` without the last ones.
         stream: The sampled states, `state_words` words each.
     """
 
     parameters: BM2Parameters
-    samples: list[int]
-    unused: list[int]
-    batches: list[bytes]
-    timed_out_bit: int
-    stream: bytes
+    samples: int = 0
+    unused: int = 0
+    timed_out_bit: int = -1
+    batches: list[bytes] = msgspec.field(default_factory=list)
+    stream: bytearray = msgspec.field(default_factory=bytearray)
+
+    def add(self, answer: memoryview) -> None:
+        """Add an answer of the board: the words of `UsedRegisters.answer`."""
+        end = 4 * self.parameters.result_words
+        self.samples, self.unused, bit, *streamed = np.frombuffer(answer[end : end + 16], "<u4").tolist()
+        self.timed_out_bit = -1 if bit == _NO_BIT else bit
+        if streamed:
+            self.stream += answer[end + 16 : end + 16 + 4 * self.parameters.state_words * streamed[0]]
+        else:
+            self.batches.append(bytes(answer[:end]))
 
 
 def _kept(board: BoardResult) -> Kept:
@@ -374,7 +342,6 @@ def _kept(board: BoardResult) -> Kept:
     if (
         sizes != {4 * parameters.result_words}
         or len(kept.stream) % (4 * parameters.state_words)
-        or not len(kept.samples) == len(kept.unused) == len(kept.batches) + 1
         or board.reason not in BM2.reasons
         or not -1 <= kept.timed_out_bit < parameters.state_bits
     ):
@@ -402,19 +369,14 @@ class _Course(FrameCourse):
     ) -> None:
         self.starts = starts
         self.begun = self.end = 0
-        self._parameters = [machine.parameters for machine in machines]
         total = settings.target_count
-        batches = 1 if self._parameters[0].stream else BATCHES
+        batches = 1 if machines[0].parameters.stream else BATCHES
         # the samples at which each batch ends; several may be the same if there are few samples
         self._targets = sorted({total * (at + 1) // batches for at in range(batches)} - {0}) or [0]
         self._settings = settings
         self._take_target()
-
-        # Of each board: the boards that may go on, and its answers so far.
+        self._kept = [Kept(machine.parameters) for machine in machines]
         self._running = list(range(len(machines)))
-        self._answers: list[list[tuple[int, int, bytes]]] = [[] for _ in machines]
-        self._timed_out = [-1] * len(machines)
-        self._streams = [bytearray() for _ in machines]
 
     def _take_target(self) -> None:
         self.settings = self._settings._replace(target_count=self._targets.pop(0))
@@ -423,42 +385,19 @@ class _Course(FrameCourse):
         """Resume with the next batch the boards that have drawn all samples, and those whose streams are full."""
         going = {BM2StopReason.FULL} if not self._targets else {BM2StopReason.FULL, BM2StopReason.SAMPLES}
         for number in self._running:
-            self._keep(number, boards[number].answer)
+            self._kept[number].add(boards[number].answer)
         self._running = [number for number in self._running if boards[number].reasons[0] in going]
         if self._running and self._targets:
             self._take_target()
         return self._running, {}
 
-    def _keep(self, number: int, answer: memoryview) -> None:
-        parameters = self._parameters[number]
-        end = 4 * parameters.result_words
-        samples, unused, bit, *streamed = np.frombuffer(answer[end : end + 16], "<u4").tolist()
-        self._timed_out[number] = -1 if bit == _NO_BIT else bit
-        if streamed:
-            size = 4 * parameters.state_words * streamed[0]
-            self._streams[number] += answer[end + 16 : end + 16 + size]
-            self._answers[number].clear()
-        self._answers[number].append((samples, unused, b"" if streamed else bytes(answer[:end])))
-
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:
         """Add what is known of the chains."""
+        for kept in self._kept:
+            del kept.batches[-1:]
         return [
-            msgspec.structs.replace(
-                result,
-                kept=msgspec.msgpack.encode(
-                    Kept(
-                        parameters=parameters,
-                        samples=[samples for samples, _, _ in answers],
-                        unused=[unused for _, unused, _ in answers],
-                        batches=[words for _, _, words in answers[:-1]],
-                        timed_out_bit=bit,
-                        stream=bytes(stream),
-                    )
-                ),
-            )
-            for result, parameters, answers, bit, stream in zip(
-                results, self._parameters, self._answers, self._timed_out, self._streams, strict=True
-            )
+            msgspec.structs.replace(result, kept=msgspec.msgpack.encode(kept))
+            for result, kept in zip(results, self._kept, strict=True)
         ]
 
 
@@ -476,14 +415,14 @@ class _OnHost(HostMachine):
 
     def begin(self, frame: FrameInput) -> FrameCourse:
         """Return the course of a frame; its boards start from the smallest and the largest state by turns."""
+        return _Course(*self.starts(frame), self._machines)
+
+    def starts(self, frame: FrameInput) -> tuple[Sequence[Blocks], FrameSettings]:
+        """Return the blocks of each board and the settings of a whole frame; a StartError if it does not fit."""
         parameters = self._parameters
-        for name, value, lowest, highest in (
-            ("The number of samples", frame.target_count, 1, SAMPLES_MAX),
-            ("The most cycles", frame.max_cycles, 1, CYCLES_MAX),
-            ("The RNG bank", frame.bank, 0, parameters.rng_banks - 1),
-        ):
-            if not lowest <= value <= highest:
-                raise StartError(f"{name} is {value}; this machine takes {lowest} to {highest}")
+        check_frame_value("The number of samples", frame.target_count, 1, SAMPLES_MAX)
+        check_frame_value("The most cycles", frame.max_cycles, 1, CYCLES_MAX)
+        check_frame_value("The RNG bank", frame.bank, 0, parameters.rng_banks - 1)
         if frame.prior_codes is not None:
             raise StartError("The frame has a written prior, but the prior of the machine is in its tables")
         if frame.target_count * self._stream_bytes > STREAM_BYTES_MAX:
@@ -495,7 +434,7 @@ class _OnHost(HostMachine):
         # no state agrees with the readings: the boards are asked for no samples
         samples = frame.target_count if starts else 0
         settings = FrameSettings(samples, frame.max_cycles, frame.bank, 0)
-        return _Course(starts or [self._blocks] * len(self._machines), settings, self._machines)
+        return starts or [self._blocks] * len(self._machines), settings
 
     def slowest(self) -> FrameInput:
         """Return a frame without readings, in which all bits are sampled."""

@@ -5,8 +5,8 @@ import numpy.typing as npt
 
 from machines.bm2 import BM2Machine, BM2Start, BM2StopReason, unpack
 from machines.bm2_kernel import BM2Kernel
-from machines.parameters import RngKind, RngReset, SampleEvery, Sequencer
-from machines.rng import LFSR, random_numbers
+from machines.parameters import RngKind, SampleEvery, Sequencer
+from machines.rng import LFSR, sequencer_seed
 
 _SEQUENCER_STEPS = 16
 
@@ -16,8 +16,7 @@ class ReferenceBM2(BM2Kernel):
 
     def __init__(self, machine: BM2Machine) -> None:
         super().__init__(machine)
-        parameters = self._parameters = machine.parameters
-        self._random_numbers = random_numbers(machine)
+        parameters = machine.parameters
         self._factor_bits = [parameters.factor_bits(factor) for factor in range(parameters.cdes)]
         # the CDEs whose factor has the bit, for each bit of the state
         self._concerned = [
@@ -32,11 +31,6 @@ class ReferenceBM2(BM2Kernel):
         return self._state
 
     @property
-    def results(self) -> npt.NDArray[np.uint32]:
-        """A copy of the result words: uint32[result_words], histograms, then the joint."""
-        return self._results.copy()
-
-    @property
     def rng_state(self) -> npt.NDArray[np.uint64]:
         """A copy of the generators' states: uint64[CDEs]."""
         return self._states.copy()
@@ -44,7 +38,7 @@ class ReferenceBM2(BM2Kernel):
     @property
     def sequencer_state(self) -> int:
         """The state of the sequencer's own generator, which only moves in `random` order."""
-        return int(self._order_state[0])
+        return int(self._order_state)
 
     @property
     def stream(self) -> npt.NDArray[np.uint32]:
@@ -53,15 +47,13 @@ class ReferenceBM2(BM2Kernel):
         packed = b"".join(state.to_bytes(4 * words, "little") for state in self._stream)
         return np.frombuffer(packed, "<u4").astype(np.uint32).reshape(-1, words)
 
-    def _reset(self) -> None:
-        self._restart(0)
-        self._load_state(0)
+    def _restart(self, bank: int) -> None:
+        self._states = self._random_numbers.restart(bank)
+        self._order_state = np.array(sequencer_seed(self._parameters, bank), dtype=np.uint64)
 
     def _load(self, start: BM2Start) -> None:
         parameters = self._parameters
-        if parameters.rng_reset is RngReset.BANK:
-            self._restart(start.bank)
-        self._load_state(start.state)
+        self._state = start.state
         self._unknown = [
             variable for variable, mask in enumerate(parameters.masks) if mask and not start.known & mask
         ]
@@ -71,16 +63,6 @@ class ReferenceBM2(BM2Kernel):
         self._burn_in = start.burn_in  # sweeps left
         self._move = 0  # number of the move within the sweep
         self._begin_move()
-
-    def _restart(self, bank: int) -> None:
-        self._states = self._random_numbers.restart(bank)
-        number = np.array([self._parameters.seed_set(bank)], dtype=np.uint64)
-        self._order_state = LFSR(RngKind.LFSR16).seeds(number)
-
-    def _load_state(self, state: int) -> None:
-        self._state = state
-        self._results = np.zeros(self._parameters.result_words, dtype=np.uint32)
-        self._empty_stream()
 
     def _empty_stream(self) -> None:
         self._stream: list[int] = []
@@ -130,7 +112,7 @@ class ReferenceBM2(BM2Kernel):
         local_bits = self._factor_bits[cde]
         others = [self._state >> other & 1 for other in local_bits if other != bit]
         address = local_bits.index(bit) << len(others) | sum(value << at for at, value in enumerate(others))
-        return int(self._machine.tables[cde][address])
+        return int(self.machine.tables[cde][address])
 
     def _end_move(self) -> BM2StopReason:
         """Take a sample if one is due, and point at the next bits."""

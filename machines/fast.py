@@ -95,7 +95,7 @@ class FastBM1(BM1Kernel):
     @property
     def counts(self) -> npt.NDArray[np.uint32]:
         """A copy of the counters: uint32[lines], with several replicas uint32[replicas, lines]."""
-        return self._frame.counts.reshape(self._machine.parameters.count_shape).copy()
+        return self._frame.counts.reshape(self.machine.parameters.count_shape).copy()
 
     @property
     def rng_state(self) -> npt.NDArray[np.uint64]:
@@ -112,7 +112,7 @@ class FastBM1(BM1Kernel):
     def prepare(self) -> None:
         """Fill the cache for the first `PREPARED_CYCLES` cycles of every bank, in at most 0.1 s."""
         blocks = min(self.kept_cycles, PREPARED_CYCLES) // BLOCK_CYCLES
-        for bank in range(self._machine.parameters.rng_banks if blocks else 0):
+        for bank in range(self.machine.parameters.rng_banks if blocks else 0):
             self._restart(bank)
             fill_blocks(self._generators, self._store, self._frame, self._first_slot, blocks, self._period)
         self.reset()
@@ -123,13 +123,13 @@ class FastBM1(BM1Kernel):
         self._restart(0)
 
     def _start(self, start: Start) -> None:
-        parameters = self._machine.parameters
+        parameters = self.machine.parameters
         if parameters.rng_reset is RngReset.BANK:
             self._restart(int(start.bank))
         else:
             self._frame.starts[:] = self.rng_state
         self._free_rows()
-        codes = addressed_codes(self._machine, start)
+        codes = addressed_codes(self.machine, start)
         # One call for all replicas, because passing a machine's arrays costs as much as a block of its
         # cycles.
         self._rows = begin(

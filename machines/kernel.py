@@ -19,17 +19,12 @@ class BM1Kernel(ABC):
     """
 
     def __init__(self, machine: BM1Machine) -> None:
-        self._machine = machine
+        self.machine = machine
         self._cycles = [0] * machine.parameters.replicas
         self._reasons = [StopReason.NONE] * machine.parameters.replicas
         self._halted: set[int] = set()
         self._target_count = 1
         self._max_cycles = 1
-
-    @property
-    def machine(self) -> BM1Machine:
-        """The machine that this kernel runs."""
-        return self._machine
 
     @property
     def cycles(self) -> int:
@@ -80,7 +75,7 @@ class BM1Kernel(ABC):
         Raises:
             StartError: The start does not fit the machine; nothing has changed.
         """
-        check_start(self._machine.parameters, start)
+        check_start(self.machine.parameters, start)
         self._target_count = int(start.target_count)
         self._max_cycles = int(start.max_cycles)
         self._halted = set()

@@ -19,6 +19,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from machines.errors import StartError
+
 Blocks: TypeAlias = Mapping[str, bytes]
 """Words to write, by the name of their block in the register map."""
 
@@ -152,9 +154,13 @@ class BoardMachine(ABC):
     All three stop at cycle `end` at the latest (0: no such limit), with the results in `UsedRegisters.answer`.
     """
 
-    @abstractmethod
+    def __init__(self, kernel: Any, memory: Mapping[str, memoryview]) -> None:
+        self._kernel = kernel
+        self._memory = memory
+
     def prepare(self) -> None:
         """Do in advance the work that would slow down the first frames, and reset the machine."""
+        self.reset()
 
     @abstractmethod
     def reset(self) -> None:
@@ -178,19 +184,19 @@ class BoardMachine(ABC):
         """True if the machine has stopped only because of `end`, and `step` continues."""
 
     @property
-    @abstractmethod
     def resumable(self) -> bool:
         """True if a host may resume the frame."""
+        return self.paused
 
     @property
-    @abstractmethod
     def reason(self) -> int:
         """The stop reason of the machine: a key of `MachineKind.reasons`."""
+        return int(self._kernel.reason)
 
     @property
-    @abstractmethod
     def cycles(self) -> int:
         """Cycles of this frame."""
+        return int(self._kernel.cycles)
 
 
 class StoppedBoard(Protocol):
@@ -227,6 +233,12 @@ class FrameCourse(ABC):
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:
         """Return the results of the frame with what the course has kept of its slices."""
         return results
+
+
+def check_frame_value(name: str, value: int, lowest: int, highest: int) -> None:
+    """Refuse a value of a frame that is not from `lowest` to `highest`."""
+    if not lowest <= value <= highest:
+        raise StartError(f"{name} is {value}; this machine takes {lowest} to {highest}")
 
 
 class HostMachine(ABC):

@@ -2,11 +2,9 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final, TypeVar
+from typing import ClassVar, Final
 
 from machines.errors import ParameterError
-
-_Choice = TypeVar("_Choice", bound=StrEnum)
 
 PROB_BITS_MAX: Final = 16
 """Maximum width of a code in bits, because tables contain uint16."""
@@ -130,16 +128,13 @@ class BM1Parameters:
     ideal_seed: int = 0
     sensor_mode: SensorMode = SensorMode.COLUMN
     replicas: int = 1
+    # all boards have the seeds of board 0
+    chain: ClassVar = 0
+    chains: ClassVar = 1
 
     def __post_init__(self) -> None:
         """Check every parameter, convert strings to enum members, and set the default of `steps_per_clock`."""
-        for name, kind in (
-            ("prior_mode", PriorMode),
-            ("rng", RngKind),
-            ("rng_reset", RngReset),
-            ("sensor_mode", SensorMode),
-        ):
-            object.__setattr__(self, name, checked_choice(name, getattr(self, name), kind))
+        set_choices(self, prior_mode=PriorMode, rng=RngKind, rng_reset=RngReset, sensor_mode=SensorMode)
         object.__setattr__(self, "sensor_bits", tuple(self.sensor_bits))
         check_parameter("lines", self.lines, 1, 2**32 - 1)
         for column, bits in enumerate(self.sensor_bits, start=1):
@@ -186,15 +181,6 @@ class BM1Parameters:
         return (self.columns,) if self.shared else (self.lines, self.columns)
 
     @property
-    def seed_sets(self) -> int:
-        """Number of sets of seeds: one per bank, since all boards have the same ones."""
-        return self.rng_banks
-
-    def seed_set(self, bank: int) -> int:
-        """Return the set of seeds of a bank."""
-        return bank
-
-    @property
     def has_tables(self) -> bool:
         """True if sensor columns have tables; in `threshold` mode their inputs are codes."""
         return self.sensor_mode is not SensorMode.THRESHOLD
@@ -236,12 +222,14 @@ class BM1Parameters:
         return (1 << self.sensor_bits[column - 1]) - 1
 
 
-def checked_choice(name: str, value: str, kind: type[_Choice]) -> _Choice:
-    """Return a value as a member of an enumeration of strings."""
-    try:
-        return kind(value)
-    except ValueError:
-        raise ParameterError(f"{name} is {value!r}; it must be one of {', '.join(kind)}.") from None
+def set_choices(parameters: object, **kinds: type[StrEnum]) -> None:
+    """Convert parameters to members of enumerations of strings, each to that of its name."""
+    for name, kind in kinds.items():
+        given = getattr(parameters, name)
+        try:
+            object.__setattr__(parameters, name, kind(given))
+        except ValueError:
+            raise ParameterError(f"{name} is {given!r}; it must be one of {', '.join(kind)}.") from None
 
 
 def check_parameter(name: str, value: object, lowest: int, highest: int) -> None:

@@ -27,7 +27,7 @@ class ReferenceBM1(BM1Kernel):
     @property
     def counts(self) -> npt.NDArray[np.uint32]:
         """A copy of the counters: uint32[lines], with several replicas uint32[replicas, lines]."""
-        return self._counts.reshape(self._machine.parameters.count_shape).copy()
+        return self._counts.reshape(self.machine.parameters.count_shape).copy()
 
     @property
     def rng_state(self) -> npt.NDArray[np.uint64]:
@@ -39,8 +39,8 @@ class ReferenceBM1(BM1Kernel):
         self._states = self._random_numbers.restart(0)
 
     def _start(self, start: Start) -> None:
-        parameters = self._machine.parameters
-        by_column = addressed_codes(self._machine, start).reshape(
+        parameters = self.machine.parameters
+        by_column = addressed_codes(self.machine, start).reshape(
             parameters.replicas, parameters.columns, parameters.lines
         )
         self._codes = by_column.swapaxes(1, 2)
@@ -70,7 +70,7 @@ class ReferenceBM1(BM1Kernel):
 
     def _cycle(self, running: list[int]) -> None:
         """Compute the bits of all cells, count the lines of the running replicas, and step all generators."""
-        ones = self._machine.parameters.ones_code
+        ones = self.machine.parameters.ones_code
         random = self._random_numbers.show(self._states)
         bits = (random < self._codes) | (self._codes == ones)
         counting = bits.all(axis=2)

@@ -14,9 +14,12 @@ from typing import Final, Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from machines.parameters import RngKind
+from machines.bm1 import BM1Machine
+from machines.bm2 import BM2Machine, BM2Parameters
+from machines.parameters import BM1Parameters, RngKind
 
 Words: TypeAlias = npt.NDArray[np.uint64]
+RngParameters: TypeAlias = BM1Parameters | BM2Parameters
 
 GOLDEN: Final = 0x9E3779B97F4A7C15
 """2**64 divided by the golden ratio, rounded to an odd number: its multiples are evenly spread."""
@@ -33,49 +36,6 @@ POLYNOMIALS: Final = {
 """Non-zero exponents of the maximal-length polynomial of each LFSR, in descending order."""
 
 
-class RngParameters(Protocol):
-    """The parameters of any machine on which its generators depend."""
-
-    @property
-    def rng(self) -> RngKind:
-        """Kind of random number generators."""
-
-    @property
-    def ones_code(self) -> int:
-        """Mask of the low `prob_bits` bits."""
-
-    @property
-    def steps_per_clock(self) -> int:
-        """Steps of a generator per cycle."""
-
-    @property
-    def ideal_seed(self) -> int:
-        """Seed of the `ideal` generator."""
-
-    @property
-    def generator_shape(self) -> tuple[int, ...]:
-        """Shape of the generators' states."""
-
-    @property
-    def seed_sets(self) -> int:
-        """Number of sets of seeds, over all banks and boards."""
-
-    def seed_set(self, bank: int) -> int:
-        """Return the set of seeds of a bank."""
-
-
-class RandomMachine(Protocol):
-    """Any machine with generators."""
-
-    @property
-    def parameters(self) -> RngParameters:
-        """The parameters."""
-
-    @property
-    def rng_table(self) -> npt.NDArray[np.uint32] | None:
-        """The random numbers of all generators, if they use a table."""
-
-
 class RandomNumbers(Protocol):
     """All generators of a machine: arrays have one element per generator."""
 
@@ -89,7 +49,7 @@ class RandomNumbers(Protocol):
         """Return the states after one clock, which is `steps_per_clock` steps."""
 
 
-def random_numbers(machine: RandomMachine) -> RandomNumbers:
+def random_numbers(machine: BM1Machine | BM2Machine) -> RandomNumbers:
     """Return the generators of a machine."""
     parameters = machine.parameters
     if parameters.rng in POLYNOMIALS:
@@ -99,10 +59,15 @@ def random_numbers(machine: RandomMachine) -> RandomNumbers:
     return IdealNumbers(parameters)
 
 
+def seed_set(parameters: RngParameters, bank: int) -> int:
+    """Return the set of seeds of a bank on a board; no other board of a BM2 has it in any bank."""
+    return bank * parameters.chains + parameters.chain
+
+
 def generator_numbers(parameters: RngParameters, bank: int) -> Words:
     """Return the numbers of a bank's generators, in the parameters' `generator_shape`."""
     count = math.prod(parameters.generator_shape)
-    first = parameters.seed_set(bank) * count
+    first = seed_set(parameters, bank) * count
     return np.arange(first, first + count, dtype=np.uint64).reshape(parameters.generator_shape)
 
 
@@ -156,6 +121,11 @@ class LFSR:
         return self.jump(np.full(numbers.shape, base, dtype=np.uint64), distances)
 
 
+def sequencer_seed(parameters: BM2Parameters, bank: int) -> int:
+    """Return the first state in a bank of the LFSR16 that a BM2's sequencer has for its random order."""
+    return int(LFSR(RngKind.LFSR16).seeds(np.array([seed_set(parameters, bank)], dtype=np.uint64))[0])
+
+
 @dataclass(frozen=True, slots=True)
 class LFSRNumbers:
     """LFSRs, which output the low bits of their states."""
@@ -191,8 +161,8 @@ class TableNumbers:
 
     def restart(self, bank: int) -> Words:
         """Return the initial indices."""
-        shape = self.parameters.generator_shape
-        count, sets, own = math.prod(shape), self.parameters.seed_sets, self.parameters.seed_set(bank)
+        shape, sets = self.parameters.generator_shape, self.parameters.rng_banks * self.parameters.chains
+        count, own = math.prod(shape), seed_set(self.parameters, bank)
         # Python integers, because the products may exceed 64 bits
         starts = [(n * sets + own) * len(self.table) // (count * sets) for n in range(count)]
         return np.array(starts, dtype=np.uint64).reshape(shape)

@@ -88,7 +88,7 @@ def frame(*addresses, samples=300, **settings):
 
 
 def expected(machine, *, state, known, samples=300, bank=0, batches=BATCHES, max_cycles=2**32):
-    """The result words, cycles and reason, the samples and unused of each batch, and the stream of a kernel."""
+    """The result words, cycles and reason, samples and unused, the words of the batches before, and the stream."""
     parameters, kernel = machine.parameters, BM2.kernel(machine)
     targets = [samples * (at + 1) // batches for at in range(batches)]
     first = targets[0] if not parameters.stream else samples
@@ -104,22 +104,22 @@ def expected(machine, *, state, known, samples=300, bank=0, batches=BATCHES, max
             sequencer=parameters.sequencer,
         )
     )
-    done, stream = [(kernel.samples, kernel.unused)], kernel.stream.tobytes()
+    before, stream = [], kernel.stream.tobytes()
     while kernel.reason is BM2StopReason.FULL:
         kernel.resume(samples)
         stream += kernel.stream.tobytes()
-        done = [(kernel.samples, kernel.unused)]
     for target in targets[1:] if not parameters.stream else ():
         if kernel.reason is BM2StopReason.SAMPLES:
+            before.append(kernel.results.tobytes())
             kernel.resume(target)
-            done.append((kernel.samples, kernel.unused))
-    return (kernel.results.tolist(), kernel.cycles, kernel.reason, done, stream)
+    done = (kernel.samples, kernel.unused)
+    return (kernel.results.tolist(), kernel.cycles, kernel.reason, done, before, stream)
 
 
 def found(result):
     kept = msgspec.msgpack.decode(result.kept, type=Kept)
-    done = list(zip(kept.samples, kept.unused, strict=True))
-    return (result.counts.tolist(), result.cycles, result.reason, done, kept.stream)
+    done = (kept.samples, kept.unused)
+    return (result.counts.tolist(), result.cycles, result.reason, done, kept.batches, kept.stream)
 
 
 @pytest.mark.parametrize("sequencer", Sequencer)

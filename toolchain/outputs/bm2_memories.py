@@ -3,11 +3,9 @@
 from collections.abc import Iterator, Sequence
 from functools import partial
 
-import numpy as np
-
 from machines.bm2 import BM2Machine
 from machines.parameters import RngKind
-from machines.rng import LFSR, random_numbers
+from machines.rng import random_numbers, sequencer_seed
 from pcie_shim.programming_file import Image
 from toolchain.outputs.memories import Memory, rng_table_memory, seed_width
 
@@ -64,11 +62,10 @@ def _seeds(machine: BM2Machine, prefix: str) -> Iterator[Memory]:
             f"address = bank * {parameters.cdes} + CDE",
         ),
     )
-    sets = np.array([parameters.seed_set(bank) for bank in banks], dtype=np.uint64)
     yield Memory(
         name=f"{prefix}sequencer_seeds.mif",
         width=16,
         depth=parameters.rng_banks,
-        words=lambda: map(int, LFSR(RngKind.LFSR16).seeds(sets)),
+        words=lambda: (sequencer_seed(parameters, bank) for bank in banks),
         comments=("where the generator (lfsr16) of the random sequencer starts", "address = bank"),
     )
