@@ -9,12 +9,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from machines import bm2_chains, make_bm2_kernel
-from machines.bm2 import BM2Machine, BM2Parameters, BM2StopReason
+from machines.bm2 import BM2Machine, BM2StopReason
 from machines.bm2_chains import ChainResult, Chains
 from machines.errors import ParameterError, StartError
 from machines.parameters import RngReset, SampleEvery, Sequencer
 from tests.machines.random_networks import LFSRS, runs
-from tests.machines.test_bm2_fast import network, start_of
+from tests.machines.test_bm2_fast import contradiction, network, start_of
 
 
 def boards(machine, count, **changes):
@@ -107,20 +107,21 @@ def test_chains_fill_several_vectors_and_know_different_things():
     assert len({tuple(result.rng_state.tolist()) for result in results}) == 600
 
 
-def contradiction(**changes):
-    """A variable of which one factor excludes a value, and another one the other: they agree in 2**-15 of the cycles."""
-    parameters = BM2Parameters(cardinalities=(2,), factors=((0,), (0,)), **changes)
-    return BM2Machine.from_factors(parameters, [[1, 0], [0, 1]])
+def test_a_chain_of_one_bit_can_sample_in_every_cycle():
+    """Its one CDE agrees with itself, so a sweep takes a cycle, and every cycle of a block can be the last."""
+    machines = boards(network(cardinalities=(2,), factors=((0,),)), 32)
+    for samples in range(1, 36):
+        for burn_in in (0, 8, 17):
+            results = Chains(machines).run([start_of(samples=samples, burn_in=burn_in, max_cycles=100)] * 32)
+            assert {(each.cycles, each.samples) for each in results} == {(samples + burn_in, samples)}
 
 
-def test_a_chain_that_may_have_timed_out_is_run_again():
-    results = run_both(boards(contradiction(), 64), [start_of(samples=1, ops_timeout=2**14)] * 64)
-    assert {result.reason for result in results} == {BM2StopReason.SAMPLES, BM2StopReason.OPS_TIMEOUT}
-
-
-def test_long_moves_do_not_time_out():
-    results = run_both(boards(contradiction(), 32), [start_of(samples=1, ops_timeout=2**22)] * 32)
-    assert max(result.cycles for result in results) > 2**16
+def test_one_chain_times_out_by_one_cycle():
+    machines = boards(contradiction(), 32)
+    moves = [each.cycles for each in run_both(machines, [start_of(samples=1, ops_timeout=2**22)] * 32)]
+    results = run_both(machines, [start_of(samples=1, ops_timeout=max(moves) - 1)] * 32)
+    assert max(moves) > 2**16
+    assert [each.reason for each in results].count(BM2StopReason.OPS_TIMEOUT) == 1
 
 
 def test_other_chains_run_one_by_one():

@@ -69,6 +69,21 @@ def test_numbers_are_those_of_the_generators(kind, steps_per_clock):
     assert kernel.rng_state[0] == states[-1]
 
 
+def contradiction():
+    """A variable of which each factor excludes a value: they agree in one of 2**15 cycles."""
+    parameters = BM2Parameters(cardinalities=(2,), factors=((0,), (0,)))
+    return BM2Machine.from_factors(parameters, [[1, 0], [0, 1]])
+
+
+@pytest.mark.parametrize("limits", [{"ops_timeout": 5000}, {"max_cycles": 5000}])
+def test_a_move_may_take_many_blocks(limits):
+    kernel = FastBM2(contradiction())
+    slow = ReferenceBM2(contradiction())
+    start = start_of(**limits)
+    assert seen(kernel, kernel.start(start)) == seen(slow, slow.start(start))
+    assert kernel.cycles == 5000
+
+
 def test_a_stream_grows_up_to_its_size():
     kernel = FastBM2(network(stream=3 * STREAM_ROOM))
     assert kernel.start(start_of(samples=4 * STREAM_ROOM)) is BM2StopReason.FULL
