@@ -3,6 +3,7 @@
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from itertools import chain
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -20,14 +21,18 @@ class MachineContents:
     __slots__: tuple[str, ...] = ()
     parameters: Any
 
+    @property
+    def arrays(self) -> tuple[npt.NDArray[Any], ...]:
+        """The arrays, in the order of the programming file."""
+        contents = [getattr(self, name) for name in self.__slots__ if name != "parameters"]
+        every = chain.from_iterable(each if isinstance(each, tuple) else (each,) for each in contents)
+        return tuple(array for array in every if array is not None)
+
     def __eq__(self, other: object) -> bool:
-        if type(other) is not type(self):
+        if not isinstance(other, MachineContents):
             return NotImplemented
-        pairs = [(getattr(self, name), getattr(other, name)) for name in self.__slots__]
-        return all(
-            all(map(np.array_equal, one, its)) if isinstance(one, tuple) else np.array_equal(one, its)
-            for one, its in pairs
-        )
+        same_parameters: bool = self.parameters == other.parameters
+        return same_parameters and all(map(np.array_equal, self.arrays, other.arrays))
 
     def __hash__(self) -> int:
         # equal machines have equal ones

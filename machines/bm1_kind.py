@@ -25,7 +25,6 @@ from machines.kind import (
     HostMachine,
     Inference,
     MachineKind,
-    StoppedBoard,
     UsedRegisters,
     check_frame_value,
 )
@@ -50,17 +49,8 @@ class BM1Kind(MachineKind):
         StopReason.IMPOSSIBLE: "impossible",
     }
 
-    def sections(self, machine: BM1Machine) -> list[tuple[str, npt.NDArray[Any]]]:
-        """Return the prior, the table of each column (each a MIF of the thesis), and a table of random numbers."""
-        sections: list[tuple[str, npt.NDArray[Any]]] = [("prior", machine.prior.astype("<u2", copy=False))]
-        for column, table in enumerate(machine.tables, start=1):
-            sections.append((f"column {column}", table.astype("<u2", copy=False)))
-        if machine.rng_table is not None:
-            sections.append(("rng", machine.rng_table.astype("<u4", copy=False)))
-        return sections
-
     def due_sections(self, parameters: BM1Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the sections that follow from the parameters."""
+        """Yield those of the prior, of each column (each a MIF of the thesis), and of a table of random numbers."""
         yield "prior", "<u2", (parameters.prior_addresses, parameters.lines)
         if parameters.has_tables:
             for column, bits in enumerate(parameters.sensor_bits, start=1):
@@ -303,20 +293,21 @@ class _Course(FrameCourse):
         # the last slice ends with the frame
         self.end = 0 if end >= self._max_cycles else end
 
-    def proceed(self, boards: Sequence[StoppedBoard]) -> tuple[Sequence[int], Blocks]:
+    def proceed(
+        self, reasons: Sequence[Sequence[int]], _: Sequence[memoryview]
+    ) -> tuple[Sequence[int], Blocks]:
         """With `slices`, a machine that has overflowed on a board ends on all; with `own`, there is one slice."""
         over = {
             replica
-            for board in boards
-            for replica, reason in enumerate(board.reasons)
+            for of_board in reasons
+            for replica, reason in enumerate(of_board)
             if reason == StopReason.OVERFLOW
         }
         running = [
-            number
-            for number, board in enumerate(boards)
+            board
+            for board, of_board in enumerate(reasons)
             if any(
-                reason == StopReason.SLICE and replica not in over
-                for replica, reason in enumerate(board.reasons)
+                reason == StopReason.SLICE and replica not in over for replica, reason in enumerate(of_board)
             )
         ]
         self.begun = self.end

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from machines.bm1 import MachineContents, checked_codes, checked_rng_table, frozen
 from machines.errors import ParameterError, StartError
+from machines.kernel import check_start_value
 from machines.parameters import (
     PROB_BITS_MAX,
     RNG_BANKS_MAX,
@@ -310,13 +311,18 @@ class BM2Machine(MachineContents):
             )
         tables, supports = [], []
         for at, (table, support) in enumerate(zip(self.tables, self.supports, strict=True)):
+            values = tuple(parameters.cardinalities[variable] for variable in parameters.factors[at])
+            if support.shape != values:
+                raise ParameterError(
+                    f"Factor {at} has the shape {support.shape}; its variables have {values} values."
+                )
+            supports.append(frozen(support.astype(np.bool_, copy=False)))
             bits = len(parameters.factor_bits(at))
-            shape = (bits << bits >> 1,)
             tables.append(
-                checked_codes(f"The table of CDE {at}", table, shape, parameters.prob_bits, lowest=1)
+                checked_codes(
+                    f"The table of CDE {at}", table, (bits << bits >> 1,), parameters.prob_bits, lowest=1
+                )
             )
-            supports.append(frozen(np.asarray(support, dtype=np.bool_)))
-            _check_shape(parameters, at, supports[-1].shape)
         object.__setattr__(self, "tables", tuple(tables))
         object.__setattr__(self, "supports", tuple(supports))
         object.__setattr__(self, "rng_table", checked_rng_table(self.rng_table, parameters.rng))
@@ -334,18 +340,11 @@ class BM2Machine(MachineContents):
             ParameterError: A factor has a wrong shape, a negative or non-finite entry, or only zeros.
         """
         arrays = [np.asarray(factor, dtype=np.float64) for factor in factors]
-        for at, array in enumerate(arrays[: parameters.cdes]):
-            _check_shape(parameters, at, array.shape)
+        for at, array in enumerate(arrays):
             if not (np.isfinite(array) & (array >= 0)).all() or not array.any():
                 raise ParameterError(f"Factor {at} has a negative or non-finite entry, or only zeros.")
         tables = tuple(cde_table(array, parameters.prob_bits) for array in arrays)
         return cls(parameters, tables, tuple(array > 0 for array in arrays), rng_table)
-
-
-def _check_shape(parameters: BM2Parameters, factor: int, shape: tuple[int, ...]) -> None:
-    due = tuple(parameters.cardinalities[variable] for variable in parameters.factors[factor])
-    if shape != due:
-        raise ParameterError(f"Factor {factor} has the shape {shape}; its variables have {due} values.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -431,17 +430,10 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
         StartError: A value is out of range, or the search takes too long.
     """
     parameters = machine.parameters
-    domains = []
-    for variable, cardinality in enumerate(parameters.cardinalities):
-        domain = np.ones(cardinality, dtype=np.bool_)
-        if variable in evidence:
-            given = evidence[variable]
-            if not 0 <= given < cardinality:
-                raise StartError(
-                    f"The value of variable {variable} is {given}; it must be from 0 to {cardinality - 1}."
-                )
-            domain = np.arange(cardinality) == given
-        domains.append(domain)
+    domains = [np.ones(cardinality, dtype=np.bool_) for cardinality in parameters.cardinalities]
+    for variable, value in evidence.items():
+        check_start_value(f"The value of variable {variable}", value, 0, len(domains[variable]) - 1)
+        domains[variable] = np.arange(len(domains[variable])) == value
     # the factors with zeros, and their numbers for each variable
     zeros = [
         (scope, support)

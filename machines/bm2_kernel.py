@@ -24,7 +24,7 @@ class BM2Kernel(ABC):
         self._random_numbers = random_numbers(machine)
         self._results = np.zeros(machine.parameters.result_words, dtype=np.int64)
 
-    def _clear(self) -> None:
+    def _begin(self, start: BM2Start, *, restarts: bool) -> None:
         # Set by each kernel's `_run`; counted since the frame's start.
         self.cycles = 0
         self.samples = 0
@@ -34,6 +34,13 @@ class BM2Kernel(ABC):
         self.reason = BM2StopReason.NONE
         self.timed_out_bit = -1
         """After `OPS_TIMEOUT`: the lowest-numbered bit of the move that was not written."""
+        self._samples_due = start.samples
+        self._max_cycles = start.max_cycles
+        self._results[:] = 0
+        self._empty_stream()
+        if restarts:
+            self._restart(start.bank)
+        self._load(start)
 
     @property
     @abstractmethod
@@ -65,16 +72,6 @@ class BM2Kernel(ABC):
         self._begin(
             BM2Start(state=0, known=0, samples=0, burn_in=0, ops_timeout=1, max_cycles=1), restarts=True
         )
-
-    def _begin(self, start: BM2Start, *, restarts: bool) -> None:
-        self._clear()
-        self._samples_due = start.samples
-        self._max_cycles = start.max_cycles
-        self._results[:] = 0
-        self._empty_stream()
-        if restarts:
-            self._restart(start.bank)
-        self._load(start)
 
     def start(self, start: BM2Start, pause_at: int = 0) -> BM2StopReason:
         """Run a new frame, from its start state to a stop.

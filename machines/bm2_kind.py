@@ -24,7 +24,6 @@ from machines.kind import (
     HostMachine,
     Inference,
     MachineKind,
-    StoppedBoard,
     UsedRegisters,
     check_frame_value,
 )
@@ -62,19 +61,8 @@ class BM2Kind(MachineKind):
         BM2StopReason.FULL: "stream full",
     }
 
-    def sections(self, machine: BM2Machine) -> list[tuple[str, npt.NDArray[Any]]]:
-        """Return the table of each CDE, the non-zero entries of each factor, and a table of random numbers."""
-        sections: list[tuple[str, npt.NDArray[Any]]] = []
-        for at, table in enumerate(machine.tables):
-            sections.append((f"cde {at}", table.astype("<u2", copy=False)))
-        for at, support in enumerate(machine.supports):
-            sections.append((f"support {at}", support.astype("<u1")))
-        if machine.rng_table is not None:
-            sections.append(("rng", machine.rng_table.astype("<u4", copy=False)))
-        return sections
-
     def due_sections(self, parameters: BM2Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the sections that follow from the parameters."""
+        """Yield those of each CDE, of the non-zero entries of each factor, and of a table of random numbers."""
         for at in range(parameters.cdes):
             bits = len(parameters.factor_bits(at))
             yield f"cde {at}", "<u2", (bits << bits >> 1,)
@@ -373,22 +361,20 @@ class _Course(FrameCourse):
         batches = 1 if machines[0].parameters.stream else BATCHES
         # the samples at which each batch ends; several may be the same if there are few samples
         self._targets = sorted({total * (at + 1) // batches for at in range(batches)} - {0}) or [0]
-        self._settings = settings
-        self._take_target()
+        self.settings = settings._replace(target_count=self._targets.pop(0))
         self._kept = [Kept(machine.parameters) for machine in machines]
         self._running = list(range(len(machines)))
 
-    def _take_target(self) -> None:
-        self.settings = self._settings._replace(target_count=self._targets.pop(0))
-
-    def proceed(self, boards: Sequence[StoppedBoard]) -> tuple[Sequence[int], Blocks]:
+    def proceed(
+        self, reasons: Sequence[Sequence[int]], answers: Sequence[memoryview]
+    ) -> tuple[Sequence[int], Blocks]:
         """Resume with the next batch the boards that have drawn all samples, and those whose streams are full."""
         going = {BM2StopReason.FULL} if not self._targets else {BM2StopReason.FULL, BM2StopReason.SAMPLES}
         for number in self._running:
-            self._kept[number].add(boards[number].answer)
-        self._running = [number for number in self._running if boards[number].reasons[0] in going]
+            self._kept[number].add(answers[number])
+        self._running = [number for number in self._running if reasons[number][0] in going]
         if self._running and self._targets:
-            self._take_target()
+            self.settings = self.settings._replace(target_count=self._targets.pop(0))
         return self._running, {}
 
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:

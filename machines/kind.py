@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, Literal, NamedTuple, Protocol, TypeAlias
+from typing import Any, ClassVar, Final, Literal, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
@@ -199,18 +199,6 @@ class BoardMachine(ABC):
         return int(self._kernel.cycles)
 
 
-class StoppedBoard(Protocol):
-    """The last answer of a board, as a driver has received it.
-
-    Attributes:
-        reasons: The stop reason of each replica.
-        answer: The words of `UsedRegisters.answer`, valid until the board is resumed.
-    """
-
-    reasons: tuple[int, ...]
-    answer: memoryview
-
-
 class FrameCourse(ABC):
     """A frame on all boards, from its start through its slices.
 
@@ -227,8 +215,15 @@ class FrameCourse(ABC):
     end: int
 
     @abstractmethod
-    def proceed(self, boards: Sequence[StoppedBoard]) -> tuple[Sequence[int], Blocks]:
-        """Return the numbers of the boards to resume (none: the frame is over), and the blocks to write before that."""
+    def proceed(
+        self, reasons: Sequence[Sequence[int]], answers: Sequence[memoryview]
+    ) -> tuple[Sequence[int], Blocks]:
+        """Return the numbers of the boards to resume (none: the frame is over), and the blocks to write before that.
+
+        Args:
+            reasons: The last stop reasons of each board's replicas.
+            answers: The words of `UsedRegisters.answer` of each board, valid until it is resumed.
+        """
 
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:
         """Return the results of the frame with what the course has kept of its slices."""
@@ -270,9 +265,10 @@ class MachineKind(ABC):
 
     # ---- programming file -----------------------------------------------------------------------------
 
-    @abstractmethod
     def sections(self, machine: Any) -> list[tuple[str, npt.NDArray[Any]]]:
         """Return the tables of a machine in the order and types of the programming file."""
+        due = zip(self.due_sections(machine.parameters), machine.arrays, strict=True)
+        return [(name, array.astype(words, copy=False)) for (name, words, _), array in due]
 
     @abstractmethod
     def due_sections(self, parameters: Any) -> Iterator[tuple[str, str, tuple[int, ...]]]:

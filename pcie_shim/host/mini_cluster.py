@@ -289,7 +289,9 @@ class MiniCluster:
             board.done.compute_ns for board in progress.running if board.done is not None
         )
         course = progress.course
-        numbers, blocks = course.proceed(self._boards)
+        numbers, blocks = course.proceed(
+            [board.reasons for board in self._boards], [board.answer for board in self._boards]
+        )
         if numbers:
             progress.running = [self._boards[number] for number in numbers]
             for board in progress.running:
