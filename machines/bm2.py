@@ -386,8 +386,9 @@ def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np
         uint16[n * 2**(n - 1)] for n bits.
     """
     # NaN at unused codes: what is computed with one is NaN, too
-    unused = [(0, (1 << (cardinality - 1).bit_length()) - cardinality) for cardinality in factor.shape]
-    values = np.pad(factor, unused, constant_values=np.nan).ravel(order="F")
+    padded = np.full([1 << (cardinality - 1).bit_length() for cardinality in factor.shape], np.nan)
+    padded[tuple(map(slice, factor.shape))] = factor
+    values = padded.ravel(order="F")
     tables = [np.empty(0)]
     for j in range(values.size.bit_length() - 1):
         zero, one = values.reshape(-1, 2, 1 << j).swapaxes(0, 1).reshape(2, -1)

@@ -41,7 +41,6 @@ class Estimate:
         effective_samples: Those of the value that has the fewest, over all boards that count; NaN if unknown.
         r_hat: The largest one of all values; NaN for one board, or if it is unknown.
         left_out: Numbers of the boards that do not count: those that timed out, or have no sample.
-        is_marked: True if a board ended by its maximum number of cycles, which biases its samples.
     """
 
     posterior: Floats | None
@@ -49,29 +48,24 @@ class Estimate:
     effective_samples: float
     r_hat: float
     left_out: tuple[int, ...]
-    is_marked: bool
 
 
 def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
-    """Return the counts of the searched joint's values, row-major, from the result words of a machine.
+    """Return the counts of the searched joint's values, row-major: integers[..., product of the cardinalities].
 
     Args:
         parameters: Parameters of the machine; its joint fits the result words, or one variable is searched.
         results: Integers[..., result_words].
-
-    Returns:
-        Integers[..., product of the searched cardinalities].
     """
-    bits = [parameters.bits[variable] for variable in parameters.searched]
     first = parameters.histogram_words
     if not parameters.joint_words:
         (variable,) = parameters.searched
-        first = sum(1 << own for own in parameters.bits[:variable])
-    words = results[..., first : first + (1 << sum(bits))]
-    # row-major, so the codes of the first searched variable are the slowest axis
-    codes = np.arange(1 << sum(bits)).reshape([1 << own for own in bits])
-    used = codes[np.ix_(*(range(parameters.cardinalities[variable]) for variable in parameters.searched))]
-    return words[..., used.ravel()]
+        first = sum(1 << bits for bits in parameters.bits[:variable])
+    # the codes of the first searched variable are the slowest axis
+    sizes = [1 << parameters.bits[variable] for variable in parameters.searched]
+    codes = np.arange(first, first + math.prod(sizes)).reshape(sizes)
+    used = codes[tuple(slice(parameters.cardinalities[variable]) for variable in parameters.searched)]
+    return results[..., used.ravel()]
 
 
 def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
@@ -81,17 +75,14 @@ def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -
         parameters: Parameters of the machine.
         stream: uint32[samples, state_words].
     """
-    # one word more, because a code may begin in one word and end in the next
-    words = np.pad(stream.astype(np.uint64), ((0, 0), (0, 1)))
+    state = np.unpackbits(stream.astype("<u4").view(np.uint8), axis=1, bitorder="little")
     values = np.zeros(len(stream), dtype=np.int64)
     unused = np.zeros(len(stream), dtype=np.bool_)
     codes = []
     for offset, bits, cardinality in zip(
         parameters.offsets, parameters.bits, parameters.cardinalities, strict=True
     ):
-        word, bit = divmod(offset, 32)
-        both = words[:, word] | words[:, word + 1] << np.uint64(32) if bits else words[:, 0]
-        codes.append((both >> np.uint64(bit) & np.uint64((1 << bits) - 1)).astype(np.int64))
+        codes.append(state[:, offset : offset + bits] @ (1 << np.arange(bits)))
         unused |= codes[-1] >= cardinality
     for variable in parameters.searched:
         values = values * parameters.cardinalities[variable] + codes[variable]
@@ -100,12 +91,10 @@ def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -
 
 def estimate(chains: Sequence[Chain]) -> Estimate:
     """Return the estimate from the chains of all boards."""
-    posterior, left_out, is_marked = merge(
-        [chain.counts[-1] for chain in chains], [chain.reason for chain in chains]
-    )
+    posterior, left_out = merge([chain.counts[-1] for chain in chains], [chain.reason for chain in chains])
     counted = [chain for board, chain in enumerate(chains) if board not in left_out]
     if posterior is None:
-        return Estimate(None, None, math.nan, math.nan, left_out, is_marked)
+        return Estimate(None, None, math.nan, math.nan, left_out)
     effective = np.sum([_effective_samples_of(chain) for chain in counted], axis=0)
     r_hat = math.nan
     if len(counted) > 1:
@@ -115,13 +104,13 @@ def estimate(chains: Sequence[Chain]) -> Estimate:
     # Laplace's rule: a value that was never seen has an error, too
     smooth = (effective * posterior + 1) / (effective + 2)
     error = np.sqrt(smooth * (1 - smooth) / effective)
-    return Estimate(posterior, error, float(effective.min()), r_hat, left_out, is_marked)
+    return Estimate(posterior, error, float(effective.min()), r_hat, left_out)
 
 
 def merge(
     counts: Sequence[npt.NDArray[np.integer]], reasons: Sequence[BM2StopReason]
-) -> tuple[Floats | None, tuple[int, ...], bool]:
-    """Return the posterior of all boards, the numbers of those left out, and whether the result is marked.
+) -> tuple[Floats | None, tuple[int, ...]]:
+    """Return the posterior of all boards, and the numbers of those left out.
 
     A board that timed out or has no sample is left out. The counts of the others are added, because all have drawn
     as many samples; but if one ended by its maximum number of cycles, each board has the same weight.
@@ -135,12 +124,13 @@ def merge(
         for board, (own, reason) in enumerate(zip(counts, reasons, strict=True))
         if reason is BM2StopReason.OPS_TIMEOUT or not own.any()
     )
-    is_marked = BM2StopReason.MAX_CYCLES in reasons
     kept = [own.astype(np.float64) for board, own in enumerate(counts) if board not in left_out]
     if not kept:
-        return None, left_out, is_marked
-    total: Floats = np.sum([own / own.sum() if is_marked else own for own in kept], axis=0)
-    return total / total.sum(), left_out, is_marked
+        return None, left_out
+    if BM2StopReason.MAX_CYCLES in reasons:
+        kept = [own / own.sum() for own in kept]
+    total: Floats = np.sum(kept, axis=0)
+    return total / total.sum(), left_out
 
 
 def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:
@@ -225,11 +215,11 @@ def _effective_samples_of(chain: Chain) -> Floats:
 
 def _halves(chain: Chain) -> npt.NDArray[np.integer]:
     """Return the counts of a chain's two halves: of its samples, or of its batches without a stream."""
-    if chain.values is None:
-        first, last = chain.counts[len(chain.counts) // 2 - 1], chain.counts[-1]
-        return np.stack([first, last - first])
-    used = chain.values[chain.values >= 0]
-    half = len(used) // 2
-    return np.stack(
-        [np.bincount(part, minlength=chain.counts.shape[1]) for part in (used[:half], used[half:])]
-    )
+    counts = chain.counts
+    if chain.values is not None:
+        used = chain.values[chain.values >= 0]
+        counts = np.stack(
+            [np.bincount(part, minlength=counts.shape[1]) for part in (used[: len(used) // 2], used)]
+        )
+    first, last = counts[len(counts) // 2 - 1], counts[-1]
+    return np.stack([first, last - first])

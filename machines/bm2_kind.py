@@ -73,9 +73,9 @@ class BM2Kind(MachineKind):
 
     def machine(self, parameters: BM2Parameters, sections: Mapping[str, npt.NDArray[Any]]) -> BM2Machine:
         """Return the machine with these tables."""
-        cdes = range(parameters.cdes)
-        tables = tuple(sections[f"cde {at}"] for at in cdes)
-        supports = tuple(sections[f"support {at}"].astype(np.bool_) for at in cdes)
+        tables, supports = (
+            tuple(sections[f"{name} {at}"] for at in range(parameters.cdes)) for name in ("cde", "support")
+        )
         return BM2Machine(parameters, tables, supports, sections.get("rng"))
 
     def registers(self, parameters: BM2Parameters) -> UsedRegisters:
@@ -131,10 +131,6 @@ class BM2Kind(MachineKind):
         """Return the machines of all boards, each with a chain of the model."""
         return _OnHost(machines)
 
-    def joint_reason(self, reasons: Sequence[int]) -> int:
-        """Return the reason of the single machine of a board."""
-        return reasons[0]
-
     def infer(self, results: Sequence[BoardResult], variables: Sequence[str] = ()) -> Inference:
         """Return the posterior of all chains; those that timed out are left out, and named in the details."""
         chains, every = [], [_kept(board) for board in results]
@@ -168,22 +164,12 @@ class BM2Kind(MachineKind):
             details["r_hat"] = f"{found.r_hat:.4f}"
         if left_out:
             details["left_out"] = left_out
-        if found.is_marked:
-            # their samples depend on how long the moves took
-            details["ended_early"] = ", ".join(
-                f"board{number}"
-                for number, board in enumerate(results)
-                if board.reason == BM2StopReason.MAX_CYCLES
-            )
-        return Inference(
-            results,
-            found.posterior,
-            totals,
-            "posterior",
-            details,
-            b"".join([kept.stream for kept in counted]),
-            4 * every[0].parameters.state_words,
-        )
+        # their samples depend on how long the moves took
+        early = [at for at, board in enumerate(results) if board.reason == BM2StopReason.MAX_CYCLES]
+        if early:
+            details["ended_early"] = ", ".join(f"board{number}" for number in early)
+        samples, size = b"".join([kept.stream for kept in counted]), 4 * every[0].parameters.state_words
+        return Inference(results, found.posterior, totals, "posterior", details, samples, size)
 
     def posterior(
         self, machines: Sequence[BM2Machine], frame: FrameInput, variables: Sequence[str] = ()

@@ -116,25 +116,23 @@ def test_a_board_that_drifts_disagrees_with_itself():
 
 
 def test_boards_that_drew_all_samples_are_added():
-    posterior, left_out, is_marked = merge([np.array([30, 10]), np.array([50, 10])], [SAMPLES, SAMPLES])
+    posterior, left_out = merge([np.array([30, 10]), np.array([50, 10])], [SAMPLES, SAMPLES])
     assert posterior.tolist() == [0.8, 0.2]
     assert left_out == ()
-    assert not is_marked
 
 
 def test_a_board_that_timed_out_is_left_out():
-    posterior, left_out, _ = merge([np.array([30, 10]), np.array([0, 99])], [SAMPLES, TIMEOUT])
+    posterior, left_out = merge([np.array([30, 10]), np.array([0, 99])], [SAMPLES, TIMEOUT])
     assert posterior.tolist() == [0.75, 0.25]
     assert left_out == (1,)
-    assert merge([np.array([1, 1])], [TIMEOUT]) == (None, (0,), False)
+    assert merge([np.array([1, 1])], [TIMEOUT]) == (None, (0,))
 
 
 def test_boards_have_equal_weights_if_one_ran_out_of_cycles():
     counts = [np.array([30, 10]), np.array([0, 1]), np.array([0, 0]), np.array([5, 0])]
-    posterior, left_out, is_marked = merge(counts, [SAMPLES, CYCLES, CYCLES, TIMEOUT])
+    posterior, left_out = merge(counts, [SAMPLES, CYCLES, CYCLES, TIMEOUT])
     assert posterior.tolist() == [0.375, 0.625]
     assert left_out == (2, 3)
-    assert is_marked
 
 
 def test_nothing_to_estimate():
