@@ -444,61 +444,47 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
     of_variable = [
         [at for at, (scope, _) in enumerate(zeros) if variable in scope] for variable in range(len(domains))
     ]
-    if not _propagate(zeros, of_variable, domains, range(len(zeros))):
-        return None
+
+    def propagate(domains: list[npt.NDArray[np.bool_]], changed: Sequence[int]) -> bool:
+        """Remove the values that a factor excludes, until nothing changes; return False if no value is left."""
+        due = list(changed)  # numbers of factors that have a variable whose domain has changed
+        while due:
+            at = due.pop()
+            scope, support = zeros[at]
+            possible = support[np.ix_(*(domains[variable] for variable in scope))]
+            for axis, variable in enumerate(scope):
+                kept = possible.any(axis=tuple(other for other in range(len(scope)) if other != axis))
+                if not kept.any():
+                    return False
+                if not kept.all():
+                    domain = np.zeros_like(domains[variable])
+                    domain[np.flatnonzero(domains[variable])[kept]] = True
+                    domains[variable] = domain
+                    due += [other for other in of_variable[variable] if other != at and other not in due]
+        return True
+
     # Values that are still to try, the next one last: the domains, a variable before which all have one value, and
     # its value. The first complete state is the answer, since variables and values are tried in order.
-    due: list[tuple[list[npt.NDArray[np.bool_]], int, int]] = []
+    left: list[tuple[list[npt.NDArray[np.bool_]], int, int]] = []
+    changed: Sequence[int] = range(len(zeros))
     variable = dead_ends = 0
     while True:
-        while variable < len(domains) and domains[variable].sum() == 1:
-            variable += 1
-        if variable == len(domains):
-            return pack(parameters, [int(domain.argmax()) for domain in domains])
-        values = np.flatnonzero(domains[variable]).tolist()
-        due += [(domains, variable, value) for value in (values if largest else reversed(values))]
-        while due:
-            before, variable, value = due.pop()
-            domains = list(before)
-            domains[variable] = np.arange(len(before[variable])) == value
-            if _propagate(zeros, of_variable, domains, of_variable[variable]):
-                break
+        if propagate(domains, changed):
+            while variable < len(domains) and domains[variable].sum() == 1:
+                variable += 1
+            if variable == len(domains):
+                return pack(parameters, [int(domain.argmax()) for domain in domains])
+            values = np.flatnonzero(domains[variable]).tolist()
+            left += [(domains, variable, value) for value in (values if largest else reversed(values))]
+        else:
             dead_ends += 1
             if dead_ends > DEAD_ENDS_MAX:
                 raise StartError(
                     f"No start state was found before {DEAD_ENDS_MAX} dead ends; the model has too many zeros: "
                     "replace some by small probabilities."
                 )
-        else:
+        if not left:
             return None
-
-
-def _propagate(
-    zeros: Sequence[tuple[tuple[int, ...], npt.NDArray[np.bool_]]],
-    of_variable: Sequence[Sequence[int]],
-    domains: list[npt.NDArray[np.bool_]],
-    changed: Sequence[int],
-) -> bool:
-    """Remove the values that a factor excludes, until nothing changes; return False if a domain becomes empty.
-
-    Args:
-        zeros: Variables and support of each factor with zeros.
-        of_variable: Numbers of the factors of each variable.
-        domains: The possible values of each variable, bool[cardinality].
-        changed: Numbers of the factors that have a variable whose domain has changed.
-    """
-    due = list(changed)
-    while due:
-        at = due.pop()
-        scope, support = zeros[at]
-        possible = support[np.ix_(*(domains[variable] for variable in scope))]
-        for axis, variable in enumerate(scope):
-            kept = possible.any(axis=tuple(other for other in range(len(scope)) if other != axis))
-            if not kept.any():
-                return False
-            if not kept.all():
-                domain = np.zeros_like(domains[variable])
-                domain[np.flatnonzero(domains[variable])[kept]] = True
-                domains[variable] = domain
-                due += [other for other in of_variable[variable] if other != at and other not in due]
-    return True
+        before, variable, value = left.pop()
+        domains, changed = list(before), of_variable[variable]
+        domains[variable] = np.arange(len(before[variable])) == value

@@ -90,11 +90,24 @@ def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -
 
 
 def estimate(chains: Sequence[Chain]) -> Estimate:
-    """Return the estimate from the chains of all boards."""
-    posterior, left_out = merge([chain.counts[-1] for chain in chains], [chain.reason for chain in chains])
+    """Return the estimate from the chains of all boards.
+
+    A board that timed out or has no sample is left out. The counts of the others are added, because all have drawn
+    as many samples; but if one ended by its maximum number of cycles, each board has the same weight.
+    """
+    left_out = tuple(
+        board
+        for board, chain in enumerate(chains)
+        if chain.reason is BM2StopReason.OPS_TIMEOUT or not chain.counts[-1].any()
+    )
     counted = [chain for board, chain in enumerate(chains) if board not in left_out]
-    if posterior is None:
+    if not counted:
         return Estimate(None, None, math.nan, math.nan, left_out)
+    weights = [chain.counts[-1].astype(np.float64) for chain in counted]
+    if any(chain.reason is BM2StopReason.MAX_CYCLES for chain in chains):
+        weights = [own / own.sum() for own in weights]
+    posterior: Floats = np.sum(weights, axis=0)
+    posterior /= posterior.sum()
     effective = np.sum([_effective_samples_of(chain) for chain in counted], axis=0)
     r_hat = math.nan
     if len(counted) > 1:
@@ -105,32 +118,6 @@ def estimate(chains: Sequence[Chain]) -> Estimate:
     smooth = (effective * posterior + 1) / (effective + 2)
     error = np.sqrt(smooth * (1 - smooth) / effective)
     return Estimate(posterior, error, float(effective.min()), r_hat, left_out)
-
-
-def merge(
-    counts: Sequence[npt.NDArray[np.integer]], reasons: Sequence[BM2StopReason]
-) -> tuple[Floats | None, tuple[int, ...]]:
-    """Return the posterior of all boards, and the numbers of those left out.
-
-    A board that timed out or has no sample is left out. The counts of the others are added, because all have drawn
-    as many samples; but if one ended by its maximum number of cycles, each board has the same weight.
-
-    Args:
-        counts: Counts of the searched joint's values, of each board.
-        reasons: Stop reason of each board.
-    """
-    left_out = tuple(
-        board
-        for board, (own, reason) in enumerate(zip(counts, reasons, strict=True))
-        if reason is BM2StopReason.OPS_TIMEOUT or not own.any()
-    )
-    kept = [own.astype(np.float64) for board, own in enumerate(counts) if board not in left_out]
-    if not kept:
-        return None, left_out
-    if BM2StopReason.MAX_CYCLES in reasons:
-        kept = [own / own.sum() for own in kept]
-    total: Floats = np.sum(kept, axis=0)
-    return total / total.sum(), left_out
 
 
 def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:

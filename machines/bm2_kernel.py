@@ -107,7 +107,7 @@ class BM2Kernel(ABC):
                 f"There is nothing to resume: the machine has stopped with reason {self.reason.name.lower()}."
             )
         check_start_value("samples", samples, self.samples + 1, SAMPLES_MAX)
-        self._check_pause(pause_at)
+        check_start_value("pause_at", pause_at or CYCLES_MAX, self.cycles + 1, CYCLES_MAX)
         self._samples_due = samples
         self._empty_stream()
         return self._continue(pause_at)
@@ -122,12 +122,8 @@ class BM2Kernel(ABC):
             raise StartError(
                 f"The machine is not paused: it has stopped with reason {self.reason.name.lower()}."
             )
-        self._check_pause(pause_at)
+        check_start_value("pause_at", pause_at or CYCLES_MAX, self.cycles + 1, CYCLES_MAX)
         return self._continue(pause_at)
-
-    def _check_pause(self, pause_at: int) -> None:
-        if pause_at != 0:
-            check_start_value("pause_at", pause_at, self.cycles + 1, CYCLES_MAX)
 
     def _continue(self, pause_at: int) -> BM2StopReason:
         # all samples may have been drawn in the frame's last cycle

@@ -436,12 +436,7 @@ class _OnHost(HostMachine):
             raise StartError("All variables of the frame are known, so that there is nothing to sample")
         ends = [start_state(self._machines[0], evidence, largest=largest) for largest in (False, True)]
         size = 4 * parameters.state_words
-        return [
-            {
-                **self._blocks,
-                "KNOWN_MASK": known.to_bytes(size, "little"),
-                "START_STATE": state.to_bytes(size, "little"),
-            }
-            for machine in self._machines
-            if (state := ends[machine.parameters.chain & 1]) is not None
-        ]
+        words = [b"" if end is None else end.to_bytes(size, "little") for end in ends]
+        common = {**self._blocks, "KNOWN_MASK": known.to_bytes(size, "little")}
+        boards = self._machines if all(words) else ()
+        return [{**common, "START_STATE": words[machine.parameters.chain & 1]} for machine in boards]

@@ -12,7 +12,6 @@ from machines.bm2_estimate import (
     batch_effective_samples,
     effective_samples,
     estimate,
-    merge,
     searched_counts,
     searched_values,
     split_r_hat,
@@ -31,6 +30,11 @@ def sticky(stay, samples, seed=1):
 
 def cumulative(values, batches, size=2):
     return np.cumsum([np.bincount(part, minlength=size) for part in np.array_split(values, batches)], axis=0)
+
+
+def ended(reason, *counts):
+    """The chain of a board that ended with these counts."""
+    return Chain(reason, np.array([counts]))
 
 
 @pytest.mark.parametrize("stay", [0.5, 0.7, 0.9, 0.97])
@@ -116,23 +120,25 @@ def test_a_board_that_drifts_disagrees_with_itself():
 
 
 def test_boards_that_drew_all_samples_are_added():
-    posterior, left_out = merge([np.array([30, 10]), np.array([50, 10])], [SAMPLES, SAMPLES])
-    assert posterior.tolist() == [0.8, 0.2]
-    assert left_out == ()
+    result = estimate([ended(SAMPLES, 30, 10), ended(SAMPLES, 50, 10)])
+    assert result.posterior.tolist() == [0.8, 0.2]
+    assert result.left_out == ()
 
 
 def test_a_board_that_timed_out_is_left_out():
-    posterior, left_out = merge([np.array([30, 10]), np.array([0, 99])], [SAMPLES, TIMEOUT])
-    assert posterior.tolist() == [0.75, 0.25]
-    assert left_out == (1,)
-    assert merge([np.array([1, 1])], [TIMEOUT]) == (None, (0,))
+    result = estimate([ended(SAMPLES, 30, 10), ended(TIMEOUT, 0, 99)])
+    assert result.posterior.tolist() == [0.75, 0.25]
+    assert result.left_out == (1,)
+    alone = estimate([ended(TIMEOUT, 1, 1)])
+    assert (alone.posterior, alone.left_out) == (None, (0,))
 
 
 def test_boards_have_equal_weights_if_one_ran_out_of_cycles():
-    counts = [np.array([30, 10]), np.array([0, 1]), np.array([0, 0]), np.array([5, 0])]
-    posterior, left_out = merge(counts, [SAMPLES, CYCLES, CYCLES, TIMEOUT])
-    assert posterior.tolist() == [0.375, 0.625]
-    assert left_out == (2, 3)
+    result = estimate(
+        [ended(SAMPLES, 30, 10), ended(CYCLES, 0, 1), ended(CYCLES, 0, 0), ended(TIMEOUT, 5, 0)]
+    )
+    assert result.posterior.tolist() == [0.375, 0.625]
+    assert result.left_out == (2, 3)
 
 
 def test_nothing_to_estimate():
