@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Final, Self, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -170,7 +170,7 @@ class TomlFile:
         return found
 
     def _wrong_value(self, model: type[BaseModel], detail: ErrorDetails) -> ToolchainError:
-        place = _followed(model, detail["loc"])[0]
+        place, models = _followed(model, detail["loc"])
         if detail["type"] == "union_tag_invalid":
             place.append("type")
         line = self._line_of(place)
@@ -184,12 +184,12 @@ class TomlFile:
         value = value if len(value) <= _SHOWN else value[:_SHOWN] + "..."
         match detail["type"]:
             case "extra_forbidden":
-                known = _keys(_followed(model, detail["loc"][:-1])[1])
+                known = _keys(models[0])
                 sentence = f"unknown key '{place[-1]}'{section}; {nearest_name(str(place[-1]), known)}"
             case "missing":
                 sentence = f"the key '{place[-1]}' is missing{section}"
             case "union_tag_invalid":
-                nearest = nearest_name(detail["ctx"]["tag"], list(_models_of(model, place[0])))
+                nearest = nearest_name(detail["ctx"]["tag"], [_type_of(each) for each in models])
                 sentence = f"type = {detail['ctx']['tag']!r}{section} is not a valid value; {nearest}"
             case "literal_error" | "enum":
                 expected = [word.strip("' ") for word in re.split(r",| or ", str(detail["ctx"]["expected"]))]
@@ -231,31 +231,29 @@ def _keys(model: type[BaseModel]) -> list[str]:
     return [str(field.validation_alias or name) for name, field in model.model_fields.items()]
 
 
-def _models_of(model: type[BaseModel], key: str | int) -> dict[str, type[BaseModel]]:
-    """Return the models of a field by their `type`, or by an empty text if it is always the same."""
-    for name, field in model.model_fields.items():
-        if key in (name, field.validation_alias):
-            inner = [
-                get_args(each)[0] if get_origin(each) is Annotated else each
-                for each in get_args(field.annotation)
-            ]
-            found = [
-                t for t in (field.annotation, *inner) if isinstance(t, type) and issubclass(t, BaseModel)
-            ]
-            return {"" if len(found) == 1 else str(each.model_fields["type"].default): each for each in found}
-    return {}
+def _type_of(model: type[BaseModel]) -> str:
+    return str(model.model_fields["type"].default)
 
 
-def _followed(model: type[BaseModel], place: Sequence[str | int]) -> tuple[list[str | int], type[BaseModel]]:
-    """Follow a place through the fields of models; return it without the types of sections, and the model at its end."""
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models in an annotation: several if the `type` of a section decides."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for each in get_args(annotation) for model in _models_in(each)]
+
+
+def _followed(
+    model: type[BaseModel], place: Sequence[str | int]
+) -> tuple[list[str | int], list[type[BaseModel]]]:
+    """Follow a place through the fields of models; return it without the types of sections, and the last models."""
     followed: list[str | int] = []
-    choice: dict[str, type[BaseModel]] = {}
+    models = [model]
     for step in place:
-        if step in choice:
-            model, choice = choice[str(step)], {}
+        if len(models) > 1:
+            models = [each for each in models if _type_of(each) == step]
             continue
         followed.append(step)
-        if not isinstance(step, int):
-            choice = _models_of(model, step)
-            model, choice = (choice[""], {}) if "" in choice else (model, choice)
-    return followed, model
+        for name, field in models[0].model_fields.items():
+            if step in (name, field.validation_alias):
+                models = _models_in(field.annotation) or models
+    return followed, models

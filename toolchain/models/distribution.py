@@ -9,15 +9,16 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar, Final, Literal, TypeAlias
+from typing import Any, ClassVar, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from toolchain.bounded_files import nearest_name
+from toolchain.deployment import Dimension
 from toolchain.errors import ModelError
 from toolchain.models.conditional import normal_table, wrapped_normal_table
-from toolchain.models.model import MAX_ENTRIES, Normal, check_size
+from toolchain.models.model import MAX_ENTRIES, Normal, check_size, dimension
 
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
 _NO_AND_YES: Final = ({"false", "true"}, {"no", "yes"}, {"off", "on"})
@@ -181,6 +182,36 @@ class Symbol:
         values: NDArray[np.float64] = self.type.offset + np.arange(self.size) * np.float64(self.type.step)
         return values
 
+    def shown(self, at: int) -> str:
+        """Return a value as its label or number."""
+        return self.type.labels[at] if self.type.labels else f"{self.values()[at]:g}"
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """The fields of a known variable that come from its symbol."""
+        return {
+            "name": self.name,
+            "bits": self.bits,
+            "offset": self.type.offset,
+            "step": self.type.step,
+            "period": self.period,
+            "on_range": self.on_range,
+            "on_missing": self.on_missing,
+            "path": self.path,
+            "states": self.type.labels,
+        }
+
+    def dimension(self) -> Dimension:
+        """Return it as a searched dimension, or raise a ModelError."""
+        return dimension(
+            self.name,
+            size=self.size,
+            offset=self.type.offset,
+            step=self.type.step,
+            unit=self.type.unit,
+            states=self.type.labels,
+        )
+
     def index(self, label: str) -> int:
         """Return the index of the value with this label or number, or raise a ModelError."""
         if label in self.type.labels:
@@ -241,6 +272,11 @@ class Potential:
     table: NDArray[np.float64]
     """float64[size of each symbol], from 0."""
 
+    @property
+    def title(self) -> str:
+        """The potential as text."""
+        return f"the potential of {', '.join(each.name for each in self.scope)}"
+
     def __repr__(self) -> str:
         return f"Potential({', '.join(each.name for each in self.scope)}, {_sizes(self.table)})"
 
@@ -266,7 +302,7 @@ def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) ->
     wrong = np.argwhere(np.abs(sums - 1) > _SUM_TOLERANCE)
     if len(wrong):
         place = tuple(wrong[0])
-        where = ", ".join(f"{each.name} = {_shown(each, at)}" for each, at in zip(given, place, strict=True))
+        where = ", ".join(f"{each.name} = {each.shown(at)}" for each, at in zip(given, place, strict=True))
         raise ModelError(
             f"{_title(symbol, given)} sums to {float(sums[place]):.9g}"
             + (f" for {where}" if where else "")
@@ -409,7 +445,3 @@ def _title(symbol: Symbol, given: tuple[Symbol, ...]) -> str:
 
 def _sizes(table: NDArray[np.float64]) -> str:
     return " x ".join(map(str, table.shape))
-
-
-def _shown(symbol: Symbol, at: int) -> str:
-    return symbol.type.labels[at] if symbol.type.labels else f"{symbol.values()[at]:g}"

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
 from operator import itemgetter
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,6 @@ from toolchain.models.model import (
     Normal,
     PriorSelect,
     check_size,
-    dimension,
 )
 from toolchain.models.network import NetworkModel, network_model
 
@@ -277,30 +276,20 @@ class Question:
         normals = {symbol.name: self._normal(symbol) for symbol in self.known}
         return Model(
             name=self.joint.name,
-            searched=tuple(
-                dimension(
-                    each.name,
-                    size=each.size,
-                    offset=each.type.offset,
-                    step=each.type.step,
-                    unit=each.type.unit,
-                    states=each.type.labels,
-                )
-                for each in self.searched
-            ),
+            searched=tuple(each.dimension() for each in self.searched),
             known=tuple(
                 Known(
                     table=given_line[symbol.name],
                     floor=0.0 if (normal := normals[symbol.name]) is None else normal.floor,
                     normal=normal,
-                    **_rule(symbol),
+                    **symbol.reading,
                 )
                 for symbol in self.known
             ),
             prior=prior,
             prior_select=None
             if (select := self.prior_select) is None
-            else PriorSelect(table=_given_value(given_line[select.name] * prior, prior), **_rule(select)),
+            else PriorSelect(table=_given_value(given_line[select.name] * prior, prior), **select.reading),
         )
 
     def _normal(self, symbol: Symbol) -> Normal | None:
@@ -350,18 +339,3 @@ def _scaled(weights: NDArray[np.float64]) -> NDArray[np.float64]:
     largest = weights.max()
     scaled: NDArray[np.float64] = weights / largest if largest > 0 else weights
     return scaled
-
-
-def _rule(symbol: Symbol) -> dict[str, Any]:
-    """Return the fields of a known variable that come from its symbol."""
-    return {
-        "name": symbol.name,
-        "bits": symbol.bits,
-        "offset": symbol.type.offset,
-        "step": symbol.type.step,
-        "period": symbol.period,
-        "on_range": symbol.on_range,
-        "on_missing": symbol.on_missing,
-        "path": symbol.path,
-        "states": symbol.type.labels,
-    }

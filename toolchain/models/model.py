@@ -9,7 +9,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -104,12 +104,16 @@ class TabulatedVariable:
         """Return the conversion of readings to addresses, as in `deployment.toml`, or raise a ModelError."""
         own = {each.name for each in fields(self)}
         rule = {key: getattr(self, key) for key in Variable.model_fields if key in own}
-        try:
-            return Variable(
-                kind="sensor" if isinstance(self, Known) else "prior_select", values=self.values, **rule
-            )
-        except ValidationError as reason:
-            raise ModelError(f"variable {self.name!r}: {first_mistake(reason)}") from None
+        kind = "sensor" if isinstance(self, Known) else "prior_select"
+        return checked_variable(kind=kind, values=self.values, **rule)
+
+
+def checked_variable(*, name: str, **rule: Any) -> Variable:
+    """Return a known variable as in `deployment.toml`, or raise a ModelError."""
+    try:
+        return Variable(name=name, **rule)
+    except ValidationError as reason:
+        raise ModelError(f"variable {name!r}: {_first(reason)}") from None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -254,7 +258,7 @@ def dimension(
     try:
         return Dimension(label=label, size=size, offset=offset, step=step, unit=unit, states=states)
     except ValidationError as reason:
-        raise ModelError(f"searched dimension {label!r}: {first_mistake(reason)}") from None
+        raise ModelError(f"searched dimension {label!r}: {_first(reason)}") from None
 
 
 def interval(label: str, low: float, high: float, *, cells: int, unit: str = "") -> Dimension:
@@ -294,8 +298,7 @@ def _check_distribution(what: str, table: NDArray[np.float64]) -> None:
         raise ModelError(f"{what} sums to {sums[line]:.9g}{where}; a distribution sums to 1")
 
 
-def first_mistake(reason: ValidationError) -> str:
-    """Return the first thing that pydantic refuses, as a clause."""
+def _first(reason: ValidationError) -> str:
     detail = reason.errors(include_url=False)[0]
     if detail["type"] == "value_error":
         return str(detail["ctx"]["error"])
