@@ -41,7 +41,7 @@ def machine_of(model, **parameters):
         BM2Parameters(
             cardinalities=model.cardinalities,
             factors=tuple(tuple(places[name] for name in term.scope) for term in model.factors),
-            searched=tuple(places[name] for name in model.searched),
+            searched=tuple(places[each.label] for each in model.searched),
             known=tuple(places[name] for name in model.known),
             **parameters,
         ),

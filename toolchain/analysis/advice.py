@@ -143,7 +143,7 @@ def advise(source: Model | Question, options: AdviceOptions) -> Advice:
     known = f" | {', '.join(network.known)}" if network.known else ""
     return Advice(
         model=network.name,
-        question=f"P({', '.join(network.searched)}{known})",
+        question=f"P({', '.join(each.label for each in network.searched)}{known})",
         accuracy=options.accuracy,
         frames=options.frames,
         clock_hz=options.clock_hz,

@@ -119,7 +119,7 @@ def _check_same(deployment: Deployment, machine: BM2Machine, model: NetworkModel
     p = machine.parameters
     place = {name: at for at, name in enumerate(model.names)}.__getitem__
     scopes = tuple(tuple(map(place, term.scope)) for term in model.factors)
-    asked = (tuple(map(place, model.searched)), tuple(map(place, model.known)))
+    asked = (tuple(place(each.label) for each in model.searched), tuple(map(place, model.known)))
     if (model.cardinalities, scopes, asked) == (p.cardinalities, p.factors, (p.searched, p.known)):
         tables = [term.table for term in model.factors]
         if BM2Machine.from_factors(p, tables, machine.rng_table) == machine:

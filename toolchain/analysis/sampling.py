@@ -46,7 +46,7 @@ def drawn_readings(model: NetworkModel, frames: int, seed: int) -> list[Addresse
     random = np.random.default_rng(seed)
     given_earlier = [
         replace(
-            model, dimensions=(Dimension(label=each.name, size=each.values),), variables=model.variables[:at]
+            model, searched=(Dimension(label=each.name, size=each.values),), variables=model.variables[:at]
         )
         for at, each in enumerate(model.variables)
     ]

@@ -1,14 +1,21 @@
 """The BM2 for a model: its plan, the sizes of its tables and results, and the machine of each board, a chain (thesis 2.1.3)."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import ClassVar, Final
 
 from machines import KINDS
 from machines.bm2 import CHAINS_MAX, FACTOR_BITS_MAX, BM2Machine, BM2Parameters, start_state
 from machines.errors import MachineError, ParameterError
 from machines.parameters import RngKind
 from pcie_shim.register_layout import BLOCKS
-from toolchain.building.machine import BoardLayout, LineBlock, check_seeds, fitted_interface
+from toolchain.building.machine import (
+    BoardLayout,
+    LineBlock,
+    check_seeds,
+    fitted_interface,
+    machine_options,
+    option,
+)
 from toolchain.building.options import BuildOptions
 from toolchain.deployment import BM2Section
 from toolchain.errors import BuildError
@@ -20,41 +27,23 @@ _MOST_CODES: Final = 1 << 27
 
 BM2_KEYS: Final = tuple(key for key in BM2Section.model_fields if key in BM2Parameters.__dataclass_fields__)
 """The parameters with the same names in `[machine]`."""
-_OPTIONS: Final = tuple(key for key in BM2_KEYS if key in BuildOptions.__dataclass_fields__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BM2Plan:
     """The BM2 for a model, before any table is computed."""
 
+    kind: ClassVar = "BM2"
+    why: str
+    """The reason for a BM2, as a clause."""
     model: NetworkModel
     options: BuildOptions
-    """The options."""
     parameters: BM2Parameters
     """The parameters of the first board; the others differ only in their number."""
-    why: str = "it was asked for"
-    """The reason for a BM2, as a clause."""
-
-    @property
-    def target_count(self) -> int:
-        """The number of samples of each board."""
-        asked = self.options.target_count
-        return int(BM2Section.model_fields["target_count"].default) if asked is None else asked
-
-    @property
-    def max_cycles(self) -> int:
-        """The maximum number of cycles: a safety stop, and the limit of the wait for a board."""
-        asked, parameters = self.options.max_cycles, self.parameters
-        if asked is not None:
-            return asked
-        # a move takes 3 to 6 cycles in the mean, unless zeros are clipped
-        moves = (parameters.burn_in + self.target_count) * parameters.state_bits
-        return max(int(BM2Section.model_fields["max_cycles"].default), 64 * moves)
-
-
-def bm2_options(source: BuildOptions | BM2Section) -> dict[str, Any]:
-    """Return the parameters of a machine with the same names in the build options and in `[machine]`."""
-    return {key: value for key in _OPTIONS if (value := getattr(source, key)) is not None}
+    target_count: int
+    """The number of samples of each board."""
+    max_cycles: int
+    """The maximum number of cycles: a safety stop, and the limit of the wait for a board."""
 
 
 def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was asked for") -> BM2Plan:
@@ -67,10 +56,10 @@ def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was aske
         parameters = BM2Parameters(
             cardinalities=model.cardinalities,
             factors=tuple(tuple(place[name] for name in term.scope) for term in model.factors),
-            searched=tuple(place[name] for name in model.searched),
+            searched=tuple(place[each.label] for each in model.searched),
             known=tuple(place[name] for name in model.known),
             chains=options.partitions,
-            **bm2_options(options),
+            **machine_options(options, BM2_KEYS),
         )
     except ParameterError as reason:
         raise BuildError(str(reason)) from reason
@@ -80,7 +69,18 @@ def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was aske
             f"--stream {parameters.stream}: a sample of this model has {parameters.state_words} words, and the "
             f"register map has room for {room} samples"
         )
-    return BM2Plan(model=model, options=options, parameters=parameters, why=why)
+    target_count, max_cycles = (option(key, options, BM2Section) for key in ("target_count", "max_cycles"))
+    if options.max_cycles is None:  # a move takes 3 to 6 cycles in the mean, unless zeros are clipped
+        moves = (parameters.burn_in + target_count) * parameters.state_bits
+        max_cycles = max(max_cycles, 64 * moves)
+    return BM2Plan(
+        why=why,
+        model=model,
+        options=options,
+        parameters=parameters,
+        target_count=target_count,
+        max_cycles=max_cycles,
+    )
 
 
 def _check_sizes(model: NetworkModel) -> None:
@@ -101,7 +101,7 @@ def _check_sizes(model: NetworkModel) -> None:
             f"is {limit}: give its variables fewer values, or fix one with --given"
         )
     room, words = BLOCKS["RESULTS"].words, sum(1 << width for width in bits.values())
-    joint = 1 << sum(bits[name] for name in model.searched)
+    joint = 1 << sum(bits[each.label] for each in model.searched)
     if words + joint > room:
         largest = max(model.symbols, key=lambda each: each.size)
         most = 1 << bits[largest.name]

@@ -9,11 +9,13 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from machines.bm1 import BM1Machine
@@ -39,15 +41,12 @@ from toolchain.deployment import (
     BM2Section,
     BoardSection,
     Deployment,
-    Dimension,
     Output,
     Variable,
     write_deployment,
 )
 from toolchain.deployment.deployment import with_hash
 from toolchain.errors import BuildError, DeploymentError
-from toolchain.models.model import Model
-from toolchain.models.network import NetworkModel
 from toolchain.outputs.output_files import image_files, memory_files, quartus_files, text_file, write_files
 
 
@@ -59,18 +58,10 @@ class Built:
     """The content of `deployment.toml`."""
     images: tuple[Image, ...]
     """One per board."""
-    interface_reason: str
-    """The reason for an interface that is not the default, as a clause; otherwise empty."""
+    quantised: Quantised | None
+    """The codes of a BM1 before they were divided among boards, and the quantisation loss; None for a BM2."""
     report: str
     """The content of `report.txt`."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BM1Built(Built):
-    """The same of a BM1, with its codes."""
-
-    quantised: Quantised
-    """The codes before they were divided among boards, and the quantisation loss."""
 
 
 REPORT_NAME: Final = "report.txt"
@@ -82,7 +73,7 @@ def build_deployment(plan: MachinePlan | BM2Plan, directory: Path, *, remark: st
     The same plan gives the same bytes. A deployment in the folder is replaced; `remark` ends the report. A
     BuildError if the options contradict the register map, or the folder cannot be written.
     """
-    built = assemble_bm2(plan) if isinstance(plan, BM2Plan) else assemble(plan)
+    built = assemble(plan)
     if remark:
         built = replace(built, report=f"{built.report}\n{remark}\n")
     with file_errors(directory, "written", BuildError, "; choose another folder with -o"):
@@ -102,35 +93,48 @@ def build_deployment(plan: MachinePlan | BM2Plan, directory: Path, *, remark: st
         raise BuildError(str(reason)) from None
 
 
-def assemble(plan: MachinePlan) -> BM1Built:
-    """Return the deployment of a BM1 without writing anything, or raise a BuildError."""
-    model, parameters, options = plan.model, plan.parameters, plan.options
-    layout = board_layout(parameters, options.partitions, options.interface)
-    quantised = quantise(
-        model, prob_bits=parameters.prob_bits, scale=options.scaling, sensor_mode=parameters.sensor_mode
+def assemble(
+    plan: MachinePlan | BM2Plan, place: Callable[[Deployment], Deployment] = lambda deployment: deployment
+) -> Built:
+    """Return a deployment without writing anything, or raise a BuildError; `place` may change its topics and paths."""
+    model, options, quantised = plan.model, plan.options, None
+    machines: Sequence[BM1Machine | BM2Machine]
+    if isinstance(plan, BM2Plan):
+        machines = chain_machines(plan)
+        layout, lines = chain_layout(plan.parameters, options.interface), len(machines)
+        identity = _model_hash(plan, [*machines[0].tables, *machines[0].supports])
+        report = partial(bm2_report, plan.model, machine=machines[0], why=plan.why)
+    else:
+        layout, lines = board_layout(plan.parameters, options.partitions, options.interface), model.lines
+        quantised = quantise(
+            plan.model,
+            prob_bits=plan.parameters.prob_bits,
+            scale=options.scaling,
+            sensor_mode=plan.parameters.sensor_mode,
+        )
+        machine = whole_machine(plan, quantised)
+        machines = split(machine, len(layout.blocks))
+        identity = _model_hash(plan, [machine.prior, *machine.tables])
+        report = partial(build_report, plan.model, quantised=quantised)
+    images = tuple(
+        Image(
+            machine=machine,
+            partition=Partition(board, len(machines), block.offset, lines),
+            interface_sensors=layout.interface[0],
+            interface_results=layout.interface[1],
+            model_hash=identity,
+            build_date=options.build_date,
+            tool_version=tool_version(),
+        )
+        for board, (machine, block) in enumerate(zip(machines, layout.blocks, strict=True))
     )
-    machine = whole_machine(plan, quantised)
-    parts = split(machine, len(layout.blocks))
-    images = board_images(plan, parts, layout, model_hash(model, machine), model.lines)
-    deployment = describe(plan, layout, images)
-    report = build_report(model, deployment, quantised, layout.reason)
-    return BM1Built(
+    deployment = place(describe(plan, layout, images))
+    return Built(
         deployment=deployment,
         images=images,
         quantised=quantised,
-        interface_reason=layout.reason,
-        report=report,
+        report=report(deployment=deployment, interface_reason=layout.reason),
     )
-
-
-def assemble_bm2(plan: BM2Plan) -> Built:
-    """Return the deployment of a BM2 without writing anything, or raise a BuildError."""
-    machines = chain_machines(plan)
-    layout = chain_layout(plan.parameters, plan.options.interface)
-    images = board_images(plan, machines, layout, bm2_hash(plan.model, machines[0]), len(machines))
-    deployment = describe(plan, layout, images)
-    report = bm2_report(plan.model, deployment, machines[0], plan.why, layout.reason)
-    return Built(deployment=deployment, images=images, interface_reason=layout.reason, report=report)
 
 
 def build_date(model_file: Path) -> str:
@@ -147,97 +151,54 @@ def build_date(model_file: Path) -> str:
         raise BuildError(f"SOURCE_DATE_EPOCH is {epoch!r}, expected a number of seconds since 1970") from None
 
 
-def model_hash(model: Model, machine: BM1Machine) -> str:
+def _model_hash(plan: MachinePlan | BM2Plan, codes: Sequence[NDArray[Any]]) -> str:
     """Return the SHA-256 (hexadecimal) of the whole machine and its names.
 
-    It covers codes, not probabilities, whose last bits depend on the mathematics library.
+    It covers codes (and, of a BM2, what is possible), not probabilities, whose last bits depend on the mathematics library.
     """
-    parameters = machine.parameters
-    words = {
+    model, parameters = plan.model, plan.parameters
+    words: dict[str, Any] = {
         "name": model.name,
         "searched": [dimension.model_dump(mode="json") for dimension in model.searched],
         "known": [variable.model_dump(mode="json") for variable in model.variables],
         "prob_bits": parameters.prob_bits,
     }
-    if parameters.sensor_mode is not SensorMode.COLUMN or parameters.replicas > 1:
-        words |= {"sensor_mode": parameters.sensor_mode.value, "replicas": parameters.replicas}
+    if isinstance(plan, BM2Plan):
+        words["variables"] = list(zip(plan.model.names, plan.model.cardinalities, strict=True))
+        words["factors"] = plan.parameters.factors
+    elif plan.parameters.sensor_mode is not SensorMode.COLUMN or plan.parameters.replicas > 1:
+        words |= {"sensor_mode": plan.parameters.sensor_mode.value, "replicas": plan.parameters.replicas}
     digest = hashlib.sha256(json.dumps(words, sort_keys=True, separators=(",", ":")).encode())
-    for codes in (machine.prior, *machine.tables):
-        digest.update(codes.astype("<u2", copy=False).tobytes())
+    for part in codes:
+        digest.update(part.astype("<u2", copy=False).tobytes())
     return digest.hexdigest()
-
-
-def bm2_hash(model: NetworkModel, machine: BM2Machine) -> str:
-    """Return the SHA-256 (hexadecimal) of a BM2 and its names; its codes, and what is possible, instead of probabilities."""
-    words = {
-        "name": model.name,
-        "variables": list(zip(model.names, model.cardinalities, strict=True)),
-        "factors": machine.parameters.factors,
-        "searched": [dimension.model_dump(mode="json") for dimension in model.dimensions],
-        "known": [variable.model_dump(mode="json") for variable in model.variables],
-        "prob_bits": machine.parameters.prob_bits,
-    }
-    digest = hashlib.sha256(json.dumps(words, sort_keys=True, separators=(",", ":")).encode())
-    for codes, support in zip(machine.tables, machine.supports, strict=True):
-        digest.update(codes.astype("<u2", copy=False).tobytes())
-        digest.update(support.tobytes())
-    return digest.hexdigest()
-
-
-def board_images(
-    plan: MachinePlan | BM2Plan,
-    machines: Sequence[BM1Machine | BM2Machine],
-    layout: BoardLayout,
-    identity: str,
-    lines: int,
-) -> tuple[Image, ...]:
-    """Return one image per board; `identity` is the hash of the model, and `lines` is the number of lines of all boards."""
-    return tuple(
-        Image(
-            machine=machine,
-            partition=Partition(board, len(machines), block.offset, lines),
-            interface_sensors=layout.interface[0],
-            interface_results=layout.interface[1],
-            model_hash=identity,
-            build_date=plan.options.build_date,
-            tool_version=tool_version(),
-        )
-        for board, (machine, block) in enumerate(zip(machines, layout.blocks, strict=True))
-    )
 
 
 def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[Image]) -> Deployment:
     """Return the deployment of these images, with its hash; a BuildError if an option does not fit the machine."""
     model, options = plan.model, plan.options
-    limits: dict[str, Any] = {
-        "lines": model.lines,
-        "interface": layout.interface_text,
-        "target_count": plan.target_count,
-        "max_cycles": plan.max_cycles,
-    }
+    own: dict[str, Any]
+    section: type[BM1Section | BM2Section]
+    if isinstance(plan, BM2Plan):
+        section, keys, own = BM2Section, BM2_KEYS, {"variables": plan.model.names}
+    else:
+        section, keys, own = BM1Section, MACHINE_KEYS, {"scale": options.scaling, "stop": options.stop}
+    own |= {key: getattr(plan.parameters, key) for key in keys}
     try:
-        section: BM1Section | BM2Section
-        if isinstance(plan, BM2Plan):
-            section = BM2Section(
-                **limits,
-                variables=plan.model.names,
-                **{key: getattr(plan.parameters, key) for key in BM2_KEYS},
-            )
-        else:
-            section = BM1Section(
-                scale=options.scaling,
-                stop=options.stop,
-                **limits,
-                **{key: getattr(plan.parameters, key) for key in MACHINE_KEYS},
-            )
         deployment = Deployment(
             name=model.name,
             queue=options.queue,
             tolerance_s=options.tolerance_s,
             sources=options.all_sources,
             variables=_variables(plan),
-            searched=dimensions_of(plan),
-            machine=section,
+            searched=model.searched,
+            machine=section(
+                lines=model.lines,
+                interface=layout.interface_text,
+                target_count=plan.target_count,
+                max_cycles=plan.max_cycles,
+                **own,
+            ),
             prior=options.written_prior,
             boards=tuple(
                 BoardSection(
@@ -253,11 +214,6 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
     except ValidationError as reason:
         raise refused_option(reason) from None
     return with_hash(deployment)
-
-
-def dimensions_of(plan: MachinePlan | BM2Plan) -> tuple[Dimension, ...]:
-    """Return the searched variables of a plan's model."""
-    return plan.model.dimensions if isinstance(plan, BM2Plan) else plan.model.searched
 
 
 def _variables(plan: MachinePlan | BM2Plan) -> tuple[Variable, ...]:

@@ -1,7 +1,6 @@
 """The choice of a machine for a model: a BM1 for a naive fusion, a BM2 for every other question (thesis 2.1)."""
 
 from collections.abc import Sequence
-from typing import Final
 
 from toolchain.building.bm2_machine import BM2Plan, plan_bm2
 from toolchain.building.machine import MachinePlan, plan_machine, with_bits
@@ -11,15 +10,13 @@ from toolchain.models.joint import Question
 from toolchain.models.model import Model
 from toolchain.models.network import NetworkModel, network_of
 
-_FUSION: Final = "the known variables are independent given the searched ones"
-
 
 def plan_for(
     source: Model | Question, options: BuildOptions, bits: Sequence[str] = (), device: str | None = None
-) -> tuple[MachinePlan | BM2Plan, str]:
-    """Return the plan of the machine that the options ask for, and why; arguments and errors as for `model_for`."""
+) -> MachinePlan | BM2Plan:
+    """Return the plan of the machine that the options ask for; arguments and errors as for `model_for`."""
     model, why = model_for(source, options, bits, device)
-    return (plan_machine(model, options) if isinstance(model, Model) else plan_bm2(model, options, why)), why
+    return plan_machine(model, options) if isinstance(model, Model) else plan_bm2(model, options, why)
 
 
 def model_for(
@@ -38,7 +35,7 @@ def model_for(
     """
     refusal = source.refusal() if isinstance(source, Question) else None
     choice = options.machine
-    why = _FUSION if refusal is None else refusal.why
+    why = MachinePlan.why if refusal is None else refusal.why
     if choice is MachineChoice.BM1 or (choice is MachineChoice.AUTO and refusal is None):
         _refuse(given_flags(options, BM2Options), "BM2", "BM1", choice, why)
         model = source.model() if isinstance(source, Question) else source
@@ -48,9 +45,7 @@ def model_for(
     if options.written_prior is not None:
         flags.append("--prior-path" if options.sources is None else "a prior in the file of --sources")
     _refuse(flags, "BM1", "BM2", choice, why)
-    network = network_for(source)
-    why = why if refusal is not None else "it was asked for"
-    return network, why
+    return network_for(source), "it was asked for" if refusal is None else why
 
 
 def network_for(source: Model | Question) -> NetworkModel:

@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from machines.parameters import ADDRESS_BITS_MAX, BM1Parameters, PriorMode, RngK
 from pcie_shim.register_layout import interface_room
 from toolchain.building.options import BuildOptions
 from toolchain.building.quantise import Quantised
-from toolchain.deployment import BM1Section, MachineSection, Scale
+from toolchain.deployment import BM1Section, BM2Section, MachineSection, Scale
 from toolchain.errors import BuildError
 from toolchain.flags import key_values
 from toolchain.models.model import Model
@@ -26,44 +26,39 @@ from toolchain.outputs.mif import random_table
 _MOST_CODES: Final = 1 << 30
 """Maximum number of codes of all columns, which take 2 bytes each while they are computed."""
 
-_PROB_BITS: Final = 8
-"""Bits of a code of a BM1, unless others are asked for."""
-_MAX_CYCLES: Final = 2**17
-"""Maximum number of cycles of a BM1, unless another is asked for."""
-
 MACHINE_KEYS: Final = tuple(
     key for key in BM1Section.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
 )
 """The parameters with the same names in `[machine]`; its `lines` are those of all boards."""
 
 
-def machine_options(source: BuildOptions | MachineSection) -> dict[str, Any]:
-    """Return the parameters of a machine with the same names in the build options and in `[machine]`."""
-    found = {key: getattr(source, key) for key in MACHINE_KEYS if key != "prior_bits"}
-    return {key: value for key, value in found.items() if value is not None}
+def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) -> dict[str, Any]:
+    """Return those parameters of a machine that have the same names in the build options and in `[machine]`."""
+    options = [key for key in keys if key in BuildOptions.__dataclass_fields__]
+    return {key: value for key in options if (value := getattr(source, key)) is not None}
+
+
+def option(key: str, options: BuildOptions, section: type[BM1Section | BM2Section]) -> int:
+    """Return the value of an option, by default that of `[machine]`."""
+    asked = getattr(options, key)
+    return int(section.model_fields[key].default if asked is None else asked)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MachinePlan:
-    """The machine for a model, before any table is computed."""
+    """The BM1 for a model, before any table is computed."""
 
+    kind: ClassVar = "BM1"
+    why: ClassVar = "the known variables are independent given the searched ones"
+    """The reason for a BM1, as a clause."""
     model: Model
     options: BuildOptions
     """The options; only the number of boards may still change, because the parameters do not contain it."""
     parameters: BM1Parameters
     """The parameters of the whole machine, with the lines of all boards."""
-
-    @property
-    def target_count(self) -> int:
-        """The count that stops a machine."""
-        asked = self.options.target_count
-        return self.parameters.target_count_max if asked is None else asked
-
-    @property
-    def max_cycles(self) -> int:
-        """The maximum number of cycles."""
-        asked = self.options.max_cycles
-        return _MAX_CYCLES if asked is None else asked
+    target_count: int
+    """The count that stops a machine."""
+    max_cycles: int
 
 
 def with_bits(model: Model, bits: Iterable[str]) -> Model:
@@ -105,18 +100,25 @@ def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
         raise BuildError(
             f"the tables have {codes} codes, and a machine can have {_MOST_CODES}: use fewer lines, or fewer --bits"
         )
-    prob_bits = _PROB_BITS if options.prob_bits is None else options.prob_bits
+    prob_bits = option("prob_bits", options, BM1Section)
     per_line_codes = options.sensor_mode is SensorMode.THRESHOLD
     try:
         parameters = BM1Parameters(
             lines=model.lines,
             sensor_bits=tuple(prob_bits if per_line_codes else known.bits for known in model.known),
             prior_bits=0 if model.prior_select is None else model.prior_select.bits,
-            **machine_options(options),
+            **machine_options(options, MACHINE_KEYS),
         )
     except ParameterError as reason:
         raise BuildError(str(reason)) from reason
-    return MachinePlan(model=model, options=options, parameters=parameters)
+    target_count = parameters.target_count_max if options.target_count is None else options.target_count
+    return MachinePlan(
+        model=model,
+        options=options,
+        parameters=parameters,
+        target_count=target_count,
+        max_cycles=option("max_cycles", options, BM1Section),
+    )
 
 
 def whole_machine(plan: MachinePlan, quantised: Quantised) -> BM1Machine:

@@ -3,34 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
 from machines.parameters import SensorMode
 from pcie_shim.programming_file import Image
-from toolchain.building.bm2_machine import BM2Plan, bm2_options, chain_layout
-from toolchain.building.build import (
-    REPORT_NAME,
-    Built,
-    assemble,
-    assemble_bm2,
-    check_agreement,
-    dimensions_of,
-    read_images,
-)
-from toolchain.building.choice import plan_for
-from toolchain.building.machine import board_layout, machine_options, plan_machine
+from toolchain.building.bm2_machine import BM2_KEYS, BM2Plan, chain_layout, plan_bm2
+from toolchain.building.build import REPORT_NAME, assemble, check_agreement, read_images
+from toolchain.building.choice import model_for
+from toolchain.building.machine import MACHINE_KEYS, MachinePlan, board_layout, machine_options, plan_machine
 from toolchain.building.options import BuildOptions, DeploymentEdits, MachineChoice, refused_option
-from toolchain.building.report import bm2_report, build_report
-from toolchain.deployment import (
-    FILE_NAME,
-    BM2Section,
-    Deployment,
-    Dimension,
-    Variable,
-    deployment_text,
-    load_deployment,
-)
+from toolchain.deployment import FILE_NAME, BM2Section, Deployment, Variable, deployment_text, load_deployment
 from toolchain.deployment.deployment import with_hash
 from toolchain.errors import BuildError, ModelError
 from toolchain.flags import key_values, names_in
@@ -129,24 +113,16 @@ def regenerate_memories(
     images = read_images(deployment)
     if model is None:
         return write_files(directory, memory_files(deployment, images))
-    options = replace(_options(deployment, images[0]), build_date=build_date)
-    built: Built
-    if isinstance(deployment.machine, BM2Section):
-        plan = _same_chains(model, options, deployment, images[0])
-        built = assemble_bm2(plan)
-        new = _with_places(built.deployment, deployment)
-        report = bm2_report(plan.model, new, built.images[0].machine, plan.why, built.interface_reason)
-    else:
-        fusion = _with_widths(model.model() if isinstance(model, Question) else model, deployment)
-        built = assemble(plan_machine(fusion, options))
-        new = _with_places(built.deployment, deployment)
-        report = build_report(fusion, new, built.quantised, built.interface_reason)
+    plan = _plan(
+        model, replace(_options(deployment, images[0]), build_date=build_date), deployment, images[0]
+    )
+    built = assemble(plan, lambda new: _with_places(new, deployment))
     parts = [
-        image_files(new, built.images),
-        memory_files(new, built.images),
-        text_file(REPORT_NAME, report),
+        image_files(built.deployment, built.images),
+        memory_files(built.deployment, built.images),
+        text_file(REPORT_NAME, built.report),
         text_file(
-            FILE_NAME, deployment_text(new)
+            FILE_NAME, deployment_text(built.deployment)
         ),  # last, so that a partially written folder has the old hashes
     ]
     return sorted(change for part in parts for change in write_files(directory, part))
@@ -173,14 +149,15 @@ def regenerate_deployment(directory: Path, edits: DeploymentEdits) -> Changes:
 def _options(deployment: Deployment, image: Image) -> BuildOptions:
     machine, source, parameters = deployment.machine, deployment.sources[0], image.machine.parameters
     partitions = len(deployment.boards)
+    own: dict[str, Any] = {}
     if isinstance(machine, BM2Section):
-        without_flag = chain_layout(parameters, None)
-        own = {"machine": MachineChoice.BM2} | bm2_options(machine)
+        without_flag, keys = chain_layout(parameters, None), BM2_KEYS
     else:
         without_flag = board_layout(replace(parameters, lines=machine.lines), partitions, None)
-        own = {"scale": machine.scale, "stop": machine.stop} | machine_options(machine)
+        own, keys = {"scale": machine.scale, "stop": machine.stop}, MACHINE_KEYS
     interface = (machine.interface_sensors, machine.interface_results)
     return BuildOptions(
+        machine=MachineChoice(machine.type.lower()),
         uri=source.uri,
         topic=source.topic,
         type=source.type,
@@ -190,30 +167,18 @@ def _options(deployment: Deployment, image: Image) -> BuildOptions:
         max_cycles=machine.max_cycles,
         rng_table=image.machine.rng_table,
         **own,
+        **machine_options(machine, keys),
     )
 
 
-def _same_chains(
-    model: Model | Question, options: BuildOptions, deployment: Deployment, image: Image
-) -> BM2Plan:
-    """Return the plan for a BM2, or raise a BuildError if it is another machine than the deployment's."""
-    plan, _ = plan_for(model, options)
-    _check_variables(plan.model.variables, dimensions_of(plan), deployment)
-    if not isinstance(plan, BM2Plan) or plan.parameters != image.machine.parameters:
-        raise BuildError(
-            "the model now has other variables or factors: this is another machine, so build it again with "
-            "'toolchain build'"
-        )
-    return plan
-
-
-def _check_variables(
-    variables: Sequence[Variable], searched: Sequence[Dimension], deployment: Deployment
-) -> None:
-    """Raise a BuildError if a model has other searched or known variables than the deployment."""
-    sizes = [(each.label, each.size) for each in searched]
+def _plan(
+    source: Model | Question, options: BuildOptions, deployment: Deployment, image: Image
+) -> MachinePlan | BM2Plan:
+    """Return the plan for the machine of a deployment, or raise a BuildError if the model now needs another one."""
+    model, why = model_for(source, options)
+    sizes = [(each.label, each.size) for each in model.searched]
     built_sizes = [(each.label, each.size) for each in deployment.searched]
-    names = sorted(each.name for each in variables)
+    names = sorted(each.name for each in model.variables)
     built_names = sorted(each.name for each in deployment.variables)
     for what, new, old in (("searches", sizes, built_sizes), ("knows", names, built_names)):
         if new != old:
@@ -221,11 +186,19 @@ def _check_variables(
                 f"the model {what} {_listed(new)}, but the deployment {_listed(old)}: this is another machine, so "
                 "build it again with 'toolchain build'"
             )
+    if isinstance(model, Model):
+        return plan_machine(_with_widths(model, deployment), options)
+    plan = plan_bm2(model, options, why)
+    if plan.parameters != image.machine.parameters:
+        raise BuildError(
+            "the model now has other variables or factors: this is another machine, so build it again with "
+            "'toolchain build'"
+        )
+    return plan
 
 
 def _with_widths(model: Model, deployment: Deployment) -> Model:
     """Return the model with the address widths of the deployment, or raise a BuildError if it needs another machine."""
-    _check_variables(model.variables, model.searched, deployment)
     kinds = {variable.name: variable.kind for variable in model.variables}
     built_kinds = {variable.name: variable.kind for variable in deployment.variables}
     if kinds != built_kinds:

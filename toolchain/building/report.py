@@ -6,55 +6,109 @@ It has no dates or paths, so the same input gives the same bytes.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from machines.bm2 import BM2Machine
 from machines.parameters import PriorMode, SensorMode
+from toolchain.building.machine import MachinePlan
 from toolchain.building.quantise import Quantised
-from toolchain.deployment import Deployment, Dimension, MachineSection, Variable
+from toolchain.deployment import Deployment, MachineSection
 from toolchain.models.model import Model
 from toolchain.models.network import NetworkModel
 
 
-def build_report(
-    model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str = ""
-) -> str:
-    """Return what was built and what was lost, in plain sentences, without dates or paths: same input, same bytes."""
+def build_report(model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str) -> str:
+    """Return the report of a BM1."""
     machine = deployment.machine
     grid = " x ".join(f"{d.label} {d.size}" for d in model.searched)
     names = ", ".join(known.name for known in model.known)
     count = f"{len(model.known)} known variable{'s' if len(model.known) != 1 else ''}"
-    machine_sentence = (
-        f"Machine: BM1, since the known variables are independent given the searched ones. Codes of {machine.prob_bits} bits (scale = {machine.scale}), counters of "
+    if names:
+        names = f", in the order of the columns: {names}" if len(model.known) > 1 else f", {names}"
+    sentence = (
+        f"Machine: BM1, since {MachinePlan.why}. Codes of {machine.prob_bits} bits (scale = {machine.scale}), counters of "
         f"{machine.counter_bits} bits, stops at a count of {machine.target_count} or after {machine.max_cycles} "
-        f"cycles, stop = {machine.stop}; {machine.rng} with {machine.rng_banks} banks, rng_reset = "
-        f"{machine.rng_reset}, {machine.steps_per_clock} steps per clock."
+        f"cycles, stop = {machine.stop}; {_generators(machine)}{many_sentence(machine)}"
     )
-    machine_sentence += many_sentence(machine)
-    paragraphs = [
-        f"Model {model.name}: {model.lines} lines ({grid}), {count}"
-        + (
-            f", in the order of the columns: {names}."
-            if len(model.known) > 1
-            else f", {names}."
-            if names
-            else "."
-        ),
-        *_state_paragraph(model.searched, model.variables),
-        *_prior_paragraph(model, deployment),
-        machine_sentence,
-        f"Interface: {machine.interface}{interface_reason}.",
-        f"Boards: {len(deployment.boards)}.\n"
-        + "\n".join(
-            f"  {board.image}: lines {board.line_offset} to {board.line_offset + board.lines - 1}, "
-            f"image {board.image_hash[:16]}"
-            for board in deployment.boards
-        ),
-        loss_heading(machine.sensor_mode) + "\n" + _loss_table(quantised),
+    places = [
+        f"lines {each.line_offset} to {each.line_offset + each.lines - 1}" for each in deployment.boards
     ]
-    paragraphs += [f"Warning: {warning}" for warning in quantised.warnings]
-    paragraphs.append(f"{_topics_sentence(deployment)} Deployment {deployment.hash[:16]}.")
+    return _report(
+        model,
+        deployment,
+        f"{model.lines} lines ({grid}), {count}{names}.",
+        [*_prior_paragraph(model, deployment), sentence],
+        interface_reason,
+        _boards(deployment, "", places),
+        loss_heading(machine.sensor_mode) + "\n" + _loss_table(quantised),
+        *(f"Warning: {warning}" for warning in quantised.warnings),
+    )
+
+
+def bm2_report(
+    model: NetworkModel, deployment: Deployment, machine: BM2Machine, why: str, interface_reason: str
+) -> str:
+    """Return the report of a BM2; `why` is the reason for this kind of machine, as a clause."""
+    searched = ", ".join(f"{each.label} ({each.size})" for each in model.searched)
+    known = ", ".join(model.known) or "nothing"
+    parameters, limits = machine.parameters, deployment.machine
+    sentence = (
+        f"Machine: BM2, since {why}. Codes of {parameters.prob_bits} bits, sequencer = {parameters.sequencer}"
+        + (", literal" if parameters.literal else "")
+        + f"; each board draws {limits.target_count} samples, one per {parameters.sample_every}, after "
+        f"{parameters.burn_in} sweeps, or stops after {limits.max_cycles} cycles, or {parameters.ops_timeout} of one move; "
+        + _generators(limits)
+    )
+    if parameters.stream:
+        sentence += f" It keeps {parameters.stream} samples for /bm/samples."
+    return _report(
+        model,
+        deployment,
+        f"{len(model.symbols)} variables in {parameters.state_bits} bits, {parameters.cdes} factors; "
+        f"it searches {searched}, and knows {known}.",
+        [sentence],
+        interface_reason,
+        _boards(
+            deployment,
+            ", each with a chain of its own",
+            [f"chain {each.line_offset}" for each in deployment.boards],
+        ),
+        "CDEs (clipped: codes of odds that are 0 or infinite, or too extreme for a code):\n"
+        + _cde_table(model.titles, machine),
+        "The VHDL of a BM2 does not exist yet, so there are memories, but no parameters and no project.",
+    )
+
+
+def _report(
+    model: Model | NetworkModel,
+    deployment: Deployment,
+    content: str,
+    machine: Sequence[str],
+    interface_reason: str,
+    *rest: str,
+) -> str:
+    paragraphs = [
+        f"Model {model.name}: {content}",
+        *_state_paragraph(model),
+        *machine,
+        f"Interface: {deployment.machine.interface}{interface_reason}.",
+        *rest,
+        f"{_topics_sentence(deployment)} Deployment {deployment.hash[:16]}.",
+    ]
     return "\n\n".join(paragraphs) + "\n"
+
+
+def _generators(machine: MachineSection) -> str:
+    return (
+        f"{machine.rng} with {machine.rng_banks} banks, rng_reset = {machine.rng_reset}, {machine.steps_per_clock} steps "
+        "per clock."
+    )
+
+
+def _boards(deployment: Deployment, what: str, places: Sequence[str]) -> str:
+    return f"Boards: {len(places)}{what}.\n" + "\n".join(
+        f"  {board.image}: {place}, image {board.image_hash[:16]}"
+        for board, place in zip(deployment.boards, places, strict=True)
+    )
 
 
 def loss_heading(sensor_mode: SensorMode) -> str:
@@ -101,12 +155,12 @@ def _topics_sentence(deployment: Deployment) -> str:
     )
 
 
-def _state_paragraph(searched: Sequence[Dimension], known: Sequence[Variable]) -> list[str]:
+def _state_paragraph(model: Model | NetworkModel) -> list[str]:
     named = [
         f"  {name}: " + ", ".join(f"{offset + at * step:g} {state}" for at, state in enumerate(states))
         for name, offset, step, states in (
-            *((each.label, each.offset, each.step, each.states) for each in searched),
-            *((each.name, each.offset, each.step, each.states) for each in known),
+            *((each.label, each.offset, each.step, each.states) for each in model.searched),
+            *((each.name, each.offset, each.step, each.states) for each in model.variables),
         )
         if states
     ]
@@ -135,53 +189,11 @@ def _loss_table(quantised: Quantised) -> str:
     return "\n".join(rows)
 
 
-def bm2_report(
-    model: NetworkModel, deployment: Deployment, machine: BM2Machine, why: str, interface_reason: str
-) -> str:
-    """Return the report of a BM2; `why` is the reason for this kind of machine, as a clause."""
-    searched = ", ".join(f"{each.label} ({each.size})" for each in model.dimensions)
-    known = f"knows {', '.join(model.known)}" if model.known else "knows nothing"
-    parameters, limits = machine.parameters, deployment.machine
-    sentence = (
-        f"Machine: BM2, since {why}. Codes of {parameters.prob_bits} bits, sequencer = {parameters.sequencer}"
-        + (", literal" if parameters.literal else "")
-        + f"; each board draws {limits.target_count} samples, one per {parameters.sample_every}, after "
-        f"{parameters.burn_in} sweeps, or stops after {limits.max_cycles} cycles, or {parameters.ops_timeout} of one move; "
-        f"{parameters.rng} with {parameters.rng_banks} banks, rng_reset = {parameters.rng_reset}, "
-        f"{parameters.steps_per_clock} steps per clock."
-    )
-    if parameters.stream:
-        sentence += f" It keeps {parameters.stream} samples for /bm/samples."
-    first = (
-        f"Model {model.name}: {len(model.symbols)} variables in {parameters.state_bits} bits, {parameters.cdes} factors; "
-        f"it searches {searched}, and {known}."
-    )
-    paragraphs = [
-        first,
-        *_state_paragraph(model.dimensions, model.variables),
-        sentence,
-        f"Interface: {limits.interface}{interface_reason}.",
-        f"Boards: {len(deployment.boards)}, each with a chain of its own.\n"
-        + "\n".join(
-            f"  {board.image}: chain {board.line_offset}, image {board.image_hash[:16]}"
-            for board in deployment.boards
-        ),
-        "CDEs (clipped: codes of odds that are 0 or infinite, or too extreme for a code):\n"
-        + _cde_table(model.titles, machine),
-        "The VHDL of a BM2 does not exist yet, so there are memories, but no parameters and no project.",
-        f"{_topics_sentence(deployment)} Deployment {deployment.hash[:16]}.",
-    ]
-    return "\n\n".join(paragraphs) + "\n"
-
-
 def _cde_table(titles: Sequence[str], machine: BM2Machine) -> str:
     width, most = max(map(len, titles)), machine.parameters.ones_code
     rows = [f"  {'factor':{width}}  bits    codes  clipped"]
     for at, (title, table) in enumerate(zip(titles, machine.tables, strict=True)):
         bits = len(machine.parameters.factor_bits(at))
-        rows.append(f"  {title:{width}}  {bits:4d}  {table.size:7d}  {_clipped(table, most):7d}")
+        clipped = np.count_nonzero((table == 1) | (table == most))
+        rows.append(f"  {title:{width}}  {bits:4d}  {table.size:7d}  {clipped:7d}")
     return "\n".join(rows)
-
-
-def _clipped(table: NDArray[np.uint16], most: int) -> int:
-    return int(np.count_nonzero((table == 1) | (table == most)))

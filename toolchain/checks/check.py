@@ -13,7 +13,7 @@ from pcie_shim.errors import PcieShimError
 from pcie_shim.programming_file import Image
 from toolchain.analysis.emulation import joined
 from toolchain.building.bm2_machine import plan_bm2
-from toolchain.building.build import assemble, assemble_bm2, check_agreement, read_images
+from toolchain.building.build import assemble, check_agreement, read_images
 from toolchain.building.machine import MachinePlan, partition_lines, plan_machine
 from toolchain.building.options import BuildOptions
 from toolchain.checks.chain_findings import CheckedChain, chain_findings
@@ -56,13 +56,13 @@ def check_model(
         built = assemble(fit(plan))
     except ToolchainError as reason:
         return [*refused, refusal(reason, "the machine")]
-    findings = _check(built.deployment, built.images, model)
-    return _sorted([*findings, *loss_findings(built.quantised, options)])
+    losses = loss_findings(built.quantised, options) if built.quantised is not None else ()
+    return _sorted([*_check(built.deployment, built.images, model), *losses])
 
 
 def _check_network(model: NetworkModel, options: BuildOptions) -> list[Finding]:
     try:
-        built = assemble_bm2(plan_bm2(model, options))
+        built = assemble(plan_bm2(model, options))
     except ToolchainError as reason:
         return [refusal(reason, "the machine")]
     return _sorted(_check(built.deployment, built.images, model))

@@ -62,12 +62,10 @@ def build(
     typer.echo(f"Reading {file}", err=True)
     source = read_source(model, flags)
     dated = replace(options, build_date=build_date(file))
-    plan, reason = plan_for(source, dated, flags.bits or (), flags.device)
-    why, kind = "", "BM2"
+    plan, why = plan_for(source, dated, flags.bits or (), flags.device), ""
     if isinstance(plan, MachinePlan):
         plan, why = fit_to_device(plan, flags.device)
-        kind = "BM1"
-    typer.echo(f"Building a {kind}, since {reason}", err=True)
+    typer.echo(f"Building a {plan.kind}, since {plan.why}", err=True)
     typer.echo(f"Quantising {plan.model.name} and writing its images", err=True)
     built = build_deployment(plan, directory, remark=why)
     typer.echo(built.report, nl=False)

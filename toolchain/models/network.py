@@ -32,16 +32,11 @@ class NetworkModel:
     """The name of each factor, such as P(A | B)."""
     variables: tuple[Variable, ...]
     """The known variables as in `deployment.toml`, in the order of a frame's readings."""
-    dimensions: tuple[Dimension, ...]
+    searched: tuple[Dimension, ...]
     """The searched variables as in `deployment.toml`, the slowest first."""
 
     def __repr__(self) -> str:
         return f"NetworkModel({self.name!r}, {len(self.symbols)} variables, {len(self.factors)} factors)"
-
-    @property
-    def searched(self) -> tuple[str, ...]:
-        """The names of the searched variables, the slowest first."""
-        return tuple(each.label for each in self.dimensions)
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -61,7 +56,7 @@ class NetworkModel:
     @property
     def lines(self) -> int:
         """The number of probabilities of a posterior."""
-        return math.prod(each.size for each in self.dimensions)
+        return math.prod(each.size for each in self.searched)
 
     def exact(self, addresses: Sequence[int | None]) -> NDArray[np.float64]:
         """Return the exact posterior of the searched variables together, float64[lines], the first one slowest.
@@ -72,12 +67,13 @@ class NetworkModel:
         Raises:
             ModelError: The readings have the probability 0, or inference needs a table above the limit.
         """
+        asked = [each.label for each in self.searched]
         sizes = dict(zip(self.names, self.cardinalities, strict=True))
         pairs = zip(self.known, addresses, strict=True)
         evidence = {name: address for name, address in pairs if address is not None}
         terms = [reduced(term, evidence) for term in self.factors]
-        left = eliminate(terms, sizes.keys() - evidence.keys() - set(self.searched), sizes)
-        weights = product(left, self.searched, sizes).ravel()
+        left = eliminate(terms, sizes.keys() - evidence.keys() - set(asked), sizes)
+        weights = product(left, asked, sizes).ravel()
         if not weights.sum() > 0:
             raise ModelError(f"{self.name}: these readings are impossible together: there is no posterior")
         posterior: NDArray[np.float64] = weights / weights.sum()
@@ -132,7 +128,7 @@ def network_model(
             checked_variable(**each.reading | {"bits": each.bits or each.size.bit_length()}, values=each.size)
             for each in known
         ),
-        dimensions=tuple(each.dimension() for each in searched),
+        searched=tuple(each.dimension() for each in searched),
     )
 
 
@@ -160,7 +156,7 @@ def network_of(model: Model) -> NetworkModel:
         ),
     ]
     network = network_model(model.name, factors, [*searched, *known], searched, known, {})
-    return replace(network, variables=model.variables, dimensions=model.searched)
+    return replace(network, variables=model.variables, searched=model.searched)
 
 
 def _plain_symbol(name: str, size: int, states: tuple[str, ...]) -> Symbol:

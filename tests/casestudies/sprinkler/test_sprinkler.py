@@ -33,7 +33,7 @@ def test_the_network_is_that_of_the_thesis():
     network = model().network()
     assert network.names == ("R", "S", "G")
     assert [each.scope for each in network.factors] == [("R",), ("R", "S"), ("R", "S", "G")]
-    assert (network.searched, network.known) == (("R",), ("G",))
+    assert ([each.label for each in network.searched], network.known) == (["R"], ("G",))
     assert [variable.path for variable in network.variables] == ["data"]
     together = np.einsum("r,rs,rsg->rsg", *(each.table for each in network.factors))
     assert together[1].sum(axis=0)[WET] == pytest.approx(0.16038)

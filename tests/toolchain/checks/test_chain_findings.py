@@ -14,7 +14,7 @@ from machines.rng import LFSR
 from tests.toolchain.chains import network, sprinkler
 from tests.toolchain.running import OPTIONS
 from toolchain.building.bm2_machine import plan_bm2
-from toolchain.building.build import assemble_bm2
+from toolchain.building.build import assemble
 from toolchain.checks.chain_findings import CheckedChain, chain_findings, clipped, legal_states, unconnected
 from toolchain.checks.findings import Check, Severity
 
@@ -24,7 +24,7 @@ OR = [[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 1.0]]]
 
 def checked(model, *, samples=10_000, known_model=True, **options):
     """The findings about the BM2 of a network, or about its deployment, which does not have the model."""
-    built = assemble_bm2(plan_bm2(model, replace(OPTIONS, target_count=samples, **options)))
+    built = assemble(plan_bm2(model, replace(OPTIONS, target_count=samples, **options)))
     chain = CheckedChain(built.deployment, built.images[0].machine, model if known_model else None)
     return list(chain_findings(chain))
 
