@@ -219,12 +219,10 @@ def _split(place: Sequence[str | int]) -> tuple[str, int | None, str]:
 def nearest_name(word: str, known: Sequence[str], *, cutoff: float = 0.5) -> str:
     """Return advice on a wrong name: the nearest valid name, or the first valid ones."""
     close = difflib.get_close_matches(word, known, n=1, cutoff=cutoff)
+    if close:
+        return f"did you mean '{close[0]}'?"
     more = f" and {len(known) - _LISTED} more" if len(known) > _LISTED else ""
-    return (
-        f"did you mean '{close[0]}'?"
-        if close
-        else f"expected one of {', '.join(known[:_LISTED]) or 'none'}{more}"
-    )
+    return f"expected one of {', '.join(known[:_LISTED]) or 'none'}{more}"
 
 
 def _keys(model: type[BaseModel]) -> list[str]:

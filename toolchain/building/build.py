@@ -1,8 +1,8 @@
 """The path from a model to a deployment (thesis 3.4).
 
-BM1: model, options ──▶ plan_machine ──▶ quantise ──▶ whole_machine ──▶ board_images ──▶ describe ──▶ files
+BM1: model, options ──▶ plan_machine ──▶ quantise ──▶ whole_machine ──▶ split ──▶ images ──▶ describe ──▶ files
                         └─▶ board_layout (lines and interface of each board, before tables are computed)
-BM2: network, options ──▶ plan_bm2 ──▶ chain_machines ──▶ board_images ──▶ describe ──▶ files
+BM2: network, options ──▶ plan_bm2 ──▶ chain_machines ──▶ images ──▶ describe ──▶ files
 """
 
 import hashlib
@@ -269,20 +269,17 @@ def _parameter_pairs(
     deployment: Deployment, parameters: BM1Parameters | BM2Parameters
 ) -> dict[str, tuple[object, object]]:
     """Return what a deployment says about the parameters of its machine, and what they are, by name."""
-    sensors = deployment.sensors
+    machine, sensors = deployment.machine, deployment.sensors
+    pairs: dict[str, tuple[object, object]]
     if isinstance(parameters, BM1Parameters):
         keys, count = MACHINE_KEYS, parameters.sensors
         widths = zip(sensors, parameters.sensor_bits, strict=False)
-        pairs: dict[str, tuple[object, object]] = {
-            f"bits of {each.name}": (each.bits, bits) for each, bits in widths
-        }
+        pairs = {f"bits of {each.name}": (each.bits, bits) for each, bits in widths}
     else:
         keys, count, sizes = BM2_KEYS, len(parameters.known), parameters.cardinalities
-        pairs = {
-            f"values of {each.name}": (each.values, sizes[at])
-            for each, at in zip(sensors, parameters.known, strict=False)
-        }
+        places = zip(sensors, parameters.known, strict=False)
+        pairs = {f"values of {each.name}": (each.values, sizes[at]) for each, at in places}
         found = tuple(sizes[at] for at in parameters.searched)
         pairs["sizes of the searched variables"] = tuple(each.size for each in deployment.searched), found
-    same = {key: (getattr(deployment.machine, key), getattr(parameters, key)) for key in keys}
+    same = {key: (getattr(machine, key), getattr(parameters, key)) for key in keys}
     return {**same, **pairs, "number of sensors": (len(sensors), count)}

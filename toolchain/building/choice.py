@@ -2,21 +2,12 @@
 
 from collections.abc import Sequence
 
-from toolchain.building.bm2_machine import BM2Plan, plan_bm2
-from toolchain.building.machine import MachinePlan, plan_machine, with_bits
+from toolchain.building.machine import MachinePlan, with_bits
 from toolchain.building.options import BM1Options, BM2Options, BuildOptions, MachineChoice, given_flags
 from toolchain.errors import BuildError
 from toolchain.models.joint import Question
 from toolchain.models.model import Model
 from toolchain.models.network import NetworkModel, network_of
-
-
-def plan_for(
-    source: Model | Question, options: BuildOptions, bits: Sequence[str] = (), device: str | None = None
-) -> MachinePlan | BM2Plan:
-    """Return the plan of the machine that the options ask for; arguments and errors as for `model_for`."""
-    model, why = model_for(source, options, bits, device)
-    return plan_machine(model, options) if isinstance(model, Model) else plan_bm2(model, options, why)
 
 
 def model_for(
@@ -55,8 +46,8 @@ def network_for(source: Model | Question) -> NetworkModel:
 
 def _refuse(flags: list[str], wanted: str, chosen: str, choice: MachineChoice, why: str) -> None:
     """Raise a BuildError for flags of the machine that was not chosen."""
-    for flag in flags:
-        if choice is MachineChoice.AUTO:
-            way_out = f"leave it out, or add --machine {wanted.lower()}"
-            raise BuildError(f"{flag} is for a {wanted}, but this is a {chosen}, since {why}; {way_out}")
-        raise BuildError(f"{flag} is for a {wanted}, but this is a {chosen} (--machine {choice})")
+    if flags:
+        why_this = f", since {why}; leave it out, or add --machine {wanted.lower()}"
+        if choice is not MachineChoice.AUTO:
+            why_this = f" (--machine {choice})"
+        raise BuildError(f"{flags[0]} is for a {wanted}, but this is a {chosen}{why_this}")

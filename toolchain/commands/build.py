@@ -21,6 +21,7 @@ from toolchain.errors import BuildError, ToolchainError
 from toolchain.networks import is_network
 
 if TYPE_CHECKING:
+    from toolchain.building.bm2_machine import BM2Plan
     from toolchain.building.machine import MachinePlan
     from toolchain.checks.findings import Finding
 
@@ -53,18 +54,23 @@ def build(
     `toolchain build asia.bif --searched bronc --known smoke,dysp -o build/asia --uri ws://localhost:9090
     --topic /patient --type clinic_msgs/Patient`
     """
+    from toolchain.building.bm2_machine import plan_bm2
     from toolchain.building.build import REPORT_NAME, build_date, build_deployment
-    from toolchain.building.choice import plan_for
-    from toolchain.building.machine import MachinePlan
+    from toolchain.building.choice import model_for
+    from toolchain.building.machine import plan_machine
+    from toolchain.models.network import NetworkModel
 
     file = model_file(model)
     options = build_options(flags, target, sources)
     typer.echo(f"Reading {file}", err=True)
     source = read_source(model, flags)
     dated = replace(options, build_date=build_date(file))
-    plan, why = plan_for(source, dated, flags.bits or (), flags.device), ""
-    if isinstance(plan, MachinePlan):
-        plan, why = fit_to_device(plan, flags.device)
+    chosen, reason = model_for(source, dated, flags.bits or (), flags.device)
+    plan: MachinePlan | BM2Plan
+    if isinstance(chosen, NetworkModel):
+        plan, why = plan_bm2(chosen, dated, reason), ""
+    else:
+        plan, why = fit_to_device(plan_machine(chosen, dated), flags.device)
     typer.echo(f"Building a {plan.kind}, since {plan.why}", err=True)
     typer.echo(f"Quantising {plan.model.name} and writing its images", err=True)
     built = build_deployment(plan, directory, remark=why)

@@ -83,12 +83,7 @@ def advise(
 
 
 def explore(
-    model: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net, .xdsl (.gz)."
-        ),
-    ],
+    model: ModelPath,
     flags: ModelFlags,
     sweep: Sweep,
     readings: ReadingOptions,

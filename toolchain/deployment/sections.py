@@ -359,7 +359,6 @@ class BM2Section(CommonSection):
     stop: ClassVar = Stop.OWN
     sensor_mode: ClassVar = SensorMode.COLUMN
     counter_bits: ClassVar = 32
-    shared: ClassVar = True
     replicas: ClassVar = 1
     reads_lines: ClassVar = False
     is_plain: ClassVar = True

@@ -1,21 +1,24 @@
-"""The memories of a machine on each board, with a MIF for each: priors, tiles, random numbers (thesis 3.2).
+"""The memories of a machine on each board, with a MIF for each: priors, tiles, CDEs, random numbers (thesis 3.2).
 
 All tiles of a column have the same reading, so a column is one memory: its address is that of the reading,
 and a word contains the codes of all lines of the board, with line 0 in the lowest bits. The prior elements
 are also one memory. If each line has its own reading, each tile is a separate memory, with its bits of these words.
+A BM2 has a memory for each CDE, the same on all boards (thesis 2.1.3).
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from machines.bm1 import BM1Machine
-from machines.bm2 import BM2Machine
+from machines.bm2 import BM2Machine, BM2Parameters
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
-from machines.rng import LFSR, POLYNOMIALS, generator_numbers, random_numbers
+from machines.rng import LFSR, POLYNOMIALS, generator_numbers, random_numbers, seed_set
 from pcie_shim.programming_file import Image
 from toolchain.deployment import Deployment
 from toolchain.outputs.mif import mif_lines
@@ -50,16 +53,23 @@ def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, .
 
     Generators that exist only in emulation (`rng = ideal`) have no memories.
     """
+    first = images[0].machine
     found: list[Memory] = []
-    for board, image in enumerate(images):
-        found += [_prior(deployment, board, image), *_columns(deployment, board, image)]
-        if not image.machine.parameters.shared:
-            found += _seeds(image.machine, f"board{board}_")
-    if images[0].machine.parameters.shared:
-        found += _seeds(images[0].machine, "")
-    table = images[0].machine.rng_table
-    if table is not None:
-        found.append(rng_table_memory(table, images[0].machine.parameters.prob_bits))
+    if isinstance(first, BM2Machine):
+        found += _cdes(first)
+        for board, image in enumerate(images):
+            found += _chain_seeds(image.machine, f"board{board}_")
+    else:
+        parameters = first.parameters
+        for board, image in enumerate(images):
+            found += [_prior(deployment, board, image), *_columns(deployment, board, image)]
+            if not parameters.shared:
+                line = f"(bank * {image.machine.parameters.lines} + line of the board)"
+                found += _seeds(image.machine, f"board{board}_", f"{line} * {parameters.columns} + column")
+        if parameters.shared:
+            found += _seeds(first, "", f"bank * {parameters.columns} + column")
+    if first.rng_table is not None:
+        found.append(_rng_table(first.rng_table, first.parameters.prob_bits))
     return tuple(found)
 
 
@@ -68,13 +78,12 @@ def column_name(board: int, column: int, sensors: int) -> str:
     return f"board{board}_column{column:0{len(str(sensors))}d}.mif"
 
 
-def seed_words(machine: BM1Machine) -> NDArray[np.uint64]:
-    """Return the start of every generator in every bank: uint64[banks, columns] or [banks, lines, columns]."""
+def seed_words(machine: BM1Machine | BM2Machine) -> NDArray[np.uint64]:
+    """Return the start of every generator in every bank: uint64[banks, columns], [banks, lines, columns] or [banks, CDEs]."""
     parameters = machine.parameters
-    if parameters.rng in POLYNOMIALS:  # all banks at once: the numbers of bank b follow those of bank b - 1
-        shape = generator_numbers(parameters, 0).shape
-        every = np.arange(parameters.rng_banks * generators(parameters), dtype=np.uint64)
-        return LFSR(parameters.rng).seeds(every.reshape(-1, *shape))
+    if parameters.rng in POLYNOMIALS:  # all banks at once
+        every = np.stack([generator_numbers(parameters, bank) for bank in range(parameters.rng_banks)])
+        return LFSR(parameters.rng).seeds(every)
     numbers = random_numbers(machine)
     return np.stack([numbers.restart(bank) for bank in range(parameters.rng_banks)])
 
@@ -161,7 +170,7 @@ def _codes(name: str, what: str, image: Image, codes: NDArray[np.uint16]) -> Mem
     )
 
 
-def _seeds(machine: BM1Machine, prefix: str) -> list[Memory]:
+def _seeds(machine: BM1Machine | BM2Machine, prefix: str, address: str) -> list[Memory]:
     parameters = machine.parameters
     if parameters.rng is RngKind.IDEAL:
         return []
@@ -171,23 +180,54 @@ def _seeds(machine: BM1Machine, prefix: str) -> list[Memory]:
             width=seed_width(machine),
             depth=parameters.rng_banks * generators(parameters),
             words=lambda: (int(word) for word in seed_words(machine).ravel()),
-            comments=(
-                f"where the generators ({parameters.rng}) start",
-                f"address = bank * {parameters.columns} + column"
-                if parameters.shared
-                else f"address = (bank * {parameters.lines} + line of the board) * {parameters.columns} + column",
-            ),
+            comments=(f"where the generators ({parameters.rng}) start", f"address = {address}"),
         )
     ]
 
 
-def generators(parameters: BM1Parameters) -> int:
-    """Return the number of generators of a board: one per column, or one per cell."""
-    return parameters.columns * (1 if parameters.shared else parameters.lines)
+def generators(parameters: BM1Parameters | BM2Parameters) -> int:
+    """Return the number of generators of a board: one per column, per cell or per CDE."""
+    return math.prod(parameters.generator_shape)
 
 
-def rng_table_memory(table: NDArray[np.uint32], prob_bits: int) -> Memory:
-    """Return the memory of random numbers, whose low bits are used."""
+def _cdes(machine: BM2Machine) -> Iterator[Memory]:
+    parameters, digits = machine.parameters, len(str(machine.parameters.cdes - 1))
+    for at, (factor, table) in enumerate(zip(parameters.factors, machine.tables, strict=True)):
+        bits = parameters.factor_bits(at)
+        if not bits:  # all of its variables have one value
+            continue
+        yield Memory(
+            name=f"cde{at:0{digits}d}.mif",
+            width=parameters.prob_bits,
+            depth=table.size,
+            words=partial(map, int, table),
+            comments=(
+                f"CDE {at}, of the variables {_listed(factor)}, which are the bits {_listed(bits)} of the state",
+                f"address = j * {1 << len(bits) - 1} + the other bits, for the pointed bit number j of these",
+            ),
+        )
+
+
+def _listed(numbers: Iterable[int]) -> str:
+    return ", ".join(map(str, numbers))
+
+
+def _chain_seeds(machine: BM2Machine, prefix: str) -> Iterator[Memory]:
+    parameters = machine.parameters
+    if parameters.rng is RngKind.IDEAL:
+        return
+    yield from _seeds(machine, prefix, f"bank * {parameters.cdes} + CDE")
+    sets = np.array([seed_set(parameters, bank) for bank in range(parameters.rng_banks)], dtype=np.uint64)
+    yield Memory(
+        name=f"{prefix}sequencer_seeds.mif",
+        width=16,
+        depth=parameters.rng_banks,
+        words=lambda: map(int, LFSR(RngKind.LFSR16).seeds(sets)),
+        comments=("where the generator (lfsr16) of the random sequencer starts", "address = bank"),
+    )
+
+
+def _rng_table(table: NDArray[np.uint32], prob_bits: int) -> Memory:
     mask = (1 << prob_bits) - 1
     return Memory(
         name="rng_table.mif",

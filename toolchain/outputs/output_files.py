@@ -15,7 +15,6 @@ from pcie_shim.programming_file import Image, image_bytes
 from toolchain.bounded_files import file_errors, whole_file
 from toolchain.deployment import Deployment
 from toolchain.errors import BuildError
-from toolchain.outputs.bm2_memories import bm2_memories
 from toolchain.outputs.memories import MEMORIES_FOLDER, Memory, memories
 from toolchain.outputs.mif import printable
 from toolchain.outputs.vhdl_parameters import PARAMETERS_FILE, parameters_vhd
@@ -117,10 +116,7 @@ def memory_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles
     contents: dict[str, Iterable[bytes]] = {}
     if deployment.machine.type == "BM1":
         contents[PARAMETERS_FILE] = [parameters_vhd(deployment, images).encode()]
-        found = memories(deployment, images)
-    else:
-        found = bm2_memories(images)
-    for memory in found:
+    for memory in memories(deployment, images):
         contents[f"{MEMORIES_FOLDER}/{memory.name}"] = _encoded(memory)
     return OutputFiles(contents, _MEMORIES)
 

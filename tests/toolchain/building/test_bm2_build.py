@@ -1,6 +1,6 @@
 """A BM2 built from a network: its tables, images and files, the choice of the machine, and what is refused.
 
-network, flags ──▶ plan_for ──▶ BM2Plan ──▶ one image per chain, MIFs, deployment.toml ──▶ posterior
+network, flags ──▶ plan_bm2 ──▶ BM2Plan ──▶ one image per chain, MIFs, deployment.toml ──▶ posterior
                    └─▶ MachinePlan of a BM1 if the question is a naive fusion
 """
 
