@@ -148,9 +148,9 @@ class BM1Kind(MachineKind):
         if joint is not None:
             outcome = "posterior"
         elif all(board.reason == StopReason.IMPOSSIBLE for board in results):
-            outcome = "no posterior: the readings are impossible for every line"
+            outcome = "no posterior: all counts were 0, because the readings are impossible for every line"
         else:
-            outcome = "no posterior: no line counted within max_cycles"
+            outcome = "no posterior: all counts were 0 after max_cycles"
         return Inference(results, joint, totals, outcome)
 
     def posterior(

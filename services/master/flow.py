@@ -363,8 +363,7 @@ class FrameFlow:
             self.losses[LossReason.SOME_TOPICS] += bool(record.missed)
             self._show(record)
         elif self._once and record.outcome is Outcome.NO_POSTERIOR:
-            why = f"frame {record.number} has no posterior: all counts were 0; nothing was published"
-            self.fail(VariableError(why))
+            self.fail(VariableError(f"frame {record.number}: {record.why}; nothing was published"))
             return
         elif self._once:
             why = "the rosbridge connection was lost before the result could be published"

@@ -192,6 +192,7 @@ class ResultTopics:
             total_ns=now - publish.received_tick,
             missed=missed,
             out_ns=self._previous_out_ns,
+            why="" if report.published else report.outcome,
         )
 
     async def publish_array(self, values: Any) -> None:

@@ -56,7 +56,6 @@ class Outcome(StrEnum):
 
     PUBLISHED = "published"
     NO_POSTERIOR = "no posterior"
-    """All counts were 0."""
     ROSBRIDGE_AWAY = "rosbridge away"
     REFUSED = "refused by rosbridge"
 
@@ -211,7 +210,8 @@ class Published(Record, tag="published", frozen=True):
 
     `seen` is whether it was seen on the wire (None if that was not checked). `best_probability` is that of `best_line`;
     `total_ns` is the time from the reading's receipt to the result's sending. `missed` counts the outputs
-    whose servers were not connected, if there are several. `out_ns` is the duration of publishing.
+    whose servers were not connected, if there are several. `out_ns` is the duration of publishing. `why` is the sentence
+    of the report if there is no posterior.
     """
 
     number: int
@@ -223,6 +223,7 @@ class Published(Record, tag="published", frozen=True):
     total_ns: int
     missed: int = 0
     out_ns: int = 0
+    why: str = ""
 
 
 # What a decoder accepts, by tag; any other bytes are an error of the connection.

@@ -253,6 +253,13 @@ async def test_a_single_frame_that_has_no_result_ends_the_run(boat, end, error, 
     assert run.error.exit_code == code
 
 
+async def test_a_single_frame_without_a_posterior_ends_with_the_reason_of_its_machine(boat):
+    run = Run(boat, once=True)
+    run.read()
+    published(run, 1, Outcome.NO_POSTERIOR, why="no posterior: board0 timed out")
+    assert str(run.error) == "frame 1: no posterior: board0 timed out; nothing was published"
+
+
 async def test_a_record_of_another_service_is_reported(run):
     run.take(run.subscriber, Publish(None, 0, 0, 0, 0, 0))
     assert len(run.warnings) == 1

@@ -62,7 +62,7 @@ def folder(tmp_path_factory):
 
 
 async def published(folder, deployment, message):
-    """What is on the wire after one message: topics and their messages in order."""
+    """What the master hears after one message, and what is on the wire: topics and their messages in order."""
     async with FakeRosbridge() as fake:
         topics = ResultTopics(Settings(uri=fake.uri), deployment)
         with opened(folder, deployment) as boards:
@@ -70,17 +70,17 @@ async def published(folder, deployment, message):
             async with topics.opened():
                 (reading,) = FrameAssembler(deployment).take(0, message, 5, 6)
                 output = boards.run(FrameRequest(1, reading.addresses, 1))
-                outcome = topics.publish_now(Publish(result_record(1, output), 0, 0, 0, 0, 0)).outcome
+                heard = topics.publish_now(Publish(result_record(1, output), 0, 0, 0, 0, 0))
                 await fake.wait_for_op("publish", topic="/bm/frame")
-                if outcome is Outcome.PUBLISHED:
+                if heard.outcome is Outcome.PUBLISHED:
                     await fake.wait_for_op("publish", topic="/BMresults")
-                return outcome, [(each["topic"], each["msg"]) for each in fake.ops("publish")]
+                return heard, [(each["topic"], each["msg"]) for each in fake.ops("publish")]
 
 
 async def test_posterior_details_and_samples_are_published(folder):
     deployment = built(folder, stream=64)
-    outcome, messages = await published(folder, deployment, {"grass": "wet"})
-    assert outcome is Outcome.PUBLISHED
+    heard, messages = await published(folder, deployment, {"grass": "wet"})
+    assert (heard.outcome, heard.why) == (Outcome.PUBLISHED, "")
     assert [topic for topic, _ in messages] == ["/bm/frame", "/bm/samples", "/BMresults"]
     report, samples, result = (message for _, message in messages)
     machines = [image.machine for image in images_of(deployment)]
@@ -99,26 +99,28 @@ async def test_posterior_details_and_samples_are_published(folder):
 
 
 async def test_without_a_stream_there_is_no_topic_of_samples(folder):
-    outcome, messages = await published(folder, built(folder), {"grass": None})
-    assert outcome is Outcome.PUBLISHED
+    heard, messages = await published(folder, built(folder), {"grass": None})
+    assert (heard.outcome, heard.why) == (Outcome.PUBLISHED, "")
     assert [topic for topic, _ in messages] == ["/bm/frame", "/BMresults"]
 
 
 async def test_impossible_readings_have_a_report_alone(folder):
-    outcome, messages = await published(folder, built(folder), {"grass": "white"})
-    assert outcome is Outcome.NO_POSTERIOR
+    heard, messages = await published(folder, built(folder), {"grass": "white"})
+    assert heard.outcome is Outcome.NO_POSTERIOR
     ((topic, message),) = messages
     report = read_frame_report(message, 0)
     assert (topic, report.published) == ("/bm/frame", False)
     assert "impossible" in report.outcome
+    assert heard.why == report.outcome
     assert {board.stopped for board in report.boards} == {"impossible"}
 
 
 async def test_a_time_out_names_board_and_variable(folder):
-    outcome, messages = await published(folder, built(folder, ops_timeout=1), {"grass": "wet"})
-    assert outcome is Outcome.NO_POSTERIOR
+    heard, messages = await published(folder, built(folder, ops_timeout=1), {"grass": "wet"})
+    assert heard.outcome is Outcome.NO_POSTERIOR
     report = read_frame_report(messages[0][1], 0)
     assert "board0" in report.outcome
+    assert heard.why == report.outcome
     assert any(name in report.outcome for name in ("Rain", "Sprinkler"))
     assert {board.stopped for board in report.boards} == {"ops time-out"}
 
