@@ -164,7 +164,7 @@ class FrameFlow:
         self._last = (0, 0)
         self.losses: Counter[LossReason] = Counter()
         """Readings and results lost so far, by reason."""
-        # Causes of unusable messages of which the user has been warned: one warning each.
+        # Causes of unusable messages and of frames without a posterior of which the user has been warned: one warning each.
         self._reported_causes: set[str] = set()
         self.latencies = Latencies()
         """Latencies of the published frames."""
@@ -272,9 +272,12 @@ class FrameFlow:
             self.fail(VariableError(record.sentence))
             return
         self.losses[LossReason.UNUSABLE] += 1
-        if record.cause not in self._reported_causes:
-            self._reported_causes.add(record.cause)
-            self._log.warning(f"{record.sentence}; such messages are skipped and counted")
+        self._warn_once(record.cause, f"{record.sentence}; such messages are skipped and counted")
+
+    def _warn_once(self, cause: str, sentence: str) -> None:
+        if cause not in self._reported_causes:
+            self._reported_causes.add(cause)
+            self._log.warning(sentence)
 
     def _send_next(self) -> None:
         app = self._peers.app
@@ -371,6 +374,9 @@ class FrameFlow:
             return
         else:
             self.losses[_LOSSES[record.outcome]] += 1
+            if record.why:
+                sentence = f"frame {record.number}: {record.why}; later ones like it are only counted"
+                self._warn_once(f"{record.outcome}: {record.cause}", sentence)
         if self._count is not None and self.published >= self._count:
             if not self.end.done():
                 self.end.set_result(None)

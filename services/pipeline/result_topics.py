@@ -193,6 +193,7 @@ class ResultTopics:
             missed=missed,
             out_ns=self._previous_out_ns,
             why="" if report.published else report.outcome,
+            cause=", ".join(sorted({board.stopped for board in report.boards})),
         )
 
     async def publish_array(self, values: Any) -> None:

@@ -234,6 +234,17 @@ async def test_a_cause_is_reported_once(run):
     assert run.flow.has_data
 
 
+async def test_a_cause_of_no_posterior_is_reported_once_with_the_reason_of_the_machine(run):
+    run.read(3)
+    for number, cause in enumerate(("ops time-out", "impossible", "ops time-out"), 1):
+        computed(run)
+        published(run, number, Outcome.NO_POSTERIOR, why=f"no posterior: board0 {number}", cause=cause)
+    assert run.lost == {LossReason.NO_POSTERIOR: 3}
+    first, second = run.warnings
+    assert "frame 1: no posterior: board0 1" in first
+    assert "board0 2" in second
+
+
 @pytest.mark.parametrize(
     ("end", "error", "code"),
     [

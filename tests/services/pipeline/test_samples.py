@@ -112,7 +112,7 @@ async def test_impossible_readings_have_a_report_alone(folder):
     assert (topic, report.published) == ("/bm/frame", False)
     assert "impossible" in report.outcome
     assert heard.why == report.outcome
-    assert {board.stopped for board in report.boards} == {"impossible"}
+    assert {board.stopped for board in report.boards} == {"impossible"} == {heard.cause}
 
 
 async def test_a_time_out_names_board_and_variable(folder):
