@@ -1,5 +1,6 @@
 """BM2 as a machine kind: its sections, registers, the batches or the stream of a frame, and its posterior (thesis 2.1.3)."""
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -157,19 +158,26 @@ class BM2Kind(MachineKind):
         details = {
             "samples": str(sum(kept.samples for kept in counted)),
             "unused": str(sum(kept.unused for kept in counted)),
-            "effective_samples": f"{found.effective_samples:.0f}",
-            "standard_error": f"{0.0 if found.error is None else found.error.max():.4g}",
         }
-        if len(results) > 1:
-            details["r_hat"] = f"{found.r_hat:.4f}"
+        error = 0.0 if found.error is None else float(found.error.max())
+        numbers = {
+            "effective_samples": (found.effective_samples, ".0f"),
+            "standard_error": (error, ".4g"),
+            "r_hat": (found.r_hat, ".4f"),
+        }
+        details |= {
+            key: format(value, form) for key, (value, form) in numbers.items() if not math.isnan(value)
+        }
         if left_out:
             details["left_out"] = left_out
+        outcome = "posterior"
         # their samples depend on how long the moves took
         early = [at for at, board in enumerate(results) if board.reason == BM2StopReason.MAX_CYCLES]
         if early:
             details["ended_early"] = ", ".join(f"board{number}" for number in early)
+            outcome = f"biased posterior: max_cycles ended {details['ended_early']}"
         samples, size = b"".join([kept.stream for kept in counted]), 4 * every[0].parameters.state_words
-        return Inference(results, found.posterior, totals, "posterior", details, samples, size)
+        return Inference(results, found.posterior, totals, outcome, details, samples, size)
 
     def posterior(
         self, machines: Sequence[BM2Machine], frame: FrameInput, variables: Sequence[str] = ()

@@ -100,7 +100,7 @@ class Inference(NamedTuple):
             float64[replicas * all lines], one posterior after the other, with zeros for a replica without
             one; None if no replica has one.
         totals: The sum of the counts of each board.
-        outcome: `posterior`, or the reason why there is none.
+        outcome: `posterior`, or the reason why there is none, or why it is biased.
         details: Further values for the report of the frame, by their keys.
         samples: The machine's states that were sampled, one after the other; empty if the kind or the image has none.
         sample_bytes: Length of each of them.

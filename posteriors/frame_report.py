@@ -65,6 +65,11 @@ class FrameReport:
     details: Mapping[str, str] = field(default_factory=dict)
     """Further values, whose keys depend on the kind of machine."""
 
+    @property
+    def is_biased(self) -> bool:
+        """True if boards of a BM2 ended by their maximum number of cycles; `outcome` says which."""
+        return "ended_early" in self.details
+
 
 # Keys of the message's values and their formats. The key of a number is the name of its field; that of a
 # stage has the suffix `_us`.
@@ -102,7 +107,7 @@ def write_frame_report(report: FrameReport, ros_version: Literal[1, 2]) -> dict[
     statuses = [
         _FRAME
         % (
-            *(not report.published, _quoted(report.outcome), _quoted(report.deployment)),
+            *(not report.published or report.is_biased, _quoted(report.outcome), _quoted(report.deployment)),
             *(report.number, published, *_numbers(report), *_times(report.stages)),
         )
     ]

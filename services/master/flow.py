@@ -164,7 +164,7 @@ class FrameFlow:
         self._last = (0, 0)
         self.losses: Counter[LossReason] = Counter()
         """Readings and results lost so far, by reason."""
-        # Causes of unusable messages and of frames without a posterior of which the user has been warned: one warning each.
+        # Causes of unusable messages and of frames without a posterior or with a biased one of which the user has been warned: one warning each.
         self._reported_causes: set[str] = set()
         self.latencies = Latencies()
         """Latencies of the published frames."""
@@ -358,6 +358,9 @@ class FrameFlow:
     def _take_outcome(self, record: Published) -> None:
         publish = self._at_publisher.pop(record.number, None)
         self._published_at = time.monotonic()
+        if record.why and (record.outcome is Outcome.PUBLISHED or not self._once):
+            sentence = f"frame {record.number}: {record.why}; later ones like it are not reported"
+            self._warn_once(f"{record.outcome}: {record.cause}", sentence)
         if record.outcome is Outcome.PUBLISHED:
             if publish is not None:
                 self.latencies.add(publish, record)
@@ -374,9 +377,6 @@ class FrameFlow:
             return
         else:
             self.losses[_LOSSES[record.outcome]] += 1
-            if record.why:
-                sentence = f"frame {record.number}: {record.why}; later ones like it are only counted"
-                self._warn_once(f"{record.outcome}: {record.cause}", sentence)
         if self._count is not None and self.published >= self._count:
             if not self.end.done():
                 self.end.set_result(None)

@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.text import Text
 
 from posteriors.errors import LabelError
+from posteriors.frame_report import FrameReport
 from posteriors.pairing import FrameOutcome
 from posteriors.posterior import Posterior
 from services.output.axes import Axis, in_words, printable
@@ -48,7 +49,7 @@ def line(frame: FrameOutcome, axes: list[Axis]) -> str:
     """Return the line of one frame."""
     number = "-" if frame.number is None else str(frame.number)
     if not isinstance(frame, Posterior):
-        return f"frame {number}: {frame.outcome if frame.outcome.isprintable() else repr(frame.outcome)}"
+        return f"frame {number}: {_outcome(frame)}"
     # replicas are separate posteriors, so a mean over all of them is meaningless
     if frame.replicas > 1:
         parts = [f"frame {number}: {frame.replicas} replicas"]
@@ -61,7 +62,13 @@ def line(frame: FrameOutcome, axes: list[Axis]) -> str:
         parts.append(f"{frame.cycles} cycles")
     if frame.latency_us is not None:
         parts.append(f"{frame.latency_us / 1000:.2f} ms")
+    if frame.report is not None and frame.report.is_biased:
+        parts.append(_outcome(frame.report))
     return "; ".join(parts)
+
+
+def _outcome(report: FrameReport) -> str:
+    return report.outcome if report.outcome.isprintable() else repr(report.outcome)
 
 
 def _best(posterior: Posterior, axes: list[Axis]) -> str:

@@ -192,7 +192,7 @@ class ResultTopics:
             total_ns=now - publish.received_tick,
             missed=missed,
             out_ns=self._previous_out_ns,
-            why="" if report.published else report.outcome,
+            why="" if report.published and not report.is_biased else report.outcome,
             cause=", ".join(sorted({board.stopped for board in report.boards})),
         )
 

@@ -211,7 +211,7 @@ class Published(Record, tag="published", frozen=True):
     `seen` is whether it was seen on the wire (None if that was not checked). `best_probability` is that of `best_line`;
     `total_ns` is the time from the reading's receipt to the result's sending. `missed` counts the outputs
     whose servers were not connected, if there are several. `out_ns` is the duration of publishing. `why` is the sentence
-    of the report if there is no posterior; equal causes have equal `cause`, the stop reasons of the boards.
+    of the report if there is no posterior or a biased one; equal causes have equal `cause`, the stop reasons of the boards.
     """
 
     number: int

@@ -225,7 +225,10 @@ def test_a_result_that_ended_by_max_cycles_is_marked():
     with opened(images()) as cluster:
         inference = BM2.infer(cluster.run(frame(1, max_cycles=900)).boards)
     assert "board0" in inference.details["ended_early"]
+    assert "board0" in inference.outcome
     assert inference.posterior is not None
+    # too few batches to know them
+    assert not {"effective_samples", "standard_error", "r_hat"} & set(inference.details)
 
 
 @pytest.mark.parametrize(

@@ -245,6 +245,14 @@ async def test_a_cause_of_no_posterior_is_reported_once_with_the_reason_of_the_m
     assert "board0 2" in second
 
 
+async def test_a_biased_posterior_is_shown_with_a_warning(boat):
+    run = Run(boat, once=True)
+    run.read()
+    published(run, 1, why="biased posterior: board0", cause="max cycles")
+    assert run.error is None
+    assert len(run.warnings) == 1
+
+
 @pytest.mark.parametrize(
     ("end", "error", "code"),
     [

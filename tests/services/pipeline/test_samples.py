@@ -6,6 +6,7 @@ message ──▶ FrameAssembler ──▶ DeployedBoards ──▶ boards in th
 import base64
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,8 @@ from posteriors.frame_report import read_frame_report
 from posteriors.posterior import read_posterior
 from services.boards.deployed import images_of
 from services.boards.frames import decode_boards, result_record
+from services.output.axes import Axis
+from services.output.posterior_output import line
 from services.pipeline.frames import FrameAssembler
 from services.pipeline.result_topics import ResultTopics
 from services.pipes.pcie_app import compute_lines
@@ -125,18 +128,30 @@ async def test_a_time_out_names_board_and_variable(folder):
     assert {board.stopped for board in report.boards} == {"ops time-out"}
 
 
+async def test_a_biased_result_is_marked_as_doubtful_wherever_it_is_shown(folder):
+    heard, ((_, message), (_, result)) = await published(
+        folder, built(folder, max_cycles=900), {"grass": "wet"}
+    )
+    report = read_frame_report(message, 0)
+    assert (heard.outcome, heard.why) == (Outcome.PUBLISHED, report.outcome)
+    assert "board0" in report.outcome
+    assert (message["status"][0]["level"], report.published, report.is_biased) == (1, True, True)
+    assert "nan" not in report.details.values()
+    assert report.outcome in line(replace(read_posterior(result, 0), report=report), [Axis("Rain", 2)])
+
+
 def test_a_result_goes_through_a_pipe(folder, capsys, monkeypatch):
     deployment = built(folder)
     monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b'{"addresses": [1]}\n')))
     with opened(folder, deployment) as boards:
         compute_lines(boards, 1)
-    line = capsys.readouterr().out.encode()
-    result, _ = result_from_line(line, 1, deployment.machine)
+    printed = capsys.readouterr().out.encode()
+    result, _ = result_from_line(printed, 1, deployment.machine)
     machines = [image.machine for image in images_of(deployment)]
     frame = FrameInput(addresses=(1,), target_count=SAMPLES, max_cycles=2**32)
     boards = decode_boards(result)
     assert BM2.infer(boards).posterior.tolist() == BM2.posterior(machines, frame).tolist()
-    spoilt = json.loads(line)
+    spoilt = json.loads(printed)
     spoilt["boards"][0]["counts"].pop()
     result, _ = result_from_line(json.dumps(spoilt).encode(), 1, deployment.machine)
     with pytest.raises(MachineError):
