@@ -229,7 +229,7 @@ def check_absent_robot(stack: Stack) -> None:
 
 
 def check_own_model(stack: Stack) -> None:
-    """Check a user's model, built by `toolchain build` in the project, with readings from outside; then rebuild it."""
+    """Check a user's model, built by `toolchain build` in the project, with readings from outside; then as a BM2."""
     source = (
         "--uri",
         "ws://127.0.0.1:9090",
@@ -268,7 +268,7 @@ def check_own_model(stack: Stack) -> None:
             runs(boards=1)
             drawn = stack.compose("exec", "--no-TTY", "viewer", "listen", "--plot", "--count", "1")
             expect("###" in drawn, f"listen --plot draws {drawn}")
-            toolchain("build", "models/mine", "-o", MINE, "--partitions", "2", *source)
+            toolchain("build", "models/mine", "-o", MINE, "--machine", "bm2", "--partitions", "2", *source)
             stack.compose("restart", limit=COMMAND_LIMIT + STOP_GRACE)
             runs(boards=2)
 
