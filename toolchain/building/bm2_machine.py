@@ -12,7 +12,7 @@ from toolchain.building.machine import (
     BoardLayout,
     LineBlock,
     check_seeds,
-    fitted_interface,
+    fitted_layout,
     machine_options,
     option,
 )
@@ -135,12 +135,8 @@ def chain_machines(plan: BM2Plan) -> tuple[BM2Machine, ...]:
 
 
 def chain_layout(parameters: BM2Parameters, interface: tuple[int, int] | None) -> BoardLayout:
-    """Return the layout of the boards, each of which has a chain; a BuildError as for `fitted_interface`."""
+    """Return the layout of the boards, each of which has a chain; a BuildError as for `fitted_layout`."""
     check_seeds(parameters)
     what = f"a state of {parameters.state_bits} bits, {parameters.histogram_words} words of histograms and {parameters.joint_words} of the searched variables"
-    fitted, reason = fitted_interface(KINDS["BM2"]().registers(parameters), interface, what, "")
-    return BoardLayout(
-        blocks=tuple(LineBlock(chain, 1) for chain in range(parameters.chains)),
-        interface=fitted,
-        reason=reason,
-    )
+    blocks = tuple(LineBlock(chain, 1) for chain in range(parameters.chains))
+    return fitted_layout(blocks, KINDS["BM2"]().registers(parameters), interface, what)

@@ -59,6 +59,7 @@ class MachinePlan:
     target_count: int
     """The count that stops a machine."""
     max_cycles: int
+    """The maximum number of cycles."""
 
 
 def with_bits(model: Model, bits: Iterable[str]) -> Model:
@@ -212,25 +213,26 @@ def board_layout(
     what = f"{board.sensors} known variables and {board.lines} lines on it"
     if board.replicas > 1:
         what += f", {board.replicas} times"
-    fitted, reason = fitted_interface(used, interface, what, _advice(parameters, interface_room(used)))
-    return BoardLayout(blocks=blocks, interface=fitted, reason=reason)
+    return fitted_layout(blocks, used, interface, what, _advice(parameters, interface_room(used)))
 
 
-def fitted_interface(
-    used: UsedRegisters, asked: tuple[int, int] | None, what: str, advice: str
-) -> tuple[tuple[int, int], str]:
-    """Return the interface of boards that use these registers, and why it is not the default; a BuildError if it doesn't fit."""
+def fitted_layout(
+    blocks: tuple[LineBlock, ...],
+    used: UsedRegisters,
+    asked: tuple[int, int] | None,
+    what: str,
+    advice: str = "",
+) -> BoardLayout:
+    """Return the layout of boards that use these registers; a BuildError if the interface does not fit."""
     needed, room = (used.input_words, used.result_words), interface_room(used)
     sentence = f"a board needs {needed[0]} inputs and {needed[1]} results ({what})"
     if not _is_within(needed, room):
         raise BuildError(f"{sentence}, but the register map has room for {room[0]} and {room[1]}{advice}")
     if asked is None:
         default = DEFAULT_INTERFACE
-        asked = (max(needed[0], default[0]), max(needed[1], default[1]))
-        return (
-            asked,
-            "" if asked == default else f", larger than the default {_size_text(default)}: {sentence}",
-        )
+        fitted = (max(needed[0], default[0]), max(needed[1], default[1]))
+        reason = "" if fitted == default else f", larger than the default {_size_text(default)}: {sentence}"
+        return BoardLayout(blocks=blocks, interface=fitted, reason=reason)
     if not _is_within(asked, room):
         raise BuildError(
             f"the interface {_size_text(asked)} is larger than the register map's {_size_text(room)}"
@@ -240,7 +242,7 @@ def fitted_interface(
         raise BuildError(
             f"the model is larger than the interface {_size_text(asked)}: {sentence}; use --interface {_size_text(enough)} or leave it out"
         )
-    return asked, ", as asked for"
+    return BoardLayout(blocks=blocks, interface=asked, reason=", as asked for")
 
 
 def _size_text(size: tuple[int, int]) -> str:

@@ -13,10 +13,9 @@ import pytest
 from matplotlib.image import imread
 
 from casestudies.sprinkler import viewer as viewer_module
-from casestudies.sprinkler.estimates import Frame, draw, frame_of, mean_and_error
 from casestudies.sprinkler.garden import Garden, publish_mornings
 from casestudies.sprinkler.model import exact_rain, model
-from casestudies.sprinkler.viewer import Viewer, read_samples
+from casestudies.sprinkler.viewer import Frame, Viewer, draw, frame_of, mean_and_error, read_samples
 from posteriors.errors import NoResultError
 from posteriors.frame_report import FrameReport
 from posteriors.posterior import Posterior
