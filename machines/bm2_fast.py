@@ -27,7 +27,7 @@ from machines.bm2_kernel import BM2Kernel
 from machines.errors import MachineError
 from machines.fast_code import jit, jump
 from machines.parameters import CYCLES_MAX, RngKind, SampleEvery, Sequencer
-from machines.rng import LFSR, POLYNOMIALS, Words, jump_tables, sequencer_seed
+from machines.rng import LFSR, POLYNOMIALS, Words, jump_tables
 
 CHUNK: Final = 32
 """Number of cycles that are looked at together: the bits of a mask."""
@@ -113,12 +113,9 @@ class FastBM2(BM2Kernel):
             )
         self._jumps = jump_tables(parameters.rng, parameters.steps_per_clock).copy()
         self._wiring = wiring_of(machine)
-        # Computed once: moves by known bits and order, and the generators' and the sequencer's seeds by bank.
+        # computed once, by known bits and order
         self._kept_moves: dict[tuple[int, Sequencer], Moves] = {}
-        self._bank_starts: dict[int, tuple[Words, int]] = {}
         self._settings = np.zeros(7, dtype=np.int64)
-        # the generators' states in cycle 0 of the frame
-        self._starts = np.zeros(parameters.cdes, dtype=np.uint64)
         self._chain = Chain(
             control=np.zeros(13, dtype=np.int64),
             values=np.zeros(len(parameters.cardinalities), dtype=np.uint64),
@@ -140,35 +137,24 @@ class FastBM2(BM2Kernel):
         """A copy of the generators' states: uint64[CDEs]."""
         # `start` sets the public number of cycles to 0 before free generators go on
         cycles = int(self._chain.control[ORIGIN] + self._chain.control[AT])
-        states = np.empty_like(self._starts)
-        jump(self._jumps, self._starts, cycles % LFSR(self._parameters.rng).period, states)
+        # `_states` are those in cycle 0 of the frame
+        states = np.empty_like(self._states)
+        jump(self._jumps, self._states, cycles % LFSR(self._parameters.rng).period, states)
         return states
-
-    @property
-    def sequencer_state(self) -> int:
-        """The state of the sequencer's own generator, which only moves in `random` order."""
-        return int(self._chain.control[ORDER])
 
     @property
     def stream(self) -> npt.NDArray[np.uint32]:
         """A copy of the stream's buffer: uint32[samples since the last start or resume, state_words]."""
         return self._chain.stream[: self._chain.control[STREAMED]].copy()
 
-    def _restart(self, bank: int) -> None:
-        if bank not in self._bank_starts:
-            seeds = self._random_numbers.restart(bank), sequencer_seed(self._parameters, bank)
-            self._bank_starts[bank] = seeds
-        self._chain.control[:] = 0
-        self._starts, self._chain.control[ORDER] = self._bank_starts[bank]
-
     def _load(self, start: BM2Start) -> None:
         parameters, chain = self._parameters, self._chain
         control = chain.control
-        self._starts = self.rng_state
-        control[:ORDER] = 0
+        control[:] = 0
+        control[ORDER] = self.sequencer_state
         control[BURN_IN], control[TIMED_OUT] = start.burn_in, -1
         load_state(parameters, start.state, chain.values, chain.addresses)
-        fill(self._wiring, chain.numbers, self._starts, parameters.ones_code)
+        fill(self._wiring, chain.numbers, self._states, parameters.ones_code)
 
         wanted = start.known, start.sequencer
         if wanted not in self._kept_moves:
@@ -202,6 +188,7 @@ class FastBM2(BM2Kernel):
                 self._chain = self._chain._replace(stream=larger)
             run_chain(self._wiring, self._moves, self._chain, self._settings)
         self.cycles = int(control[ORIGIN] + control[AT])
+        self.sequencer_state = int(control[ORDER])
         self.samples, self.unused = int(control[SAMPLES]), int(control[UNUSED])
         self.reason = BM2StopReason(control[REASON])
         self.timed_out_bit = int(control[TIMED_OUT])

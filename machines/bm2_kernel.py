@@ -9,7 +9,7 @@ from machines.bm2 import SAMPLES_MAX, BM2Machine, BM2Parameters, BM2Start, BM2St
 from machines.errors import StartError
 from machines.kernel import check_start_value
 from machines.parameters import CYCLES_MAX, RngReset, Sequencer
-from machines.rng import random_numbers
+from machines.rng import Words, random_numbers, sequencer_seed
 
 
 class BM2Kernel(ABC):
@@ -22,6 +22,8 @@ class BM2Kernel(ABC):
         self.machine = machine
         self._parameters = machine.parameters
         self._random_numbers = random_numbers(machine)
+        # computed once, by bank: the states of the generators and that of the sequencer's
+        self._seeds: dict[int, tuple[Words, int]] = {}
         self._results = np.zeros(machine.parameters.result_words, dtype=np.int64)
 
     def _begin(self, start: BM2Start, *, restarts: bool) -> None:
@@ -34,18 +36,26 @@ class BM2Kernel(ABC):
         self.reason = BM2StopReason.NONE
         self.timed_out_bit = -1
         """After `OPS_TIMEOUT`: the lowest-numbered bit of the move that was not written."""
+        if restarts:
+            bank = start.bank
+            if bank not in self._seeds:
+                seeds = self._random_numbers.restart(bank), sequencer_seed(self._parameters, bank)
+                self._seeds[bank] = seeds
+            self._states, self.sequencer_state = self._seeds[bank]
+            """The state of the sequencer's own generator, which only moves in `random` order."""
+        else:
+            self._states = self.rng_state
+        self._state = start.state
         self._samples_due = start.samples
         self._max_cycles = start.max_cycles
         self._results[:] = 0
         self._empty_stream()
-        if restarts:
-            self._restart(start.bank)
         self._load(start)
 
     @property
-    @abstractmethod
     def state(self) -> int:
         """The packed state after the last cycle."""
+        return self._state
 
     @property
     def results(self) -> npt.NDArray[np.uint32]:
@@ -53,14 +63,9 @@ class BM2Kernel(ABC):
         return self._results.astype(np.uint32)
 
     @property
-    @abstractmethod
-    def rng_state(self) -> npt.NDArray[np.uint64]:
+    def rng_state(self) -> Words:
         """A copy of the generators' states: uint64[CDEs]."""
-
-    @property
-    @abstractmethod
-    def sequencer_state(self) -> int:
-        """The state of the sequencer's own generator, which only moves in `random` order."""
+        return self._states.copy()
 
     @property
     @abstractmethod
@@ -134,12 +139,8 @@ class BM2Kernel(ABC):
         return self.reason
 
     @abstractmethod
-    def _restart(self, bank: int) -> None:
-        """Restart all generators from a bank, also that of the sequencer."""
-
-    @abstractmethod
     def _load(self, start: BM2Start) -> None:
-        """Load state and sequencer; results and stream's buffer are empty."""
+        """Prepare the frame; state, results, stream's buffer and generators are those of its start."""
 
     @abstractmethod
     def _empty_stream(self) -> None:

@@ -6,7 +6,7 @@ import numpy.typing as npt
 from machines.bm2 import BM2Machine, BM2Start, BM2StopReason, unpack
 from machines.bm2_kernel import BM2Kernel
 from machines.parameters import RngKind, SampleEvery, Sequencer
-from machines.rng import LFSR, sequencer_seed
+from machines.rng import LFSR
 
 _SEQUENCER_STEPS = 16
 
@@ -26,34 +26,14 @@ class ReferenceBM2(BM2Kernel):
         self.reset()
 
     @property
-    def state(self) -> int:
-        """The packed state after the last cycle."""
-        return self._state
-
-    @property
-    def rng_state(self) -> npt.NDArray[np.uint64]:
-        """A copy of the generators' states: uint64[CDEs]."""
-        return self._states.copy()
-
-    @property
-    def sequencer_state(self) -> int:
-        """The state of the sequencer's own generator, which only moves in `random` order."""
-        return int(self._order_state)
-
-    @property
     def stream(self) -> npt.NDArray[np.uint32]:
         """A copy of the stream's buffer: uint32[samples since the last start or resume, state_words]."""
         words = self._parameters.state_words
         packed = b"".join(state.to_bytes(4 * words, "little") for state in self._stream)
         return np.frombuffer(packed, "<u4").astype(np.uint32).reshape(-1, words)
 
-    def _restart(self, bank: int) -> None:
-        self._states = self._random_numbers.restart(bank)
-        self._order_state = np.array(sequencer_seed(self._parameters, bank), dtype=np.uint64)
-
     def _load(self, start: BM2Start) -> None:
         parameters = self._parameters
-        self._state = start.state
         self._unknown = [
             variable for variable, mask in enumerate(parameters.masks) if mask and not start.known & mask
         ]
@@ -124,8 +104,10 @@ class ReferenceBM2(BM2Kernel):
             self._burn_in -= 1
         self._move = 0 if ends_sweep else self._move + 1
         if self._sequencer is Sequencer.RANDOM:
+            state = np.array(self.sequencer_state, dtype=np.uint64)
             for _ in range(_SEQUENCER_STEPS):
-                self._order_state = LFSR(RngKind.LFSR16).step(self._order_state)
+                state = LFSR(RngKind.LFSR16).step(state)
+            self.sequencer_state = int(state)
         self._begin_move()
         if sampled and self.samples == self._samples_due:
             return BM2StopReason.SAMPLES
