@@ -78,8 +78,7 @@ class BM2Parameters:
         burn_in: Default number of whole sweeps before the first sample.
         ops_timeout: Default maximum number of cycles of a move.
         rng: Kind of random number generators; `lfsr8` and `lfsr16` are too narrow.
-        steps_per_clock: Steps of a generator per cycle, a power of two. 0 is replaced by the default: for an LFSR the
-            smallest power of two that is at least `prob_bits`; 1 for `table` and `ideal`.
+        steps_per_clock: Steps of a generator per cycle, a power of two. 0 is replaced by the default, as for a BM1.
         rng_banks: Number of seed sets of each board; a start selects one.
         rng_reset: Whether a start restarts the generators.
         ideal_seed: Seed of the `ideal` generator, 64 bits.
@@ -260,9 +259,7 @@ class BM2Parameters:
     def moves(self, known: int, sequencer: Sequencer) -> tuple[tuple[int, ...], ...]:
         """Return the bits of each move of a sweep, in rising order; `random` draws its moves from these.
 
-        Args:
-            known: Mask of the known state bits.
-            sequencer: The order of the moves.
+        The known state bits, given as a mask, are in none.
         """
         if sequencer is not Sequencer.COLOURED:
             return tuple((bit,) for bit in range(self.state_bits) if not known >> bit & 1)
@@ -376,14 +373,8 @@ def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np
     """Return the codes of a CDE: of the odds factor(bit = 1) / factor(bit = 0), for each pointed bit.
 
     The odds of a used code against an unused one (cardinality no power of two) are clipped towards the used one; if
-    both are unused, or another variable is at an unused code, they are 1.
-
-    Args:
-        factor: float64[cardinalities of the variables].
-        prob_bits: Bits of a code (W).
-
-    Returns:
-        uint16[n * 2**(n - 1)] for n bits.
+    both are unused, or another variable is at an unused code, they are 1. The factor is float64[cardinalities of the
+    variables]; the result for n bits is uint16[n * 2**(n - 1)].
     """
     # NaN at unused codes: what is computed with one is NaN, too
     padded = np.full([1 << (cardinality - 1).bit_length() for cardinality in factor.shape], np.nan)

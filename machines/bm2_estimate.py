@@ -53,9 +53,7 @@ class Estimate:
 def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
     """Return the counts of the searched joint's values, row-major: integers[..., product of the cardinalities].
 
-    Args:
-        parameters: Parameters of the machine; its joint fits the result words, or one variable is searched.
-        results: Integers[..., result_words].
+    The results are integers[..., result_words]; the joint fits them, or one variable is searched.
     """
     first = parameters.histogram_words
     if not parameters.joint_words:
@@ -71,9 +69,7 @@ def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer])
 def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
     """Return the searched joint's value of each sample of a stream; -1 if any variable is at an unused code.
 
-    Args:
-        parameters: Parameters of the machine.
-        stream: uint32[samples, state_words].
+    A stream is uint32[samples, state_words].
     """
     state = np.unpackbits(stream.astype("<u4").view(np.uint8), axis=1, bitorder="little")
     values = np.zeros(len(stream), dtype=np.int64)
@@ -123,14 +119,8 @@ def estimate(chains: Sequence[Chain]) -> Estimate:
 def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:
     """Return the effective samples of each value's indicator, by Geyer's initial positive sequence (1992).
 
-    They are at most the samples; a value that is always or never there has as many.
-
-    Args:
-        values: Integers[samples] from 0 to size - 1.
-        size: Number of values.
-
-    Returns:
-        float64[size].
+    They are at most the samples; a value that is always or never there has as many. The values are
+    integers[samples] from 0 to `size` - 1; the result is float64[size].
     """
     samples = len(values)
     padded = 1 << (2 * samples - 1).bit_length()  # so that the correlations do not wrap around
@@ -150,13 +140,9 @@ def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:
 def batch_effective_samples(counts: npt.NDArray[np.integer]) -> Floats:
     """Return the effective samples of each value, from the means of a chain's batches.
 
-    They are at most the samples; a value that is equally frequent in all batches has as many.
-
-    Args:
-        counts: Integers[batches, values], the cumulative counts after each batch.
-
-    Returns:
-        float64[values]; NaN if there are fewer than `BATCHES_MIN` batches with samples.
+    They are at most the samples; a value that is equally frequent in all batches has as many. The counts are
+    integers[batches, values], cumulative; the result is float64[values], NaN if fewer than `BATCHES_MIN` batches have
+    samples.
     """
     of_batch = np.diff(counts.astype(np.float64), axis=0, prepend=0)
     of_batch = of_batch[of_batch.any(axis=1)]
@@ -175,13 +161,8 @@ def batch_effective_samples(counts: npt.NDArray[np.integer]) -> Floats:
 def split_r_hat(counts: npt.NDArray[np.integer]) -> Floats:
     """Return the split R-hat of each value's indicator (Gelman et al. 2013), from the counts of half chains.
 
-    If no half varies within itself, it is 1 where all are equal, else infinite.
-
-    Args:
-        counts: Integers[halves, values]; 2 or more samples in each half.
-
-    Returns:
-        float64[values].
+    If no half varies within itself, it is 1 where all are equal, else infinite. The counts are integers[halves,
+    values], with 2 or more samples in each half; the result is float64[values].
     """
     n = counts.sum(axis=1, keepdims=True).astype(np.float64)
     means = counts / n

@@ -79,11 +79,7 @@ class BM2Kernel(ABC):
         )
 
     def start(self, start: BM2Start, pause_at: int = 0) -> BM2StopReason:
-        """Run a new frame, from its start state to a stop.
-
-        Args:
-            start: The registers of the frame.
-            pause_at: Cycle after which the machine pauses, 1 or more; 0 for no pause.
+        """Run a new frame, from its start state to a stop, or to a pause after cycle `pause_at` (0: no pause).
 
         Raises:
             StartError: The start does not fit the machine; nothing has changed.
@@ -98,11 +94,7 @@ class BM2Kernel(ABC):
         return self.reason
 
     def resume(self, samples: int, pause_at: int = 0) -> BM2StopReason:
-        """Continue the frame without another burn-in, with an empty stream's buffer.
-
-        Args:
-            samples: The new total of samples.
-            pause_at: As for `start`, a later cycle than the last one.
+        """Continue the frame to a new total of samples without another burn-in, with an empty stream's buffer.
 
         Raises:
             StartError: The frame cannot be continued, or a value does not fit; nothing has changed.

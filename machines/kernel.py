@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from machines.bm1 import BM1Machine, Start, StopReason, checked_codes, joint_reason
 from machines.errors import ParameterError, StartError
-from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, SensorMode
+from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, SensorMode, check_parameter
 
 
 class BM1Kernel(ABC):
@@ -204,7 +204,5 @@ def _check_inputs(parameters: BM1Parameters, given: object) -> None:
 
 def check_start_value(name: str, value: object, lowest: int, highest: int) -> None:
     """Refuse a value that is not an integer from `lowest` to `highest`."""
-    if not isinstance(value, int | np.integer) or isinstance(value, bool):
-        raise StartError(f"{name} is {value!r}; it must be an integer.")
-    if not lowest <= value <= highest:
-        raise StartError(f"{name} is {value}; it must be from {lowest} to {highest}.")
+    value = int(value) if isinstance(value, np.integer) else value
+    check_parameter(name, value, lowest, highest, StartError)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar, Final
 
-from machines.errors import ParameterError
+from machines.errors import MachineError, ParameterError
 
 PROB_BITS_MAX: Final = 16
 """Maximum width of a code in bits, because tables contain uint16."""
@@ -232,9 +232,11 @@ def set_choices(parameters: object, **kinds: type[StrEnum]) -> None:
             raise ParameterError(f"{name} is {given!r}; it must be one of {', '.join(kind)}.") from None
 
 
-def check_parameter(name: str, value: object, lowest: int, highest: int) -> None:
+def check_parameter(
+    name: str, value: object, lowest: int, highest: int, error: type[MachineError] = ParameterError
+) -> None:
     """Refuse a value that is not an integer from `lowest` to `highest`."""
     if not isinstance(value, int) or isinstance(value, bool):
-        raise ParameterError(f"{name} is {value!r}; it must be an integer.")
+        raise error(f"{name} is {value!r}; it must be an integer.")
     if not lowest <= value <= highest:
-        raise ParameterError(f"{name} is {value}; it must be from {lowest} to {highest}.")
+        raise error(f"{name} is {value}; it must be from {lowest} to {highest}.")
