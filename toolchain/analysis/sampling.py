@@ -141,7 +141,8 @@ class SampledBoards:
                 rows.append((distance(posterior, exact), found.effective_samples, found.r_hat, cycles))
             advance()
         if not rows:
-            raise BuildError("none of the readings gives a posterior; see 'toolchain check'")
+            ends = ", ".join(f"{name} {count}" for name, count in sorted(reasons.items()))
+            raise BuildError(f"none of the readings gives a posterior; boards stopped by: {ends}")
         distances, effective, r_hat, lengths = np.nan_to_num(
             np.array(rows, dtype=np.float64), posinf=_INFINITE
         ).T

@@ -3,6 +3,9 @@
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from machines import KINDS
 from machines.bm2 import CHAINS_MAX, FACTOR_BITS_MAX, BM2Machine, BM2Parameters, start_state
 from machines.errors import MachineError, ParameterError
@@ -132,6 +135,24 @@ def chain_machines(plan: BM2Plan) -> tuple[BM2Machine, ...]:
         BM2Machine(replace(parameters, chain=chain), first.tables, first.supports, first.rng_table)
         for chain in range(parameters.chains)
     )
+
+
+def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]:
+    """Return how many odds of a factor are clipped, how many of these by zeros, and the number of all odds.
+
+    A CDE compares two values of a variable whose codes differ in one bit, the other variables being equal.
+    """
+    clips = zeros = count = 0
+    for axis, size in enumerate(factor.shape):
+        for bit in (1 << k for k in range((size - 1).bit_length())):
+            low = [code for code in range(size) if not code & bit and code | bit < size]
+            zero, one = np.take(factor, low, axis), np.take(factor, [code | bit for code in low], axis)
+            both = zero + one
+            share = np.divide(np.minimum(zero, one), both, out=np.ones_like(both), where=both > 0)
+            clips += int((share < 0.5 / 2**prob_bits).sum())
+            zeros += int((share == 0).sum())
+            count += both.size
+    return clips, zeros, count
 
 
 def chain_layout(parameters: BM2Parameters, interface: tuple[int, int] | None) -> BoardLayout:

@@ -5,10 +5,9 @@ It has no dates or paths, so the same input gives the same bytes.
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from machines.bm2 import BM2Machine
 from machines.parameters import PriorMode, SensorMode
+from toolchain.building.bm2_machine import clipped
 from toolchain.building.machine import MachinePlan
 from toolchain.building.quantise import Quantised
 from toolchain.deployment import Deployment, MachineSection
@@ -59,7 +58,7 @@ def bm2_report(
         + _generators(limits)
     )
     if parameters.stream:
-        sentence += f" It keeps {parameters.stream} samples for /bm/samples."
+        sentence += f" All samples go to /bm/samples; the board's buffer holds {parameters.stream}."
     return _report(
         model,
         deployment,
@@ -72,8 +71,8 @@ def bm2_report(
             ", each with a chain of its own",
             [f"chain {each.line_offset}" for each in deployment.boards],
         ),
-        "CDEs (clipped: codes of odds that are 0 or infinite, or too extreme for a code):\n"
-        + _cde_table(model.titles, machine),
+        "CDEs (clipped: odds of used codes that are 0 or infinite, or too extreme for a code):\n"
+        + _cde_table(model, machine),
         "The VHDL of a BM2 does not exist yet, so there are memories, but no parameters and no project.",
     )
 
@@ -189,11 +188,10 @@ def _loss_table(quantised: Quantised) -> str:
     return "\n".join(rows)
 
 
-def _cde_table(titles: Sequence[str], machine: BM2Machine) -> str:
-    width, most = max(map(len, titles)), machine.parameters.ones_code
+def _cde_table(model: NetworkModel, machine: BM2Machine) -> str:
+    width, p = max(map(len, model.titles)), machine.parameters
     rows = [f"  {'factor':{width}}  bits    codes  clipped"]
-    for at, (title, table) in enumerate(zip(titles, machine.tables, strict=True)):
-        bits = len(machine.parameters.factor_bits(at))
-        clipped = np.count_nonzero((table == 1) | (table == most))
-        rows.append(f"  {title:{width}}  {bits:4d}  {table.size:7d}  {clipped:7d}")
+    for at, (title, table) in enumerate(zip(model.titles, machine.tables, strict=True)):
+        clips, _, _ = clipped(model.factors[at].table, p.prob_bits)
+        rows.append(f"  {title:{width}}  {len(p.factor_bits(at)):4d}  {table.size:7d}  {clips:7d}")
     return "\n".join(rows)

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from machines.bm2 import BM2Machine, unpack
-from machines.parameters import RngReset
+from machines.parameters import PROB_BITS_MAX, RngKind, RngReset, SampleEvery
 from machines.rng import LFSR
 from toolchain.analysis.chain import ChainError, agreement, chain_error, factor_bits
 from toolchain.analysis.logic import BLOCK_SHAPES, blocks_of, device_named
+from toolchain.building.bm2_machine import clipped
 from toolchain.checks.findings import Check, Finding, Severity, error, note, reading, warning
 from toolchain.checks.generators import relations
 
@@ -40,11 +41,12 @@ _BLANKET_BITS: Final = 16
 _RELATED_BITS: Final = 2048
 """Maximum number of bits of random numbers of a board whose relations are searched, because all pairs are kept."""
 _TIMEOUT_RISK: Final = 1e-6
+_MOVE_CYCLES: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedChain:
-    """A BM2 to check, as its first board has it; without a model, only known and searched variables have names."""
+    """A BM2 to check, as its first board has it; without a model, hidden variables have no names of states."""
 
     deployment: Deployment
     machine: BM2Machine
@@ -57,21 +59,29 @@ class CheckedChain:
             return self.model.names
         p, deployment = self.machine.parameters, self.deployment
         own = [*(each.name for each in deployment.variables), *(each.label for each in deployment.searched)]
-        named = dict(zip((*p.known, *p.searched), own, strict=True))
+        named = dict(enumerate(deployment.machine.variables)) | dict(
+            zip((*p.known, *p.searched), own, strict=True)
+        )
         return tuple(named.get(at, f"variable {at}") for at in range(len(p.cardinalities)))
 
     @property
     def titles(self) -> tuple[str, ...]:
         """The names of its factors."""
-        cdes = range(self.machine.parameters.cdes)
-        return tuple(f"CDE {at}" for at in cdes) if self.model is None else self.model.titles
+        if self.model is not None:
+            return self.model.titles
+        scopes = [", ".join(self.names[at] for at in scope) for scope in self.machine.parameters.factors]
+        return tuple(f"CDE {at} ({scope})" for at, scope in enumerate(scopes))
 
     def state(self, values: Sequence[int], variables: Sequence[int]) -> str:
         """Return values of some variables in words: `rain = yes, grass = wet`."""
-        symbols = None if self.model is None else self.model.symbols
-        labels = [symbols[at].type.labels if symbols else () for at in range(len(values))]
-        words = [own[value] if own else str(value) for own, value in zip(labels, values, strict=True)]
-        return ", ".join(f"{self.names[each]} = {words[each]}" for each in variables)
+        p, deployment = self.machine.parameters, self.deployment
+        if self.model is None:
+            labels = dict(zip(p.known, (each.states for each in deployment.variables), strict=True))
+            labels |= dict(zip(p.searched, (each.states for each in deployment.searched), strict=True))
+        else:
+            labels = {at: symbol.type.labels for at, symbol in enumerate(self.model.symbols)}
+        words = {at: labels[at][values[at]] if labels.get(at) else str(values[at]) for at in variables}
+        return ", ".join(f"{self.names[at]} = {word}" for at, word in words.items())
 
     @property
     def always_known(self) -> set[int]:
@@ -90,25 +100,8 @@ def chain_findings(chain: CheckedChain) -> Iterator[Finding]:
     if chain.model is not None:
         found = chain_error(chain.machine, chain.model, samples=chain.deployment.machine.target_count)
         yield from _error(chain, found)
+    yield from _limits(chain, found)
     yield from _numbers(chain, found)
-
-
-def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]:
-    """Return how many odds of a factor are clipped, how many of these by zeros, and the number of all odds.
-
-    A CDE compares two values of a variable whose codes differ in one bit, the other variables being equal.
-    """
-    clips = zeros = count = 0
-    for axis, size in enumerate(factor.shape):
-        for bit in (1 << k for k in range((size - 1).bit_length())):
-            low = [code for code in range(size) if not code & bit and code | bit < size]
-            zero, one = np.take(factor, low, axis), np.take(factor, [code | bit for code in low], axis)
-            both = zero + one
-            share = np.divide(np.minimum(zero, one), both, out=np.ones_like(both), where=both > 0)
-            clips += int((share < 0.5 / 2**prob_bits).sum())
-            zeros += int((share == 0).sum())
-            count += both.size
-    return clips, zeros, count
 
 
 def _clips(chain: CheckedChain) -> Iterator[Finding]:
@@ -122,7 +115,8 @@ def _clips(chain: CheckedChain) -> Iterator[Finding]:
             what = f"{clips} of its {count} odds are clipped to 1 in {2**width}"
             what += f", {zeros} of them because of zeros" if zeros else ""
             rarer = "more --prob-bits make crossing a zero rarer, and the samples less independent"
-            yield note(Check.CLIPPED, title, what, rarer if zeros else "use more --prob-bits")
+            advice = rarer if zeros else "use more --prob-bits"
+            yield note(Check.CLIPPED, title, what, advice if width < PROB_BITS_MAX else "")
 
 
 def _error(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
@@ -137,7 +131,8 @@ def _error(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
     where = ", ".join(f"{variable.name} = {reading(variable, address)}" for variable, address in pairs)
     large = found.worst > _LARGE_ERROR
     if large or not all(support.all() for support in chain.machine.supports):
-        severity, advice = (Severity.WARNING, "use more --prob-bits") if large else (Severity.NOTE, "")
+        severity = Severity.WARNING if large else Severity.NOTE
+        advice = "use more --prob-bits" if large and p.prob_bits < PROB_BITS_MAX else ""
         what = f"quantising and clipping change the posterior by a total variation of {found.quantising:.2g} in the mean{of_all}"
         what += f", {found.worst:.2g} at worst ({where})" if where else ""
         yield Finding(severity, Check.CODES_ERROR, "the codes", what, advice)
@@ -279,10 +274,30 @@ def _memories(chain: CheckedChain) -> Iterator[Finding]:
         yield warning(Check.WIDE_FACTOR, title, what, advice)
 
 
+def _limits(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
+    """Find limits that stop a frame before its last sample."""
+    p, limits = chain.machine.parameters, chain.deployment.machine
+    own = max(1, len(p.moves(sum(p.masks[at] for at in p.known), p.sequencer)))
+    moves = p.burn_in * own + limits.target_count * (own if p.sample_every is SampleEvery.SWEEP else 1)
+    # without the model, as many as a move takes if no zeros are clipped
+    mean = _MOVE_CYCLES if found is None else found.cycles / own
+    if limits.max_cycles < moves * mean:
+        finding = error if limits.max_cycles < moves else warning
+        what = f"burn-in and samples are {moves:,} moves, which take about {moves * mean:,.0f} cycles"
+        advice = "use more --max-cycles, fewer --samples or a shorter --burn-in"
+        yield finding(Check.STOPPING, f"max_cycles = {limits.max_cycles}", what, advice)
+    if p.ops_timeout < mean * math.log(moves):
+        what = (
+            f"one of a frame's {moves:,} moves probably takes longer, as the mean is about {mean:.2g} cycles"
+        )
+        yield warning(Check.STOPPING, f"ops_timeout = {p.ops_timeout}", what, "use a larger --ops-timeout")
+
+
 def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
     """Find random numbers that are shared between boards, banks or CDEs, related, repeated, or not fresh."""
     p, about = chain.machine.parameters, f"rng = {chain.machine.parameters.rng}"
     width, boards, sets = p.rng.lfsr_bits, p.chains, p.rng_banks * p.chains
+    wider = "" if p.rng is RngKind.LFSR32 else "--rng lfsr32, or "
     if p.rng_banks == 1 and p.rng_reset is RngReset.BANK:
         what = (
             "every frame uses the same random numbers, so averaging over frames does not remove their error"
@@ -305,7 +320,7 @@ def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]
             for at in np.flatnonzero(seeds == own[counts.argmax()])[:2].tolist()
         )
         what = f"the generators of {one} and {other} have the same seed"
-        yield error(Check.RNG_RELATION, about, what, "use a wider --rng, or fewer --rng-banks")
+        yield error(Check.RNG_RELATION, about, what, f"use {wider}fewer --rng-banks")
     related, groups = relations(
         p.rng, seeds.reshape(sets, p.cdes)[:, : _RELATED_BITS // p.prob_bits], p.prob_bits
     )
@@ -319,10 +334,10 @@ def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]
             bits = " and ".join(f"bit {bit} of {chain.titles[cde]}" for cde, bit in those[0].bits)
             what = f"in {len(those)} of {groups} banks of boards {size} random bits {'are the same' if size == 2 else 'XOR to 0'} in "
             what += f"every cycle (bank {bank}, board {board}: {bits})"
-            yield finding(Check.RNG_RELATION, about, what, "use --rng lfsr32, or fewer --prob-bits")
+            yield finding(Check.RNG_RELATION, about, what, f"use {wider}fewer --prob-bits")
     limits, sweep = chain.deployment.machine, p.state_bits if found is None else found.cycles
     cycles = min(limits.max_cycles, (p.burn_in + limits.target_count) * sweep) * boards
     if cycles > 2**width / 10:
         what = f"a frame takes {cycles:.2g} cycles on all boards, more than a tenth of the generators' period of {2**width - 1}"
-        advice = "use a wider --rng, fewer --samples or fewer --partitions"
-        yield warning(Check.RNG_PERIOD, about, what, advice)
+        ways = ["fewer --samples", "a shorter --burn-in", "fewer --partitions"][: 2 if boards == 1 else 3]
+        yield warning(Check.RNG_PERIOD, about, what, f"use {wider}{' or '.join(ways)}")

@@ -13,9 +13,9 @@ from machines.bm2 import BM2Machine, BM2Parameters, pack, unpack
 from machines.rng import LFSR
 from tests.toolchain.chains import network, sprinkler
 from tests.toolchain.running import OPTIONS
-from toolchain.building.bm2_machine import plan_bm2
+from toolchain.building.bm2_machine import clipped, plan_bm2
 from toolchain.building.build import assemble
-from toolchain.checks.chain_findings import CheckedChain, chain_findings, clipped, legal_states, unconnected
+from toolchain.checks.chain_findings import CheckedChain, chain_findings, legal_states, unconnected
 from toolchain.checks.findings import Check, Severity
 
 OR = [[[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0], [1.0, 1.0]]]
@@ -62,10 +62,16 @@ def test_clipped_odds_are_counted():
 
 def test_a_clipped_factor_is_named_with_and_without_the_model():
     model = sprinkler()
-    for known_model, title in ((True, "P(grass | sprinkler, rain)"), (False, "CDE 2")):
+    for known_model, title in (
+        (True, "P(grass | sprinkler, rain)"),
+        (False, "CDE 2 (rain, sprinkler, grass)"),
+    ):
         finding = only(checked(model, known_model=known_model), Check.CLIPPED)
         assert finding.about == title
         assert "3 of its 12 odds are clipped to 1 in 65536, 3 of them because of zeros" in finding.what
+        assert finding.advice == ""  # there are no more bits
+    fewer = only(checked(model, prob_bits=12), Check.CLIPPED)
+    assert "more --prob-bits" in fewer.advice
     small = network({"A": [1, 1e-4], "AB": [[1, 2], [3, 1]]})
     assert "1 of its 1 odds are clipped to 1 in 256" in only(checked(small, prob_bits=8), Check.CLIPPED).what
     assert not found(checked(small, prob_bits=8, known_model=False), Check.CLIPPED)
@@ -91,6 +97,23 @@ def test_samples_that_are_worth_few():
     assert finding.severity is Severity.WARNING
     assert "1000 sweeps of burn-in leave" in finding.what
     assert not found(checked(sprinkler(), samples=10**6), Check.MIXING)
+
+
+def test_limits_that_stop_a_frame_early():
+    for limits, severity, about in (
+        ({"max_cycles": 10}, Severity.ERROR, "max_cycles = 10"),
+        ({"max_cycles": 21_999}, Severity.ERROR, "max_cycles = 21999"),
+        ({"max_cycles": 22_000}, Severity.WARNING, "max_cycles = 22000"),
+        ({"ops_timeout": 1}, Severity.WARNING, "ops_timeout = 1"),
+    ):
+        for known_model in (True, False):
+            finding = only(checked(sprinkler(), known_model=known_model, **limits), Check.STOPPING)
+            assert (finding.severity, finding.about) == (severity, about)
+            assert "22,000 moves" in finding.what
+    assert (
+        "12,000 moves" in only(checked(sprinkler(), max_cycles=9, sample_every="move"), Check.STOPPING).what
+    )
+    assert not found(checked(sprinkler(), max_cycles=200_000, ops_timeout=200), Check.STOPPING)
 
 
 # Clips in opposite directions
@@ -183,6 +206,13 @@ def test_connection_is_that_of_a_search(data):
         assert all(table[unpack(p, state)] for state in pair)
 
 
+def test_states_and_names_are_those_of_the_deployment():
+    model = gate(known=("D",), searched=("B",))
+    what = only(checked(model, known_model=False), Check.CONNECTION).what
+    assert "with D = d0, " in what
+    assert "from A = 0, C = 0 to A = 1, C = 1" in what  # hidden ones have names, but no states
+
+
 # Memories
 
 
@@ -192,7 +222,7 @@ RANDOM = np.random.default_rng(2)
 def test_a_factor_that_is_too_wide_is_named():
     model = network({"ABC": RANDOM.random((64, 64, 64)), "A": np.arange(1, 65)})
     finding = only(checked(model, known_model=False), Check.WIDE_FACTOR)
-    assert finding.about == "CDE 0"
+    assert finding.about == "CDE 0 (A, B, C)"
     assert "2,359,296 words of 16 bits" in finding.what
     assert "holds 2,102,272" in finding.what
     assert not found(checked(model, known_model=False, prob_bits=10), Check.WIDE_FACTOR)
@@ -231,6 +261,7 @@ def test_bits_that_are_related():
     ring = {f"{a}{b}": [[1, 2], [3, 1]] for a, b in zip("ABCDEFGH", "BCDEFGHA", strict=True)}
     finding = only(checked(network(ring), rng="lfsr24"), Check.RNG_RELATION)
     assert "4 random bits XOR to 0 in every cycle" in finding.what
+    assert finding.advice == "use --rng lfsr32, or fewer --prob-bits"
     many = network({f"{a}{b}": [[1, 2], [3, 1]] for a in "ABCDEFGHIJKL" for b in "MNOPQRSTUVWX"})
     assert any(
         "searched among 128 of 144 CDEs" in each.what for each in found(checked(many), Check.RNG_RELATION)
@@ -242,5 +273,7 @@ def test_a_frame_that_is_long_for_its_period():
     assert not found(checked(sprinkler(), rng="lfsr24", samples=200_000), Check.RNG_PERIOD)
     finding = only(checked(sprinkler(), rng="lfsr24", samples=300_000), Check.RNG_PERIOD)
     assert "more than a tenth of the generators' period of 16777215" in finding.what
+    long = only(checked(sprinkler(), burn_in=4 * 10**9), Check.RNG_PERIOD)
+    assert long.advice == "use fewer --samples or a shorter --burn-in"  # no generator is wider
     assert found(checked(sprinkler(), rng="lfsr24", samples=150_000, partitions=2), Check.RNG_PERIOD)
     assert not found(checked(sprinkler(), rng="lfsr24", samples=10**8, max_cycles=10**6), Check.RNG_PERIOD)
