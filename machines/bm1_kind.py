@@ -155,9 +155,9 @@ class BM1Kind(MachineKind):
 
     def posterior(
         self, machines: Sequence[BM1Machine], frame: FrameInput, _: Sequence[str] = ()
-    ) -> npt.NDArray[np.float64]:
-        """Run the machines as `machines.posterior.posterior` does."""
-        return posterior(
+    ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
+        """Run the machines as `machines.posterior.posterior` does; there are no details."""
+        values = posterior(
             machines,
             frame.addresses,
             prior_address=frame.prior_address,
@@ -166,6 +166,7 @@ class BM1Kind(MachineKind):
             max_cycles=frame.max_cycles,
             bank=frame.bank,
         )
+        return values, {}
 
 
 BM1: Final = BM1Kind()

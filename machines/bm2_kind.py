@@ -181,7 +181,7 @@ class BM2Kind(MachineKind):
 
     def posterior(
         self, machines: Sequence[BM2Machine], frame: FrameInput, variables: Sequence[str] = ()
-    ) -> npt.NDArray[np.float64]:
+    ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
         """Run the chains one after the other in this process, as boards run them."""
         starts, settings = _OnHost(machines).starts(frame)
         results = []
@@ -189,8 +189,15 @@ class BM2Kind(MachineKind):
             # a stream changes nothing but the way of the samples to the host
             parameters = replace(machine.parameters, stream=0)
             kernel = make_bm2_kernel(replace(machine, parameters=parameters))
-            kernel.start(_start_of(parameters, blocks, settings))
-            kept = Kept(parameters, kernel.samples, kernel.unused, kernel.timed_out_bit)
+            first, *others = _batch_ends(settings.target_count)
+            kernel.start(_start_of(parameters, blocks, settings._replace(target_count=first)))
+            batches = []
+            for target in others:
+                if kernel.reason is not BM2StopReason.SAMPLES:
+                    break
+                batches.append(kernel.results.astype("<u4").tobytes())
+                kernel.resume(target)
+            kept = Kept(parameters, kernel.samples, kernel.unused, kernel.timed_out_bit, batches)
             words = kernel.results.astype("<u4").tobytes()
             results.append(
                 BoardResult(words, kernel.cycles, kernel.reason, kept=msgspec.msgpack.encode(kept))
@@ -198,7 +205,7 @@ class BM2Kind(MachineKind):
         inference = self.infer(results, variables)
         if inference.posterior is None:
             raise NoPosteriorError(f"There is {inference.outcome}.")
-        return inference.posterior
+        return inference.posterior, inference.details
 
 
 BM2: Final = BM2Kind()
@@ -235,6 +242,11 @@ def _start_of(
         bank=settings.bank,
         sequencer=_ORDERS[order],
     )
+
+
+def _batch_ends(samples: int, batches: int = BATCHES) -> list[int]:
+    """Return the samples at which each batch ends; there are fewer batches if there are few samples."""
+    return sorted({samples * (at + 1) // batches for at in range(batches)} - {0}) or [0]
 
 
 class _OnBoard(BoardMachine):
@@ -351,10 +363,7 @@ class _Course(FrameCourse):
     ) -> None:
         self.starts = starts
         self.begun = self.end = 0
-        total = settings.target_count
-        batches = 1 if machines[0].parameters.stream else BATCHES
-        # the samples at which each batch ends; several may be the same if there are few samples
-        self._targets = sorted({total * (at + 1) // batches for at in range(batches)} - {0}) or [0]
+        self._targets = _batch_ends(settings.target_count, 1 if machines[0].parameters.stream else BATCHES)
         self.settings = settings._replace(target_count=self._targets.pop(0))
         self._kept = [Kept(machine.parameters) for machine in machines]
         self._running = list(range(len(machines)))

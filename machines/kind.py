@@ -316,8 +316,8 @@ class MachineKind(ABC):
     @abstractmethod
     def posterior(
         self, machines: Sequence[Any], frame: FrameInput, variables: Sequence[str] = ()
-    ) -> npt.NDArray[np.float64]:
-        """Run the machines of all boards in this process, each to its own stop, and return the posterior.
+    ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
+        """Run the machines of all boards in this process, each to its own stop, and return the posterior and the details.
 
         Raises:
             NoPosteriorError: There is none for these readings.

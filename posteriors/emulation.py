@@ -54,10 +54,11 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
         bank=bank,
     )
     machines = [read_image(deployment.image_path(board)).machine for board in range(len(deployment.boards))]
-    values = deployment.machine.kind.posterior(machines, frame, deployment.machine.variables)
+    values, details = deployment.machine.kind.posterior(machines, frame, deployment.machine.variables)
     return Posterior(
         probabilities=tuple(values.tolist()),
         labels=tuple(dimension.label for dimension in deployment.searched),
         sizes=tuple(dimension.size for dimension in deployment.searched),
         heard_ns=time.time_ns(),
+        details=details,
     )

@@ -77,7 +77,8 @@ class Pairing:
                 self._reports.popleft()  # its posterior was lost
                 self.announced_only += 1
             else:
-                ready.append(replace(self._posteriors.popleft(), report=self._reports.popleft()))
+                report = self._reports.popleft()
+                ready.append(replace(self._posteriors.popleft(), report=report, details=report.details))
         return ready
 
     def _belongs_to_a_later(self, posterior: Posterior) -> bool:

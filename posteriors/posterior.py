@@ -3,7 +3,7 @@
 import difflib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -51,6 +51,8 @@ class Posterior:
     """Time of arrival, Unix time in nanoseconds."""
     report: FrameReport | None = None
     """Its `/bm/frame`; None if that was lost."""
+    details: Mapping[str, str] = field(default_factory=dict)
+    """What is known of the samples of a BM2, by the keys of `/bm/frame`; empty for a BM1."""
 
     @cached_property
     def values(self) -> "NDArray[np.float64]":

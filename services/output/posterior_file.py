@@ -78,6 +78,8 @@ def record(frame: FrameOutcome, axes: list[Axis]) -> dict[str, Any]:
         values["mean_value"] = {
             axis.label: axis.value(mean[axis.label]) for axis in axes if not axis.has_states
         }
+    if frame.details:
+        values["details"] = frame.details
     return known | {
         "latency_us": frame.latency_us,
         "probability": frame.probability,

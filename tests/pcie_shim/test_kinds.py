@@ -142,7 +142,7 @@ def test_two_boards_are_chains_equal_to_kernels(sequencer):
     assert 0 < float(inference.details["effective_samples"]) <= 600
     assert (
         inference.posterior.tolist()
-        == BM2.posterior([part.machine for part in parts], frame(1, bank=4)).tolist()
+        == BM2.posterior([part.machine for part in parts], frame(1, bank=4))[0].tolist()
     )
 
 

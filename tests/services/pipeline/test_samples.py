@@ -16,10 +16,12 @@ from machines.errors import MachineError
 from machines.kind import FrameInput
 from posteriors import posterior
 from posteriors.frame_report import read_frame_report
+from posteriors.pairing import Pairing
 from posteriors.posterior import read_posterior
 from services.boards.deployed import images_of
 from services.boards.frames import decode_boards, result_record
 from services.output.axes import Axis
+from services.output.posterior_file import record
 from services.output.posterior_output import line
 from services.pipeline.frames import FrameAssembler
 from services.pipeline.result_topics import ResultTopics
@@ -89,12 +91,19 @@ async def test_posterior_details_and_samples_are_published(folder):
     machines = [image.machine for image in images_of(deployment)]
     frame = FrameInput(addresses=(1,), target_count=SAMPLES, max_cycles=2**32, bank=1)
     found = read_posterior(result, 0)
-    assert found.probabilities == tuple(BM2.posterior(machines, frame).tolist())
-    assert found.probabilities == posterior(folder / "built", {"Grass": "wet"}, bank=1).probabilities
+    assert found.probabilities == tuple(BM2.posterior(machines, frame)[0].tolist())
+    here = posterior(folder / "built", {"Grass": "wet"}, bank=1)
+    assert found.probabilities == here.probabilities
     assert found.labels == ("Rain",)
     details = read_frame_report(report, 0).details
     assert details["samples"] == str(2 * SAMPLES)
     assert {"unused", "effective_samples", "standard_error", "r_hat"} <= set(details)
+    pairing = Pairing()
+    pairing.add_report(read_frame_report(report, 0))
+    (heard_of,) = pairing.add_posterior(found)
+    for each in (heard_of, here):
+        assert {"samples", "effective_samples", "standard_error", "r_hat"} <= set(each.details)
+        assert record(each, [Axis("Rain", 2)])["details"] == each.details
     assert [each["size"] for each in samples["layout"]["dim"]] == [2 * SAMPLES, 4]
     states = np.frombuffer(base64.b64decode(samples["data"]), "<u4")
     assert (states >> 2 == 1).all()
@@ -150,7 +159,7 @@ def test_a_result_goes_through_a_pipe(folder, capsys, monkeypatch):
     machines = [image.machine for image in images_of(deployment)]
     frame = FrameInput(addresses=(1,), target_count=SAMPLES, max_cycles=2**32)
     boards = decode_boards(result)
-    assert BM2.infer(boards).posterior.tolist() == BM2.posterior(machines, frame).tolist()
+    assert BM2.infer(boards).posterior.tolist() == BM2.posterior(machines, frame)[0].tolist()
     spoilt = json.loads(printed)
     spoilt["boards"][0]["counts"].pop()
     result, _ = result_from_line(json.dumps(spoilt).encode(), 1, deployment.machine)
