@@ -36,8 +36,7 @@ def to_address(variable: Variable, value: object) -> int | None:
     if not isinstance(value, int | float):  # bool is an int: False is 0, True is 1
         if isinstance(value, list | tuple) and not value:
             return _missing(variable, "is an empty array")
-        states = ", ".join(variable.states)
-        names = f", nor one of its states: {_shortened(states)}" if states else ""
+        names = f", nor one of its states: {_states(variable)}" if variable.states else ""
         raise NotANumberError(
             f"variable {variable.name}: {_shown(value)} is {_kind(value)}, not a number{names}"
         )
@@ -75,8 +74,12 @@ def _unserved(variable: Variable, value: float, beyond_top: bool | None) -> int 
     around = f", around a period of {variable.period} steps" if variable.period else ""
     raise ValueOutOfRangeError(
         f"variable {variable.name}: {_shown(value)} is out of range, expected {low:g} to {high:g} "
-        f"in steps of {abs(variable.step):g}{around}"
+        f"in steps of {abs(variable.step):g}{around}{f' ({_states(variable)})' if variable.states else ''}"
     )
+
+
+def _states(variable: Variable) -> str:
+    return _shortened(", ".join(variable.states))
 
 
 def _shown(value: object) -> str:

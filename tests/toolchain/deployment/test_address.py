@@ -78,6 +78,11 @@ def test_a_wrong_state_is_refused_with_the_right_ones():
         to_address(variable(values=2, states=("wet", "dry")), "damp")
 
 
+def test_a_number_beyond_the_states_is_refused_with_their_names():
+    with pytest.raises(ValueOutOfRangeError, match=r"expected 0 to 1 in steps of 1 \(wet, dry\)"):
+        to_address(variable(values=2, states=("wet", "dry")), 5)
+
+
 @pytest.mark.parametrize(("value", "address"), [(49.5, 50), (-0.5, 0), (True, 1), (False, 0)])
 def test_rounding_and_booleans(value, address):
     assert to_address(variable(), value) == address
