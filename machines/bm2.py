@@ -257,10 +257,7 @@ class BM2Parameters:
         return tuple(colours[variable] for variable in range(len(neighbours)))
 
     def moves(self, known: int, sequencer: Sequencer) -> tuple[tuple[int, ...], ...]:
-        """Return the bits of each move of a sweep, in rising order; `random` draws its moves from these.
-
-        The known state bits, given as a mask, are in none.
-        """
+        """Return the bits of each move of a sweep, rising and without a mask of known ones; `random` draws from these."""
         if sequencer is not Sequencer.COLOURED:
             return tuple((bit,) for bit in range(self.state_bits) if not known >> bit & 1)
         unknown = [
@@ -410,13 +407,8 @@ def unpack(parameters: BM2Parameters, state: int) -> tuple[int, ...]:
 def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bool = False) -> int | None:
     """Return the lexicographically smallest (or largest) state of non-zero probability; variable 0 comes first.
 
-    Args:
-        machine: The machine.
-        evidence: Values of the known variables.
-        largest: Return the largest state, for every other board.
-
-    Returns:
-        The packed state; None if the evidence has probability 0.
+    The evidence is the values of the known variables; without a state that agrees with it, the result is None. Every
+    other board starts from the largest state.
 
     Raises:
         StartError: A value is out of range, or the search takes too long.

@@ -67,10 +67,7 @@ def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer])
 
 
 def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
-    """Return the searched joint's value of each sample of a stream; -1 if any variable is at an unused code.
-
-    A stream is uint32[samples, state_words].
-    """
+    """Return the searched joint's values in a stream, uint32[samples, state_words]; -1 with a variable at an unused code."""
     state = np.unpackbits(stream.astype("<u4").view(np.uint8), axis=1, bitorder="little")
     values = np.zeros(len(stream), dtype=np.int64)
     unused = np.zeros(len(stream), dtype=np.bool_)

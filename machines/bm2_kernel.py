@@ -1,6 +1,7 @@
 """The common base of the kernels of a BM2, and the checks of their arguments."""
 
 from abc import ABC, abstractmethod
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +23,10 @@ class BM2Kernel(ABC):
         self.machine = machine
         self._parameters = machine.parameters
         self._random_numbers = random_numbers(machine)
-        # computed once, by bank: the states of the generators and that of the sequencer's
-        self._seeds: dict[int, tuple[Words, int]] = {}
+        # the states of the generators and that of the sequencer's, computed once for each bank
+        self._seeds = cache(
+            lambda bank: (self._random_numbers.restart(bank), sequencer_seed(self._parameters, bank))
+        )
         self._results = np.zeros(machine.parameters.result_words, dtype=np.int64)
 
     def _begin(self, start: BM2Start, *, restarts: bool) -> None:
@@ -37,11 +40,7 @@ class BM2Kernel(ABC):
         self.timed_out_bit = -1
         """After `OPS_TIMEOUT`: the lowest-numbered bit of the move that was not written."""
         if restarts:
-            bank = start.bank
-            if bank not in self._seeds:
-                seeds = self._random_numbers.restart(bank), sequencer_seed(self._parameters, bank)
-                self._seeds[bank] = seeds
-            self._states, self.sequencer_state = self._seeds[bank]
+            self._states, self.sequencer_state = self._seeds(start.bank)
             """The state of the sequencer's own generator, which only moves in `random` order."""
         else:
             self._states = self.rng_state

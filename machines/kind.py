@@ -220,9 +220,8 @@ class FrameCourse(ABC):
     ) -> tuple[Sequence[int], Blocks]:
         """Return the numbers of the boards to resume (none: the frame is over), and the blocks to write before that.
 
-        Args:
-            reasons: The last stop reasons of each board's replicas.
-            answers: The words of `UsedRegisters.answer` of each board, valid until it is resumed.
+        It takes the last stop reasons of each board's replicas, and each board's words of `UsedRegisters.answer`, which
+        are valid until it is resumed.
         """
 
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:
