@@ -13,6 +13,8 @@ from machines.bm2 import BM2Parameters, BM2StopReason
 BATCHES_MIN: Final = 20
 """Minimum number of batches from whose means the effective samples are computed."""
 
+_AGREE: Final = 1.1  # R-hat above which boards have not seen the same distribution (Gelman and Rubin 1992)
+
 Floats = npt.NDArray[np.float64]
 
 
@@ -37,8 +39,10 @@ class Estimate:
 
     Attributes:
         posterior: float64[values] of the searched joint; None if no board has a sample that counts.
-        error: float64[values], the posterior's standard error; NaN where the effective samples are unknown.
-        effective_samples: Those of the value that has the fewest, over all boards that count; NaN if unknown.
+        error: float64[values], the posterior's standard error; NaN where the effective samples are unknown, unless
+            boards disagree.
+        effective_samples: Those of the value that has the fewest, over all boards that count; NaN if unknown, as for
+            a board whose samples all have the same value.
         r_hat: The largest one of all values; NaN for one board, or if it is unknown.
         left_out: Numbers of the boards that do not count: those that timed out, or have no sample.
     """
@@ -110,6 +114,10 @@ def estimate(chains: Sequence[Chain]) -> Estimate:
     # Laplace's rule: a value that was never seen has an error, too
     smooth = (effective * posterior + 1) / (effective + 2)
     error = np.sqrt(smooth * (1 - smooth) / effective)
+    if r_hat > _AGREE:
+        # chains that have not mixed know no error of their own
+        means = [chain.counts[-1] / chain.counts[-1].sum() for chain in counted]
+        error = np.fmax(error, np.sqrt(np.var(means, axis=0, ddof=1) / len(means)))
     return Estimate(posterior, error, float(effective.min()), r_hat, left_out)
 
 
@@ -173,6 +181,9 @@ def split_r_hat(counts: npt.NDArray[np.integer]) -> Floats:
 
 
 def _effective_samples_of(chain: Chain) -> Floats:
+    if np.count_nonzero(chain.counts[-1]) == 1:
+        # a chain that is stuck looks the same as a certain answer
+        return np.full(chain.counts.shape[1], np.nan)
     if chain.values is None:
         return batch_effective_samples(chain.counts)
     return effective_samples(chain.values[chain.values >= 0], chain.counts.shape[1])

@@ -168,9 +168,37 @@ def test_the_error_is_that_of_the_posterior(streamed):
 
 
 def test_a_value_that_was_never_seen_has_an_error():
-    result = estimate([Chain(SAMPLES, cumulative(np.zeros(1000, dtype=np.int64), 20, 2))])
-    assert result.posterior.tolist() == [1, 0]
-    assert 0 < result.error[1] < 0.01
+    result = estimate([Chain(SAMPLES, cumulative(sticky(0.5, 1000), 20, 3))])
+    assert result.posterior[2] == 0
+    assert 0 < result.error[2] < 0.01
+
+
+@pytest.mark.parametrize("streamed", [False, True])
+def test_chains_that_never_change(streamed):
+    """Such a chain may be stuck: it tells nothing of its error, but two of them that disagree do."""
+    zeros, ones = (
+        Chain(SAMPLES, cumulative(values, 20), values if streamed else None)
+        for values in (np.zeros(1000, dtype=np.int64), np.ones(1000, dtype=np.int64))
+    )
+    for same in ([zeros], [zeros, zeros]):
+        result = estimate(same)
+        assert result.posterior.tolist() == [1, 0]
+        assert math.isnan(result.effective_samples)
+        assert np.isnan(result.error).all()
+    apart = estimate([zeros, ones])
+    assert (apart.r_hat, apart.error.tolist()) == (math.inf, [0.5, 0.5])
+    assert math.isnan(apart.effective_samples)
+
+
+def test_boards_that_disagree_have_the_error_between_them():
+    """Each chain mixes well, but around another mean."""
+    random = np.random.default_rng(1)
+    values = [(random.random(4000) < chance).astype(np.int64) for chance in (0.2, 0.8)]
+    result = estimate([Chain(SAMPLES, cumulative(own, 20)) for own in values])
+    due = np.std([own.mean() for own in values], ddof=1) / math.sqrt(2)
+    assert result.r_hat > 1.1
+    assert result.effective_samples > 4000
+    assert result.error == pytest.approx([due, due])
 
 
 @pytest.mark.parametrize("joint", [True, False])

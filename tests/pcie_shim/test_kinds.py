@@ -139,7 +139,10 @@ def test_two_boards_are_chains_equal_to_kernels(sequencer):
     assert (inference.outcome, inference.details["samples"]) == ("posterior", "600")
     assert inference.posterior[1] == pytest.approx(RAIN_GIVEN_WET, abs=0.3)
     assert float(inference.details["r_hat"]) > 0.9
-    assert 0 < float(inference.details["effective_samples"]) <= 600
+    # a chain that always saw the same rain may be stuck
+    moved = all(board.counts[:2].all() for board in output.boards)
+    assert ("effective_samples" in inference.details) == moved
+    assert 0 < float(inference.details.get("effective_samples", 1)) <= 600
     assert (
         inference.posterior.tolist()
         == BM2.posterior([part.machine for part in parts], frame(1, bank=4))[0].tolist()

@@ -69,7 +69,7 @@ class Sampled:
         total_variation: Mean distance of the posteriors from exact inference; None without a model.
         cycles: Cycles of the longest-running board.
         sweep_cycles: Cycles of a sweep, in the mean; 0 if samples are taken after every move.
-        effective_samples: Independent samples that those of a frame are worth, in the median and at least.
+        effective_samples: Independent samples that those of a frame are worth, in the median and at least; 0 if unknown.
         r_hat: The median of frames; 0 for one board, 1e9 if it is infinite.
         reasons: How often boards stopped for each reason; `impossible` for readings without a possible state.
     """
