@@ -19,7 +19,7 @@ from toolchain.building.machine import (
     machine_options,
     option,
 )
-from toolchain.building.options import BuildOptions
+from toolchain.building.options import BuildOptions, refused_parameter
 from toolchain.deployment import BM2Section
 from toolchain.errors import BuildError
 from toolchain.models.network import NetworkModel
@@ -65,7 +65,7 @@ def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was aske
             **machine_options(options, BM2_KEYS),
         )
     except ParameterError as reason:
-        raise BuildError(str(reason)) from reason
+        raise refused_parameter(reason) from reason
     room = BLOCKS["STREAM"].words // parameters.state_words
     if parameters.stream > room:
         raise BuildError(

@@ -29,13 +29,15 @@ def model_for(
     why = MachinePlan.why if refusal is None else refusal.why
     if choice is MachineChoice.BM1 or (choice is MachineChoice.AUTO and refusal is None):
         _refuse(given_flags(options, BM2Options), "BM2", "BM1", choice, why)
+        if refusal is not None:
+            raise BuildError(f"{refusal}, or use --machine bm2")
         model = source.model() if isinstance(source, Question) else source
         return with_bits(model, bits), why
     flags = given_flags(options, BM1Options)
     flags += [flag for flag, given in (("--bits", bits), ("--device", device)) if given]
     if options.written_prior is not None:
         flags.append("--prior-path" if options.sources is None else "a prior in the file of --sources")
-    _refuse(flags, "BM1", "BM2", choice, why)
+    _refuse(flags, "BM1", "BM2", choice, why, is_possible=refusal is None)
     return network_for(source), "it was asked for" if refusal is None else why
 
 
@@ -44,10 +46,11 @@ def network_for(source: Model | Question) -> NetworkModel:
     return source.network() if isinstance(source, Question) else network_of(source)
 
 
-def _refuse(flags: list[str], wanted: str, chosen: str, choice: MachineChoice, why: str) -> None:
+def _refuse(
+    flags: list[str], wanted: str, chosen: str, choice: MachineChoice, why: str, *, is_possible: bool = True
+) -> None:
     """Raise a BuildError for flags of the machine that was not chosen."""
     if flags:
-        why_this = f", since {why}; leave it out, or add --machine {wanted.lower()}"
-        if choice is not MachineChoice.AUTO:
-            why_this = f" (--machine {choice})"
-        raise BuildError(f"{flags[0]} is for a {wanted}, but this is a {chosen}{why_this}")
+        this = f"{chosen}, since {why}" if choice is MachineChoice.AUTO else f"{chosen} (--machine {choice})"
+        other = f", or use --machine {wanted.lower()}" if is_possible else ""
+        raise BuildError(f"{flags[0]} is for a {wanted}, but this is a {this}; leave it out{other}")

@@ -15,7 +15,7 @@ from machines.errors import ParameterError
 from machines.kind import UsedRegisters
 from machines.parameters import ADDRESS_BITS_MAX, BM1Parameters, PriorMode, RngKind, SensorMode
 from pcie_shim.register_layout import interface_room
-from toolchain.building.options import BuildOptions
+from toolchain.building.options import BuildOptions, refused_parameter
 from toolchain.building.quantise import Quantised
 from toolchain.deployment import BM1Section, BM2Section, MachineSection, Scale
 from toolchain.errors import BuildError
@@ -111,7 +111,7 @@ def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
             **machine_options(options, MACHINE_KEYS),
         )
     except ParameterError as reason:
-        raise BuildError(str(reason)) from reason
+        raise refused_parameter(reason) from reason
     target_count = parameters.target_count_max if options.target_count is None else options.target_count
     return MachinePlan(
         model=model,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from pydantic import Field, ValidationError
 
+from machines.errors import ParameterError
 from machines.parameters import PriorMode, RngKind, RngReset, SampleEvery, SensorMode, Sequencer
 from toolchain.bounded_files import TomlFile, nearest_name
 from toolchain.deployment import Output, Queue, Scale, Source, Stop, Variable, WrittenPrior
@@ -297,13 +299,15 @@ class BM2Options:
     )
     burn_in: Annotated[int, typer.Option(help="Sweeps of a BM2 before its first sample.", min=0)] = 1000
     ops_timeout: Annotated[int, typer.Option(help="Maximum number of cycles of a BM2's move.", min=1)] = 2**20
-    stream: Annotated[int, typer.Option(help="Samples that a BM2 keeps for /bm/samples; 0: none.", min=0)] = 0
+    stream: Annotated[
+        int, typer.Option(help="Samples in the buffer of a BM2's board for /bm/samples; 0: none.", min=0)
+    ] = 0
 
 
 def given_flags(options: object, group: type[BM1Options | BM2Options]) -> list[str]:
     """Return the flags of a group that do not have their defaults."""
     names = [each.name for each in fields(group) if getattr(options, each.name) != each.default]
-    return [_FLAGS.get(name, "--" + name.replace("_", "-")) for name in names]
+    return [_flag(name) for name in names]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -353,11 +357,24 @@ class BuildOptions(MachineOptions, TargetOptions):
         return None if self.prior_path is None else WrittenPrior(path=self.prior_path)
 
 
+def refused_parameter(reason: ParameterError) -> BuildError:
+    """Return the error for parameters of which there is no machine, with flags instead of keys."""
+    keys = "|".join(each.name for each in fields(MachineOptions))
+    named = re.sub(rf"\b({keys})(?= is | = )", lambda found: _flag(found[1]), str(reason).rstrip("."))
+    return BuildError(named.replace(" = true", "").replace(" = ", " "))
+
+
+def _flag(key: str) -> str:
+    return _FLAGS.get(key, "--" + key.replace("_", "-"))
+
+
 def refused_option(reason: ValidationError) -> BuildError:
     """Return the error for an option that pydantic refuses, with the flag of the field."""
     detail = reason.errors(include_url=False)[0]
     key = str(detail["loc"][0]) if detail["loc"] else ""
-    flag = "--output" if reason.title == "Output" else _FLAGS.get(key, "--" + key.replace("_", "-"))
+    flag = {"Output": "--output", "BM2Section": _flag(key).replace("--target-count", "--samples")}.get(
+        reason.title, _flag(key)
+    )
     if detail["type"] == "value_error":
         sentence = str(detail["ctx"]["error"])
         return BuildError(f"{flag}: {sentence}" if key else sentence)

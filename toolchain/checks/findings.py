@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machines.bm1 import BM1Machine
-from machines.parameters import BM1Parameters, PriorMode, SensorMode
+from machines.parameters import PROB_BITS_MAX, BM1Parameters, PriorMode, SensorMode
 from toolchain.building.options import BuildOptions
 from toolchain.building.quantise import Quantised
 from toolchain.deployment import Deployment, Dimension, Scale, Variable
@@ -311,8 +311,9 @@ def _stopping(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def _wider(machine: CheckedMachine) -> str:
-    scale = "" if machine.deployment.machine.scale == "address" else "--scale address or "
-    return f"use {scale}more --prob-bits"
+    ways = ["--scale address"] if machine.deployment.machine.scale != "address" else []
+    ways += ["more --prob-bits"] if machine.parameters.prob_bits < PROB_BITS_MAX else []
+    return f"use {' or '.join(ways)}" if ways else ""
 
 
 def _some_lines(deployment: Deployment, lines: NDArray[np.int64]) -> str:

@@ -10,6 +10,7 @@ import typer
 
 from toolchain.analysis import AdviceOptions, InspectOptions, ReadingOptions, Sweep
 from toolchain.commands.request import ModelFlags, ModelPath, read_model, read_source
+from toolchain.errors import BuildError, NotFusionError
 from toolchain.flags import Bits
 
 
@@ -111,7 +112,12 @@ def explore(
     if plot is not None:
         sweeps.check_pictures_possible(plot)
     device = device_named(readings.device)
-    read = read_model(model, flags, bits)
+    try:
+        read = read_model(model, flags, bits)
+    except NotFusionError as reason:
+        raise BuildError(
+            f"explore is for a BM1, but {reason.why}; 'toolchain advise' also tries a BM2"
+        ) from None
     if readings.readings is None:
         drawn = sample_readings(read, frames, seed=readings.seed)
     else:

@@ -225,6 +225,8 @@ class Symbol:
         expected = f"expected {self.type.offset:g} to {last:g}"
         if self.type.labels:
             expected = nearest_name(label, self.type.labels, cutoff=0.6)
+        if "," in label and "=" in label:
+            expected += "; repeat --given for each variable"
         raise ModelError(f"{self.name} is never {label!r}; {expected}")
 
 

@@ -197,7 +197,7 @@ def test_a_naive_fusion_becomes_a_bm1_unless_a_bm2_is_asked_for(network, case):
     assert load_deployment(network.parent / "out").machine.lines == 4
     done(build(case, "--machine", "bm2"))  # a Model, too
     assert load_deployment(case.parent / "out").machine.variables == ("s", "K")
-    assert_refused(build(network, *GRASS, "--machine", "bm1"), "sprinkler", "grass", "joins them")
+    assert_refused(build(network, *GRASS, "--machine", "bm1"), "joins them", "or use --machine bm2")
 
 
 MARKOV = """MARKOV
@@ -250,13 +250,20 @@ BM2_FLAGS = (
 def test_flags_of_the_other_machine_are_refused(network):
     for flag in BM1_FLAGS:
         assert_refused(
-            build(network, *GRASS, *flag), flag[0], "BM1", "this is a BM2, since", "grass", "--machine bm1"
+            build(network, *GRASS, *flag),
+            flag[0],
+            "BM1",
+            "this is a BM2, since",
+            "grass",
+            "joins them; leave it out",
         )
     for flag in BM2_FLAGS:
         fusion = build(network, "--searched", "rain", "--known", "grass", *flag)
         assert_refused(fusion, flag[0], "BM2", "this is a BM1, since", "--machine bm2")
     asked = build(network, *GRASS, "--machine", "bm2", *BM1_FLAGS[0])
-    assert_refused(asked, "--scale is for a BM1, but this is a BM2 (--machine bm2)")
+    assert_refused(asked, "--scale is for a BM1, but this is a BM2 (--machine bm2); leave it out")
+    asked = build(network, *GRASS, "--machine", "bm1", "--stream", "5")
+    assert_refused(asked, "--stream", "this is a BM1 (--machine bm1); leave it out, or use --machine bm2")
     assert not (network.parent / "out").exists()
     for group, given in ((BM1Options, BM1_FLAGS), (BM2Options, BM2_FLAGS)):
         changed = group(**dict.fromkeys(group.__dataclass_fields__, "other"))
@@ -273,16 +280,19 @@ def test_flags_of_the_other_machine_are_refused(network):
             ["--given", "either=no", "--given", "tub=yes"],
             ["P(either | lung, tub) is 0 everywhere where either = no"],
         ),
+        (["--burn-in", str(2**32)], ["--burn-in is 4294967296"]),
+        (["--rng-banks", "0"], ["--rng-banks is 0"]),
+        (["--given", "either=yes,lung=no"], ["repeat --given"]),
         (["--given", "eithr=no"], ["no variable 'eithr'; did you mean 'either'?"]),
         (["--given", "either=noo"], ["either is never 'noo'; did you mean 'no'?"]),
         (["--known", "dysp,bronc"], ["bronc is in the question twice"]),
         (["--partitions", "0"], ["--partitions 0"]),
-        (["--prob-bits", "1"], ["prob_bits is 1; it must be from 2 to 16"]),
+        (["--prob-bits", "1"], ["--prob-bits is 1; it must be from 2 to 16"]),
         (["--rng", "lfsr16"], ["lfsr16"]),
-        (["--sequencer", "coloured", "--literal"], ["coloured", "literal"]),
-        (["--steps-per-clock", "3"], ["steps_per_clock is 3", "power of two"]),
+        (["--sequencer", "coloured", "--literal"], ["--sequencer coloured is not possible with --literal;"]),
+        (["--steps-per-clock", "3"], ["--steps-per-clock is 3", "power of two"]),
         (["--stream", "5000"], ["--stream 5000", "room for 4096 samples"]),
-        (["--samples", "0"], ["--target-count"]),
+        (["--samples", "0"], ["--samples is 0"]),
         (["--interface", "1x3"], ["interface 1x3", "use --interface 1x16"]),
     ],
 )

@@ -52,6 +52,18 @@ def test_inspect(network, deployment):
     assert found["resources"]["fits"]
 
 
+def test_inspect_says_why_no_reading_gives_a_posterior(network, tmp_path):
+    out = tmp_path / "hasty"
+    done(toolchain("build", network, *QUESTION, "-o", out, *TARGET, "--ops-timeout", "1"))
+    assert_refused(toolchain("inspect", out, "--frames", "2"), "boards stopped by: ops_timeout 2")
+
+
+def test_explore_is_for_a_bm1(network):
+    assert_refused(
+        toolchain("explore", network, *QUESTION), "explore is for a BM1, but sprinkler and grass", "advise"
+    )
+
+
 def test_inspect_refuses_what_it_cannot_do(network, deployment):
     question = ("--searched", "rain", "--known", "grass")
     assert_refused(
