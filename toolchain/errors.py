@@ -78,3 +78,8 @@ class ValueOutOfRangeError(ReadingError):
 
 class ReadingMissingError(ReadingError):
     """A required reading is missing (`on_missing = error`)."""
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number and its noun for a sentence: `1 bit`, `2 bits`."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"

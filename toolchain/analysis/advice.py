@@ -99,19 +99,43 @@ class Advice:
 
     def as_json(self) -> str:
         """Return the advice as one JSON object."""
-        return json.dumps(asdict(self)) + "\n"
+        content = asdict(self)
+        for each in content["machines"]:
+            if each["refused"]:
+                each |= {key: None for key in each if key not in {"machine", "refused"}}
+        return json.dumps(content) + "\n"
 
     def report(self) -> str:
         """Return the advice as a table and sentences."""
         exact = f"Exact inference on this host: {with_unit(self.exact_seconds, 's')}."
         time = f"time at {with_unit(self.clock_hz, 'Hz')}"
-        names = f"|bits of a code|target count or samples|total variation|cycles of a frame|{time}|boards|ALMs of a board|its memory blocks"
-        columns = [names.split("|")]
+        columns = [
+            [
+                "",
+                "bits of a code",
+                "target count or samples",
+                "total variation",
+                "cycles of a frame",
+                time,
+                "boards",
+                "ALMs of a board",
+                "its memory blocks",
+            ]
+        ]
         for each in self.machines:
             if not each.refused:
-                cells = f"{each.machine}|{each.prob_bits}|{each.setting:,}|{each.total_variation:.4f}|{each.cycles:,.0f}|"
-                cells += f"{with_unit(each.seconds, 's')}|{each.boards}|{each.alms:,.0f}|{each.blocks:,}"
-                columns.append(cells.split("|"))
+                cells = [
+                    each.machine,
+                    str(each.prob_bits),
+                    f"{each.setting:,}",
+                    f"{each.total_variation:.4f}",
+                    f"{each.cycles:,.0f}",
+                    with_unit(each.seconds, "s"),
+                    str(each.boards),
+                    f"{each.alms:,.0f}",
+                    f"{each.blocks:,}",
+                ]
+                columns.append(cells)
         rows = [
             f"{name:23}" + "".join(f"{cell:>14}" for cell in cells)
             for name, *cells in zip(*columns, strict=True)

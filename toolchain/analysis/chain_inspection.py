@@ -15,7 +15,7 @@ from toolchain.analysis.logic import device_named
 from toolchain.analysis.resources import Estimate
 from toolchain.analysis.sampling import Sampled, SampledBoards, chain_resources, drawn_readings
 from toolchain.building.build import read_images
-from toolchain.errors import BuildError
+from toolchain.errors import BuildError, counted
 
 if TYPE_CHECKING:
     from toolchain.analysis import InspectOptions, Progress
@@ -69,13 +69,15 @@ class ChainInspection:
             accuracy = f"Total variation from exact inference: {tv.value:.4f} ({tv.low:.4f}..{tv.high:.4f})."
         if (e := self.exact) is not None:
             accuracy += f" Computed: {e.quantising:.2g} by the codes, {e.start:.2g} by the start state, {e.sampling:.2g} by too few samples."
+        r_hat = f"; R-hat {ran.r_hat:.4g}" if p.chains > 1 else ""
+        bits = counted(p.state_bits, "bit")
         rows = (
-            f"Deployment {self.deployment.name} ({self.deployment.hash[:16]}): a BM2, {p.chains} board{'s' * (p.chains > 1)} with a chain each.",
-            f"{len(p.cardinalities)} variables in {p.state_bits} bits; {p.cdes} CDEs with {sum(sizes):,} codes of {p.prob_bits} bits, at most {max(sizes):,}.",
+            f"Deployment {self.deployment.name} ({self.deployment.hash[:16]}): a BM2, {counted(p.chains, 'board')} with a chain each.",
+            f"{counted(len(p.cardinalities), 'variable')} in {bits}; {counted(p.cdes, 'CDE')} with {sum(sizes):,} codes of {p.prob_bits} bits, at most {max(sizes):,}.",
             f"{count:,} samples after {p.burn_in:,} sweeps, {p.sequencer} order, {p.rng} ({p.steps_per_clock} steps per clock, {p.rng_banks} banks).",
             f"Readings: {self.readings}. Boards stopped by: {', '.join(f'{name} {n}' for name, n in sorted(ran.reasons.items()))}.",
             f"Cycles of a frame, and time at {with_unit(self.clock_hz, 'Hz')} (no link, no ROS): {cycles}; {ran.sweep_cycles:.2f} per sweep.",
-            f"Its samples are worth {ran.effective_samples[0]:,.0f} independent ones in the median, {ran.effective_samples[1]:,.0f} at least; R-hat {ran.r_hat:.4g}.",
+            f"Its samples are worth {ran.effective_samples[0]:,.0f} independent ones in the median, {ran.effective_samples[1]:,.0f} at least{r_hat}.",
             accuracy,
             f"Resources of a {cost.device.title}, estimated from the units of a BM1: {resources}.",
         )

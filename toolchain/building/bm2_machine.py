@@ -21,7 +21,7 @@ from toolchain.building.machine import (
 )
 from toolchain.building.options import BuildOptions, refused_parameter
 from toolchain.deployment import BM2Section
-from toolchain.errors import BuildError
+from toolchain.errors import BuildError, counted
 from toolchain.models.network import NetworkModel
 from toolchain.outputs.mif import random_table
 
@@ -69,7 +69,7 @@ def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was aske
     room = BLOCKS["STREAM"].words // parameters.state_words
     if parameters.stream > room:
         raise BuildError(
-            f"--stream {parameters.stream}: a sample of this model has {parameters.state_words} words, and the "
+            f"--stream {parameters.stream}: a sample of this model has {counted(parameters.state_words, 'word')}, and the "
             f"register map has room for {room} samples"
         )
     target_count, max_cycles = (option(key, options, BM2Section) for key in ("target_count", "max_cycles"))
@@ -158,6 +158,6 @@ def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]
 def chain_layout(parameters: BM2Parameters, interface: tuple[int, int] | None) -> BoardLayout:
     """Return the layout of the boards, each of which has a chain; a BuildError as for `fitted_layout`."""
     check_seeds(parameters)
-    what = f"a state of {parameters.state_bits} bits, {parameters.histogram_words} words of histograms and {parameters.joint_words} of the searched variables"
+    what = f"a state of {counted(parameters.state_bits, 'bit')}, {parameters.histogram_words} words of histograms and {parameters.joint_words} of the searched variables"
     blocks = tuple(LineBlock(chain, 1) for chain in range(parameters.chains))
     return fitted_layout(blocks, KINDS["BM2"]().registers(parameters), interface, what)

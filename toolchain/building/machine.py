@@ -18,7 +18,7 @@ from pcie_shim.register_layout import interface_room
 from toolchain.building.options import BuildOptions, refused_parameter
 from toolchain.building.quantise import Quantised
 from toolchain.deployment import BM1Section, BM2Section, MachineSection, Scale
-from toolchain.errors import BuildError
+from toolchain.errors import BuildError, counted
 from toolchain.flags import key_values
 from toolchain.models.model import Model
 from toolchain.outputs.mif import random_table
@@ -225,7 +225,7 @@ def fitted_layout(
 ) -> BoardLayout:
     """Return the layout of boards that use these registers; a BuildError if the interface does not fit."""
     needed, room = (used.input_words, used.result_words), interface_room(used)
-    sentence = f"a board needs {needed[0]} inputs and {needed[1]} results ({what})"
+    sentence = f"a board needs {counted(needed[0], 'input')} and {counted(needed[1], 'result')} ({what})"
     if not _is_within(needed, room):
         raise BuildError(f"{sentence}, but the register map has room for {room[0]} and {room[1]}{advice}")
     if asked is None:

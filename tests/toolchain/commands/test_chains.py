@@ -43,6 +43,7 @@ def test_check_names_factors_of_a_network_and_of_a_deployment(network, deploymen
 def test_inspect(network, deployment):
     said = done(toolchain("inspect", deployment, "--model", network, *QUESTION, "--frames", "4")).stdout
     assert "a BM2, 2 boards with a chain each" in said
+    assert "R-hat" in said
     assert "3 variables in 3 bits; 3 CDEs with 17 codes of 16 bits, at most 12." in said
     assert "Total variation from exact inference: 0.0" in said
     found = json.loads(done(toolchain("inspect", deployment, "--json", "--frames", "4")).stdout)
@@ -56,6 +57,8 @@ def test_inspect_says_why_no_reading_gives_a_posterior(network, tmp_path):
     out = tmp_path / "hasty"
     done(toolchain("build", network, *QUESTION, "-o", out, *TARGET, "--ops-timeout", "1"))
     assert_refused(toolchain("inspect", out, "--frames", "2"), "boards stopped by: ops_timeout 2")
+    done(toolchain("build", network, *QUESTION, "-o", out, *TARGET))
+    assert "R-hat" not in done(toolchain("inspect", out, "--frames", "2")).stdout  # there is one board
 
 
 def test_explore_is_for_a_bm1(network):
@@ -91,6 +94,10 @@ def test_advice_says_why_a_bm1_cannot_answer(network):
     said = done(toolchain("advise", network, *QUESTION, "--accuracy", "0.05", "--frames", "5")).stdout
     assert "BM1: sprinkler and grass are not independent given rain" in said
     assert "BM2" in said.splitlines()[1]
+    found = json.loads(
+        done(toolchain("advise", network, *QUESTION, "--accuracy", "0.5", "--frames", "5", "--json")).stdout
+    )
+    assert [each["cycles"] is None for each in found["machines"]] == [True, False]
     assert_refused(toolchain("advise", network), "give the searched and known variables")
     assert_refused(toolchain("advise", network, *QUESTION, "--device", "x"), "--device x")
 
