@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import lru_cache
 from itertools import accumulate
 from typing import Final
 
@@ -39,8 +40,14 @@ CHAINS_MAX: Final = 65536
 SAMPLES_MAX: Final = 2**32 - 1
 """Maximum number of samples of a frame; no 32-bit histogram overflows."""
 
-DEAD_ENDS_MAX: Final = 2000
-"""Maximum number of dead ends in the search for a start state, which takes about a second for them."""
+CDES_MAX: Final = 8192
+"""Maximum number of factors."""
+
+FACTOR_VARIABLES_MAX: Final = 32
+"""Maximum number of variables of a factor: the axes of its array."""
+
+SEARCH_MAX: Final = 150_000
+"""Maximum work of the search for a start state, which takes about a second for it; it has no unit."""
 
 
 class BM2StopReason(IntEnum):
@@ -146,10 +153,12 @@ class BM2Parameters:
 
     def _check_variables(self) -> None:
         """Check variables, factors, and the sizes that follow from them."""
+        check_parameter("The number of variables", len(self.cardinalities), 1, RESULT_WORDS_MAX)
+        check_parameter("The number of factors", len(self.factors), 1, CDES_MAX)
         for variable, cardinality in enumerate(self.cardinalities):
             check_parameter(f"The cardinality of variable {variable}", cardinality, 1, 2**16)
         check_parameter("The number of bits of the state", self.state_bits, 1, STATE_BITS_MAX)
-        last = len(self.cardinalities) - 1
+        last, bits = len(self.cardinalities) - 1, self.bits
         for name, variables in (
             *((f"factor {at}", factor) for at, factor in enumerate(self.factors)),
             ("searched", self.searched),
@@ -164,12 +173,12 @@ class BM2Parameters:
                 raise ParameterError(
                     f"The variables of factor {at} are {factor}; give one or more in rising order."
                 )
-            check_parameter(
-                f"The number of bits of factor {at}", len(self.factor_bits(at)), 0, FACTOR_BITS_MAX
-            )
-        for variable in range(last + 1):
-            if not any(variable in factor for factor in self.factors):
-                raise ParameterError(f"Variable {variable} is in no factor, so no CDE can sample it.")
+            check_parameter(f"The number of variables of factor {at}", len(factor), 1, FACTOR_VARIABLES_MAX)
+            width = sum(bits[variable] for variable in factor)
+            check_parameter(f"The number of bits of factor {at}", width, 0, FACTOR_BITS_MAX)
+        alone = set(range(last + 1)).difference(*self.factors)
+        if alone:
+            raise ParameterError(f"Variable {min(alone)} is in no factor, so no CDE can sample it.")
         both = set(self.searched) & set(self.known)
         if both:
             raise ParameterError(f"Variable {min(both)} is both searched and known.")
@@ -178,12 +187,12 @@ class BM2Parameters:
     @property
     def bits(self) -> tuple[int, ...]:
         """Number of bits of each variable's code."""
-        return tuple((cardinality - 1).bit_length() for cardinality in self.cardinalities)
+        return _layout(self.cardinalities)[0]
 
     @property
     def offsets(self) -> tuple[int, ...]:
         """First (lowest) state bit of each variable."""
-        return tuple(accumulate(self.bits, initial=0))[:-1]
+        return _layout(self.cardinalities)[1]
 
     @property
     def state_bits(self) -> int:
@@ -273,6 +282,13 @@ class BM2Parameters:
             for k in range(max(self.bits))
         )
         return tuple(move for move in moves if move)
+
+
+@lru_cache(64)
+def _layout(cardinalities: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the number of bits of each variable, and its first bit."""
+    bits = tuple((cardinality - 1).bit_length() for cardinality in cardinalities)
+    return bits, tuple(accumulate(bits, initial=0))[:-1]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -411,7 +427,7 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
     other board starts from the largest state.
 
     Raises:
-        StartError: A value is out of range, or the search takes too long.
+        StartError: A value is out of range, or the search takes more than `SEARCH_MAX`.
     """
     parameters = machine.parameters
     domains = [np.ones(cardinality, dtype=np.bool_) for cardinality in parameters.cardinalities]
@@ -424,17 +440,29 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
         for scope, support in zip(parameters.factors, machine.supports, strict=True)
         if not support.all()
     ]
-    of_variable = [
-        [at for at, (scope, _) in enumerate(zeros) if variable in scope] for variable in range(len(domains))
-    ]
+    of_variable: list[list[int]] = [[] for _ in domains]
+    for at, (scope, _) in enumerate(zeros):
+        for variable in scope:
+            of_variable[variable].append(at)
+    work = 0
+
+    def spend(amount: int) -> None:
+        nonlocal work
+        work += amount
+        if work > SEARCH_MAX:
+            raise StartError(
+                "The search for a start state takes too long; the model has too many zeros: replace some by small "
+                "probabilities."
+            )
 
     def propagate(domains: list[npt.NDArray[np.bool_]], changed: Sequence[int]) -> bool:
         """Remove the values that a factor excludes, until nothing changes; return False if no value is left."""
-        due = list(changed)  # numbers of factors that have a variable whose domain has changed
+        due = dict.fromkeys(changed)  # numbers of factors that have a variable whose domain has changed
         while due:
-            at = due.pop()
+            at, _ = due.popitem()
             scope, support = zeros[at]
             possible = support[np.ix_(*(domains[variable] for variable in scope))]
+            spend(len(scope) * (1 + possible.size // 2048))
             for axis, variable in enumerate(scope):
                 kept = possible.any(axis=tuple(other for other in range(len(scope)) if other != axis))
                 if not kept.any():
@@ -443,15 +471,16 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
                     domain = np.zeros_like(domains[variable])
                     domain[np.flatnonzero(domains[variable])[kept]] = True
                     domains[variable] = domain
-                    due += [other for other in of_variable[variable] if other != at and other not in due]
+                    due |= dict.fromkeys(other for other in of_variable[variable] if other != at)
         return True
 
     # Values that are still to try, the next one last: the domains, a variable before which all have one value, and
     # its value. The first complete state is the answer, since variables and values are tried in order.
     left: list[tuple[list[npt.NDArray[np.bool_]], int, int]] = []
     changed: Sequence[int] = range(len(zeros))
-    variable = dead_ends = 0
+    variable = 0
     while True:
+        spend(1 + len(domains) // 256)
         if propagate(domains, changed):
             while variable < len(domains) and domains[variable].sum() == 1:
                 variable += 1
@@ -459,13 +488,6 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
                 return pack(parameters, [int(domain.argmax()) for domain in domains])
             values = np.flatnonzero(domains[variable]).tolist()
             left += [(domains, variable, value) for value in (values if largest else reversed(values))]
-        else:
-            dead_ends += 1
-            if dead_ends > DEAD_ENDS_MAX:
-                raise StartError(
-                    f"No start state was found before {DEAD_ENDS_MAX} dead ends; the model has too many zeros: "
-                    "replace some by small probabilities."
-                )
         if not left:
             return None
         before, variable, value = left.pop()

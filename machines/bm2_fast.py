@@ -258,7 +258,14 @@ def wiring_of(machine: BM2Machine) -> Wiring:
         exponents=np.array(exponents, dtype=np.int64),
         clock=jump_tables(parameters.rng, parameters.steps_per_clock)[:1].copy(),
         order_clock=jump_tables(RngKind.LFSR16, 16)[:1].copy(),
-        places=np.array([divmod(offset, 32) for offset in parameters.offsets], dtype=np.uint64),
+        # a variable without bits may be beyond the last word
+        places=np.array(
+            [
+                divmod(offset, 32) if mask else (0, 0)
+                for offset, mask in zip(parameters.offsets, parameters.masks, strict=True)
+            ],
+            dtype=np.uint64,
+        ),
         searched=np.array(
             [(variable, parameters.bits[variable]) for variable in parameters.searched], dtype=np.uint64
         ).reshape(-1, 2),

@@ -420,6 +420,8 @@ class _OnHost(HostMachine):
                 f"{STREAM_BYTES_MAX // self._stream_bytes} samples, or no stream"
             )
         starts = self._starts(tuple(frame.addresses))
+        if isinstance(starts, str):
+            raise StartError(starts)
         # no state agrees with the readings: the boards are asked for no samples
         samples = frame.target_count if starts else 0
         settings = FrameSettings(samples, frame.max_cycles, frame.bank, 0)
@@ -431,8 +433,8 @@ class _OnHost(HostMachine):
         samples = STREAM_BYTES_MAX // self._stream_bytes if self._stream_bytes else SAMPLES_MAX
         return FrameInput(addresses=known, target_count=samples, max_cycles=CYCLES_MAX)
 
-    def _blocks_of(self, addresses: tuple[int | None, ...]) -> list[Blocks]:
-        """Return the blocks of each board for these readings; none if their probability is 0."""
+    def _blocks_of(self, addresses: tuple[int | None, ...]) -> list[Blocks] | str:
+        """Return the blocks of each board for these readings; none if their probability is 0; or why there are none."""
         parameters = self._parameters
         if len(addresses) != len(parameters.known):
             raise StartError(
@@ -451,7 +453,10 @@ class _OnHost(HostMachine):
         known = sum(parameters.masks[variable] for variable in evidence)
         if known == (1 << parameters.state_bits) - 1:
             raise StartError("All variables of the frame are known, so that there is nothing to sample")
-        ends = [start_state(self._machines[0], evidence, largest=largest) for largest in (False, True)]
+        try:
+            ends = [start_state(self._machines[0], evidence, largest=largest) for largest in (False, True)]
+        except StartError as error:
+            return str(error)  # remembered, too: a long search is not made again
         size = 4 * parameters.state_words
         words = [b"" if end is None else end.to_bytes(size, "little") for end in ends]
         common = {**self._blocks, "KNOWN_MASK": known.to_bytes(size, "little")}

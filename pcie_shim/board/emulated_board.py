@@ -142,9 +142,9 @@ class EmulatedBoard:
             machine = image.kind.on_board(kernel, self._blocks)
             # now, so that the first frame does not wait for it
             machine.prepare()
+            speed = self._measured_speed(image, machine)
         except (ImageError, MachineError) as error:
             raise RefusedError(ErrorCode.BAD_IMAGE, str(error).rstrip(".")) from error
-        speed = self._measured_speed(image, machine)
         self._machine = machine
         self.programmed += 1
         # the registers of the former image must not be seen beside those of this one
@@ -317,12 +317,13 @@ class EmulatedBoard:
         self._number = number
         try:
             if doorbell == rm.RESUME:
-                self._run(machine, machine.resume, self._chunk_end(machine.cycles))
+                self._run(machine, machine.resume, self._chunk_end(machine.cycles, self._max_cycles))
             else:
                 frame = FrameSettings(*settings)
-                self._max_cycles = frame.max_cycles
                 self._chunk = self._first_chunk
-                self._run(machine, partial(machine.start, frame), self._chunk_end(0))
+                self._run(machine, partial(machine.start, frame), self._chunk_end(0, frame.max_cycles))
+                # only now: after a refused start, a resume still continues the frame before
+                self._max_cycles = frame.max_cycles
         except StartError as error:
             self._refuse(ErrorCode.BAD_VALUE, str(error).rstrip("."))
         # only now: a refused doorbell leaves the register as it was
@@ -332,7 +333,7 @@ class EmulatedBoard:
         """Run the machine for one more chunk; then `running` tells whether it must continue."""
         machine = self._machine
         if machine is not None and self.running:
-            self._run(machine, machine.step, self._chunk_end(machine.cycles))
+            self._run(machine, machine.step, self._chunk_end(machine.cycles, self._max_cycles))
 
     def _run(self, machine: BoardMachine, chunk: Callable[[int], None], end: int) -> None:
         """Run one chunk, to cycle `end`; then write the results to the registers, where a host may read them."""
@@ -354,13 +355,13 @@ class EmulatedBoard:
             self.done = self._number
             self._publish(BoardState.DONE, machine.reason, cycles)
 
-    def _chunk_end(self, cycles: int) -> int:
+    def _chunk_end(self, cycles: int, max_cycles: int) -> int:
         """Return the end of the next chunk, or of the slice if that is nearer, in cycles; 0 for none."""
         end = cycles + self._chunk
         if end - cycles > _ALIGNMENT:
             end -= end % _ALIGNMENT
         run_until = self._run_until
-        return run_until if end >= self._max_cycles or end >= run_until > 0 else end
+        return run_until if end >= max_cycles or end >= run_until > 0 else end
 
     def _publish(self, state: BoardState, reason: int, cycles: int) -> None:
         """Write the outcome to the registers."""

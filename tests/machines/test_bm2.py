@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from machines.bm2 import (
+    CDES_MAX,
     BM2Machine,
     BM2Parameters,
     BM2Start,
@@ -491,8 +492,32 @@ def test_a_search_that_takes_too_long():
     machine = BM2Machine.from_factors(
         BM2Parameters(cardinalities=(8,) * 9, factors=pairs), [1 - np.eye(8)] * len(pairs)
     )
-    with pytest.raises(StartError, match="2000 dead ends"):
+    with pytest.raises(StartError, match="too many zeros"):
         start_state(machine, {})
+
+
+def test_the_work_of_a_search_is_bounded_not_only_its_dead_ends(monkeypatch):
+    """Every value tried and every factor checked counts."""
+    monkeypatch.setattr("machines.bm2.SEARCH_MAX", 1000)
+    with pytest.raises(StartError, match="too many zeros"):
+        parity_chain(200, 1)
+    monkeypatch.setattr("machines.bm2.SEARCH_MAX", 300)
+    with pytest.raises(StartError, match="too many zeros"):
+        start_state(uniform((2,) * 400), {})
+
+
+def test_a_machine_of_the_largest_numbers():
+    """32 variables of a factor are the axes of its array; every variable has a word of results."""
+    sizes = (2,) + (1,) * 4094
+    rows = tuple(tuple(range(first, min(first + 32, 4095))) for first in range(0, 4095, 32))
+    largest = uniform(sizes, rows + ((0,),) * (CDES_MAX - len(rows)))
+    assert start_state(largest, {}) == 0
+    with pytest.raises(ParameterError, match="number of factors is 8193"):
+        BM2Parameters(cardinalities=(2,), factors=((0,),) * (CDES_MAX + 1))
+    with pytest.raises(ParameterError, match="number of variables is 4097"):
+        BM2Parameters(cardinalities=(*sizes, 1, 1), factors=rows)
+    with pytest.raises(ParameterError, match="variables of factor 0 is 33"):
+        BM2Parameters(cardinalities=(2,) + (1,) * 32, factors=(tuple(range(33)),))
 
 
 def test_evidence_outside_the_values():

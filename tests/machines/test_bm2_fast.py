@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 
 from machines import make_bm2_kernel
 from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, Sequencer
-from machines.bm2_fast import STREAM_ROOM, FastBM2
+from machines.bm2_fast import STREAM_ROOM, FastBM2, wiring_of
 from machines.bm2_reference import ReferenceBM2
 from machines.errors import MachineError
 from machines.parameters import RngKind
@@ -104,6 +104,13 @@ def test_a_state_may_have_many_words():
     start = start_of(samples=3, sequencer=Sequencer.COLOURED)
     assert seen(quick, quick.start(start)) == seen(slow, slow.start(start))
     assert quick.stream.shape == (3, 13)
+
+
+def test_a_variable_without_bits_is_in_no_word_of_its_own():
+    """The last one would begin behind the last word of a full state."""
+    parameters = BM2Parameters(cardinalities=(2,) * 32 + (1,), factors=tuple((at,) for at in range(33)))
+    machine = BM2Machine.from_factors(parameters, [[1.0] * size for size in parameters.cardinalities])
+    assert wiring_of(machine).places[:, 0].max() == parameters.state_words - 1 == 0
 
 
 def test_other_generators_are_refused():

@@ -11,7 +11,7 @@ import pytest
 from machines import KINDS
 from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason
 from machines.bm2_kind import BATCHES, BM2, STREAM_BYTES_MAX, Kept
-from machines.errors import NoPosteriorError, ParameterError
+from machines.errors import NoPosteriorError, ParameterError, StartError
 from machines.kind import FrameInput
 from machines.parameters import SampleEvery, Sequencer
 from pcie_shim import register_map as rm
@@ -292,6 +292,46 @@ def test_a_board_refuses_a_start_that_does_not_fit(writes):
     assert refused.value.code is ErrorCode.BAD_VALUE
     assert not board.running
     assert board.done == 0
+
+
+def test_a_start_state_that_is_too_hard_is_no_crash(monkeypatch):
+    """A board refuses the image; a host searches once for the same readings."""
+    calls = []
+
+    def search(*arguments, **flags):
+        calls.append(arguments)
+        raise StartError("The search takes too long.")
+
+    monkeypatch.setattr("machines.bm2_kind.start_state", search)
+    with pytest.raises(RefusedError) as refused:
+        board_with(weather())
+    assert refused.value.code is ErrorCode.BAD_IMAGE
+    calls.clear()
+    host = BM2.on_host([weather()])
+    for _ in range(2):
+        with pytest.raises(StartError, match="too long"):
+            host.begin(frame(1))
+    assert len(calls) == 1
+
+
+def test_a_refused_start_leaves_the_limit_of_the_frame_before(monkeypatch):
+    """A resume after it still runs in chunks, between which the board reads."""
+    board = board_with(weather())
+    board.write(rm.TARGET_COUNT, words(10, 1 << 30, 0, 0, 0, 0, 0))
+    board.write(rm.START, words(1))
+    while board.running:
+        board.step()
+    board.write(rm.TARGET_COUNT, words(10, 1, 0, 0, 0, 0, 0))
+    board.write(rm.ORDER, words(9))
+    with pytest.raises(RefusedError):
+        board.write(rm.START, words(2))
+    board.write(rm.TARGET_COUNT, words(2**31))
+    monkeypatch.setattr(
+        "machines.bm2_kernel.BM2Kernel.resume", lambda _, samples, pause_at: ends.append(pause_at)
+    )
+    ends = []
+    board.write(rm.RESUME, words(2))
+    assert ends[0] > 0
 
 
 def test_a_board_has_the_registers_of_its_kind():
