@@ -338,9 +338,10 @@ class BoardServer:
         self._epoll.register(loader.socket.fileno(), _READABLE)
 
     def _serve_loader(self, loader: LoaderConnection) -> None:
-        loader.last_frame = time.monotonic()
         loader.receive()
         loader.answer(partial(self._program, loader))
+        # after the answer, because the time in which the board loads the image is no silence of its loader
+        loader.last_frame = time.monotonic()
         if not loader.open:
             self._drop_loader(loader)
 

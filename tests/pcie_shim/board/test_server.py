@@ -362,6 +362,19 @@ def test_a_loader_that_says_nothing_loses_its_turn(start_board, monkeypatch):
     program(board.endpoint, image(MACHINE))
 
 
+def test_a_loader_keeps_its_turn_while_the_board_loads_for_long(start_board, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(board_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    load = EmulatedBoard.load
+
+    def slow(self, content):
+        load(self, content)
+        now[0] += board_module.PROGRAMMING_SILENCE_S + 1
+
+    monkeypatch.setattr(EmulatedBoard, "load", slow)
+    assert program(start_board().endpoint, image(MACHINE)) == image(MACHINE).image_hash
+
+
 def begin(link, size, digest):
     payload = framing.ProgramBegin(size=size, sha256=digest, token=framing.NO_TOKEN).encode()
     link.request(framing.PROGRAM, framing.BEGIN, 0, len(payload) // 4, payload)
