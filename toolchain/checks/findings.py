@@ -292,7 +292,8 @@ def _columns(machine: CheckedMachine) -> Iterator[Finding]:
                 Check.COLUMN_WITHOUT_EFFECT,
                 variable.name,
                 "each of its values has the same code on every line, so its readings have no effect",
-                "omit it, or use more --prob-bits",
+                "omit it"
+                + (", or use more --prob-bits" if machine.parameters.prob_bits < PROB_BITS_MAX else ""),
             )
 
 

@@ -64,7 +64,8 @@ def _period(machine: CheckedMachine, length: int) -> Iterator[Finding]:
     parameters, limits = machine.parameters, machine.deployment.machine
     period = length // math.gcd(length, parameters.steps_per_clock)
     if limits.max_cycles > period:
-        longer = "a longer --rng-table" if parameters.rng is RngKind.TABLE else "a wider --rng"
+        ways = {RngKind.TABLE: ", or a longer --rng-table", RngKind.LFSR32: ""}
+        longer = ways.get(parameters.rng, ", or a wider --rng")
         shortened = (
             ""
             if period == length
@@ -77,7 +78,7 @@ def _period(machine: CheckedMachine, length: int) -> Iterator[Finding]:
                 f"the random numbers repeat after {period} cycles{shortened}, and a frame may run {limits.max_cycles}: "
                 "later cycles add no information"
             ),
-            f"use --max-cycles {period}, or {longer}",
+            f"use --max-cycles {period}{longer}",
         )
 
 
@@ -110,7 +111,7 @@ def _relations(machine: CheckedMachine) -> Iterator[Finding]:
                 f"{'are the same' if count == 2 else 'XOR to 0'} in every cycle ({where}: {bits}), so these columns are not "
                 "independent"
             ),
-            "use a wider --rng or fewer --prob-bits"
+            f"use {'' if parameters.rng is RngKind.LFSR32 else 'a wider --rng or '}fewer --prob-bits"
             + (f", or --rng-banks {clean}, which excludes these banks" if clean > 1 else ""),
         )
     if groups < len(seeds):
