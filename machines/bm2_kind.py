@@ -91,6 +91,7 @@ class BM2Kind(MachineKind):
             answer |= {"STREAM_COUNT": 1, "STREAM": parameters.stream * words}
         return UsedRegisters(
             lines=1,
+            part=(parameters.chain, parameters.chains),
             replicas=1,
             inputs="START_STATE",
             input_words=words,
@@ -348,7 +349,7 @@ def _why_left_out(number: int, reason: int, kept: Kept, variables: Sequence[str]
         return f"board{number} drew no sample that counts: raise max_cycles"
     parameters, bit = kept.parameters, kept.timed_out_bit
     variable = next(at for at, mask in enumerate(parameters.masks) if mask >> bit & 1)
-    name = variables[variable] if variables else f"variable {variable}"
+    name = variables[variable] if variable < len(variables) else f"variable {variable}"
     return (
         f"board{number} timed out on bit {bit - parameters.offsets[variable]} of {name}, on which its factors did not "
         f"agree: raise --ops-timeout, or take fewer --prob-bits"

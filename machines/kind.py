@@ -126,6 +126,7 @@ class UsedRegisters:
 
     Attributes:
         lines: Lines of the model on the board.
+        part: Number of the board and of all boards, where the parameters say so; None otherwise.
         replicas: Machines on the board.
         inputs: Name of the block of inputs.
         input_words: Inputs of all replicas, in words.
@@ -137,6 +138,7 @@ class UsedRegisters:
     """
 
     lines: int
+    part: tuple[int, int] | None = None
     replicas: int
     inputs: str
     input_words: int

@@ -110,6 +110,10 @@ class Image:
                 f"Part {part.index} of {part.count} cannot hold {lines} lines from line {part.line_offset} "
                 f"on: the model has {part.total_lines}"
             )
+        if registers.part not in {None, (part.index, part.count)}:
+            raise ImageError(
+                f"The machine is part (number, of) {registers.part}, the image {part.index, part.count}"
+            )
 
     @cached_property
     def kind(self) -> MachineKind:

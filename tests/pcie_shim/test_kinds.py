@@ -4,6 +4,8 @@ frame ──▶ on_host ── blocks ──▶ board 0, board 1 (chains) ──
                         the same start ──▶ the reference in this process ── must be equal, to the bit
 """
 
+import dataclasses
+
 import msgspec
 import numpy as np
 import pytest
@@ -17,7 +19,7 @@ from machines.parameters import SampleEvery, Sequencer
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.board.rtl_board import RtlBoard
-from pcie_shim.errors import FrameInputError, ImageMismatchError
+from pcie_shim.errors import FrameInputError, ImageError, ImageMismatchError
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, Partition, image_bytes, image_from_bytes
 from pcie_shim.register_map import ErrorCode
@@ -224,6 +226,16 @@ def test_a_board_that_times_out_is_left_out_and_named():
     assert both.posterior.tolist() == BM2.infer([good]).posterior.tolist()
 
 
+def test_a_time_out_of_a_variable_without_a_name_has_its_number():
+    parameters = BM2Parameters(
+        cardinalities=(2, 2), factors=((0,), (1,), (1,)), searched=(1,), known=(0,), ops_timeout=1
+    )
+    factors = ([0.5, 0.5], [0.001, 0.999], [0.999, 0.001])
+    with opened([image(BM2Machine.from_factors(parameters, factors))]) as cluster:
+        late = cluster.run(frame(0)).boards
+    assert "variable 1" in BM2.infer(late, ("only",)).outcome
+
+
 def test_a_result_that_ended_by_max_cycles_is_marked():
     with opened(images()) as cluster:
         inference = BM2.infer(cluster.run(frame(1, max_cycles=900)).boards)
@@ -332,6 +344,12 @@ def test_a_refused_start_leaves_the_limit_of_the_frame_before(monkeypatch):
     ends = []
     board.write(rm.RESUME, words(2))
     assert ends[0] > 0
+
+
+def test_an_image_is_of_the_same_board_as_its_machine():
+    whole = images(2)[1]
+    with pytest.raises(ImageError, match=r"part \(number, of\) \(1, 2\), the image \(0, 2\)"):
+        dataclasses.replace(whole, partition=Partition(0, 2, 0, 2))
 
 
 def test_a_board_has_the_registers_of_its_kind():

@@ -281,5 +281,16 @@ def _parameter_pairs(
         pairs = {f"values of {each.name}": (each.values, sizes[at]) for each, at in places}
         found = tuple(sizes[at] for at in parameters.searched)
         pairs["sizes of the searched variables"] = tuple(each.size for each in deployment.searched), found
+        names = getattr(machine, "variables", ())
+        pairs["number of names in 'variables'"] = len(names), len(sizes)
+        if len(names) == len(sizes):
+            # the known ones as a set, since 'regenerate deployment --order' changes which column is which
+            labels, asked = (
+                [each.label for each in deployment.searched],
+                [names[at] for at in parameters.searched],
+            )
+            pairs["searched variables"] = labels, asked
+            read = sorted(names[at] for at in parameters.known)
+            pairs["known variables"] = sorted(each.name for each in sensors), read
     same = {key: (getattr(machine, key), getattr(parameters, key)) for key in keys}
     return {**same, **pairs, "number of sensors": (len(sensors), count)}

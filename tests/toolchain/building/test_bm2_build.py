@@ -16,10 +16,10 @@ from machines.rng import LFSR, random_numbers
 from posteriors import posterior
 from tests.toolchain.running import OPTIONS, TARGET, TINY, assert_refused, contents, done, toolchain
 from toolchain.building.bm2_machine import BM2Plan, chain_machines, plan_bm2
-from toolchain.building.build import read_images
+from toolchain.building.build import check_agreement, read_images
 from toolchain.building.options import BM1Options, BM2Options, given_flags
 from toolchain.deployment import load_deployment
-from toolchain.errors import BuildError
+from toolchain.errors import BuildError, DeploymentError
 from toolchain.models import IntegerType, JointDistribution, Symbol, potential, table, uniform
 from toolchain.networks import read_network
 from toolchain.outputs.mif import read_mif
@@ -388,6 +388,25 @@ def test_a_deployment_is_edited_if_its_images_agree(network):
     file = out / "deployment.toml"
     file.write_text(file.read_text().replace("burn_in = 1000", "burn_in = 999"))
     assert_refused(regenerate("deployment", out), "burn_in = 999", "built with 1000")
+
+
+@pytest.mark.parametrize(
+    ("names", "named"),
+    [
+        ((), "number of names in 'variables'"),
+        (("rain", "sprinkler"), "number of names in 'variables'"),
+        (("sprinkler", "rain", "grass"), "searched variables"),
+        (("rain", "sprinkler", "roof"), "known variables"),
+    ],
+)
+def test_names_of_the_variables_are_those_of_the_images(network, names, named):
+    done(build(network, *GRASS))
+    deployment = load_deployment(network.parent / "out")
+    images = read_images(deployment)
+    check_agreement(deployment, images)
+    wrong = deployment.replace(machine=deployment.machine.replace(variables=names))
+    with pytest.raises(DeploymentError, match=named):
+        check_agreement(wrong, images)
 
 
 def test_sources_give_a_path_to_each_variable(network):
