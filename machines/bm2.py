@@ -244,7 +244,7 @@ class BM2Parameters:
 
     def factor_bits(self, factor: int) -> tuple[int, ...]:
         """Return the state bits of a factor's variables, in rising order: its local bits."""
-        bits, offsets = self.bits, self.offsets
+        bits, offsets = _layout(self.cardinalities)
         return tuple(
             offsets[variable] + bit for variable in self.factors[factor] for bit in range(bits[variable])
         )
