@@ -1,6 +1,6 @@
 """Case studies, each with a model, a simulator or a data reader, and a page that describes it.
 
-This module has their common errors, and the flag `--uri` of their commands.
+This module has their common errors, and the common flags of their commands.
 """
 
 from typing import Annotated, ClassVar
@@ -27,3 +27,5 @@ Uri = Annotated[
     ),
 ]
 DEFAULT_URI = "ws://127.0.0.1:9090"
+FirstTimeout = Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")]
+Timeout = Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")]

@@ -48,7 +48,7 @@ LOW_PLANES: Final = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ChainResult:
-    """What the kernel of a chain shows after its stop; see `BM2Kernel`."""
+    """The results and the state of a chain after its stop; the attributes are those of `BM2Kernel`."""
 
     reason: BM2StopReason
     cycles: int

@@ -20,7 +20,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """What one board has drawn in a frame.
+    """The samples that one board has drawn in a frame.
 
     Attributes:
         reason: Its last stop reason.

@@ -1,4 +1,4 @@
-"""BM2 as a machine kind: its sections, registers, the batches or the stream of a frame, and its posterior (thesis 2.1.3)."""
+"""BM2 as a machine kind: its sections, registers, frames (batches or a stream) and posteriors (thesis 2.1.3)."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -184,25 +184,17 @@ class BM2Kind(MachineKind):
         self, machines: Sequence[BM2Machine], frame: FrameInput, variables: Sequence[str] = ()
     ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
         """Run the chains one after the other in this process, as boards run them."""
-        starts, settings = _OnHost(machines).starts(frame)
+        # a stream changes nothing but the way of the samples to the host
+        kernels = [
+            make_bm2_kernel(replace(machine, parameters=replace(machine.parameters, stream=0)))
+            for machine in machines
+        ]
         results = []
-        for machine, blocks in zip(machines, starts, strict=True):
-            # a stream changes nothing but the way of the samples to the host
-            parameters = replace(machine.parameters, stream=0)
-            kernel = make_bm2_kernel(replace(machine, parameters=parameters))
-            first, *others = _batch_ends(settings.target_count)
-            kernel.start(_start_of(parameters, blocks, settings._replace(target_count=first)))
-            batches = []
-            for target in others:
-                if kernel.reason is not BM2StopReason.SAMPLES:
-                    break
-                batches.append(kernel.results.astype("<u4").tobytes())
-                kernel.resume(target)
-            kept = Kept(parameters, kernel.samples, kernel.unused, kernel.timed_out_bit, batches)
-            words = kernel.results.astype("<u4").tobytes()
-            results.append(
-                BoardResult(words, kernel.cycles, kernel.reason, kept=msgspec.msgpack.encode(kept))
-            )
+        for kernel, ended in zip(kernels, run_batches(kernels, frame), strict=True):
+            *batches, words = (each.astype("<u4").tobytes() for each in ended)
+            parameters, bit = kernel.machine.parameters, kernel.timed_out_bit
+            kept = msgspec.msgpack.encode(Kept(parameters, kernel.samples, kernel.unused, bit, batches))
+            results.append(BoardResult(words, kernel.cycles, kernel.reason, kept=kept))
         inference = self.infer(results, variables)
         if inference.posterior is None:
             raise NoPosteriorError(f"There is {inference.outcome}.")
@@ -243,6 +235,35 @@ def _start_of(
         bank=settings.bank,
         sequencer=_ORDERS[order],
     )
+
+
+def run_batches(kernels: Sequence[BM2Kernel], frame: FrameInput) -> list[list[npt.NDArray[np.uint32]]]:
+    """Run a frame on kernels without a stream, one after the other, in the batches in which boards run it.
+
+    Args:
+        kernels: One for each board, in the order of the chains.
+        frame: The readings and settings.
+
+    Returns:
+        The result words of each kernel at the end of each batch.
+
+    Raises:
+        StartError: The frame does not fit the machines.
+    """
+    machines = [kernel.machine for kernel in kernels]
+    starts, settings = _OnHost(machines).starts(frame)
+    first, *others = _batch_ends(settings.target_count)
+    ended = []
+    for kernel, blocks in zip(kernels, starts, strict=True):
+        kernel.start(_start_of(kernel.machine.parameters, blocks, settings._replace(target_count=first)))
+        batches = [kernel.results]
+        for target in others:
+            if kernel.reason is not BM2StopReason.SAMPLES:
+                break
+            kernel.resume(target)
+            batches.append(kernel.results)
+        ended.append(batches)
+    return ended
 
 
 def _batch_ends(samples: int, batches: int = BATCHES) -> list[int]:
@@ -297,7 +318,7 @@ class _OnBoard(BoardMachine):
 
 
 class Kept(msgspec.Struct, array_like=True):
-    """What a frame leaves of one board, beside its last results.
+    """The record of one board's chain in a frame, in addition to its last result words.
 
     Attributes:
         parameters: The parameters of its machine.

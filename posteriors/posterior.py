@@ -52,7 +52,7 @@ class Posterior:
     report: FrameReport | None = None
     """Its `/bm/frame`; None if that was lost."""
     details: Mapping[str, str] = field(default_factory=dict)
-    """What is known of the samples of a BM2, by the keys of `/bm/frame`; empty for a BM1."""
+    """Statistics of a BM2's samples, by their keys in `/bm/frame`; empty for a BM1."""
 
     @cached_property
     def values(self) -> "NDArray[np.float64]":

@@ -30,7 +30,7 @@ class ModelError(ToolchainError):
 
 
 class NotFusionError(ModelError):
-    """A question that is not a naive fusion, so that a BM1 cannot compute it: two known symbols depend on each other."""
+    """A question that a BM1 cannot compute, because two known symbols depend on each other."""
 
     def __init__(self, why: str, advice: str) -> None:
         """Compose the sentence; `why` names the two symbols and the path between them."""

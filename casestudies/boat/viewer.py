@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from casestudies import DEFAULT_URI, Uri
+from casestudies import DEFAULT_URI, FirstTimeout, Timeout, Uri
 from casestudies.boat.sensors import TRUE_POSE_TOPIC
 from posteriors.errors import NoResultError
 from terminal.command_line import CommandLine
@@ -255,8 +255,8 @@ def boat_viewer(
     truth_tolerance: Annotated[
         float, typer.Option(min=0, help="Seconds by which a true pose may be older than the reading.")
     ] = 0.5,
-    first_timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")] = 60.0,
-    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")] = 30.0,
+    first_timeout: FirstTimeout = 60.0,
+    timeout: Timeout = 30.0,
 ) -> None:
     """Show each posterior's mean next to the boat's true position, and draw the thesis's figures 4.4 and 4.5.
 

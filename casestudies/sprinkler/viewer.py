@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bridge.client import Subscription, connect
 from bridge.errors import NoMessageError
-from casestudies import DEFAULT_URI, Uri
+from casestudies import DEFAULT_URI, FirstTimeout, Timeout, Uri
 from casestudies.pictures import check_pictures_possible, new_figure, save_figure
 from casestudies.sprinkler.garden import Rain
 from casestudies.sprinkler.model import RAIN, TRUTH_TOPIC, TYPE, exact_rain
@@ -266,8 +266,8 @@ def sprinkler_viewer(
         Path | None, typer.Option(help=f"Write {PICTURE} into this folder.", file_okay=False)
     ] = None,
     rain: Rain = RAIN,
-    first_timeout: Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")] = 60.0,
-    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")] = 30.0,
+    first_timeout: FirstTimeout = 60.0,
+    timeout: Timeout = 30.0,
 ) -> None:
     """Show P(R = 1) of each frame and its error next to the exact value, and draw how the estimates converge.
 

@@ -340,7 +340,7 @@ class BoardServer:
     def _serve_loader(self, loader: LoaderConnection) -> None:
         loader.receive()
         loader.answer(partial(self._program, loader))
-        # after the answer, because the time in which the board loads the image is no silence of its loader
+        # after the answer, because a loader that waits while the board loads its image is not silent
         loader.last_frame = time.monotonic()
         if not loader.open:
             self._drop_loader(loader)

@@ -68,7 +68,7 @@ class Network:
     zeros: int
     """The number of zeros in the tables."""
     warnings: list[Finding]
-    """What `toolchain check` warns of."""
+    """The warnings of `toolchain check`."""
     pyagrum: Any
     theirs: Any
     """The network in pyagrum."""

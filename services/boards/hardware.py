@@ -63,7 +63,7 @@ class SimulatedHardware:
     def _compiled(self, image: Image) -> Compiled:
         if not image.kind.has_hardware:
             raise SimulationError(
-                f"There is no hardware of a {image.kind.name}: use emulated boards (--engine emulated)"
+                f"A {image.kind.name} exists only in emulation, not as hardware: use emulated boards (--engine emulated)"
             )
         try:
             return compiled(image, self._simulator, self._folder, say)

@@ -164,7 +164,8 @@ class FrameFlow:
         self._last = (0, 0)
         self.losses: Counter[LossReason] = Counter()
         """Readings and results lost so far, by reason."""
-        # Causes of unusable messages and of frames without a posterior or with a biased one of which the user has been warned: one warning each.
+        # Causes of unusable messages, and of frames without a posterior or with a biased one: the user is warned once
+        # of each.
         self._reported_causes: set[str] = set()
         self.latencies = Latencies()
         """Latencies of the published frames."""

@@ -243,7 +243,7 @@ class PageBM2:
         return "FULL" if self.p.stream and len(self.buffer) == self.p.stream else None
 
     def shown(self, reason):
-        """What a kernel shows, in the form of `random_networks.seen`."""
+        """Return the attributes of a kernel, in the form of `random_networks.seen`."""
         p = self.p
         codes = [range(2 ** math.ceil(math.log2(cardinality))) for cardinality in p.cardinalities]
         results = [self.histograms.get((at, code), 0) for at, own in enumerate(codes) for code in own]

@@ -1,4 +1,4 @@
-"""Advice on the machine for a question: BM1 and BM2 at the same accuracy, and exact inference on this host (thesis 5.2).
+"""Advice on the machine for a question: BM1, BM2, and exact inference on this host, at one accuracy (thesis 5.2).
 
 Both machines are emulated on readings drawn from the model, and run longer until the mean total variation from exact
 inference is as asked. A machine that does not reach it within `MOST_CYCLES` says how near it came.
@@ -145,7 +145,10 @@ class Advice:
                 rows.append(f"{each.machine}: {each.refused or f'on a {self.device} {each.unfit}'}.")
             elif each.total_variation > self.accuracy:
                 rows.append(f"{each.machine}: it comes no nearer in {MOST_CYCLES:,} cycles.")
-        heading = f"{self.model}: {self.question}, to a mean total variation of {self.accuracy:g} over {self.frames} readings"
+        heading = (
+            f"{self.model}: {self.question}, to a mean total variation of {self.accuracy:g} over "
+            f"{self.frames} readings"
+        )
         return "\n".join([heading, *rows, exact, self.recommendation]) + "\n"
 
 
@@ -237,7 +240,7 @@ def _bm2(
 def _run_until(
     run: Callable[[int], tuple[float, float]], setting: int, accuracy: float
 ) -> tuple[int, float, float]:
-    """Return the setting for an accuracy, with the total variation and the cycles; the most accurate one if none is enough.
+    """Return the setting for an accuracy, or the most accurate one, with its total variation and its cycles.
 
     The error falls with the root of the setting, so every run predicts the next setting.
     """

@@ -194,7 +194,7 @@ class ExactChain:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChainError:
-    """What a frame of some samples is expected to get wrong, in the mean over readings, without having run any.
+    """The expected error of a frame, in the mean over readings, computed without running one.
 
     Distances are total variations of the searched variables' posterior.
     """
@@ -214,7 +214,7 @@ class ChainError:
     cycles: float
     """Cycles of a sweep."""
     effective: float
-    """Number of independent samples that a sweep is worth, for the reading and the searched value that mix most slowly."""
+    """Effective samples per sweep, for the reading and the searched value that mix most slowly."""
 
 
 def distance(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> float:

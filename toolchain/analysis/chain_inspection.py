@@ -62,22 +62,42 @@ class ChainInspection:
         lengths = (ran.cycles.median.value, ran.cycles.percentile_95.value, float(ran.cycles.worst))
         shown = [f"{each:,.0f} ({with_unit(each / self.clock_hz, 's')})" for each in lengths]
         cycles = f"{shown[0]} in the median, {shown[1]} at 95 %, {shown[2]} at worst"
-        resources = f"{cost.alms:,.0f} ALMs ({cost.alm_share:.1%}), {cost.memories.blocks:,} memory blocks ({cost.block_share:.1%}); "
+        resources = f"{cost.alms:,.0f} ALMs ({cost.alm_share:.1%}), "
+        resources += f"{cost.memories.blocks:,} memory blocks ({cost.block_share:.1%}); "
         resources += "it fits" if cost.fits else f"it does not fit: {cost.why_not}"
         accuracy = "Give the model with --model for the accuracy."
         if (tv := ran.total_variation) is not None:
             accuracy = f"Total variation from exact inference: {tv.value:.4f} ({tv.low:.4f}..{tv.high:.4f})."
         if (e := self.exact) is not None:
-            accuracy += f" Computed: {e.quantising:.2g} by the codes, {e.start:.2g} by the start state, {e.sampling:.2g} by too few samples."
+            accuracy += (
+                f" Computed: {e.quantising:.2g} by the codes, {e.start:.2g} by the start state, "
+                f"{e.sampling:.2g} by too few samples."
+            )
         r_hat = f"; R-hat {ran.r_hat:.4g}" if p.chains > 1 else ""
         bits = counted(p.state_bits, "bit")
+        stops = ", ".join(f"{name} {n}" for name, n in sorted(ran.reasons.items()))
         rows = (
-            f"Deployment {self.deployment.name} ({self.deployment.hash[:16]}): a BM2, {counted(p.chains, 'board')} with a chain each.",
-            f"{counted(len(p.cardinalities), 'variable')} in {bits}; {counted(p.cdes, 'CDE')} with {sum(sizes):,} codes of {p.prob_bits} bits, at most {max(sizes):,}.",
-            f"{count:,} samples after {p.burn_in:,} sweeps, {p.sequencer} order, {p.rng} ({p.steps_per_clock} steps per clock, {p.rng_banks} banks).",
-            f"Readings: {self.readings}. Boards stopped by: {', '.join(f'{name} {n}' for name, n in sorted(ran.reasons.items()))}.",
-            f"Cycles of a frame, and time at {with_unit(self.clock_hz, 'Hz')} (no link, no ROS): {cycles}; {ran.sweep_cycles:.2f} per sweep.",
-            f"Its samples are worth {ran.effective_samples[0]:,.0f} independent ones in the median, {ran.effective_samples[1]:,.0f} at least{r_hat}.",
+            (
+                f"Deployment {self.deployment.name} ({self.deployment.hash[:16]}): a BM2, "
+                f"{counted(p.chains, 'board')} with a chain each."
+            ),
+            (
+                f"{counted(len(p.cardinalities), 'variable')} in {bits}; {counted(p.cdes, 'CDE')} with {sum(sizes):,} "
+                f"codes of {p.prob_bits} bits, at most {max(sizes):,}."
+            ),
+            (
+                f"{count:,} samples after {p.burn_in:,} sweeps, {p.sequencer} order, {p.rng} "
+                f"({p.steps_per_clock} steps per clock, {p.rng_banks} banks)."
+            ),
+            f"Readings: {self.readings}. Boards stopped by: {stops}.",
+            (
+                f"Cycles of a frame, and time at {with_unit(self.clock_hz, 'Hz')} (no link, no ROS): {cycles}; "
+                f"{ran.sweep_cycles:.2f} per sweep."
+            ),
+            (
+                f"Its samples are worth {ran.effective_samples[0]:,.0f} independent ones in the median, "
+                f"{ran.effective_samples[1]:,.0f} at least{r_hat}."
+            ),
             accuracy,
             f"Resources of a {cost.device.title}, estimated from the units of a BM1: {resources}.",
         )

@@ -1,4 +1,4 @@
-"""Runs of a BM2 on drawn readings, as the host runs its boards, beside exact inference; and what it takes on an FPGA."""
+"""Runs of a BM2 on drawn readings, compared with exact inference, and its resources on an FPGA."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from machines import make_bm2_kernel
-from machines.bm2 import BM2Machine, BM2Start, BM2StopReason, start_state
-from machines.bm2_estimate import BATCHES_MIN, Chain, estimate, searched_counts
+from machines.bm2 import BM2Machine
+from machines.bm2_estimate import Chain, estimate, searched_counts
+from machines.bm2_kind import run_batches
+from machines.kind import FrameInput
 from machines.parameters import SampleEvery
 from toolchain.analysis.accuracy import Cycles, Interval, bootstrap
 from toolchain.analysis.chain import distance
@@ -62,14 +64,14 @@ def drawn_readings(model: NetworkModel, frames: int, seed: int) -> list[Addresse
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sampled:
-    """What a BM2 did on some readings; intervals are of 95 %, over frames.
+    """Results of a BM2 on some readings; intervals are of 95 %, over frames.
 
     Attributes:
         frames: Frames with a posterior.
         total_variation: Mean distance of the posteriors from exact inference; None without a model.
         cycles: Cycles of the longest-running board.
         sweep_cycles: Cycles of a sweep, in the mean; 0 if samples are taken after every move.
-        effective_samples: Independent samples that those of a frame are worth, in the median and at least; 0 if unknown.
+        effective_samples: Effective samples of a frame, in the median and at least; 0 if unknown.
         r_hat: The median of frames; 0 for one board, 1e9 if it is infinite.
         reasons: How often boards stopped for each reason; `impossible` for readings without a possible state.
     """
@@ -96,30 +98,15 @@ class SampledBoards:
 
     def run(self, addresses: Addresses, bank: int, samples: int) -> tuple[list[Chain], int]:
         """Run a frame in batches like the host; return the chains and the cycles of the longest-running board."""
-        machine = self.machines[0]
-        p = machine.parameters
-        evidence = dict(zip(p.known, addresses, strict=True))
-        ends = sorted({max(1, samples * batch // BATCHES_MIN) for batch in range(1, BATCHES_MIN + 1)})
-        chains = []
-        for board, kernel in enumerate(self._kernels):
-            state = start_state(machine, evidence, largest=board % 2 == 1)
-            start = BM2Start(
-                state=state or 0,
-                known=sum(p.masks[variable] for variable in evidence),
-                samples=0 if state is None else ends[0],
-                burn_in=p.burn_in,
-                ops_timeout=p.ops_timeout,
-                max_cycles=self._max_cycles,
-                bank=bank % p.rng_banks,
-                sequencer=p.sequencer,
-            )
-            reason = kernel.start(start)
-            counts = [searched_counts(p, kernel.results)]
-            for end in ends[1:]:
-                if reason is BM2StopReason.SAMPLES:
-                    reason = kernel.resume(end)
-                    counts.append(searched_counts(p, kernel.results))
-            chains.append(Chain(reason, np.array(counts)))
+        p = self.machines[0].parameters
+        frame = FrameInput(
+            addresses=addresses, target_count=samples, max_cycles=self._max_cycles, bank=bank % p.rng_banks
+        )
+        ended = run_batches(self._kernels, frame)
+        chains = [
+            Chain(kernel.reason, searched_counts(p, np.array(batches)))
+            for kernel, batches in zip(self._kernels, ended, strict=True)
+        ]
         return chains, max(kernel.cycles for kernel in self._kernels)
 
     def measure(
@@ -162,7 +149,7 @@ class SampledBoards:
 
 
 def chain_resources(machine: BM2Machine, device: Device) -> Estimate:
-    """Return what a board takes, by the units of a BM1, of which a BM2 consists as well; there is no VHDL to compare."""
+    """Return the resources of a board, estimated from the units of a BM1; there is no VHDL of a BM2 to compare."""
     p = machine.parameters
     seed, adders = p.rng.lfsr_bits or 16, len([bits for bits in p.bits if bits]) + 1
     # each local bit of a CDE moves by one place in the address if the pointer is below it

@@ -1,4 +1,4 @@
-"""The BM2 for a model: its plan, the sizes of its tables and results, and the machine of each board, a chain (thesis 2.1.3)."""
+"""The BM2 for a model: its plan, the sizes of tables and results, and the chain of each board (thesis 2.1.3)."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
@@ -158,6 +158,9 @@ def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]
 def chain_layout(parameters: BM2Parameters, interface: tuple[int, int] | None) -> BoardLayout:
     """Return the layout of the boards, each of which has a chain; a BuildError as for `fitted_layout`."""
     check_seeds(parameters)
-    what = f"a state of {counted(parameters.state_bits, 'bit')}, {parameters.histogram_words} words of histograms and {parameters.joint_words} of the searched variables"
+    what = (
+        f"a state of {counted(parameters.state_bits, 'bit')}, {parameters.histogram_words} words of histograms and "
+        f"{parameters.joint_words} of the searched variables"
+    )
     blocks = tuple(LineBlock(chain, 1) for chain in range(parameters.chains))
     return fitted_layout(blocks, KINDS["BM2"]().registers(parameters), interface, what)

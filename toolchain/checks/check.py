@@ -41,7 +41,7 @@ def check_model(
     options: BuildOptions,
     fit: Callable[[MachinePlan], MachinePlan] = lambda plan: plan,
 ) -> list[Finding]:
-    """Return the findings about a model and its machine, the worst first; `fit` may increase the number of boards of a BM1."""
+    """Return the findings about a model and its machine, the worst first; `fit` may give a BM1 more boards."""
     if isinstance(model, NetworkModel):
         return _check_network(model, options)
     refused: list[Finding] = []

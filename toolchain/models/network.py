@@ -1,4 +1,4 @@
-"""The network that a BM2 samples: the relevant factors of a question, over its searched, known and unknown symbols (thesis 2.1.3).
+"""The network that a BM2 samples: the relevant factors of a question and their symbols (thesis 2.1.3).
 
 Known symbols remain variables, because a reading may be missing; given ones are fixed in the tables. Symbols that
 sum to 1 in every answer are left out.
@@ -140,7 +140,8 @@ def network_of(model: Model) -> NetworkModel:
     """
     if model.prior_select is not None:
         raise ModelError(
-            f"{model.name}: {model.prior_select.name} selects the prior, which only a BM1 has: build one with --machine bm1"
+            f"{model.name}: {model.prior_select.name} selects the prior, which only a BM1 has: build one with "
+            "--machine bm1"
         )
     searched = [_plain_symbol(each.label, each.size, each.states) for each in model.searched]
     known = [_plain_symbol(each.name, each.values, each.states) for each in model.known]

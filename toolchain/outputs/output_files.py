@@ -134,7 +134,7 @@ def only_emulated(deployment: Deployment) -> str:
 
 
 def quartus_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
-    """Return the Quartus project: `bm1.qpf`, a `.qsf` per board, `bm1.tcl`; none if the machine exists only in emulation."""
+    """Return the Quartus project: `bm1.qpf`, a `.qsf` per board, `bm1.tcl`; nothing for a machine without hardware."""
     if only_emulated(deployment):
         return OutputFiles({}, _PROJECT)
     names = [memory.name for memory in memories(deployment, images)]

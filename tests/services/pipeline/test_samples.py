@@ -67,7 +67,7 @@ def folder(tmp_path_factory):
 
 
 async def published(folder, deployment, message):
-    """What the master hears after one message, and what is on the wire: topics and their messages in order."""
+    """Publish the result of one message; return the record for the master, and topics and messages as published."""
     async with FakeRosbridge() as fake:
         topics = ResultTopics(Settings(uri=fake.uri), deployment)
         with opened(folder, deployment) as boards:

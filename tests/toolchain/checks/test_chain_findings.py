@@ -174,7 +174,7 @@ def test_a_deterministic_or_is_not_connected():
 @settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_connection_is_that_of_a_search(data):
-    """Against a search from each state, with cardinalities that are no powers of two."""
+    """Compare with a search from each state, also where cardinalities are not powers of two."""
     sizes = data.draw(st.lists(st.integers(2, 5), min_size=2, max_size=3))
     count = math.prod(sizes)
     entries = data.draw(st.lists(st.sampled_from([0, 0, 1]), min_size=count, max_size=count))
