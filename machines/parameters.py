@@ -1,4 +1,4 @@
-"""The parameters of a BM1: sizes, widths and random number generators (thesis 2.1.2)."""
+"""The parameters of a BM1 (thesis 2.1.2), and the choices and checks of the parameters of both machines."""
 
 from dataclasses import dataclass
 from enum import StrEnum
