@@ -28,6 +28,7 @@ from terminal.connection import report_connection
 from terminal.errors import ExitCode, StoppedError
 from terminal.output import check_writable, say, warn
 from terminal.signals import run_async
+from toolchain.errors import counted
 
 PICTURE: Final = "sprinkler.png"
 KEPT: Final = 2000
@@ -235,14 +236,13 @@ class Viewer:
             if here := [frame for frame in self.frames if frame.grass == grass]:
                 mean, error = mean_and_error(here)
                 print(
-                    f"{GRASS[grass]} grass: P(R = 1 | G = {grass}) is {mean:.4f} +- {error:.4f} in {len(here)} "
-                    f"frames, and {exact_rain(grass, self._rain):.4f} exactly; "
+                    f"{GRASS[grass]} grass: P(R = 1 | G = {grass}) is {mean:.4f} +- {error:.4f} in "
+                    f"{counted(len(here), 'frame')}, and {exact_rain(grass, self._rain):.4f} exactly; "
                     f"it had rained on {rainy} of {mornings} mornings"
                 )
         if self.repeated:
-            print(
-                f"{self.repeated} frames have the samples of an earlier one, and are left out: add --rng-banks"
-            )
+            repeated = counted(self.repeated, "repetition")
+            print(f"{repeated} of an earlier frame's samples left out: build with more --rng-banks")
         if out is not None and self.frames:
             draw(out / PICTURE, self.frames, self._rain)
             print(f"wrote {out / PICTURE}")

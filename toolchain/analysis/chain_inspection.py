@@ -78,8 +78,8 @@ class ChainInspection:
         stops = ", ".join(f"{name} {n}" for name, n in sorted(ran.reasons.items()))
         rows = (
             (
-                f"Deployment {self.deployment.name} ({self.deployment.hash[:16]}): a BM2, "
-                f"{counted(p.chains, 'board')} with a chain each."
+                f"Deployment {self.deployment.name} ({self.deployment.hash[:16]}): a BM2 with "
+                f"{counted(p.chains, 'chain')}, one per board."
             ),
             (
                 f"{counted(len(p.cardinalities), 'variable')} in {bits}; {counted(p.cdes, 'CDE')} with {sum(sizes):,} "

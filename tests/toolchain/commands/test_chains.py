@@ -42,7 +42,7 @@ def test_check_names_factors_of_a_network_and_of_a_deployment(network, deploymen
 
 def test_inspect(network, deployment):
     said = done(toolchain("inspect", deployment, "--model", network, *QUESTION, "--frames", "4")).stdout
-    assert "a BM2, 2 boards with a chain each" in said
+    assert "a BM2 with 2 chains, one per board" in said
     assert "R-hat" in said
     assert "3 variables in 3 bits; 3 CDEs with 17 codes of 16 bits, at most 12." in said
     assert "Total variation from exact inference: 0.0" in said
