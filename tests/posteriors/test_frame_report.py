@@ -190,6 +190,14 @@ def test_a_result_is_of_the_first_report_until_the_disorder_is_over(heard, numbe
     assert pairs(pairing.add_posterior(result(7, heard))) == [(number, 7)]
 
 
+@pytest.mark.parametrize(("second", "number"), [(21, 2), (22, 1)])
+def test_a_result_is_of_the_second_report_from_the_disorder_before_it_on(second, number):
+    pairing = Pairing(disorder_ns=5)
+    pairing.add_report(report(1, 10))
+    pairing.add_report(report(2, second))
+    assert pairs(pairing.add_posterior(result(7, 16))) == [(number, 7)]
+
+
 def test_memory_is_bounded_where_only_one_topic_speaks():
     reports, results = Pairing(), Pairing()
     came = 0

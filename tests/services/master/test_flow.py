@@ -253,6 +253,14 @@ async def test_a_biased_posterior_is_shown_with_a_warning(boat):
     assert len(run.warnings) == 1
 
 
+async def test_one_cause_of_a_biased_posterior_and_of_none_has_two_warnings(run):
+    run.read(4)
+    for outcome in (Outcome.PUBLISHED, Outcome.NO_POSTERIOR) * 2:
+        computed(run)
+        published(run, run.publisher.records[-1].result.number, outcome, why="a reason", cause="max cycles")
+    assert len(run.warnings) == 2
+
+
 @pytest.mark.parametrize(
     ("end", "error", "code"),
     [

@@ -12,6 +12,7 @@ from bridge.client import State
 from machines.kind import BoardResult
 from services.boards.frames import encode_boards
 from services.pipeline.connections import NotReceivableError
+from services.pipeline.inference import infer, report_of
 from services.pipeline.publisher import Publisher
 from services.pipeline.result_topics import ResultTopics
 from services.settings import Settings
@@ -253,3 +254,13 @@ async def test_one_result_that_nobody_can_receive_is_an_error(boat, link, other)
                 await task
         assert caught.value.exit_code == 3
         assert not link.of(Published)
+
+
+def test_the_stages_of_a_report_are_the_whole_time_of_its_frame(boat):
+    boards = result(boat, 1).result.boards
+    publish = Publish(FrameResult(1, boards, 3_000, 70_000, 5_000, 60_000), 8, 9, 100_000, 120_000, 11_000)
+    inference = infer(publish.result, boat)
+    stages = report_of(publish, inference, boat, now=(1, 300_000), previous_out_ns=4_000).stages
+    assert (stages.rosbridge_in, stages.waited, stages.rosbridge_out) == (20, 11, 4)
+    assert (stages.register_writes, stages.compute, stages.reads, stages.boards_compute) == (3, 70, 5, 60)
+    assert stages.local_hops == 300 - 120 - 11 - (3 + 70 + 5)  # what no process has measured
