@@ -148,6 +148,20 @@ def test_an_output_says_how_each_board_ended_and_where_the_time_went(cluster, mo
     assert output.boards[0].counts.flags.owndata
 
 
+def test_the_computing_times_of_the_slices_are_added(start_board, monkeypatch):
+    times, take = [], DrivenBoard._take
+
+    def taken(board, done):
+        times.append(done.compute_ns)
+        take(board, done)
+
+    monkeypatch.setattr(DrivenBoard, "_take", taken)
+    with MiniCluster.open([start_board().endpoint], [image(never_stopping())]) as cluster:
+        output = cluster.run(FrameInput(addresses=(1,), target_count=255, max_cycles=2**17, stop="slices"))
+    assert output.slices == len(times) > 1
+    assert output.boards_compute_ns == sum(times)
+
+
 @pytest.mark.parametrize(
     "bad",
     [
@@ -394,6 +408,17 @@ def test_the_slowest_board_sets_the_deadline(boards, clock):
         assert cluster.seconds_left == 7
         while cluster.collect(1) is None:
             pass
+
+
+def test_a_later_slice_has_the_time_of_its_own_cycles(boards, clock):
+    parts = [image(never_stopping(), total=8, count=2, index=at, offset=4 * at) for at in range(2)]
+    with MiniCluster.open(endpoints_of(boards), parts, slack=5) as cluster:
+        cluster._boards[0].speed = cluster._boards[1].speed = 1e3
+        cluster.post(FrameInput(addresses=(1,), target_count=255, max_cycles=2**17, stop="slices"))
+        for slices, cycles in enumerate((512, 512, 1024)):  # they end at 512, 1024 and 2048
+            while cluster._progress.slices < slices:
+                assert cluster.collect(1) is None
+            assert cluster.seconds_left == pytest.approx(5 + 2 * cycles / 1e3)
 
 
 def test_a_failure_in_a_later_slice(start_board, clock):
