@@ -4,6 +4,7 @@ frame ──▶ on_host ── blocks ──▶ board 0, board 1 (chains) ──
                         the same start ──▶ the reference in this process ── must be equal, to the bit
 """
 
+import contextlib
 import dataclasses
 
 import msgspec
@@ -13,8 +14,8 @@ import pytest
 from machines import KINDS
 from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason
 from machines.bm2_kind import BATCHES, BM2, STREAM_BYTES_MAX, Kept
-from machines.errors import NoPosteriorError, ParameterError, StartError
-from machines.kind import FrameInput
+from machines.errors import MachineError, NoPosteriorError, ParameterError, StartError
+from machines.kind import BoardResult, FrameInput
 from machines.parameters import SampleEvery, Sequencer
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
@@ -226,6 +227,17 @@ def test_a_board_that_times_out_is_left_out_and_named():
     assert both.posterior.tolist() == BM2.infer([good]).posterior.tolist()
 
 
+def test_samples_of_a_board_that_is_left_out_are_not_handed_on():
+    parameters = sprinkler(stream=4).parameters
+    counts = np.ones(parameters.result_words, "<u4").tobytes()
+    boards = []
+    for reason, states in ((BM2StopReason.OPS_TIMEOUT, (5, 5)), (BM2StopReason.SAMPLES, (4, 6, 7))):
+        kept = Kept(parameters, len(states), timed_out_bit=0, stream=bytearray(words(*states)))
+        boards.append(BoardResult(counts, 9, reason, kept=msgspec.msgpack.encode(kept)))
+    inference = BM2.infer(boards)
+    assert (inference.samples, inference.details["samples"]) == (words(4, 6, 7), "3")
+
+
 def test_a_time_out_of_a_variable_without_a_name_has_its_number():
     parameters = BM2Parameters(
         cardinalities=(2, 2), factors=((0,), (1,), (1,)), searched=(1,), known=(0,), ops_timeout=1
@@ -234,6 +246,24 @@ def test_a_time_out_of_a_variable_without_a_name_has_its_number():
     with opened([image(BM2Machine.from_factors(parameters, factors))]) as cluster:
         late = cluster.run(frame(0)).boards
     assert "variable 1" in BM2.infer(late, ("only",)).outcome
+
+
+@pytest.mark.parametrize("bit", [-2, 3])
+def test_a_time_out_on_a_bit_that_is_not_of_the_state_is_refused(bit):
+    """The result came from a pipe; the state has three bits."""
+    parameters = sprinkler().parameters
+    kept = msgspec.msgpack.encode(Kept(parameters, timed_out_bit=bit))
+    with pytest.raises(MachineError, match="does not match"):
+        BM2.infer([BoardResult(bytes(4 * parameters.result_words), 9, BM2StopReason.OPS_TIMEOUT, kept=kept)])
+
+
+@pytest.mark.parametrize("size", [4, 8])
+def test_a_stream_is_of_whole_states(size):
+    parameters = wide(stream=6).parameters
+    kept = msgspec.msgpack.encode(Kept(parameters, stream=bytearray(size)))
+    board = BoardResult(bytes(4 * parameters.result_words), 9, BM2StopReason.SAMPLES, kept=kept)
+    with pytest.raises(MachineError, match="does not match") if size == 4 else contextlib.nullcontext():
+        BM2.infer([board])
 
 
 def test_a_result_that_ended_by_max_cycles_is_marked():
