@@ -201,6 +201,21 @@ def test_boards_that_disagree_have_the_error_between_them():
     assert result.error == pytest.approx([due, due])
 
 
+@pytest.mark.parametrize(("share", "disagrees"), [(0.31, False), (0.3, True)])
+def test_boards_disagree_from_an_r_hat_of_1_1_on(share, disagrees):
+    """Until then, their error is that of as many independent samples."""
+    random = np.random.default_rng(1)
+    chains = [
+        Chain(SAMPLES, cumulative((random.random(4000) < chance).astype(np.int64), 20))
+        for chance in (share, 1 - share)
+    ]
+    result = estimate(chains)
+    assert (result.r_hat > 1.1) is disagrees
+    assert result.r_hat == pytest.approx(1.1, abs=0.01)
+    own = math.sqrt(0.25 / result.effective_samples)
+    assert bool(result.error[0] > 1.5 * own) is disagrees
+
+
 @pytest.mark.parametrize("joint", [True, False])
 def test_counts_and_stream_name_the_same_values(joint):
     """A searched joint of three variables, in another order than the state's, whose codes cross a word."""
