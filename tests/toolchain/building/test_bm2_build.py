@@ -4,8 +4,10 @@ network, flags ──▶ plan_bm2 ──▶ BM2Plan ──▶ one image per chai
                    └─▶ MachinePlan of a BM1 if the question is a naive fusion
 """
 
+import contextlib
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,8 +18,9 @@ from machines.rng import LFSR, random_numbers
 from posteriors import posterior
 from tests.toolchain.running import OPTIONS, TARGET, TINY, assert_refused, contents, done, toolchain
 from toolchain.building.bm2_machine import BM2Plan, chain_machines, plan_bm2
-from toolchain.building.build import check_agreement, read_images
-from toolchain.building.options import BM1Options, BM2Options, given_flags
+from toolchain.building.build import assemble, check_agreement, read_images
+from toolchain.building.choice import model_for
+from toolchain.building.options import BM1Options, BM2Options, MachineChoice, given_flags
 from toolchain.deployment import load_deployment
 from toolchain.errors import BuildError, DeploymentError
 from toolchain.models import IntegerType, JointDistribution, Symbol, potential, table, uniform
@@ -154,6 +157,20 @@ def test_codes_of_values_that_are_no_power_of_two():
         assert codes.tolist() == codes_of_the_page(term, sizes, 16).tolist()
 
 
+def test_the_hash_of_a_model_covers_what_is_possible():
+    """A probability that is too small for a code, and 0, have the same codes."""
+    a, b = (Symbol(name, IntegerType(0, 1)) for name in "AB")
+    images = []
+    for least in (0, 1e-9):
+        factors = (uniform(a), potential([a, b], np.array([[1, 1], [1, least]])))
+        network = JointDistribution("n", factors).ask(["A"], ["B"]).network()
+        images.append(assemble(plan_bm2(network, OPTIONS)).images[0])
+    one, other = images
+    for own, its in zip(one.machine.tables, other.machine.tables, strict=True):
+        assert own.tolist() == its.tolist()
+    assert one.model_hash != other.model_hash
+
+
 def test_the_same_network_gives_the_same_bytes(asia):
     arguments = ("--searched", "bronc", "--known", "smoke,dysp", "--partitions", "2", "--rng", "table")
     for name in ("one", "two"):
@@ -270,6 +287,14 @@ def test_flags_of_the_other_machine_are_refused(network):
         assert set(given_flags(changed, group)) <= {flag[0] for flag in given}
 
 
+def test_no_machine_is_advised_that_cannot_be_built(network):
+    question = read_network(network).ask(["rain"], ["sprinkler", "grass"])  # they depend on each other
+    for choice in ("auto", "bm2"):
+        options = replace(OPTIONS, machine=MachineChoice(choice), scale="none")
+        with pytest.raises(BuildError, match=r"--scale is for a BM1.*; leave it out$"):
+            model_for(question, options)
+
+
 # Bad input
 
 
@@ -335,6 +360,14 @@ def test_what_is_too_large_is_named():
         plan_of(16, 16, 16, 16)
     with pytest.raises(BuildError, match="8194 words .* and 2 .*: ask about fewer than 65 variables"):
         plan_of(2, *[128] * 64, searched=1)
+
+
+@pytest.mark.parametrize("most", [39, 40])
+def test_the_codes_of_all_factors_have_a_limit(monkeypatch, most):
+    monkeypatch.setattr("toolchain.building.bm2_machine._MOST_CODES", most)
+    what = "V0, V1 is over 4 bits, .* needs 32 codes; the maximum is 39 codes of all CDEs, which need 40"
+    with pytest.raises(BuildError, match=what) if most == 39 else contextlib.nullcontext():
+        plan_of(4, 4, scope=2)
 
 
 # One part again
