@@ -340,3 +340,15 @@ def test_messages_that_arrive_together_are_read_up_to_another_topic_or_an_unusab
         messages, subscriptions = core.receive_known(together, first, 1, 2)
         assert messages == [(topic, {}, 1, 2, 0.0)] * count
         assert not count or subscriptions == (numbers[topic],)
+
+
+def test_a_message_with_a_known_envelope_has_the_limit_of_its_topic():
+    core = connected()
+    core.subscriptions.subscribe("/a", delivery=Delivery(max_bytes=60))
+    size = len(data := b'{"op":"publish","topic":"/a","msg":{"d":""}}')
+    core.receive(data, 0.0)
+    for length in (59, 60, 61):
+        longer = data.replace(b'""', b'"%b"' % (b"x" * (length - size)))
+        messages, _ = core.receive_known((longer,), 0, 1, 2)
+        assert len(messages) == (length <= 60)
+        assert core.subscriptions.largest == ("/a", min(length, 60))
