@@ -389,6 +389,13 @@ def test_programming_again_makes_another_board(board):
     assert read(board, rm.DONE) == 1
 
 
+def test_programming_forgets_half_a_read_value(board):
+    board._publish(BoardState.IDLE, StopReason.NONE, 0x1_FFFFFFFF)
+    read(board, rm.CYCLES)
+    board.load(image_bytes(image(MACHINE)))
+    assert read(board, rm.CYCLES + 4) == 0
+
+
 def test_a_bad_image_leaves_the_board_as_it_was(board):
     start(board, 1, 1)
     with refused(ErrorCode.BAD_IMAGE):

@@ -1,5 +1,6 @@
 """Boards with replicas and with inputs per cell: their results equal those of machines that run alone, to the bit."""
 
+import contextlib
 import dataclasses
 import struct
 
@@ -9,16 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from machines.bm1 import StopReason
-from machines.kind import FrameInput
+from machines.kind import OUTCOME, FrameInput
 from machines.parameters import PriorMode, SensorMode
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.endpoint import parse_endpoint
-from pcie_shim.errors import FrameInputError, ImageMismatchError, LinkClosedError
+from pcie_shim.errors import FrameInputError, FramingError, ImageMismatchError, LinkClosedError
 from pcie_shim.host.driven_board import DrivenBoard
 from pcie_shim.host.mini_cluster import MiniCluster
+from pcie_shim.host.socket_link import Done
 from pcie_shim.programming_file import Image, image_bytes
-from pcie_shim.register_map import ErrorCode
+from pcie_shim.register_map import BoardState, ErrorCode
 from tests.patience import PATIENCE
 from tests.pcie_shim.boards import board_fails, expected_of_replicas, image, images, machine, opened, words
 
@@ -214,3 +216,18 @@ def test_a_board_of_other_capabilities_is_refused(start_board, monkeypatch, repl
     monkeypatch.setattr(Image, "registers", property(lambda _: registers))
     with board_fails(ImageMismatchError):
         MiniCluster.open(endpoints, [other])
+
+
+@pytest.mark.parametrize("reason", [StopReason.MAX_CYCLES, StopReason.NONE, 99])
+def test_a_replica_that_stopped_for_an_unknown_reason_breaks_the_link(reason):
+    part = images(1, (3,), replicas=2)[0]
+    board = DrivenBoard(0, parse_endpoint("unix:/nowhere"), part)
+    board.waiting = True
+    outcomes = np.array([(StopReason.MAX_CYCLES, 0, 9), (reason, 0, 9)], OUTCOME).tobytes()
+    results = bytes(4 * part.registers.result_words)
+    status = BoardState.DONE << rm.STATUS_STATE_SHIFT | StopReason.MAX_CYCLES << rm.STATUS_STOP_REASON_SHIFT
+    done = Done(board.number, status, 9, 100, memoryview(results + outcomes))
+    is_known = reason is StopReason.MAX_CYCLES
+    with contextlib.nullcontext() if is_known else pytest.raises(FramingError, match="replica"):
+        board._take(done)
+    assert board.waiting is not is_known
