@@ -116,8 +116,9 @@ async def test_without_a_stream_there_is_no_topic_of_samples(folder):
     assert [topic for topic, _ in messages] == ["/bm/frame", "/BMresults"]
 
 
-async def test_impossible_readings_have_a_report_alone(folder):
-    heard, messages = await published(folder, built(folder), {"grass": "white"})
+@pytest.mark.parametrize("stream", [0, 64])
+async def test_impossible_readings_have_a_report_alone(folder, stream):
+    heard, messages = await published(folder, built(folder, stream=stream), {"grass": "white"})
     assert heard.outcome is Outcome.NO_POSTERIOR
     ((topic, message),) = messages
     report = read_frame_report(message, 0)
