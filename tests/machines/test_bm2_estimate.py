@@ -111,6 +111,13 @@ def test_r_hat_sees_boards_that_disagree():
     assert math.isnan(estimate(chains[:1]).r_hat)
 
 
+@pytest.mark.parametrize("samples", [1, 2])
+def test_halves_of_one_sample_have_no_r_hat(samples):
+    half = np.array([samples - 1, 1])
+    result = estimate([Chain(SAMPLES, np.stack([half, 2 * half]))] * 2)
+    assert math.isnan(result.r_hat) is (samples == 1)
+
+
 def test_a_board_that_drifts_disagrees_with_itself():
     """Both boards have the same mean, but their halves differ: only split chains show it."""
     drifting = np.repeat([0, 1], 1000)

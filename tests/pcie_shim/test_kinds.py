@@ -232,10 +232,12 @@ def test_samples_of_a_board_that_is_left_out_are_not_handed_on():
     counts = np.ones(parameters.result_words, "<u4").tobytes()
     boards = []
     for reason, states in ((BM2StopReason.OPS_TIMEOUT, (5, 5)), (BM2StopReason.SAMPLES, (4, 6, 7))):
-        kept = Kept(parameters, len(states), timed_out_bit=0, stream=bytearray(words(*states)))
+        kept = Kept(parameters, len(states), 1, timed_out_bit=0, stream=bytearray(words(*states)))
         boards.append(BoardResult(counts, 9, reason, kept=msgspec.msgpack.encode(kept)))
     inference = BM2.infer(boards)
-    assert (inference.samples, inference.details["samples"]) == (words(4, 6, 7), "3")
+    assert inference.samples == words(4, 6, 7)
+    assert (inference.details["samples"], inference.details["unused"]) == ("3", "1")
+    assert inference.totals == [1, 2]
 
 
 def test_a_time_out_of_a_variable_without_a_name_has_its_number():

@@ -225,6 +225,7 @@ def test_a_factor_that_is_too_wide_is_named():
     assert finding.about == "CDE 0 (A, B, C)"
     assert "2,359,296 words of 16 bits" in finding.what
     assert "holds 2,102,272" in finding.what
+    assert "all tables together" not in finding.what
     assert not found(checked(model, known_model=False, prob_bits=10), Check.WIDE_FACTOR)
 
 
