@@ -171,6 +171,26 @@ def test_the_hash_of_a_model_covers_what_is_possible():
     assert one.model_hash != other.model_hash
 
 
+def test_the_hash_of_a_model_covers_the_scopes_of_its_factors():
+    a, b, c = (Symbol(name, IntegerType(0, 1)) for name in "ABC")
+    images = []
+    for other in (a, b):
+        factors = [potential(scope, np.array([[1, 2], [3, 1]])) for scope in ([a, b], [other, c])]
+        network = JointDistribution("n", tuple(factors)).ask(["A"], ["B", "C"]).network()
+        images.append(assemble(plan_bm2(network, OPTIONS)).images[0])
+    tables = [[each.tolist() for each in image.machine.tables] for image in images]
+    assert tables[0] == tables[1]
+    assert images[0].model_hash != images[1].model_hash
+
+
+def test_a_frame_has_64_cycles_for_each_move_unless_others_are_asked_for():
+    a, b = (Symbol(name, IntegerType(0, 1)) for name in "AB")
+    network = JointDistribution("n", (potential([a, b], np.ones((2, 2))),)).ask(["A"], ["B"]).network()
+    many = replace(OPTIONS, target_count=10**7, burn_in=5)
+    assert plan_bm2(network, many).max_cycles == 64 * (5 + 10**7) * 2
+    assert plan_bm2(network, replace(many, max_cycles=5)).max_cycles == 5
+
+
 def test_the_same_network_gives_the_same_bytes(asia):
     arguments = ("--searched", "bronc", "--known", "smoke,dysp", "--partitions", "2", "--rng", "table")
     for name in ("one", "two"):
