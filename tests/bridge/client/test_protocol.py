@@ -313,7 +313,7 @@ CONTENTS = [{}, {"a": [1.5, None]}, {"a": {"msg": "cmsg"}}, nested(62), nested(6
 @pytest.mark.parametrize("encode", [lambda operation: json.dumps(operation).encode(), cbor2.dumps])
 def test_messages_with_a_known_envelope_are_read_like_the_first_one(encode, arrays):
     received = [encode({"op": "publish", "topic": "/a", "msg": msg}) for msg in CONTENTS]
-    received += [received[1] + b"\0", received[1][:-1], received[1] + received[1]]
+    received += [received[1] + b"\0", received[1][:-1], received[1][:-1] + b" ", received[1] + received[1]]
 
     def core():
         core = connected()
