@@ -136,6 +136,8 @@ class BM2Kind(MachineKind):
     def infer(self, results: Sequence[BoardResult], variables: Sequence[str] = ()) -> Inference:
         """Return the posterior of all chains; those that timed out are left out, and named in the details."""
         chains, every = [], [_kept(board) for board in results]
+        if len({(kept.parameters.cardinalities, kept.parameters.searched) for kept in every}) > 1:
+            raise MachineError("The results of the boards are those of different models.")
         for board, kept in zip(results, every, strict=True):
             parameters = kept.parameters
             words = np.frombuffer(b"".join([*kept.batches, board.words]), "<u4")
@@ -355,11 +357,14 @@ def _kept(board: BoardResult) -> Kept:
         raise MachineError(f"The result of a board has no record of its chain: {error}.") from error
     parameters = kept.parameters
     sizes = {len(words) for words in (*kept.batches, board.words)}
+    streamed = kept.samples if parameters.stream else 0
+    lowest_bit = 0 if board.reason == BM2StopReason.OPS_TIMEOUT else -1
     if (
         sizes != {4 * parameters.result_words}
-        or len(kept.stream) % (4 * parameters.state_words)
+        or len(kept.stream) != 4 * parameters.state_words * streamed
+        or not 0 <= kept.unused <= kept.samples
         or board.reason not in BM2.reasons
-        or not -1 <= kept.timed_out_bit < parameters.state_bits
+        or not lowest_bit <= kept.timed_out_bit < parameters.state_bits
     ):
         raise MachineError("The result of a board does not match the record of its chain.")
     return kept

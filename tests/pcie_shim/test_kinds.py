@@ -250,7 +250,7 @@ def test_a_time_out_of_a_variable_without_a_name_has_its_number():
     assert "variable 1" in BM2.infer(late, ("only",)).outcome
 
 
-@pytest.mark.parametrize("bit", [-2, 3])
+@pytest.mark.parametrize("bit", [-2, -1, 3])
 def test_a_time_out_on_a_bit_that_is_not_of_the_state_is_refused(bit):
     """The result came from a pipe; the state has three bits."""
     parameters = sprinkler().parameters
@@ -259,10 +259,28 @@ def test_a_time_out_on_a_bit_that_is_not_of_the_state_is_refused(bit):
         BM2.infer([BoardResult(bytes(4 * parameters.result_words), 9, BM2StopReason.OPS_TIMEOUT, kept=kept)])
 
 
+@pytest.mark.parametrize(("samples", "unused"), [(-5, 0), (2, 3), (2, -1)])
+def test_counts_of_samples_that_cannot_be_are_refused(samples, unused):
+    parameters = sprinkler().parameters
+    kept = msgspec.msgpack.encode(Kept(parameters, samples, unused))
+    with pytest.raises(MachineError, match="does not match"):
+        BM2.infer([BoardResult(bytes(4 * parameters.result_words), 9, BM2StopReason.SAMPLES, kept=kept)])
+
+
+def test_boards_of_different_models_are_refused():
+    boards = []
+    for machine in (sprinkler(), wide()):
+        kept = msgspec.msgpack.encode(Kept(machine.parameters))
+        empty = bytes(4 * machine.parameters.result_words)
+        boards.append(BoardResult(empty, 9, BM2StopReason.SAMPLES, kept=kept))
+    with pytest.raises(MachineError, match="different models"):
+        BM2.infer(boards)
+
+
 @pytest.mark.parametrize("size", [4, 8])
 def test_a_stream_is_of_whole_states(size):
     parameters = wide(stream=6).parameters
-    kept = msgspec.msgpack.encode(Kept(parameters, stream=bytearray(size)))
+    kept = msgspec.msgpack.encode(Kept(parameters, 1, stream=bytearray(size)))
     board = BoardResult(bytes(4 * parameters.result_words), 9, BM2StopReason.SAMPLES, kept=kept)
     with pytest.raises(MachineError, match="does not match") if size == 4 else contextlib.nullcontext():
         BM2.infer([board])
