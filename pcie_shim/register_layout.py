@@ -19,13 +19,20 @@ SETTINGS: Final = struct.Struct("<IQII")
 DONE_BLOCK: Final = struct.Struct("<IIQQ")
 """DONE, STATUS, CYCLES and COMPUTE_NS."""
 
-BLOCKS: Final = {block.name: block for block in rm.BLOCKS}
-"""The blocks of the map by the names that machine kinds use."""
-
 
 def next_doorbell(number: int) -> int:
     """Return the doorbell number after `number`: one more, modulo 2^32, skipping 0, which has no effect."""
     return number % ALL_ONES + 1
+
+
+def in_field(mask: int, value: int) -> int:
+    """Return the word with a value in the field of a mask."""
+    return value * (mask & -mask)
+
+
+def field_of(mask: int, word: int) -> int:
+    """Return the value in the field of a mask."""
+    return (word & mask) // (mask & -mask)
 
 
 def register_values(fields: Mapping[str, int]) -> dict[int, int]:
@@ -33,12 +40,12 @@ def register_values(fields: Mapping[str, int]) -> dict[int, int]:
     values: dict[int, int] = {}
     for name, value in fields.items():
         register, _, field = name.partition(".")
-        shift = getattr(rm, f"{register}_{field}_SHIFT") if field else 0
-        address = BLOCKS[register].address
-        values[address] = values.get(address, 0) | value << shift
+        shifted = in_field(getattr(rm, f"{register}_{field}_MASK"), value) if field else value
+        address = rm.BLOCKS[register]
+        values[address] = values.get(address, 0) | shifted
     return values
 
 
 def interface_room(registers: UsedRegisters) -> tuple[int, int]:
     """Return the maximum numbers of input words and result words in the map, if the inputs use these registers."""
-    return BLOCKS[registers.inputs].words, rm.RESULTS_WORDS
+    return rm.BLOCKS[registers.inputs].words, rm.RESULTS.words

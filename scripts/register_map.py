@@ -47,6 +47,22 @@ library ieee;
 """
 _WORD: Final = "std_logic_vector(31 downto 0)"
 _FULL: Final = 0xFFFFFFFF
+_BLOCK_CLASS: Final = '''\
+class Block(int):
+    """The address of a register, an array of registers or a memory: of 32-bit words from there on."""
+
+    words: int
+    writable: bool
+
+    def __new__(cls, address: int, words: int, *, writable: bool) -> "Block":
+        block = super().__new__(cls, address)
+        block.words, block.writable = words, writable
+        return block
+'''
+_BLOCKS: Final = (
+    "BLOCKS: Final = {name: each for name, each in tuple(globals().items()) if isinstance(each, Block)}",
+    '"""All of them by name, in the order of their addresses."""',
+)
 _ENUMERATIONS: Final = {"board_state", "error_code"}
 """Encodings in the constants module; the others belong to machine kinds, and are in `machines`."""
 
@@ -149,14 +165,14 @@ def _one_line(text: str | None) -> str:
 def module_text(register_map: RegisterMap) -> str:
     """Return the constants module."""
     lines = [
-        '"""The boards\' register map as constants: offsets in bytes, masks, shifts, encodings.',
+        '"""The boards\' register map as constants: addresses in bytes, masks of fields, encodings.',
         "",
         "Generated from hdl/bm_registers.rdl by scripts/registers: change that file, not this one. What",
         "each register means is in docs/reference/registers.md.",
         '"""',
         "",
         "from enum import IntEnum",
-        "from typing import Final, NamedTuple",
+        "from typing import Final",
         "",
         f'MAP_SHA256: Final = "{register_map.hash}"',
         f"BAR_SIZE: Final = {register_map.bar_size:#x}",
@@ -167,34 +183,15 @@ def module_text(register_map: RegisterMap) -> str:
         name = "".join(word.capitalize() for word in encoding.type_name.split("_"))
         lines += ["", "", f"class {name}(IntEnum):", f'    """Values of {user}."""', ""]
         lines += [f"    {each.name} = {int(each.value)}  # {_one_line(each.rdl_desc)}" for each in encoding]
-    lines += [
-        "",
-        "",
-        "class Block(NamedTuple):",
-        '    """A register, an array of registers or a memory: 32-bit words from `address` on."""',
-        "",
-        "    name: str",
-        "    address: int",
-        "    words: int",
-        "    writable: bool",
-        "",
-        "",
-    ]
+    lines += ["", "", _BLOCK_CLASS, ""]
     for block in register_map.blocks:
-        lines.append(f"{block.name}: Final = {block.address:#06x}")
-        if block.words > 1:
-            lines.append(f"{block.name}_WORDS: Final = {block.words}")
+        arguments = f"{block.address:#06x}, {block.words}, writable={'w' in block.access}"
+        lines.append(f"{block.name}: Final = Block({arguments})")
         if default := block.value():
             lines.append(f"{block.name}_VALUE: Final = {default:#x}")
         for field in block.fields if len(block.fields) > 1 else ():
-            lines.append(f"{block.name}_{field.name}_SHIFT: Final = {field.low}")
             lines.append(f"{block.name}_{field.name}_MASK: Final = {field.mask:#x}")
-    lines += ["", "BLOCKS: Final = ("]
-    for block in register_map.blocks:
-        lines.append(
-            f'    Block("{block.name}", {block.name}, {block.words}, writable={"w" in block.access}),'
-        )
-    return "\n".join([*lines, ")", ""])
+    return "\n".join([*lines, "", *_BLOCKS, ""])
 
 
 def document_text(register_map: RegisterMap) -> str:

@@ -30,6 +30,7 @@ from hdl.test.project import (
     SensorMode,
     Start,
     StopReason,
+    field_of,
     image_bytes,
     next_doorbell,
     reference_kernel,
@@ -192,9 +193,9 @@ class Both:
 
     async def compare_everything(self) -> None:
         """Compare all implemented words, and the first unimplemented word after each block."""
-        for block in rm.BLOCKS:
+        for block in rm.BLOCKS.values():
             for word in range(block.words):
-                if await self.read(block.address + 4 * word) is None and block.address not in _NOT_COMPARED:
+                if await self.read(block + 4 * word) is None and block not in _NOT_COMPARED:
                     break
 
     async def wait_for_seeds(self) -> None:
@@ -273,7 +274,7 @@ class Session:
             await both.finish()
             status = await both.read(rm.STATUS)
             assert status is not None
-            if (status & rm.STATUS_STOP_REASON_MASK) >> rm.STATUS_STOP_REASON_SHIFT != StopReason.SLICE:
+            if field_of(rm.STATUS_STOP_REASON_MASK, status) != StopReason.SLICE:
                 return
             due = next_doorbell(both.board.done)
             if self.chance(0.15) or not await self.resume():
@@ -404,7 +405,7 @@ class Session:
         places = [
             0x010,
             0x154 + 4,
-            rm.HALT + 4 * rm.HALT_WORDS,
+            rm.HALT + 4 * rm.HALT.words,
             rm.ID,
             rm.CAP_LINES,
             rm.STATUS,
@@ -554,12 +555,12 @@ class Session:
             mask = int(self.random.integers(2**p.replicas)) if self.chance(0.5) else 0
             if self.chance(0.1):
                 mask |= 1 << p.replicas
-            for word in range(rm.HALT_WORDS):
+            for word in range(rm.HALT.words):
                 await both.write(rm.HALT + 4 * word, mask >> 32 * word & 0xFFFFFFFF)
         if await both.write(rm.RESUME, due):
             return True
         # no replica can continue, or the mask halts a replica that does not exist
-        for word in range(rm.HALT_WORDS):
+        for word in range(rm.HALT.words):
             await both.write(rm.HALT + 4 * word, 0)
         return await both.write(rm.RESUME, due)
 

@@ -114,11 +114,11 @@ async def every_address(dut: Any) -> None:
     """Read and write every word of the map, and bytes between words, while idle and while running."""
     implemented = {"INPUTS": 9, "PRIOR_SELECTS": REPLICAS, "OUTCOMES": 4 * REPLICAS, "RESULTS": 12}
     kind: dict[int, bool] = {}
-    for block in rm.BLOCKS:
+    for name, block in rm.BLOCKS.items():
         # the other blocks of data are those of other images
-        words = block.words if block.address < rm.SENSORS else implemented.get(block.name, 0)
+        words = block.words if block < rm.SENSORS else implemented.get(name, 0)
         for word in range(words):
-            kind[block.address + 4 * word] = block.writable
+            kind[block + 4 * word] = block.writable
     random = np.random.default_rng(3)
     near = {address + step for address in kind for step in (-4, 0, 4)}
     near |= {int(word) * 4 for word in random.integers(rm.BAR_SIZE // 4, size=400)}

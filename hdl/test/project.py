@@ -17,7 +17,7 @@ from machines.reference import ReferenceBM1
 from pcie_shim import register_map
 from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.programming_file import Image, Partition, image_bytes
-from pcie_shim.register_layout import next_doorbell
+from pcie_shim.register_layout import field_of, next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode
 from toolchain.hardware import HDL, PARAMETERS, SOURCES, HardwareToolError, in_order, run_tool, verilog
 
@@ -46,6 +46,7 @@ __all__ = [
     "SensorMode",
     "Start",
     "StopReason",
+    "field_of",
     "image_bytes",
     "image_of",
     "image_of_parameters",

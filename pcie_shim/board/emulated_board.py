@@ -23,10 +23,10 @@ from pcie_shim.errors import ImageError, PcieShimError
 from pcie_shim.programming_file import Image, image_from_bytes
 from pcie_shim.register_layout import (
     ALL_ONES,
-    BLOCKS,
     DONE_BLOCK,
     SETTINGS,
     WORD,
+    in_field,
     next_doorbell,
     register_values,
 )
@@ -77,7 +77,7 @@ class EmulatedBoard:
         # words that an interrupt carries: from DONE on, and those that the image names.
         self._machine: BoardMachine | None = None
         self._blocks = {
-            block.name: self._view[block.address : block.address + 4 * block.words] for block in rm.BLOCKS
+            name: self._view[block : block + 4 * block.words] for name, block in rm.BLOCKS.items()
         }
         self._answer = [self._view[rm.DONE : rm.DONE + DONE_BLOCK.size]]
 
@@ -119,9 +119,8 @@ class EmulatedBoard:
         self._view[rm.MAP_HASH : rm.MAP_HASH + 32] = bytes.fromhex(rm.MAP_SHA256)
         self._latched.clear()
         self.done = 0
-        for block in rm.BLOCKS:
-            access = _READ_WRITE if block.writable else _READ
-            self._allow(block.address, block.words, access)
+        for block in rm.BLOCKS.values():
+            self._allow(block, block.words, _READ_WRITE if block.writable else _READ)
         for window in _DATA:
             self._allow(window.start, len(window) // 4, _NO_ACCESS)
 
@@ -172,11 +171,11 @@ class EmulatedBoard:
         for name, words in image.kind.contents(image.machine).items():
             self._blocks[name][: len(words)] = words
         self._answer[1:] = [self._blocks[name][: 4 * words] for name, words in registers.answer.items()]
-        self._allow(BLOCKS[registers.inputs].address, image.interface_sensors, _READ_WRITE)
+        self._allow(rm.BLOCKS[registers.inputs], image.interface_sensors, _READ_WRITE)
         for name, count in {**registers.answer, "RESULTS": image.interface_results}.items():
-            self._allow(BLOCKS[name].address, count, _READ)
+            self._allow(rm.BLOCKS[name], count, _READ)
         for name, count in registers.written.items():
-            self._allow(BLOCKS[name].address, count, _READ_WRITE)
+            self._allow(rm.BLOCKS[name], count, _READ_WRITE)
 
     def _measured_speed(self, image: Image, machine: BoardMachine) -> float:
         """Return the cycles per second of the slowest frame, and leave its inputs in the registers.
@@ -265,7 +264,7 @@ class EmulatedBoard:
     def _refuse(self, code: ErrorCode, detail: str) -> NoReturn:
         self._error = code
         (status,) = WORD.unpack_from(self._memory, rm.STATUS)
-        self._put(rm.STATUS, status & ~rm.STATUS_ERROR_MASK | code << rm.STATUS_ERROR_SHIFT)
+        self._put(rm.STATUS, status & ~rm.STATUS_ERROR_MASK | in_field(rm.STATUS_ERROR_MASK, code))
         raise RefusedError(code, detail)
 
     # ---- the machine ----------------------------------------------------------------------------------
@@ -366,9 +365,9 @@ class EmulatedBoard:
     def _publish(self, state: BoardState, reason: int, cycles: int) -> None:
         """Write the outcome to the registers."""
         status = (
-            state << rm.STATUS_STATE_SHIFT
-            | reason << rm.STATUS_STOP_REASON_SHIFT
-            | self._error << rm.STATUS_ERROR_SHIFT
+            in_field(rm.STATUS_STATE_MASK, state)
+            | in_field(rm.STATUS_STOP_REASON_MASK, reason)
+            | in_field(rm.STATUS_ERROR_MASK, self._error)
         )
         DONE_BLOCK.pack_into(self._memory, rm.DONE, self.done, status, cycles, self._compute_ns)
 
@@ -388,8 +387,6 @@ class EmulatedBoard:
 
 _LONG_LOW: Final = frozenset({rm.CYCLES, rm.COMPUTE_NS})
 _DATA: Final = tuple(
-    range(block.address, block.address + 4 * block.words)
-    for block in rm.BLOCKS
-    if block.address >= rm.SENSORS
+    range(block, block + 4 * block.words) for block in rm.BLOCKS.values() if block >= rm.SENSORS
 )
 """The blocks after the registers, of which a board has the words that its image uses."""

@@ -11,7 +11,7 @@ from pcie_shim.board.emulated_board import CHUNK_S, EmulatedBoard, RefusedError
 from pcie_shim.board.simulation import MOST_WORDS, Simulation
 from pcie_shim.errors import ImageError, SimulationError
 from pcie_shim.programming_file import Image, image_from_bytes
-from pcie_shim.register_layout import ALL_ONES, BLOCKS, DONE_BLOCK, SETTINGS, WORD
+from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, SETTINGS, WORD, field_of
 from pcie_shim.register_map import BoardState, ErrorCode
 
 LOAD_S: Final = 20.0
@@ -186,7 +186,7 @@ class RtlBoard:
     def _refuse(self, address: int, *, is_first: bool) -> NoReturn:
         """Refuse an access with the error that the hardware reports for one of its words."""
         status = self._word(rm.STATUS)
-        code = ErrorCode((status & rm.STATUS_ERROR_MASK) >> rm.STATUS_ERROR_SHIFT)
+        code = ErrorCode(field_of(rm.STATUS_ERROR_MASK, status))
         if code is ErrorCode.OUTSIDE and not is_first:
             code = ErrorCode.TOO_LONG  # the hardware sees single words
         raise RefusedError(code, _DETAILS.get(code, f"the hardware refuses the access to {address:#06x}"))
@@ -215,7 +215,7 @@ class RtlBoard:
         # DONE comes second: the machine may stop between the two reads
         status = self._word(rm.STATUS)
         self.done = self._word(rm.DONE)
-        self.running = status & rm.STATUS_STATE_MASK == BoardState.RUNNING << rm.STATUS_STATE_SHIFT
+        self.running = field_of(rm.STATUS_STATE_MASK, status) == BoardState.RUNNING
 
     def interrupt_words(self) -> bytes:
         """Return the payload of an interrupt: DONE to COMPUTE_NS, and the blocks that the image names."""
@@ -223,7 +223,7 @@ class RtlBoard:
         if self._image is None:
             return words
         blocks = self._image.registers.answer.items()
-        return words + b"".join(self.read(BLOCKS[name].address, count) for name, count in blocks)
+        return words + b"".join(self.read(rm.BLOCKS[name], count) for name, count in blocks)
 
     def release(self) -> None:
         """Stop a running machine and disable interrupts, because the host has disconnected."""
@@ -277,7 +277,7 @@ def _measure_speed(simulation: Simulation, image: Image) -> float:
     """Return the clocks per second of the slowest frame."""
     host = image.kind.on_host([image.machine])
     course = host.begin(host.slowest())
-    places = [(BLOCKS[name].address, words) for name, words in course.starts[0].items()]
+    places = [(rm.BLOCKS[name], words) for name, words in course.starts[0].items()]
     for address, words in [*places, (rm.TARGET_COUNT, SETTINGS.pack(*course.settings))]:
         for at, (word,) in enumerate(WORD.iter_unpack(words)):
             simulation.write(address + 4 * at, word)

@@ -23,7 +23,7 @@ from pcie_shim.errors import (
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import Done, RegisterWrite, SocketLink
 from pcie_shim.programming_file import Image
-from pcie_shim.register_layout import ALL_ONES, BLOCKS, SETTINGS, next_doorbell, register_values
+from pcie_shim.register_layout import ALL_ONES, SETTINGS, next_doorbell, register_values
 from pcie_shim.register_map import BoardState
 
 _ASSUMED_SPEED: Final = 1e4  # cycles per second of a board that does not report its speed
@@ -90,7 +90,7 @@ class DrivenBoard:
         self._forget()
         link = self._identified(timeout, connect_timeout)
         try:
-            held = link.read_block(rm.IMAGE_HASH, rm.IMAGE_HASH_WORDS)
+            held = link.read_block(rm.IMAGE_HASH, rm.IMAGE_HASH.words)
             if not any(held) or (self._reprogram and held.hex() != self.image.image_hash):
                 # with the token, because this host holds the board
                 program(self.endpoint, self.image, timeout=programming_timeout, token=link.token)
@@ -128,7 +128,7 @@ class DrivenBoard:
                 f"The device at {self.endpoint} is not a board: its ID is {identity:#010x} instead of {rm.ID_VALUE:#010x}, "
                 f"and its LIVENESS register is {'alive' if alive else 'dead'}"
             )
-        map_hash = link.read_block(rm.MAP_HASH, rm.MAP_HASH_WORDS).hex()
+        map_hash = link.read_block(rm.MAP_HASH, rm.MAP_HASH.words).hex()
         if map_hash != rm.MAP_SHA256:
             raise GreetingMismatchError(
                 f"The board at {self.endpoint} has register map {map_hash}, this software has "
@@ -136,7 +136,7 @@ class DrivenBoard:
             )
 
     def _check_image(self, link: SocketLink) -> None:
-        found = link.read_block(rm.IMAGE_HASH, rm.IMAGE_HASH_WORDS).hex()
+        found = link.read_block(rm.IMAGE_HASH, rm.IMAGE_HASH.words).hex()
         if found != self.image.image_hash:
             raise ImageMismatchError(
                 f"The board at {self.endpoint} holds image {found}, the deployment's is "
@@ -152,7 +152,7 @@ class DrivenBoard:
         # these decide how long a result is, and where its parts are
         for address, value in register_values(registers.capabilities).items():
             if theirs[address] != value:
-                name = next(name for name, block in BLOCKS.items() if block.address == address)
+                name = next(name for name, block in rm.BLOCKS.items() if block == address)
                 raise ImageMismatchError(
                     f"The board at {self.endpoint} has {name} {theirs[address]:#x}, the deployment's image has {value:#x}: "
                     "program it with the loader, or restart it"
@@ -198,7 +198,7 @@ class DrivenBoard:
         writes: list[RegisterWrite] = []
         for name, words in blocks.items():
             if self._blocks.get(name) != words:
-                writes.append((BLOCKS[name].address, words))
+                writes.append((rm.BLOCKS[name], words))
                 self._blocks[name] = words
         return writes
 

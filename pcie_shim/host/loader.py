@@ -49,7 +49,7 @@ def program(
             link.post_part(offset, padded)
         _request(link, framing.END, len(content), b"")
         identity = link.read32(register_map.ID)
-        found = link.read_block(register_map.IMAGE_HASH, register_map.IMAGE_HASH_WORDS).hex()
+        found = link.read_block(register_map.IMAGE_HASH, register_map.IMAGE_HASH.words).hex()
     # the board may have loaded something else than it was sent
     if identity != register_map.ID_VALUE or found != expected:
         raise ImageMismatchError(

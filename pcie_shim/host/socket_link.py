@@ -40,7 +40,7 @@ from pcie_shim.errors import (
     StaleHandleError,
 )
 from pcie_shim.framing import Frame, Octets
-from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, WORD
+from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, WORD, field_of
 from pcie_shim.register_map import ErrorCode
 
 LONGEST_POLL_S: Final = 3600.0
@@ -71,12 +71,12 @@ class Done(NamedTuple):
     @property
     def state(self) -> int:
         """STATUS.STATE."""
-        return self.status & register_map.STATUS_STATE_MASK
+        return field_of(register_map.STATUS_STATE_MASK, self.status)
 
     @property
     def reason(self) -> int:
         """STATUS.STOP_REASON."""
-        return (self.status & register_map.STATUS_STOP_REASON_MASK) >> register_map.STATUS_STOP_REASON_SHIFT
+        return field_of(register_map.STATUS_STOP_REASON_MASK, self.status)
 
 
 _ENDS_S: Final = 1.0

@@ -197,7 +197,7 @@ def test_accesses_are_answered_and_refused_alike(parameters, compiled_into):
     emulated, simulated = both_boards(of, compiled_into)
     random = np.random.default_rng(2)
     places = [
-        *(block.address for block in rm.BLOCKS),
+        *rm.BLOCKS.values(),
         *(inputs, inputs + 4 * 19, inputs + 4 * 21),
         *(rm.RESULTS, rm.RESULTS + 4 * 1199, rm.RESULTS + 4 * 1200),
         *(rm.PRIOR_CODES, rm.PRIOR_SELECTS, rm.OUTCOMES, rm.ID + 2, rm.BAR_SIZE - 4, rm.BAR_SIZE, 0xFFFFFFFC),

@@ -52,8 +52,8 @@ def test_the_encodings_are_the_machines_numbers():
 
 def test_blocks_neither_overlap_nor_outgrow_a_frame():
     end = 0
-    for block in register_map.BLOCKS:
-        assert block.address >= end
+    for block in register_map.BLOCKS.values():
+        assert block >= end
         assert block.words <= MAX_PAYLOAD_WORDS
-        end = block.address + 4 * block.words
+        end = block + 4 * block.words
     assert end <= register_map.BAR_SIZE

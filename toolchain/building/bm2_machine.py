@@ -10,7 +10,7 @@ from machines import KINDS
 from machines.bm2 import CHAINS_MAX, FACTOR_BITS_MAX, BM2Machine, BM2Parameters, start_state
 from machines.errors import MachineError, ParameterError
 from machines.parameters import RngKind
-from pcie_shim.register_layout import BLOCKS
+from pcie_shim import register_map as rm
 from toolchain.building.machine import (
     BoardLayout,
     LineBlock,
@@ -66,7 +66,7 @@ def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was aske
         )
     except ParameterError as reason:
         raise refused_parameter(reason) from reason
-    room = BLOCKS["STREAM"].words // parameters.state_words
+    room = rm.STREAM.words // parameters.state_words
     if parameters.stream > room:
         raise BuildError(
             f"--stream {parameters.stream}: a sample of this model has {counted(parameters.state_words, 'word')}, and the "
@@ -103,7 +103,7 @@ def _check_sizes(model: NetworkModel) -> None:
             f"{model.titles[widest]} is over {widths[widest]} bits, so its CDE needs {codes[widest]} codes; the maximum "
             f"is {limit}: give its variables fewer values, or fix one with --given"
         )
-    room, words = BLOCKS["RESULTS"].words, sum(1 << width for width in bits.values())
+    room, words = rm.RESULTS.words, sum(1 << width for width in bits.values())
     joint = 1 << sum(bits[each.label] for each in model.searched)
     if words + joint > room:
         largest = max(model.symbols, key=lambda each: each.size)

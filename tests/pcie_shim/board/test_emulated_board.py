@@ -15,7 +15,7 @@ from pcie_shim import register_map as rm
 from pcie_shim.board import emulated_board
 from pcie_shim.board.emulated_board import CHUNK_S, EmulatedBoard, RefusedError
 from pcie_shim.programming_file import image_bytes
-from pcie_shim.register_layout import next_doorbell
+from pcie_shim.register_layout import field_of, next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode
 from tests.pcie_shim.boards import image, machine, never_stopping, words
 
@@ -95,7 +95,7 @@ def test_capabilities_are_the_images():
     board = programmed(of)
     found = read(board, rm.CAP_MACHINE)
     assert found & rm.CAP_MACHINE_KIND_MASK == 1
-    assert found >> rm.CAP_MACHINE_RNG_SHIFT & 255 == 3
+    assert field_of(rm.CAP_MACHINE_RNG_MASK, found) == 3
     assert found & rm.CAP_MACHINE_SHARED_MASK
     assert found & rm.CAP_MACHINE_FREE_MASK
     assert not found & rm.CAP_MACHINE_PRIOR_WRITTEN_MASK

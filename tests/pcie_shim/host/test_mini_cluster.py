@@ -45,6 +45,7 @@ from pcie_shim.host.driven_board import DrivenBoard
 from pcie_shim.host.loader import program
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.host.socket_link import Done
+from pcie_shim.register_layout import in_field
 from pcie_shim.register_map import BoardState
 from tests.patience import PATIENCE, PROCESS_PATIENCE
 from tests.pcie_shim.boards import (
@@ -391,7 +392,8 @@ def test_a_board_of_another_register_map_is_refused(start_board):
 def test_an_interrupt_has_exactly_the_results_of_its_board(words):
     board = DrivenBoard(0, parse_endpoint("unix:/nowhere"), images(1, (3,))[0])
     board.waiting = True
-    status = BoardState.DONE << rm.STATUS_STATE_SHIFT | StopReason.OVERFLOW << rm.STATUS_STOP_REASON_SHIFT
+    status = in_field(rm.STATUS_STATE_MASK, BoardState.DONE)
+    status |= in_field(rm.STATUS_STOP_REASON_MASK, StopReason.OVERFLOW)
     done = Done(board.number, status, 9, 100, memoryview(bytes(4 * (3 + words))))
     with pytest.raises(ShortReadError) if words else contextlib.nullcontext():
         board._take(done)

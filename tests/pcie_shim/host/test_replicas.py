@@ -20,6 +20,7 @@ from pcie_shim.host.driven_board import DrivenBoard
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.host.socket_link import Done
 from pcie_shim.programming_file import Image, image_bytes
+from pcie_shim.register_layout import in_field
 from pcie_shim.register_map import BoardState, ErrorCode
 from tests.patience import PATIENCE
 from tests.pcie_shim.boards import board_fails, expected_of_replicas, image, images, machine, opened, words
@@ -225,7 +226,8 @@ def test_a_replica_that_stopped_for_an_unknown_reason_breaks_the_link(reason):
     board.waiting = True
     outcomes = np.array([(StopReason.MAX_CYCLES, 0, 9), (reason, 0, 9)], OUTCOME).tobytes()
     results = bytes(4 * part.registers.result_words)
-    status = BoardState.DONE << rm.STATUS_STATE_SHIFT | StopReason.MAX_CYCLES << rm.STATUS_STOP_REASON_SHIFT
+    status = in_field(rm.STATUS_STATE_MASK, BoardState.DONE)
+    status |= in_field(rm.STATUS_STOP_REASON_MASK, StopReason.MAX_CYCLES)
     done = Done(board.number, status, 9, 100, memoryview(results + outcomes))
     is_known = reason is StopReason.MAX_CYCLES
     with contextlib.nullcontext() if is_known else pytest.raises(FramingError, match="replica"):
