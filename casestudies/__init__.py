@@ -3,7 +3,7 @@
 This module has their common errors, and the common flags of their commands.
 """
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Final
 
 import typer
 
@@ -29,3 +29,11 @@ Uri = Annotated[
 DEFAULT_URI = "ws://127.0.0.1:9090"
 FirstTimeout = Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")]
 Timeout = Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")]
+KEPT: Final = 2000
+"""Number of frames that a viewer keeps for pictures and numbers if it runs until Ctrl-C."""
+Count = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Exit after this many results.", show_default=f"at Ctrl-C; the last {KEPT} are drawn"
+    ),
+]

@@ -5,22 +5,23 @@ from pathlib import Path
 from typing import Any, Final
 
 from terminal.errors import OutputError
+from terminal.output import check_writable
 
 _DPI: Final = 130
 
 
-def check_pictures_possible() -> None:
-    """Raise an OutputError if matplotlib is missing, so that a long run does not end without its pictures."""
+def check_pictures_possible(folder: Path) -> None:
+    """Raise an OutputError before a long run if matplotlib is missing, or the pictures' folder cannot be written."""
     if find_spec("matplotlib") is None:
         raise OutputError(
             "the pictures need matplotlib, which is not installed: run pip install matplotlib, "
             "or leave out --out"
         )
+    check_writable(folder)
 
 
 def new_figure(width: float, height: float) -> Any:
     """Return a figure of this size in inches, made without pyplot, which would need a display and keep state."""
-    check_pictures_possible()
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")

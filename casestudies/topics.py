@@ -6,7 +6,7 @@ import json
 import os
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -17,15 +17,17 @@ from bridge.client import Publication, Ros, Subscription
 from bridge.errors import DisconnectedError, SlowPeerError
 from bridge.names import same_type
 from bridge.stamps import stamp_ns
-from posteriors.errors import BadResultError
+from posteriors.errors import BadResultError, NoResultError
 from posteriors.frame_report import FrameReport
 from posteriors.listening import Posteriors, posteriors
 from posteriors.pairing import FrameOutcome
 from posteriors.posterior import Posterior
+from terminal.errors import ExitCode, StoppedError
 from terminal.health import resources, serve_health
 from terminal.one_line import shown
 from terminal.output import say, warn
 from terminal.run_directory import status_directory
+from terminal.signals import run_async
 
 RECENT_S: Final = 10.0
 """Seconds without work after which a process is not ready."""
@@ -69,6 +71,17 @@ async def serve_readiness(name: str, readiness: Readiness) -> AsyncIterator[None
     directory = status_directory(Path(given) if given else None, name)
     async with serve_health(directory, name, answer):
         yield
+
+
+def run_viewer(watching: Coroutine[Any, Any, None], finish: Callable[[], None]) -> None:
+    """Run a viewer, and finish it when it ends, also by Ctrl-C or because no more results come."""
+    try:
+        run_async(watching)
+    except (NoResultError, StoppedError) as ended:
+        if isinstance(ended, NoResultError) or ended.exit_code == ExitCode.INTERRUPTED:
+            finish()
+        raise
+    finish()
 
 
 SETTLED_S: Final = 3.0

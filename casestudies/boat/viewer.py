@@ -3,28 +3,25 @@
 import math
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from casestudies import DEFAULT_URI, FirstTimeout, Timeout, Uri
+from casestudies import DEFAULT_URI, KEPT, Count, FirstTimeout, Timeout, Uri
 from casestudies.boat.sensors import TRUE_POSE_TOPIC
 from posteriors.errors import NoResultError
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
-from terminal.errors import ExitCode, StoppedError
 from terminal.output import check_writable, say, warn, write_json
-from terminal.signals import run_async
 
 if TYPE_CHECKING:
     from casestudies.topics import Instance, Truth
 
 POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
-KEPT: Final = 2000
-"""Number of frames that a viewer keeps for pictures and numbers if it runs until Ctrl-C."""
 HEADING: Final = "frame     true y, x     mean y, x  distance     cycles   time (ms)"
 
 
@@ -232,14 +229,7 @@ app = CommandLine()
 @app.command(epilog="`boat-viewer --uri ws://127.0.0.1:9090 --count 25 --out out`")
 def boat_viewer(
     uri: Uri = DEFAULT_URI,
-    count: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Exit after this many results.",
-            show_default=f"at Ctrl-C, with the last {KEPT} in pictures and numbers",
-        ),
-    ] = None,
+    count: Count = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -263,28 +253,21 @@ def boat_viewer(
     It subscribes to /BMresults, /bm/frame and the topic of the true pose, and needs nothing else.
     """
     from casestudies.pictures import check_pictures_possible
+    from casestudies.topics import run_viewer
 
     viewer = Viewer(count)
     if out is not None:
-        check_pictures_possible()
-        check_writable(out)
+        check_pictures_possible(out)
     if numbers is not None:
         check_writable(numbers.parent)
-    try:
-        run_async(
-            viewer.watch(
-                uri,
-                truth_topic=truth_topic,
-                truth_tolerance_s=truth_tolerance,
-                first_limit_s=first_timeout,
-                limit_s=timeout,
-            )
-        )
-    except (NoResultError, StoppedError) as ended:
-        if isinstance(ended, NoResultError) or ended.exit_code == ExitCode.INTERRUPTED:
-            _finish(viewer, out, numbers)
-        raise
-    _finish(viewer, out, numbers)
+    watching = viewer.watch(
+        uri,
+        truth_topic=truth_topic,
+        truth_tolerance_s=truth_tolerance,
+        first_limit_s=first_timeout,
+        limit_s=timeout,
+    )
+    run_viewer(watching, partial(_finish, viewer, out, numbers))
 
 
 def _finish(viewer: Viewer, out: Path | None, numbers: Path | None) -> None:

@@ -8,38 +8,29 @@ from typing import Annotated
 import typer
 
 from casestudies import DEFAULT_URI, Uri
-from casestudies.sprinkler.model import GRASS_TOPIC, ON, RAIN, TRUTH_TOPIC, TYPE, WET
+from casestudies.sprinkler.model import GRASS_TOPIC, ON, RAIN, TYPE, WET
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import say
 from terminal.signals import run_async
 
-Rain = Annotated[
-    float, typer.Option(min=0.001, max=0.999, help="P(R = 1), as the model was built with --set rain=.")
-]
-
 
 class Garden:
     """A garden whose mornings are drawn from the model; two gardens with the same seed have the same mornings."""
 
-    def __init__(self, seed: int, rain: float = RAIN) -> None:
-        """Begin before the first morning; `rain` is P(R = 1)."""
+    def __init__(self, seed: int) -> None:
+        """Begin before the first morning."""
         self._random = random.Random(seed)
-        self._rain = rain
 
     def morning(self) -> tuple[int, int, int]:
         """Return R, S and G of the next morning."""
-        r = int(self._random.random() < self._rain)
+        r = int(self._random.random() < RAIN)
         s = int(self._random.random() < ON[r])
         return r, s, int(self._random.random() < WET[s][r])
 
 
 async def publish_mornings(uri: str, *, garden: Garden, rate: float, count: int | None = None) -> None:
-    """Publish the truth and then the grass of `count` mornings, or of all until cancelled.
-
-    Raises:
-        BridgeError: No rosbridge server answers at the URI.
-    """
+    """Publish the grass of `count` mornings, or of all until cancelled; a BridgeError if no server answers at the URI."""
     from bridge.client import connect
     from casestudies.topics import LossyPublication, Readiness, serve_readiness
 
@@ -48,14 +39,12 @@ async def publish_mornings(uri: str, *, garden: Garden, rate: float, count: int 
         serve_readiness("sprinkler-garden", readiness),
         connect(uri, retry=True, on_state=report_connection(uri)) as ros,
     ):
-        truth = LossyPublication(await ros.advertise(TRUTH_TOPIC, TYPE))
         grass = LossyPublication(await ros.advertise(GRASS_TOPIC, TYPE))
         begin = time.monotonic()
         step = 0
         while count is None or step < count:
-            r, s, g = garden.morning()
-            await truth.publish({"data": r + 2 * s + 4 * g})
-            if await grass.publish({"data": g}):
+            *_, wet = garden.morning()
+            if await grass.publish({"data": wet}):
                 readiness.record()
             step += 1
             await asyncio.sleep(begin + step / rate - time.monotonic())
@@ -73,12 +62,11 @@ def sprinkler_garden(
     ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Mornings per second.")] = 10.0,
     count: Annotated[int | None, typer.Option(min=1, help="Exit after this many mornings.")] = None,
-    rain: Rain = RAIN,
 ) -> int:
-    """Publish whether the grass is wet, morning after morning, and the true state on /sprinkler/truth."""
+    """Publish whether the grass is wet, morning after morning."""
     chosen = random.SystemRandom().randrange(1_000_000) if seed is None else seed
     say(f"sprinkler-garden: seed {chosen}, {rate:g} mornings a second on {GRASS_TOPIC}, {uri}")
-    return run_async(publish_mornings(uri, garden=Garden(chosen, rain), rate=rate, count=count))
+    return run_async(publish_mornings(uri, garden=Garden(chosen), rate=rate, count=count))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ R: it has rained; S: the sprinkler was on; G: the grass is wet.
 from functools import cache
 from typing import Final
 
-from toolchain.errors import ModelError
 from toolchain.models import JointDistribution, LabelType, Question, Symbol, table
 
 RAIN: Final = 0.2
@@ -18,30 +17,19 @@ WET: Final = ((0.0, 0.8), (0.9, 0.99))
 
 GRASS_TOPIC: Final = "/sprinkler/grass"
 """Topic of G, the reading."""
-TRUTH_TOPIC: Final = "/sprinkler/truth"
-"""Topic of the true state R + 2 S + 4 G, packed as the machine packs it."""
 TYPE: Final = "std_msgs/UInt8"
-"""Type of both topics, which every ROS server has installed."""
+"""Its type, which every ROS server has installed."""
 
 
-def model(rain: float = RAIN) -> Question:
-    """Return the question P(R | G).
-
-    Args:
-        rain: P(R = 1).
-
-    Raises:
-        ModelError: `rain` is not between 0 and 1.
-    """
-    if not 0 < rain < 1:
-        raise ModelError(f"rain is {rain}, expected a probability between 0 and 1")
+def model() -> Question:
+    """Return the question P(R | G)."""
     rained = Symbol("R", LabelType("no", "yes"))
     sprinkler = Symbol("S", LabelType("off", "on"))
     grass = Symbol("G", LabelType("dry", "wet"), path="data")
     joint = JointDistribution(
         "sprinkler",
         (
-            table(rained, [1 - rain, rain]),
+            table(rained, [1 - RAIN, RAIN]),
             table(sprinkler, [[1 - p for p in ON], ON], given=[rained]),
             table(grass, [[[1 - p for p in row] for row in WET], WET], given=[sprinkler, rained]),
         ),
@@ -50,6 +38,6 @@ def model(rain: float = RAIN) -> Question:
 
 
 @cache
-def exact_rain(grass: int, rain: float = RAIN) -> float:
+def exact_rain(grass: int) -> float:
     """Return P(R = 1 | G = grass) by exact inference: 0.3577 for wet grass."""
-    return float(model(rain).network().exact((grass,))[1])
+    return float(model().network().exact((grass,))[1])

@@ -1,11 +1,11 @@
 """Viewer of the sprinkler's samples: the estimates of P(R | G) from them, and their picture; it needs only topics."""
 
-import asyncio
 import base64
 import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -15,24 +15,19 @@ from numpy.typing import NDArray
 
 from bridge.client import Subscription, connect
 from bridge.errors import NoMessageError
-from casestudies import DEFAULT_URI, FirstTimeout, Timeout, Uri
+from casestudies import DEFAULT_URI, KEPT, Count, FirstTimeout, Timeout, Uri
 from casestudies.pictures import check_pictures_possible, new_figure, save_figure
-from casestudies.sprinkler.garden import Rain
-from casestudies.sprinkler.model import RAIN, TRUTH_TOPIC, TYPE, exact_rain
-from casestudies.topics import Readiness, serve_readiness
+from casestudies.sprinkler.model import exact_rain
+from casestudies.topics import Readiness, run_viewer, serve_readiness
 from posteriors.errors import NoResultError
 from posteriors.listening import posteriors
 from posteriors.posterior import SAMPLES_TOPIC, SAMPLES_TYPE, Posterior
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
-from terminal.errors import ExitCode, StoppedError
-from terminal.output import check_writable, say, warn
-from terminal.signals import run_async
+from terminal.output import say, warn
 from toolchain.errors import counted
 
 PICTURE: Final = "sprinkler.png"
-KEPT: Final = 2000
-"""Number of frames that a viewer keeps for the picture if it runs until Ctrl-C."""
 HEADING: Final = "frame  grass  P(R = 1)   error   exact  effective samples"
 GRASS: Final = ("dry", "wet")
 """The states of G."""
@@ -52,16 +47,12 @@ class Frame:
     """G."""
     share: float
     """P(R = 1) on `/BMresults`."""
+    error: float
+    """Its standard error on `/bm/frame`; 0.5, the largest one, if it is not stated."""
     effective: float
-    """Effective sample size on `/bm/frame`."""
+    """Effective samples on `/bm/frame`; 1 if they are not stated."""
     curve: NDArray[np.int64]
     """int64[points, 2]: the number of samples so far, and of those with R = 1; the last point is the whole frame."""
-
-    @property
-    def error(self) -> float:
-        """Standard error of `share`; not 0 if all samples are equal."""
-        share = (self.share * self.effective + 1) / (self.effective + 2)
-        return math.sqrt(share * (1 - share) / self.effective)
 
 
 def frame_of(posterior: Posterior, samples: NDArray[np.uint8]) -> Frame:
@@ -73,6 +64,7 @@ def frame_of(posterior: Posterior, samples: NDArray[np.uint8]) -> Frame:
         number=posterior.number or 0,
         grass=int(samples[0, 0]) >> 2 & 1,
         share=float(posterior.marginal("R")[1]),
+        error=float(details.get("standard_error", 0.5)),
         effective=max(float(details.get("effective_samples", 1)), 1.0),
         curve=np.stack([at, rained[at - 1]], axis=1),
     )
@@ -91,12 +83,8 @@ def mean_and_error(frames: Sequence[Frame]) -> tuple[float, float]:
     return mean, math.sqrt(math.fsum(frame.error**2 for frame in frames)) / len(frames)
 
 
-def draw(path: Path, frames: Sequence[Frame], rain: float = RAIN) -> None:
-    """Draw the running estimates over the samples, next to the estimate of each frame.
-
-    Raises:
-        OutputError: matplotlib is missing, or the file cannot be written.
-    """
+def draw(path: Path, frames: Sequence[Frame]) -> None:
+    """Draw the running estimates over the samples, next to the estimate of each frame, or raise an OutputError."""
     figure = new_figure(11, 4.6)
     running, each = figure.subplots(1, 2, sharey=True)
     for grass, (name, colour) in enumerate(zip(GRASS, _COLOURS, strict=True)):
@@ -109,7 +97,7 @@ def draw(path: Path, frames: Sequence[Frame], rain: float = RAIN) -> None:
         before = np.cumsum([(0, 0), *(frame.curve[-1] for frame in here[:-1])], axis=0)
         samples, rained = np.concatenate([f.curve + b for f, b in zip(here, before, strict=True)]).T
         running.plot(samples, rained / samples, color=colour, linewidth=1.8, label=f"all frames, {name}")
-        exact = exact_rain(grass, rain)
+        exact = exact_rain(grass)
         per_effective = float(np.mean([frame.curve[-1, 0] / frame.effective for frame in here]))
         axis = np.geomspace(1, samples[-1], _POINTS)
         half = 2 * np.sqrt(exact * (1 - exact) * per_effective / axis)
@@ -144,18 +132,13 @@ class Viewer:
     Attributes:
         frames: The frames that say something new, the newest last.
         results: The number of results, with those whose samples are lost or those of an earlier frame.
-        repeated: The number of frames with the very samples of an earlier one: the banks of seeds have come round.
-        mornings: For dry and for wet grass, the number of mornings in the garden, and of those after rain.
     """
 
-    def __init__(self, count: int | None, rain: float) -> None:
+    def __init__(self, count: int | None) -> None:
         """Start without frames; `count` is the number of results to wait for, None to run until Ctrl-C."""
         self.frames: deque[Frame] = deque(maxlen=KEPT if count is None else None)
         self.results = 0
-        self.repeated = 0
-        self.mornings = [[0, 0], [0, 0]]
         self._count = count
-        self._rain = rain
         self._seen: set[int] = set()
         self._unclaimed: list[NDArray[np.uint8]] = []  # samples without their frame, in the order of arrival
 
@@ -173,18 +156,13 @@ class Viewer:
             connect(uri, retry=True, on_state=report_connection(uri)) as ros,
             posteriors(ros) as heard,
             ros.subscribe(SAMPLES_TOPIC, SAMPLES_TYPE) as samples,
-            ros.subscribe(TRUTH_TOPIC, TYPE) as truths,
         ):
             say(f"sprinkler-viewer: listening to {uri}")
             print(HEADING, flush=True)
-            counting = asyncio.create_task(self._count_mornings(truths))
-            try:
-                while self._count is None or self.results < self._count:
-                    posterior = await heard.next(limit_s if self.results else first_limit_s)
-                    self.add(posterior, await self._samples_of(posterior, samples, limit_s))
-                    readiness.record()
-            finally:
-                counting.cancel()
+            while self._count is None or self.results < self._count:
+                posterior = await heard.next(limit_s if self.results else first_limit_s)
+                self.add(posterior, await self._samples_of(posterior, samples, limit_s))
+                readiness.record()
 
     def add(self, posterior: Posterior, samples: NDArray[np.uint8] | None) -> None:
         """Add a result with its samples, None if they are lost, and print its line."""
@@ -195,12 +173,14 @@ class Viewer:
         frame = frame_of(posterior, samples)
         print(
             f"{frame.number:>5}  {GRASS[frame.grass]:>5}  {frame.share:8.4f}  {frame.error:6.4f}  "
-            f"{exact_rain(frame.grass, self._rain):6.4f}  {frame.effective:17.0f}",
+            f"{exact_rain(frame.grass):6.4f}  {frame.effective:17.0f}",
             flush=True,
         )
         digest = hash(samples.tobytes())
         if digest in self._seen:
-            self.repeated += 1
+            warn(
+                f"frame {frame.number} has the samples of an earlier one, and is left out: use more --rng-banks"
+            )
         else:
             self._seen.add(digest)
             self.frames.append(frame)
@@ -223,28 +203,17 @@ class Viewer:
                 raise NoResultError(f"{error}: was the deployment built with --stream?") from None
             self._unclaimed.append(read_samples(message.msg))
 
-    async def _count_mornings(self, truths: Subscription) -> None:
-        async for message in truths:
-            state = int(message.msg["data"])
-            morning = self.mornings[state >> 2 & 1]
-            morning[0] += 1
-            morning[1] += state & 1
-
     def finish(self, out: Path | None) -> None:
         """Print the estimates, and draw the picture."""
-        for grass, (mornings, rainy) in enumerate(self.mornings):
+        for grass, name in enumerate(GRASS):
             if here := [frame for frame in self.frames if frame.grass == grass]:
                 mean, error = mean_and_error(here)
                 print(
-                    f"{GRASS[grass]} grass: P(R = 1 | G = {grass}) is {mean:.4f} +- {error:.4f} in "
-                    f"{counted(len(here), 'frame')}, and {exact_rain(grass, self._rain):.4f} exactly; "
-                    f"it had rained on {rainy} of {mornings} mornings"
+                    f"{name} grass: P(R = 1 | G = {grass}) is {mean:.4f} +- {error:.4f} in "
+                    f"{counted(len(here), 'frame')}, and {exact_rain(grass):.4f} exactly"
                 )
-        if self.repeated:
-            repeated = counted(self.repeated, "repetition")
-            print(f"{repeated} of an earlier frame's samples left out: build with more --rng-banks")
         if out is not None and self.frames:
-            draw(out / PICTURE, self.frames, self._rain)
+            draw(out / PICTURE, self.frames)
             print(f"wrote {out / PICTURE}")
 
 
@@ -254,36 +223,21 @@ app = CommandLine()
 @app.command(epilog="`sprinkler-viewer --uri ws://127.0.0.1:9090 --count 25 --out out`")
 def sprinkler_viewer(
     uri: Uri = DEFAULT_URI,
-    count: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Exit after this many results.",
-            show_default=f"at Ctrl-C, with the last {KEPT} in the picture",
-        ),
-    ] = None,
+    count: Count = None,
     out: Annotated[
         Path | None, typer.Option(help=f"Write {PICTURE} into this folder.", file_okay=False)
     ] = None,
-    rain: Rain = RAIN,
     first_timeout: FirstTimeout = 60.0,
     timeout: Timeout = 30.0,
 ) -> None:
     """Show P(R = 1) of each frame and its error next to the exact value, and draw how the estimates converge.
 
-    It subscribes to /BMresults, /bm/frame, /bm/samples and /sprinkler/truth, and needs nothing else.
+    It subscribes to /BMresults, /bm/frame and /bm/samples, and needs nothing else.
     """
-    viewer = Viewer(count, rain)
+    viewer = Viewer(count)
     if out is not None:
-        check_pictures_possible()
-        check_writable(out)
-    try:
-        run_async(viewer.watch(uri, first_limit_s=first_timeout, limit_s=timeout))
-    except (NoResultError, StoppedError) as ended:
-        if isinstance(ended, NoResultError) or ended.exit_code == ExitCode.INTERRUPTED:
-            viewer.finish(out)
-        raise
-    viewer.finish(out)
+        check_pictures_possible(out)
+    run_viewer(viewer.watch(uri, first_limit_s=first_timeout, limit_s=timeout), partial(viewer.finish, out))
 
 
 if __name__ == "__main__":
