@@ -9,6 +9,8 @@ import argparse
 import math
 import sys
 import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -18,12 +20,22 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from casestudies.mrclam.model import Landmark, LandmarkReading, model, read_landmarks, unquantised_posterior
+from casestudies.mrclam.model import (
+    BEARING_SIGMA,
+    FLOOR,
+    RANGE_SIGMA,
+    X_LIMITS,
+    Y_LIMITS,
+    Landmark,
+    model,
+    read_landmarks,
+)
 from casestudies.mrclam.player import RecordedFrame, area_grid, median_distance, play, read_recording
 from scripts.running.flags import ScriptParser
 from scripts.running.processes import ROOT, Process, build, run_script
 from toolchain.deployment.address import to_address
-from toolchain.models import Model, exact_posterior
+from toolchain.models import Model, cell_centres, exact_posterior, interval
+from toolchain.models.model import fuse
 
 TOPIC, TYPE = "/mrclam/sightings", "mrclam_msgs/Sightings"
 RECORDINGS = ("ds1_robot3.csv", "ds1_robot5.csv")
@@ -34,6 +46,45 @@ MAX_CYCLES = 2**22
 
 Figures = dict[str, Any]
 """One robot's run with one model, by column; distances are in metres, the exact ones from float64 inference."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LandmarkReading:
+    """A reading of one landmark: metres and radians (absolute, any turn), or None if it was not seen."""
+
+    range_m: float | None = None
+    bearing_rad: float | None = None
+
+
+def unquantised_posterior(
+    landmarks: Sequence[Landmark],
+    readings: Sequence[LandmarkReading],
+    *,
+    width: int = 32,
+    height: int = 32,
+    floor: float = FLOOR,
+) -> NDArray[np.float64]:
+    """Return the posterior over the cells, float64[width * height] with line = y * width + x.
+
+    There is one reading for each landmark, in the same order. The density of outliers is the floor everywhere,
+    relative to the peak. Without a floor, readings that are impossible on every line raise a ModelError.
+    """
+    y, x = cell_centres(interval("y", *Y_LIMITS, cells=height), interval("x", *X_LIMITS, cells=width))
+    factors = []
+    for landmark, reading in zip(landmarks, readings, strict=True):
+        if reading.range_m is not None:
+            away = reading.range_m - np.hypot(landmark.x - x, landmark.y - y)
+            factors.append(_likelihood(away / RANGE_SIGMA, floor))
+        if reading.bearing_rad is not None:
+            away = reading.bearing_rad - np.arctan2(landmark.y - y, landmark.x - x)
+            away = (away + np.pi) % (2 * np.pi) - np.pi
+            factors.append(_likelihood(away / BEARING_SIGMA, floor))
+    return fuse(np.ones(width * height), factors)
+
+
+def _likelihood(z: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
+    likelihood: NDArray[np.float64] = np.exp(-0.5 * z**2) + floor
+    return likelihood
 
 
 def exact_distance(

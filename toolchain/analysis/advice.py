@@ -4,22 +4,21 @@ Both machines are emulated on readings drawn from the model, and run longer unti
 inference is as asked. A machine that does not reach it within `MOST_CYCLES` says how near it came.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from statistics import median
 from time import perf_counter
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 
+from machines.bm1 import BM1Machine
 from machines.parameters import SensorMode
-from toolchain.analysis import with_unit
+from toolchain.analysis import AdviceOptions, with_unit
 from toolchain.analysis.accuracy import Accuracy, measure
 from toolchain.analysis.emulation import EmulatedBoards
-from toolchain.analysis.logic import device_named
+from toolchain.analysis.logic import Device, device_named
 from toolchain.analysis.readings import sample_readings
 from toolchain.analysis.resources import Estimate, boards_needed, estimate
 from toolchain.analysis.sampling import Addresses, SampledBoards, chain_resources, drawn_readings
@@ -31,13 +30,8 @@ from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import ToolchainError
 from toolchain.models.joint import Question
-
-if TYPE_CHECKING:
-    from machines.bm1 import BM1Machine
-    from toolchain.analysis import AdviceOptions
-    from toolchain.analysis.logic import Device
-    from toolchain.models.model import Model
-    from toolchain.models.network import NetworkModel
+from toolchain.models.model import Model
+from toolchain.models.network import NetworkModel
 
 MOST_CYCLES: Final = 30_000_000
 """Maximum number of cycles of a frame, because their emulation takes time."""

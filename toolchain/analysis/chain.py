@@ -6,27 +6,20 @@ runs approach. The codes are those of the machine, so all that quantising and cl
 sample is taken as the state after a sweep, also where a machine takes one after every move.
 """
 
-from __future__ import annotations
-
 import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from machines.bm2 import start_state
+from machines.bm2 import BM2Machine, BM2Parameters, start_state
 from machines.parameters import SampleEvery, Sequencer
 from toolchain.errors import ModelError
 from toolchain.models.inference import eliminate, product
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from machines.bm2 import BM2Machine, BM2Parameters
-    from toolchain.models.network import NetworkModel
+from toolchain.models.network import NetworkModel
 
 MOST_BITS: Final = 9
 """Maximum number of unknown bits: the matrix of a sweep has 2**bits rows and columns."""

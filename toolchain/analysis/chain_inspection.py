@@ -1,26 +1,21 @@
 """Inspection of a BM2's deployment: sizes, cycles, accuracy and resources, as text or as a JSON object."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from machines.bm2 import BM2Machine
-from toolchain.analysis import with_unit
+from toolchain.analysis import InspectOptions, Progress, with_unit
 from toolchain.analysis.chain import ChainError, chain_error
 from toolchain.analysis.logic import device_named
 from toolchain.analysis.resources import Estimate
 from toolchain.analysis.sampling import Sampled, SampledBoards, chain_resources, drawn_readings
 from toolchain.building.build import read_images
+from toolchain.deployment import Deployment
 from toolchain.errors import BuildError, counted
-
-if TYPE_CHECKING:
-    from toolchain.analysis import InspectOptions, Progress
-    from toolchain.deployment import Deployment
-    from toolchain.models.network import NetworkModel
+from toolchain.models.network import NetworkModel
 
 _FRAMES: Final = 20
 

@@ -5,23 +5,17 @@ A unit's cost is fitted to the synthesis of small machines by GHDL and yosys (`s
 into memory LABs.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from machines.bm1_kind import BM1
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
 from toolchain.errors import BuildError
 from toolchain.outputs.memories import generators
 from toolchain.outputs.mif import LENGTH
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from machines.parameters import BM1Parameters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,33 +5,25 @@ board. Logic is estimated; energy is estimated from toggles of nets, with the sa
 assumed constants are listed.
 """
 
-from __future__ import annotations
-
 import math
 from bisect import bisect_left
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from machines.bm1 import Start, addressed_codes
+from machines.bm1 import BM1Machine, Start, addressed_codes
 from machines.bm1_kind import BM1
 from machines.encode import decode_code
-from machines.parameters import SensorMode
+from machines.parameters import BM1Parameters, SensorMode
 from pcie_shim.register_layout import interface_room
 from toolchain.analysis.emulation import one_replica
-from toolchain.analysis.logic import MLAB_ALMS, MLAB_SHARE, Logic, Memories, logic_of, place_memories
+from toolchain.analysis.logic import MLAB_ALMS, MLAB_SHARE, Device, Logic, Memories, logic_of, place_memories
+from toolchain.analysis.readings import Readings
 from toolchain.building.machine import partition_lines
 from toolchain.errors import BuildError
 from toolchain.outputs.mif import LENGTH, table_length
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from machines.bm1 import BM1Machine
-    from machines.parameters import BM1Parameters
-    from toolchain.analysis.logic import Device
-    from toolchain.analysis.readings import Readings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,12 +1,10 @@
 """Runs of a BM2 on drawn readings, compared with exact inference, and its resources on an FPGA."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -22,6 +20,7 @@ from toolchain.analysis.logic import (
     MLAB_ALMS,
     MLAB_SHAPE,
     WORD_BITS,
+    Device,
     Logic,
     LogicPart,
     Memories,
@@ -32,10 +31,7 @@ from toolchain.analysis.readings import check_frames
 from toolchain.analysis.resources import Estimate
 from toolchain.deployment import Dimension
 from toolchain.errors import BuildError
-
-if TYPE_CHECKING:
-    from toolchain.analysis.logic import Device
-    from toolchain.models.network import NetworkModel
+from toolchain.models.network import NetworkModel
 
 _INFINITE: Final = 1e9
 Addresses = tuple[int, ...]

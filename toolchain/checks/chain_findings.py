@@ -4,14 +4,14 @@ Zeros of a factor are clipped to the smallest chance that a code can express, so
 What that costs is computed exactly where the states are few; elsewhere a finding says that it was not.
 """
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from machines.bm2 import BM2Machine, unpack
 from machines.parameters import PROB_BITS_MAX, RngKind, RngReset, SampleEvery
@@ -21,14 +21,8 @@ from toolchain.analysis.logic import BLOCK_SHAPES, blocks_of, device_named
 from toolchain.building.bm2_machine import clipped
 from toolchain.checks.findings import Check, Finding, Severity, error, note, reading, warning
 from toolchain.checks.generators import relations
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import NDArray
-
-    from toolchain.deployment import Deployment
-    from toolchain.models.network import NetworkModel
+from toolchain.deployment import Deployment
+from toolchain.models.network import NetworkModel
 
 _LARGE_ERROR: Final = 0.01
 """Total variation from which an error is a warning."""

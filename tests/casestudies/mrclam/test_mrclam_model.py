@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from casestudies.mrclam.model import Landmark, LandmarkReading, model, read_landmarks, unquantised_posterior
+from casestudies.mrclam.model import Landmark, model, read_landmarks
 from casestudies.mrclam.player import area_grid
 from machines.encode import decode_code
+from scripts.benches.mrclam import LandmarkReading, unquantised_posterior
 from toolchain.building.quantise import quantise
 from toolchain.deployment.address import to_address
 from toolchain.errors import ModelError
