@@ -186,18 +186,7 @@ class BM2Kind(MachineKind):
         self, machines: Sequence[BM2Machine], frame: FrameInput, variables: Sequence[str] = ()
     ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
         """Run the chains one after the other in this process, as boards run them."""
-        # a stream changes nothing but the way of the samples to the host
-        kernels = [
-            make_bm2_kernel(replace(machine, parameters=replace(machine.parameters, stream=0)))
-            for machine in machines
-        ]
-        results = []
-        for kernel, ended in zip(kernels, run_batches(kernels, frame), strict=True):
-            *batches, words = (each.astype("<u4").tobytes() for each in ended)
-            parameters, bit = kernel.machine.parameters, kernel.timed_out_bit
-            kept = msgspec.msgpack.encode(Kept(parameters, kernel.samples, kernel.unused, bit, batches))
-            results.append(BoardResult(words, kernel.cycles, kernel.reason, kept=kept))
-        inference = self.infer(results, variables)
+        inference = self.infer(run_batches(kernels_of(machines), frame), variables)
         if inference.posterior is None:
             raise NoPosteriorError(f"There is {inference.outcome}.")
         return inference.posterior, inference.details
@@ -239,33 +228,36 @@ def _start_of(
     )
 
 
-def run_batches(kernels: Sequence[BM2Kernel], frame: FrameInput) -> list[list[npt.NDArray[np.uint32]]]:
-    """Run a frame on kernels without a stream, one after the other, in the batches in which boards run it.
+def kernels_of(machines: Sequence[BM2Machine]) -> list[BM2Kernel]:
+    """Return the kernels for `run_batches`; a stream changes nothing but the way of the samples to the host."""
+    return [
+        make_bm2_kernel(replace(machine, parameters=replace(machine.parameters, stream=0)))
+        for machine in machines
+    ]
 
-    Args:
-        kernels: One for each board, in the order of the chains.
-        frame: The readings and settings.
 
-    Returns:
-        The result words of each kernel at the end of each batch.
+def run_batches(kernels: Sequence[BM2Kernel], frame: FrameInput) -> list[BoardResult]:
+    """Run a frame on the kernels of all boards, one after the other, in the batches in which boards run it.
 
     Raises:
         StartError: The frame does not fit the machines.
     """
-    machines = [kernel.machine for kernel in kernels]
-    starts, settings = _OnHost(machines).starts(frame)
+    starts, settings = _OnHost([kernel.machine for kernel in kernels]).starts(frame)
     first, *others = _batch_ends(settings.target_count)
-    ended = []
+    results = []
     for kernel, blocks in zip(kernels, starts, strict=True):
-        kernel.start(_start_of(kernel.machine.parameters, blocks, settings._replace(target_count=first)))
+        parameters = kernel.machine.parameters
+        kernel.start(_start_of(parameters, blocks, settings._replace(target_count=first)))
         batches = [kernel.results]
         for target in others:
             if kernel.reason is not BM2StopReason.SAMPLES:
                 break
             kernel.resume(target)
             batches.append(kernel.results)
-        ended.append(batches)
-    return ended
+        *before, words = (each.astype("<u4").tobytes() for each in batches)
+        kept = Kept(parameters, kernel.samples, kernel.unused, kernel.timed_out_bit, before)
+        results.append(BoardResult(words, kernel.cycles, kernel.reason, kept=msgspec.msgpack.encode(kept)))
+    return results
 
 
 def _batch_ends(samples: int, batches: int = BATCHES) -> list[int]:

@@ -21,7 +21,7 @@ from toolchain.analysis.emulation import EmulatedBoards
 from toolchain.analysis.logic import Device, device_named
 from toolchain.analysis.readings import sample_readings
 from toolchain.analysis.resources import Estimate, boards_needed, estimate
-from toolchain.analysis.sampling import Addresses, SampledBoards, chain_resources, drawn_readings
+from toolchain.analysis.sampling import Addresses, chain_resources, drawn_readings, run_chains
 from toolchain.building.bm2_machine import chain_machines, plan_bm2
 from toolchain.building.choice import network_for
 from toolchain.building.machine import partition_lines, plan_machine, whole_machine
@@ -102,38 +102,19 @@ class Advice:
     def report(self) -> str:
         """Return the advice as a table and sentences."""
         exact = f"Exact inference on this host: {with_unit(self.exact_seconds, 's')}."
-        time = f"time at {with_unit(self.clock_hz, 'Hz')}"
-        columns = [
-            [
-                "",
-                "bits of a code",
-                "target count or samples",
-                "total variation",
-                "cycles of a frame",
-                time,
-                "boards",
-                "ALMs of a board",
-                "its memory blocks",
-            ]
-        ]
-        for each in self.machines:
-            if not each.refused:
-                cells = [
-                    each.machine,
-                    str(each.prob_bits),
-                    f"{each.setting:,}",
-                    f"{each.total_variation:.4f}",
-                    f"{each.cycles:,.0f}",
-                    with_unit(each.seconds, "s"),
-                    str(each.boards),
-                    f"{each.alms:,.0f}",
-                    f"{each.blocks:,}",
-                ]
-                columns.append(cells)
-        rows = [
-            f"{name:23}" + "".join(f"{cell:>14}" for cell in cells)
-            for name, *cells in zip(*columns, strict=True)
-        ]
+        shown = [each for each in self.machines if not each.refused]
+        cells = {
+            "": [each.machine for each in shown],
+            "bits of a code": [str(each.prob_bits) for each in shown],
+            "target count or samples": [f"{each.setting:,}" for each in shown],
+            "total variation": [f"{each.total_variation:.4f}" for each in shown],
+            "cycles of a frame": [f"{each.cycles:,.0f}" for each in shown],
+            f"time at {with_unit(self.clock_hz, 'Hz')}": [with_unit(each.seconds, "s") for each in shown],
+            "boards": [str(each.boards) for each in shown],
+            "ALMs of a board": [f"{each.alms:,.0f}" for each in shown],
+            "its memory blocks": [f"{each.blocks:,}" for each in shown],
+        }
+        rows = [f"{name:23}" + "".join(f"{cell:>14}" for cell in row) for name, row in cells.items()]
         for each in self.machines:
             if each.refused or each.unfit:
                 rows.append(f"{each.machine}: {each.refused or f'on a {self.device} {each.unfit}'}.")
@@ -221,10 +202,9 @@ def _bm2(
     """Run a BM2 with the default options on one board."""
     plan = plan_bm2(network, _NO_ROBOT)
     machines = chain_machines(plan)
-    boards = SampledBoards(machines, plan.max_cycles)
 
     def run(samples: int) -> tuple[float, float]:
-        found = boards.measure(readings, samples, network)
+        found = run_chains(machines, readings, network, samples=samples, max_cycles=plan.max_cycles)
         return found.total_variation.value if found.total_variation else 1.0, found.cycles.median.value
 
     best = _run_until(run, 1000, options.accuracy)

@@ -11,7 +11,7 @@ from toolchain.analysis import InspectOptions, Progress, with_unit
 from toolchain.analysis.chain import ChainError, chain_error
 from toolchain.analysis.logic import device_named
 from toolchain.analysis.resources import Estimate
-from toolchain.analysis.sampling import Sampled, SampledBoards, chain_resources, drawn_readings
+from toolchain.analysis.sampling import Sampled, chain_resources, drawn_readings, run_chains
 from toolchain.building.build import read_images
 from toolchain.deployment import Deployment
 from toolchain.errors import BuildError, counted
@@ -117,9 +117,15 @@ def inspect_chain(
         source = f"{frames} frames drawn from the model (seed {options.seed})"
         readings = drawn_readings(model, frames, options.seed)
         exact = chain_error(machine, model, samples=limits.target_count)
-    boards = SampledBoards(machines, limits.max_cycles)
     with progress(len(readings)) as advance:
-        sampled = boards.measure(readings, limits.target_count, model, lambda: advance("frames"))
+        sampled = run_chains(
+            machines,
+            readings,
+            model,
+            samples=limits.target_count,
+            max_cycles=limits.max_cycles,
+            advance=lambda: advance("frames"),
+        )
     return ChainInspection(
         deployment=deployment,
         machine=machine,

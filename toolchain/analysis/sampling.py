@@ -8,10 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from machines import make_bm2_kernel
 from machines.bm2 import BM2Machine
-from machines.bm2_estimate import Chain, estimate, searched_counts
-from machines.bm2_kind import run_batches
+from machines.bm2_kind import BM2, kernels_of, run_batches
 from machines.kind import FrameInput
 from machines.parameters import SampleEvery
 from toolchain.analysis.accuracy import Cycles, Interval, bootstrap
@@ -81,67 +79,47 @@ class Sampled:
     reasons: Mapping[str, int]
 
 
-class SampledBoards:
-    """Boards that each run a chain of the same machine."""
-
-    def __init__(self, machines: Sequence[BM2Machine], max_cycles: int) -> None:
-        # a stream changes nothing but the way of the samples to the host
-        self.machines = [
-            replace(machine, parameters=replace(machine.parameters, stream=0)) for machine in machines
-        ]
-        self._kernels = [make_bm2_kernel(machine) for machine in self.machines]
-        self._max_cycles = max_cycles
-
-    def run(self, addresses: Addresses, bank: int, samples: int) -> tuple[list[Chain], int]:
-        """Run a frame in batches like the host; return the chains and the cycles of the longest-running board."""
-        p = self.machines[0].parameters
+def run_chains(
+    machines: Sequence[BM2Machine],
+    readings: Sequence[Addresses],
+    model: NetworkModel | None,
+    *,
+    samples: int,
+    max_cycles: int,
+    advance: Callable[[], None] = lambda: None,
+) -> Sampled:
+    """Run every reading on boards with these machines; a BuildError if none of them gives a posterior."""
+    p, kernels = machines[0].parameters, kernels_of(machines)
+    rows, reasons = [], Counter[str]()
+    for number, addresses in enumerate(readings):
         frame = FrameInput(
-            addresses=addresses, target_count=samples, max_cycles=self._max_cycles, bank=bank % p.rng_banks
+            addresses=addresses, target_count=samples, max_cycles=max_cycles, bank=number % p.rng_banks
         )
-        ended = run_batches(self._kernels, frame)
-        chains = [
-            Chain(kernel.reason, searched_counts(p, np.array(batches)))
-            for kernel, batches in zip(self._kernels, ended, strict=True)
-        ]
-        return chains, max(kernel.cycles for kernel in self._kernels)
-
-    def measure(
-        self,
-        readings: Sequence[Addresses],
-        samples: int,
-        model: NetworkModel | None,
-        advance: Callable[[], None] = lambda: None,
-    ) -> Sampled:
-        """Run every reading and compare with the model; a BuildError if no reading gives a posterior."""
-        p = self.machines[0].parameters
-        rows, reasons = [], Counter[str]()
-        for frame, addresses in enumerate(readings):
-            chains, cycles = self.run(addresses, frame, samples)
-            reasons.update(chain.reason.name.lower() for chain in chains)
-            found = estimate(chains)
-            if (posterior := found.posterior) is not None:
-                exact = posterior if model is None else model.exact(addresses)
-                rows.append((distance(posterior, exact), found.effective_samples, found.r_hat, cycles))
-            advance()
-        if not rows:
-            ends = ", ".join(f"{name} {count}" for name, count in sorted(reasons.items()))
-            raise BuildError(f"none of the readings gives a posterior; boards stopped by: {ends}")
-        distances, effective, r_hat, lengths = np.nan_to_num(
-            np.array(rows, dtype=np.float64), posinf=_INFINITE
-        ).T
-        percentile = bootstrap(lengths, lambda a, **k: np.quantile(a, 0.95, **k))
-        sweeps = p.burn_in + samples if p.sample_every is SampleEvery.SWEEP else 0
-        return Sampled(
-            frames=len(rows),
-            total_variation=None if model is None else bootstrap(distances, np.mean),
-            cycles=Cycles(
-                median=bootstrap(lengths, np.median), percentile_95=percentile, worst=int(lengths.max())
-            ),
-            sweep_cycles=float(lengths.mean() / sweeps) if sweeps else 0.0,
-            effective_samples=(float(np.median(effective)), float(effective.min())),
-            r_hat=float(np.median(r_hat)),
-            reasons=dict(reasons),
-        )
+        found = BM2.infer(run_batches(kernels, frame))
+        reasons.update(kernel.reason.name.lower() for kernel in kernels)
+        if found.posterior is not None:
+            exact = found.posterior if model is None else model.exact(addresses)
+            details = (float(found.details.get(key, 0)) for key in ("effective_samples", "r_hat"))
+            cycles = max(kernel.cycles for kernel in kernels)
+            rows.append((distance(found.posterior, exact), *details, cycles))
+        advance()
+    if not rows:
+        ends = ", ".join(f"{name} {count}" for name, count in sorted(reasons.items()))
+        raise BuildError(f"none of the readings gives a posterior; boards stopped by: {ends}")
+    distances, effective, r_hat, lengths = np.nan_to_num(np.array(rows), posinf=_INFINITE).T
+    percentile = bootstrap(lengths, lambda a, **k: np.quantile(a, 0.95, **k))
+    sweeps = p.burn_in + samples if p.sample_every is SampleEvery.SWEEP else 0
+    return Sampled(
+        frames=len(rows),
+        total_variation=None if model is None else bootstrap(distances, np.mean),
+        cycles=Cycles(
+            median=bootstrap(lengths, np.median), percentile_95=percentile, worst=int(lengths.max())
+        ),
+        sweep_cycles=float(lengths.mean() / sweeps) if sweeps else 0.0,
+        effective_samples=(float(np.median(effective)), float(effective.min())),
+        r_hat=float(np.median(r_hat)),
+        reasons=dict(reasons),
+    )
 
 
 def chain_resources(machine: BM2Machine, device: Device) -> Estimate:

@@ -49,14 +49,7 @@ class CheckedChain:
     @property
     def names(self) -> tuple[str, ...]:
         """The names of the machine's variables."""
-        if self.model is not None:
-            return self.model.names
-        p, deployment = self.machine.parameters, self.deployment
-        own = [*(each.name for each in deployment.variables), *(each.label for each in deployment.searched)]
-        named = dict(enumerate(deployment.machine.variables)) | dict(
-            zip((*p.known, *p.searched), own, strict=True)
-        )
-        return tuple(named.get(at, f"variable {at}") for at in range(len(p.cardinalities)))
+        return self.deployment.machine.variables
 
     @property
     def titles(self) -> tuple[str, ...]:

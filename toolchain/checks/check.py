@@ -42,30 +42,21 @@ def check_model(
     fit: Callable[[MachinePlan], MachinePlan] = lambda plan: plan,
 ) -> list[Finding]:
     """Return the findings about a model and its machine, the worst first; `fit` may give a BM1 more boards."""
-    if isinstance(model, NetworkModel):
-        return _check_network(model, options)
     refused: list[Finding] = []
     try:  # besides, so that both mistakes are found at once
-        partition_lines(model.lines, options.partitions)
+        if isinstance(model, Model):
+            partition_lines(model.lines, options.partitions)
     except ToolchainError as reason:
         refused.append(refusal(reason, "the partitions"))
     try:
-        plan = plan_machine(model, options)
+        plan = plan_machine(model, options) if isinstance(model, Model) else plan_bm2(model, options)
         if refused:
             return refused
-        built = assemble(fit(plan))
+        built = assemble(fit(plan) if isinstance(plan, MachinePlan) else plan)
     except ToolchainError as reason:
         return [*refused, refusal(reason, "the machine")]
     losses = loss_findings(built.quantised, options) if built.quantised is not None else ()
     return _sorted([*_check(built.deployment, built.images, model), *losses])
-
-
-def _check_network(model: NetworkModel, options: BuildOptions) -> list[Finding]:
-    try:
-        built = assemble(plan_bm2(model, options))
-    except ToolchainError as reason:
-        return [refusal(reason, "the machine")]
-    return _sorted(_check(built.deployment, built.images, model))
 
 
 def check_deployment(directory: Path) -> list[Finding]:

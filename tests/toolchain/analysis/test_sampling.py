@@ -8,7 +8,7 @@ import pytest
 from tests.toolchain.chains import machine_of, network, sprinkler
 from toolchain.analysis.chain import ExactChain
 from toolchain.analysis.logic import device_named
-from toolchain.analysis.sampling import SampledBoards, chain_resources, drawn_readings
+from toolchain.analysis.sampling import chain_resources, drawn_readings, run_chains
 from toolchain.errors import BuildError
 
 DEVICE = device_named("proce-v-d8")
@@ -28,7 +28,7 @@ def test_readings_are_drawn_from_their_joint_distribution():
 def test_runs_approach_exact_inference():
     model = sprinkler()
     machine = machine_of(model)
-    found = SampledBoards([machine], 2**40).measure([(0,), (1,)], 200_000, model)
+    found = run_chains([machine], [(0,), (1,)], model, samples=200_000, max_cycles=2**40)
     assert found.frames == 2
     assert found.total_variation.value < 0.02
     cycles = [ExactChain(machine, {2: grass}).cycles for grass in (0, 1)]
@@ -40,7 +40,7 @@ def test_runs_approach_exact_inference():
 def test_two_boards_start_apart_and_are_compared():
     model = network({"AB": [[1, 0], [0, 1]], "BC": [[1, 0], [0, 1]]}, searched=("A",))
     machines = [machine_of(model, chain=chain, chains=2, stream=8) for chain in (0, 1)]
-    found = SampledBoards(machines, 2**40).measure([()], 100, model)
+    found = run_chains(machines, [()], model, samples=100, max_cycles=2**40)
     assert found.total_variation.value < 0.05  # each is stuck where it started, at 0 and at 1
     assert found.r_hat == 1e9
     assert found.effective_samples[1] <= 200
@@ -48,13 +48,12 @@ def test_two_boards_start_apart_and_are_compared():
 
 def test_boards_that_do_not_finish():
     model = sprinkler()
-    boards = SampledBoards([machine_of(model)], 20_000)
-    assert boards.measure([(1,)], 10**6, model).reasons == {"max_cycles": 1}
-    timed_out = SampledBoards([machine_of(model, ops_timeout=1)], 2**40)
+    ended = run_chains([machine_of(model)], [(1,)], model, samples=10**6, max_cycles=20_000)
+    assert ended.reasons == {"max_cycles": 1}
     with pytest.raises(BuildError, match="none of the readings gives a posterior"):
-        timed_out.measure([(1,)], 100, model)
+        run_chains([machine_of(model, ops_timeout=1)], [(1,)], model, samples=100, max_cycles=2**40)
     impossible = network({"AB": [[1, 0], [1, 0]]}, known=("B",), searched=("A",))
-    found = SampledBoards([machine_of(impossible)], 2**40).measure([(0,), (1,)], 100, None)
+    found = run_chains([machine_of(impossible)], [(0,), (1,)], None, samples=100, max_cycles=2**40)
     assert (found.frames, found.total_variation) == (1, None)
     assert found.reasons == {"samples": 1, "impossible": 1}
 
