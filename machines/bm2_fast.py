@@ -98,11 +98,7 @@ class Chain(NamedTuple):
 
 
 class FastBM2(BM2Kernel):
-    """A kernel for a machine with LFSRs that looks at many cycles at a time (thesis 2.1.3).
-
-    Raises:
-        MachineError: The generators of the machine are not LFSRs.
-    """
+    """A kernel that looks at many cycles at a time (thesis 2.1.3); a MachineError unless the generators are LFSRs."""
 
     def __init__(self, machine: BM2Machine) -> None:
         super().__init__(machine)

@@ -109,11 +109,7 @@ class BM2Kernel(ABC):
         return self._continue(pause_at)
 
     def step(self, pause_at: int = 0) -> BM2StopReason:
-        """Continue after a pause.
-
-        Raises:
-            StartError: The machine is not paused, or `pause_at` is not a later cycle; nothing has changed.
-        """
+        """Continue after a pause; a StartError, and no change, without a pause or a later `pause_at`."""
         if self.reason is not BM2StopReason.PAUSED:
             raise StartError(
                 f"The machine is not paused: it has stopped with reason {self.reason.name.lower()}."
@@ -143,11 +139,7 @@ class BM2Kernel(ABC):
 
 
 def check_bm2_start(parameters: BM2Parameters, start: BM2Start) -> None:
-    """Refuse a start that does not fit the machine.
-
-    Raises:
-        StartError: A value does not fit; the sentence names it and its range.
-    """
+    """Raise a StartError, which names the value and its range, if a start does not fit the machine."""
     for name, value, lowest, highest in (
         ("state", start.state, 0, (1 << parameters.state_bits) - 1),
         ("known", start.known, 0, (1 << parameters.state_bits) - 1),

@@ -133,11 +133,7 @@ class BM1Kernel(ABC):
 
 
 def check_start(parameters: BM1Parameters, start: Start) -> None:
-    """Refuse a start that does not fit the machine.
-
-    Raises:
-        StartError: A value does not fit; the sentence names it and its range.
-    """
+    """Raise a StartError, which names the value and its range, if a start does not fit the machine."""
     if not _are_plain_addresses(parameters, start.addresses):
         _check_inputs(parameters, start.addresses)
     if isinstance(start.prior_address, tuple):

@@ -212,11 +212,7 @@ class BM1Parameters:
         return (1 << self.counter_bits) - 1
 
     def missing_address(self, column: int) -> int:
-        """Return the address of a missing reading in sensor column `column` (1..N): the top one.
-
-        Raises:
-            ParameterError: The column is not a sensor column.
-        """
+        """Return the address of a missing reading in sensor column `column` (1..N), or raise a ParameterError."""
         if not 1 <= column <= self.sensors:
             raise ParameterError(f"There is no sensor column {column}: this machine has 1 to {self.sensors}.")
         return (1 << self.sensor_bits[column - 1]) - 1

@@ -40,11 +40,7 @@ def joint_posterior(
 def posterior_of_lines(
     counts: npt.NDArray[np.uint32], lines: Sequence[int], cycles: Sequence[int]
 ) -> npt.NDArray[np.float64] | None:
-    """Return the `joint_posterior` of concatenated counts: uint32[all lines], board after board.
-
-    Raises:
-        MachineError: A board has counts without cycles.
-    """
+    """Return the `joint_posterior` of concatenated counts, uint32[all lines], or raise a MachineError as it does."""
     if min(cycles) <= 0:
         end = 0
         for board, (own, run) in enumerate(zip(lines, cycles, strict=True)):

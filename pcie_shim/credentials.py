@@ -45,11 +45,7 @@ def board_proof(key: bytes, board_nonce: bytes, host_nonce: bytes) -> bytes:
 
 
 def read_key(path: Path) -> bytes:
-    """Read a file with a key.
-
-    Raises:
-        CredentialsError: The file cannot be read, other users may read it, or it is not a key.
-    """
+    """Read a key; a CredentialsError if the file cannot be read, is not a key, or other users may read it."""
     try:
         mode = path.stat().st_mode
         with path.open("rb") as file:

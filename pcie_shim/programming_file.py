@@ -240,11 +240,7 @@ def read_image(path: Path) -> Image:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read the bytes of a file for `image_from_bytes`, up to the maximum that it accepts.
-
-    Raises:
-        ImageError: The file cannot be read.
-    """
+    """Read the bytes of a file, at most as many as `image_from_bytes` accepts, or raise an ImageError."""
     try:
         with path.open("rb") as file:
             # one byte more than allowed, to detect a file that is too large

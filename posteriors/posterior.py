@@ -69,11 +69,7 @@ class Posterior:
         return self.sizes[0] if self.labels[0] == REPLICA else 1
 
     def replica(self, at: int) -> "Posterior":
-        """Return the posterior of one replica, without the dimension `replica`.
-
-        Raises:
-            LabelError: The replica does not exist, or has no posterior because all its counts are 0.
-        """
+        """Return the posterior of one replica, without that dimension, or raise a LabelError if it has none."""
         if not 0 <= at < self.replicas:
             raise LabelError(f"there is no replica {at}: expected 0 to {self.replicas - 1}")
         if self.labels[0] != REPLICA:

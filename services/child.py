@@ -137,11 +137,7 @@ class Child:
         self.restarts = 0
 
     async def start(self) -> None:
-        """Start the process in its own session, so that Ctrl-C in a terminal reaches only the parent.
-
-        Raises:
-            StackError: The command is not installed.
-        """
+        """Start it in its own session, which no Ctrl-C in a terminal reaches; a StackError if it is not installed."""
         self.close()
         self._error = ""
         lines, reports = self._pipes = [_Pipe(lambda line: relay(line, self.name)), _Pipe(self._take_report)]
@@ -303,11 +299,7 @@ class _Forked:
 
 
 async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
-    """Stop children within `stop_timeout` seconds, and kill those that are left.
-
-    Returns:
-        The names of the killed ones.
-    """
+    """Stop children within `stop_timeout` seconds, kill those that are left, and return the names of the latter."""
     children = list(children)
     running = [child for child in children if child.is_running]
     for child in running:

@@ -40,11 +40,7 @@ def run_tool(
     *,
     separate: bool = False,
 ) -> str:
-    """Run a tool in a folder and return its output, without its warnings if `separate` is True.
-
-    Raises:
-        HardwareToolError: It is not installed, failed, or did not end in time.
-    """
+    """Run a tool in a folder and return its output, without warnings if `separate`, or raise a HardwareToolError."""
     if missing(command[:1]):
         raise HardwareToolError(f"{command[0]} is not installed (Debian: apt-get install {command[0]})")
     try:

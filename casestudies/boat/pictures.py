@@ -136,11 +136,7 @@ def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence
 
 
 def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> None:
-    """Draw figure 4.5: the mean time of each stage, in order, and its share of a frame's time.
-
-    Raises:
-        OutputError: matplotlib is missing, or the file cannot be written.
-    """
+    """Draw figure 4.5, the mean time of each stage and its share of a frame's time, or raise an OutputError."""
     figure = new_figure(8.4, 1.5 + 0.42 * max(len(shares), 1))
     axes = figure.subplots()
     names = [stage.name for stage in shares]

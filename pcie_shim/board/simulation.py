@@ -51,11 +51,7 @@ class Simulation:
     """
 
     def __init__(self, command: Sequence[str], folder: Path) -> None:
-        """Start the child; its first answer may take START_S.
-
-        Raises:
-            SimulationError: It cannot be started.
-        """
+        """Start the child, or raise a SimulationError; its first answer may take START_S."""
         self.speed = 0.0
 
         # The beginning of an answer whose end has not arrived.

@@ -81,11 +81,7 @@ class DrivenBoard:
     # ---- opening --------------------------------------------------------------------------------------
 
     def open(self, timeout: float, connect_timeout: float, programming_timeout: float) -> None:
-        """Open the board as `MiniCluster.open` does; each step of programming may take `programming_timeout`.
-
-        Raises:
-            PcieShimError: An error of the link or of the image.
-        """
+        """Open the board, or raise a PcieShimError; each step of programming may take `programming_timeout`."""
         self.close("it is being opened")
         self._forget()
         link = self._identified(timeout, connect_timeout)

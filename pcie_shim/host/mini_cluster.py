@@ -156,11 +156,7 @@ class MiniCluster:
         return self._boards[board].link is not None or self._boards[board] in self._interrupted
 
     def reopen(self, board: int, *, timeout: float | None = None) -> None:
-        """Reopen a board after its restart or a broken link, and program it if it is blank.
-
-        Raises:
-            BoardError: The board cannot be opened.
-        """
+        """Reopen a board after its restart or a broken link, and program a blank one, or raise a BoardError."""
         self._open(self._boards[board], self._timeout if timeout is None else timeout)
 
     def close(self) -> None:

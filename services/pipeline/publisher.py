@@ -112,11 +112,7 @@ class Publisher(Service):
         return msgspec.structs.replace(published, missed=max(published.missed, refused))
 
     async def _check_delivery(self, *, settled: bool) -> None:
-        """Find topics that the servers do not pass on, and report each once.
-
-        Raises:
-            NotReceivableError: Nobody can receive the result of a run of one frame.
-        """
+        """Report each topic that no server passes on, once; a NotReceivableError in a run of one frame."""
         topics = self._topics.advertised
         refused = await refusals(
             [*topics, *([self._topics.reports] if self._topics.reports else [])], settled=settled

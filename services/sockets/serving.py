@@ -120,11 +120,7 @@ class MasterLink(Link):
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Stop listening, and remove the socket.
-
-        Raises:
-            OutdatedError: A master requires the new deployment in the folder.
-        """
+        """Stop listening, remove the socket, and raise an OutdatedError if a master requires a new deployment."""
         if self._server is not None:
             self._server.close()
         if self._master is not None:

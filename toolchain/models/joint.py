@@ -189,11 +189,7 @@ class Question:
         return self._fusion(own, product(common, searched, sizes).ravel(), sizes)
 
     def network(self) -> NetworkModel:
-        """Return the network that a BM2 samples; a symbol that selects the prior is one of the known.
-
-        Raises:
-            ModelError: A factor has a wrong number, or is 0 for all values that the given ones leave.
-        """
+        """Return the network that a BM2 samples, or raise a ModelError; what selects the prior is one of the known."""
         joint = self.joint
         return network_model(
             joint.name, joint.factors, joint.symbols, self.searched, self.observed, self.given

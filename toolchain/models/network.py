@@ -133,11 +133,7 @@ def network_model(
 
 
 def network_of(model: Model) -> NetworkModel:
-    """Return a naive fusion as a network: its prior is one factor of all searched variables, and so is each table.
-
-    Raises:
-        ModelError: A known variable has the name of a searched one, or selects the prior.
-    """
+    """Return a naive fusion as a network, each table a factor of all searched variables, or raise a ModelError."""
     if model.prior_select is not None:
         raise ModelError(
             f"{model.name}: {model.prior_select.name} selects the prior, which only a BM1 has: build one with "
