@@ -3,6 +3,8 @@
 import asyncio
 import random
 import time
+from collections.abc import Iterator
+from itertools import islice
 from typing import Annotated
 
 import typer
@@ -15,21 +17,16 @@ from terminal.output import say
 from terminal.signals import run_async
 
 
-class Garden:
-    """A garden whose mornings are drawn from the model; two gardens with the same seed have the same mornings."""
-
-    def __init__(self, seed: int) -> None:
-        """Begin before the first morning."""
-        self._random = random.Random(seed)
-
-    def morning(self) -> tuple[int, int, int]:
-        """Return R, S and G of the next morning."""
-        r = int(self._random.random() < RAIN)
-        s = int(self._random.random() < ON[r])
-        return r, s, int(self._random.random() < WET[s][r])
+def mornings(seed: int) -> Iterator[tuple[int, int, int]]:
+    """Draw R, S and G of one morning after the other from the model; the same seed gives the same mornings."""
+    draw = random.Random(seed).random
+    while True:
+        r = int(draw() < RAIN)
+        s = int(draw() < ON[r])
+        yield r, s, int(draw() < WET[s][r])
 
 
-async def publish_mornings(uri: str, *, garden: Garden, rate: float, count: int | None = None) -> None:
+async def publish_mornings(uri: str, *, seed: int, rate: float, count: int | None = None) -> None:
     """Publish the grass of `count` mornings, or of all until cancelled; a BridgeError if no server answers at the URI."""
     from bridge.client import connect
     from casestudies.topics import LossyPublication, Readiness, serve_readiness
@@ -41,12 +38,9 @@ async def publish_mornings(uri: str, *, garden: Garden, rate: float, count: int 
     ):
         grass = LossyPublication(await ros.advertise(GRASS_TOPIC, TYPE))
         begin = time.monotonic()
-        step = 0
-        while count is None or step < count:
-            *_, wet = garden.morning()
+        for step, (*_, wet) in enumerate(islice(mornings(seed), count), start=1):
             if await grass.publish({"data": wet}):
                 readiness.record()
-            step += 1
             await asyncio.sleep(begin + step / rate - time.monotonic())
 
 
@@ -66,7 +60,7 @@ def sprinkler_garden(
     """Publish whether the grass is wet, morning after morning."""
     chosen = random.SystemRandom().randrange(1_000_000) if seed is None else seed
     say(f"sprinkler-garden: seed {chosen}, {rate:g} mornings a second on {GRASS_TOPIC}, {uri}")
-    return run_async(publish_mornings(uri, garden=Garden(chosen), rate=rate, count=count))
+    return run_async(publish_mornings(uri, seed=chosen, rate=rate, count=count))
 
 
 if __name__ == "__main__":

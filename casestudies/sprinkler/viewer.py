@@ -84,44 +84,29 @@ def mean_and_error(frames: Sequence[Frame]) -> tuple[float, float]:
 
 
 def draw(path: Path, frames: Sequence[Frame]) -> None:
-    """Draw the running estimates over the samples, next to the estimate of each frame, or raise an OutputError."""
-    figure = new_figure(11, 4.6)
-    running, each = figure.subplots(1, 2, sharey=True)
+    """Draw the running estimates over the samples, next to the exact answers, or raise an OutputError."""
+    figure = new_figure(8, 4.6)
+    axes = figure.subplots()
     for grass, (name, colour) in enumerate(zip(GRASS, _COLOURS, strict=True)):
         here = [frame for frame in frames if frame.grass == grass]
         if not here:
             continue
         for frame in here:
             samples, rained = frame.curve.T
-            running.plot(samples, rained / samples, color=colour, alpha=0.25, linewidth=0.6)
+            axes.plot(samples, rained / samples, color=colour, alpha=0.25, linewidth=0.6)
         before = np.cumsum([(0, 0), *(frame.curve[-1] for frame in here[:-1])], axis=0)
         samples, rained = np.concatenate([f.curve + b for f, b in zip(here, before, strict=True)]).T
-        running.plot(samples, rained / samples, color=colour, linewidth=1.8, label=f"all frames, {name}")
+        axes.plot(samples, rained / samples, color=colour, linewidth=1.8, label=f"{name} grass")
         exact = exact_rain(grass)
         per_effective = float(np.mean([frame.curve[-1, 0] / frame.effective for frame in here]))
-        axis = np.geomspace(1, samples[-1], _POINTS)
-        half = 2 * np.sqrt(exact * (1 - exact) * per_effective / axis)
-        running.fill_between(axis, exact - half, exact + half, color=colour, alpha=0.12, linewidth=0)
-        each.errorbar(
-            [frame.number for frame in here],
-            [frame.share for frame in here],
-            yerr=[2 * frame.error for frame in here],
-            fmt="o",
-            markersize=4,
-            elinewidth=1,
-            color=colour,
-            label=f"{name} grass",
-        )
-        for axes in (running, each):
-            axes.axhline(exact, color=colour, linewidth=0.9, linestyle=(0, (4, 3)))
-        each.annotate(f"{exact:.4f}", (1.01, exact), xycoords=("axes fraction", "data"), color=colour)
-    running.set(xscale="log", ylim=(-0.02, 1.02), xlabel="samples", ylabel="P(R = 1 | G)")
-    running.set_title("running estimates; shaded: two standard errors", fontsize=10)
-    each.set_xlabel("frame")
-    each.set_title("estimate of each frame, with two standard errors", fontsize=10)
-    for axes in (running, each):
-        axes.legend(frameon=False, fontsize=8)
-        axes.spines[["top", "right"]].set_visible(False)
+        across = np.geomspace(1, samples[-1], _POINTS)
+        half = 2 * np.sqrt(exact * (1 - exact) * per_effective / across)
+        axes.fill_between(across, exact - half, exact + half, color=colour, alpha=0.12, linewidth=0)
+        axes.axhline(exact, color=colour, linewidth=0.9, linestyle=(0, (4, 3)))
+        axes.annotate(f"{exact:.4f}", (1.01, exact), xycoords=("axes fraction", "data"), color=colour)
+    axes.set(xscale="log", ylim=(-0.02, 1.02), xlabel="samples", ylabel="P(R = 1 | G)")
+    axes.legend(frameon=False, fontsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
     figure.suptitle("Has it rained? Estimates from the samples of a BM2, and the exact answers (dashed)")
     save_figure(figure, path)
 

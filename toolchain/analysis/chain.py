@@ -9,13 +9,14 @@ sample is taken as the state after a sweep, also where a machine takes one after
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from machines.bm2 import BM2Machine, BM2Parameters, start_state
+from machines.bm2 import BM2Machine, start_state
+from machines.bm2_estimate import searched_values
 from machines.parameters import SampleEvery, Sequencer
 from toolchain.errors import ModelError
 from toolchain.models.inference import eliminate, product
@@ -28,12 +29,6 @@ _WORK: Final = 2**27
 """Maximum number of products for one matrix product of all readings together: a few seconds in all."""
 
 
-@lru_cache(1)
-def factor_bits(p: BM2Parameters) -> tuple[tuple[int, ...], ...]:
-    """Return the state bits of each factor's variables, which take long to compute for hundreds of factors."""
-    return tuple(p.factor_bits(cde) for cde in range(p.cdes))
-
-
 def agreement(
     machine: BM2Machine, bit: int, values: Mapping[int, NDArray[np.int64]]
 ) -> list[tuple[int, NDArray[np.float64]]]:
@@ -42,14 +37,14 @@ def agreement(
     `values` are the other bits of these CDEs' factors in each state, int64[states], by bit.
     """
     p, found = machine.parameters, []
-    for cde, local in enumerate(factor_bits(p)):
-        if bit in local:
-            table = machine.tables[cde]
-            j = local.index(bit)
-            places = np.zeros(next(iter(values.values())).shape if values else 1, dtype=np.int64)
-            for i, other in enumerate(local[:j] + local[j + 1 :]):
-                places |= values[other] << i
-            found.append((cde, table[(j << (len(local) - 1)) + places] / 2.0**p.prob_bits))
+    variable = next(at for at, mask in enumerate(p.masks) if mask >> bit & 1)
+    for cde in (at for at, factor in enumerate(p.factors) if variable in factor):
+        local = p.factor_bits(cde)
+        j = local.index(bit)
+        places = np.zeros(next(iter(values.values())).shape if values else 1, dtype=np.int64)
+        for i, other in enumerate(local[:j] + local[j + 1 :]):
+            places |= values[other] << i
+        found.append((cde, machine.tables[cde][(j << (len(local) - 1)) + places] / 2.0**p.prob_bits))
     return found
 
 
@@ -143,17 +138,10 @@ class ExactChain:
     @cached_property
     def _searched(self) -> NDArray[np.int64]:
         """int64[states]: the place in the joint of the searched variables; -1 if any variable is at an unused code."""
-        p = self._parameters
-        index, unused = np.zeros((2, self._one.shape[1]), dtype=np.int64)
-        codes = [
-            sum((self._values[offset + k] << k for k in range(bits)), start=np.zeros_like(index))
-            for offset, bits in zip(p.offsets, p.bits, strict=True)
-        ]
-        for code, cardinality in zip(codes, p.cardinalities, strict=True):
-            unused |= code >= cardinality
-        for variable in p.searched:
-            index = index * p.cardinalities[variable] + codes[variable]
-        return np.where(unused, -1, index)
+        bits = np.stack([self._values[bit] for bit in range(self._parameters.state_bits)], axis=1)
+        packed = np.packbits(bits.astype(np.uint8), axis=1, bitorder="little")
+        words = np.pad(packed, ((0, 0), (0, -packed.shape[1] % 4))).view("<u4")
+        return searched_values(self._parameters, words)
 
     def posterior(self, law: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the posterior from samples with this law: float64[values of the searched variables together]."""
@@ -250,15 +238,15 @@ def chain_error(machine: BM2Machine, model: NetworkModel, *, samples: int) -> Ch
         sampling = deviations.sum() / np.sqrt(2 * np.pi)  # half of the mean absolute values
         rows.append((weights[addresses], quantising, begun, sampling, chain.cycles, shares.min()))
     table = np.array(rows)
-    _, quantising, start, sampling, cycles, _ = (table[:, :1] * table).sum(axis=0) / table[:, 0].sum()
+    quantising, start, sampling, cycles, _ = np.average(table[:, 1:], axis=0, weights=table[:, 0]).tolist()
     worst = int(table[:, 1].argmax())
     return ChainError(
         share=float(table[:, 0].sum() / weights.sum()),
-        quantising=float(quantising),
+        quantising=quantising,
         worst=float(table[worst, 1]),
         worst_reading=readings[worst],
-        start=float(start),
-        sampling=float(sampling),
-        cycles=float(cycles),
+        start=start,
+        sampling=sampling,
+        cycles=cycles,
         effective=float(table[:, 5].min()),
     )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from machines.bm2 import BM2Machine, unpack
 from machines.parameters import PROB_BITS_MAX, RngKind, RngReset, SampleEvery
 from machines.rng import LFSR
-from toolchain.analysis.chain import ChainError, agreement, chain_error, factor_bits
+from toolchain.analysis.chain import ChainError, agreement, chain_error
 from toolchain.analysis.logic import BLOCK_SHAPES, blocks_of, device_named
 from toolchain.building.bm2_machine import clipped
 from toolchain.checks.findings import Check, Finding, Severity, error, note, reading, warning
@@ -139,13 +139,13 @@ def _opposite_clips(chain: CheckedChain) -> Iterator[Finding]:
     """Find bits at which factors clip in opposite directions, so that the move takes long."""
     p, wide = chain.machine.parameters, []
     for variable in sorted(set(range(len(p.cardinalities))) - chain.always_known):
-        cycles, one, other = 0.0, 0, 0
-        for bit in range(p.offsets[variable], p.offsets[variable] + p.bits[variable]):
-            blanket = sorted(set().union(*(scope for scope in factor_bits(p) if bit in scope)) - {bit})
-            if len(blanket) > _BLANKET_BITS:
-                wide.append(chain.names[variable])
-                break
-            cycles, one, other = max((cycles, one, other), _slowest(chain.machine, bit, blanket))
+        own = range(p.offsets[variable], p.offsets[variable] + p.bits[variable])
+        blanket = set().union(*(p.factor_bits(at) for at, scope in enumerate(p.factors) if variable in scope))
+        if own and len(blanket) > _BLANKET_BITS + 1:
+            wide.append(chain.names[variable])
+            continue
+        found = [_slowest(chain.machine, bit, sorted(blanket - {bit})) for bit in own]
+        cycles, one, other = max(found, default=(0.0, 0, 0))
         if cycles:
             risky = p.ops_timeout < -cycles * math.log(_TIMEOUT_RISK)
             what = f"{chain.titles[one]} and {chain.titles[other]} can clip one of its bits in opposite directions; such a move takes "

@@ -13,7 +13,7 @@ import pytest
 from matplotlib.image import imread
 
 from casestudies.sprinkler import viewer as viewer_module
-from casestudies.sprinkler.garden import Garden, publish_mornings
+from casestudies.sprinkler.garden import mornings, publish_mornings
 from casestudies.sprinkler.model import exact_rain, model
 from casestudies.sprinkler.viewer import Frame, Viewer, draw, frame_of, mean_and_error, read_samples
 from posteriors.errors import NoResultError
@@ -41,23 +41,22 @@ def test_the_network_is_that_of_the_thesis():
 
 
 def test_the_mornings_of_a_garden_are_drawn_from_the_model():
-    garden, same, other = Garden(3), Garden(3), Garden(4)
-    mornings = np.array([garden.morning() for _ in range(20_000)])
-    assert [same.morning() for _ in range(50)] == [tuple(each) for each in mornings[:50]]
-    assert [other.morning() for _ in range(50)] != [tuple(each) for each in mornings[:50]]
+    drawn = np.array(list(itertools.islice(mornings(3), 20_000)))
+    same, other = (list(itertools.islice(mornings(seed), 50)) for seed in (3, 4))
+    assert same == [tuple(each) for each in drawn[:50]]
+    assert other != same
     joint = np.einsum("r,rs,rsg->rsg", *(each.table for each in model().network().factors))
     for state in itertools.product((0, 1), repeat=3):
-        share = (mornings == state).all(axis=1).mean()
-        assert abs(share - joint[state]) <= 5 * math.sqrt(joint[state] / len(mornings))
+        share = (drawn == state).all(axis=1).mean()
+        assert abs(share - joint[state]) <= 5 * math.sqrt(joint[state] / len(drawn))
 
 
 async def test_the_grass_of_each_morning_is_published():
     async with FakeRosbridge() as fake:
-        await publish_mornings(fake.uri, garden=Garden(5), rate=1000, count=20)
+        await publish_mornings(fake.uri, seed=5, rate=1000, count=20)
         await fake.wait_for_op("publish", topic="/sprinkler/grass", count=20)
         published = fake.ops("publish")
-    garden = Garden(5)
-    expected = [("/sprinkler/grass", garden.morning()[2]) for _ in range(20)]
+    expected = [("/sprinkler/grass", wet) for *_, wet in itertools.islice(mornings(5), 20)]
     assert [(op["topic"], op["msg"]["data"]) for op in published] == expected
 
 
