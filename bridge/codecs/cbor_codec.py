@@ -202,7 +202,7 @@ def typed_array(values: Any, elements: str) -> cbor2.CBORTag:
             f"{elements!r} is not an element type of typed arrays, expected one of {' '.join(_TAGS)}"
         )
     try:
-        numbers = tuple(values)
+        numbers = values if type(values) is list else tuple(values)
         packed = struct.pack(f"<{len(numbers)}{TYPED_ARRAYS[tag][1]}", *numbers)
     except (TypeError, OverflowError, struct.error) as error:
         raise EncodeError(f"the values do not fit a typed array of {elements}: {error}") from None

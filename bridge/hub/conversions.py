@@ -1,21 +1,24 @@
-"""Conversion of messages from JSON to the types of their fields: typed arrays for CBOR, and objects for serialising.
+"""Conversion of messages from JSON to the types of their fields: CBOR with typed arrays, and objects for serialising.
 
 Every conversion checks the type, range and number of values before it allocates memory for them.
 """
 
 from base64 import b64decode
 from collections.abc import Callable
+from functools import lru_cache
 from math import inf, nan
 from typing import TYPE_CHECKING, Any, Final
 
+import cbor2
 import msgspec
 
+from bridge.codecs.cbor_codec import typed_array
 from bridge.codecs.message_check import element_of
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-Convert = Callable[[Any], Any]
+Encode = Callable[[Any], bytes]
 
 # Element types of arrays by rosbags' names of numbers.
 _NUMBERS: Final = {
@@ -48,6 +51,11 @@ _BYTES: Final = frozenset({"uint8", "octet", "char"})
 TIMES: Final = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/Duration": "duration"}
 # Fields of a time in ROS 1, by their names in rosbags, which are ROS 2's.
 ROS1_TIME: Final = {"sec": "secs", "nanosec": "nsecs"}
+# Kinds of CBOR items, sizes from which on theirs is not in the first byte, and that byte for a size of four bytes.
+_ARRAY: Final = 0x80
+_MAP: Final = 0xA0
+_INLINE: Final = 24
+_FOUR_BYTES: Final = 26
 DUMMY: Final = "structure_needs_at_least_one_member"
 
 
@@ -158,45 +166,69 @@ def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | 
     return checked
 
 
-def typed_converter(store: "Typestore", name: str, known: dict[str, Convert | None]) -> Convert | None:
-    """Return the function that converts a message's arrays of numbers, or None for a type that has none.
+def cbor_encoder(
+    store: "Typestore", name: str, defaults: Callable[[str], dict[str, Any]], known: dict[str, Encode | None]
+) -> Encode | None:
+    """Return the function that encodes a message, its arrays of numbers as typed arrays; None for a type without any.
 
-    `known` stores the functions of the types that occur inside this one.
+    `defaults` returns a type's defaults, and `known` stores the functions of the types that occur inside this one.
     """
-    converts: dict[str, Convert] = {}
+    encoders: dict[str, Encode] = {}
 
-    def convert(message: dict[str, Any]) -> dict[str, Any]:
-        return {
-            field: converts[field](value) if field in converts else value for field, value in message.items()
-        }
+    def encode(message: dict[str, Any]) -> bytes:
+        parts = [_head(_MAP, len(message))]
+        for field, value in message.items():
+            parts += _text(field), encoders.get(field, cbor2.dumps)(value)
+        return b"".join(parts)
 
+    has_arrays = False
     for field, (kind, content) in store.fielddefs[name][1]:
         element, length = element_of(kind, content)
         if element in _NUMBERS:
             if length >= 0:
-                converts[field] = _array_converter(field, element, length)
+                encoders[field] = _array_encoder(field, element, length)
+                has_arrays = True
         elif element in store.fielddefs:
             if element not in known:
-                known[element] = typed_converter(store, element, known)
+                known[element] = cbor_encoder(store, element, defaults, known)
             if (inner := known[element]) is not None:
-                converts[field] = inner if length < 0 else _each(inner)
-    return convert if converts else None
+                encoders[field] = inner if length < 0 else _each(inner)
+                has_arrays = True
+            elif length < 0:
+                encoders[field] = _unless_default(defaults(name).get(field))
+    return encode if has_arrays else None
 
 
-def _each(convert: Convert) -> Convert:
-    def each(values: Any) -> list[Any]:
+def _each(encode: Encode) -> Encode:
+    def each(values: Any) -> bytes:
         if not isinstance(values, list):
             raise TypeError
-        return [convert(value) for value in values]
+        return _head(_ARRAY, len(values)) + b"".join(map(encode, values))
 
     return each
 
 
-def _array_converter(field: str, element: str, length: int) -> Convert:
-    from bridge.codecs.cbor_codec import typed_array
+def _unless_default(default: Any) -> Encode:
+    """Return the encoder of a field that most messages lack: what it was filled with is encoded once."""
+    encoded = cbor2.dumps(default)
+    return lambda value: encoded if value is default else cbor2.dumps(value)
 
-    def convert(values: Any) -> Any:
+
+def _array_encoder(field: str, element: str, length: int) -> Encode:
+    def encode(values: Any) -> bytes:
         numbers = _numbers(values, element, length, field)
-        return bytes(numbers) if element in _BYTES else typed_array(numbers, _NUMBERS[element])
+        return cbor2.dumps(bytes(numbers) if element in _BYTES else typed_array(numbers, _NUMBERS[element]))
 
-    return convert
+    return encode
+
+
+@lru_cache(maxsize=1024)
+def _text(text: str) -> bytes:
+    return cbor2.dumps(text)
+
+
+def _head(kind: int, size: int) -> bytes:
+    """Return what precedes the content of a map or an array (RFC 8949, 3.)."""
+    if size < _INLINE:
+        return bytes((kind | size,))
+    return bytes((kind | _FOUR_BYTES,)) + size.to_bytes(4, "big")

@@ -12,18 +12,11 @@ from collections.abc import Callable, Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+import cbor2
+
 from bridge.codecs.message_check import element_of
 from bridge.errors import BridgeError
-from bridge.hub.conversions import (
-    DEFAULTS,
-    DUMMY,
-    ROS1_TIME,
-    TIMES,
-    Builder,
-    Convert,
-    fields_of,
-    typed_converter,
-)
+from bridge.hub.conversions import DEFAULTS, DUMMY, ROS1_TIME, TIMES, Builder, Encode, cbor_encoder, fields_of
 from bridge.hub.filling import Filler
 from bridge.hub.interfaces import PARTS, message_texts, part_name
 from bridge.hub.limits import RefusedOperationError
@@ -57,7 +50,7 @@ class MessageDefinitions:
         self._is_loaded = False
         self._wall_clock = wall_clock
         # What was derived from the definitions, by the names of types as they were asked for.
-        self._typed: dict[str, Convert | None] = {}
+        self._encoders: dict[str, Encode | None] = {}
         self._texts: dict[str, str] = {}
         # And by the names that rosbags uses.
         self._fillers: dict[str, Filler] = {}
@@ -146,17 +139,16 @@ class MessageDefinitions:
             if kind == (_HEADER, -1)
         }
 
-    def typed(self, type_name: str, message: dict[str, Any]) -> dict[str, Any] | None:
-        """Convert a message's arrays of numbers to typed arrays, or return None if its type is unknown or does not fit."""
+    def encode(self, type_name: str, message: dict[str, Any]) -> bytes | None:
+        """Return a message as CBOR with typed arrays, or None if its type is unknown or does not fit."""
         try:
-            if type_name not in self._typed:
+            if type_name not in self._encoders:
                 store, known = self._known(type_name)
-                self._typed[type_name] = typed_converter(store, known, {})
-            convert = self._typed[type_name]
-            converted: dict[str, Any] = message if convert is None else convert(message)
+                self._encoders[type_name] = cbor_encoder(store, known, self.defaults, {})
+            # JSON needs no check.
+            return (self._encoders[type_name] or cbor2.dumps)(message)
         except (BridgeError, TypeError, ValueError, AttributeError):
             return None
-        return converted
 
     def serialise(self, type_name: str, message: dict[str, Any], max_size: int) -> bytes:
         """Serialise a message as ROS 1's transport would, or as CDR with its header, or raise a RefusedOperationError."""

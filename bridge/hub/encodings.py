@@ -8,8 +8,10 @@ from enum import StrEnum
 from functools import lru_cache
 from typing import Any, Final
 
+import cbor2
 import orjson
 
+from bridge.codecs.cbor_codec import encode
 from bridge.codecs.png import encode as to_picture
 from bridge.errors import BridgeError
 from bridge.hub.definitions import MessageDefinitions
@@ -26,6 +28,8 @@ class Encoding(StrEnum):
 
 
 ENCODINGS: Final = tuple(Encoding)
+# Looking up a module-level name is faster than looking up an enumeration member.
+_NONE, _PNG, _, _CBOR_RAW = ENCODINGS
 
 
 def encoding_of(requested: object) -> Encoding:
@@ -85,24 +89,20 @@ class OutgoingMessage:
         return payload
 
     def _encode(self, compression: Encoding, name: str) -> bytes:
-        if compression is Encoding.NONE:
+        if compression is _NONE:
             return b"%b%b}" % (json_prefix(name), self.data)
-        if compression is Encoding.PNG:
-            return as_png(self.payload(Encoding.NONE, name))
-        import cbor2
-
+        if compression is _PNG:
+            return as_png(self.payload(_NONE, name))
         if self._parsed is None:
             self._parsed = orjson.loads(self.data)
-        if compression is Encoding.CBOR_RAW:
+        if compression is _CBOR_RAW:
             seconds, nanoseconds = divmod(self._time_ns, 10**9)
             serialised = self._definitions.serialise(self._type, self._parsed, self._max_size)
             msg = cbor2.dumps({"secs": seconds, "nsecs": nanoseconds, "bytes": serialised})
         # A message of an unknown type, or one that does not fit its type: only floats reveal their type.
-        elif (typed := self._definitions.typed(self._type, self._parsed)) is not None:
-            msg = cbor2.dumps(typed)  # of JSON, typed arrays and bytes, so it needs no check
+        elif (encoded := self._definitions.encode(self._type, self._parsed)) is not None:
+            msg = encoded
         else:
-            from bridge.codecs.cbor_codec import encode
-
             msg = encode(self._parsed, max_size=self._max_size, max_depth=_DEEPEST, pack_floats=True)
         return _cbor_prefix(name) + msg
 
@@ -110,6 +110,4 @@ class OutgoingMessage:
 @lru_cache(maxsize=1024)
 def _cbor_prefix(name: str) -> bytes:
     """Return the bytes before the CBOR of a message of topic `name`: a map of three entries, up to the last value."""
-    import cbor2
-
     return b"\xa3" + b"".join(map(cbor2.dumps, ("op", "publish", "topic", name, "msg")))

@@ -116,103 +116,123 @@ class Topics:
         not performed, because it must be parsed in full or exceeds a turn.
         """
         advertisement = client.last_published
-        if advertisement is None:
-            return first
-        dispatcher, room, depth = self._dispatcher, self._room, self._depth
-        topic, filler, envelope = advertisement.topic, advertisement.filler, advertisement.envelope
-        begin = len(envelope)
-        for index in range(first, len(messages)):
-            data = messages[index]
-            if dispatcher.work > TURN_WORK:
-                return index
+        while advertisement is not None and first < len(messages) and self._dispatcher.work <= TURN_WORK:
             # A publisher of several topics changes between their envelopes; all proven ones are kept.
-            if not data.startswith(envelope):
-                advertisement = client.envelopes.get(envelope_of(data))
+            if not messages[first].startswith(advertisement.envelope):
+                advertisement = client.envelopes.get(envelope_of(messages[first]))
                 if advertisement is None:
-                    return index
+                    break
                 client.last_published = advertisement
-                topic, filler, envelope = advertisement.topic, advertisement.filler, advertisement.envelope
-                begin = len(envelope)
+            topic = advertisement.topic
+            # What is left of the turn, in messages like the next one if all subscribers want another encoding.
+            each = _MESSAGE_WORK + (2 + (len(messages[first]) >> 6)) * len(topic.subscriptions)
+            end = first + 1 + (TURN_WORK - self._dispatcher.work) // each
+            payloads, parsed = self._read_known(advertisement, messages[first:end])
+            if not payloads:
+                break
+            if topic.subscriptions or topic.latching:
+                self._deliver(topic, payloads, parsed, advertisement.envelope, now)
+            first += len(payloads)
+        return first
+
+    def _read_known(
+        self, advertisement: Advertisement, messages: Sequence[bytes]
+    ) -> tuple[list[bytes], list[dict[str, Any]]]:
+        """Return the first messages that have the advertisement's envelope, as payloads and parsed."""
+        envelope, filler, room, depth = advertisement.envelope, advertisement.filler, self._room, self._depth
+        begin, longest = len(envelope), len(envelope) + advertisement.topic.largest + 1
+        payloads: list[bytes] = []
+        messages_parsed: list[dict[str, Any]] = []
+        for data in messages:
             # What follows a proven envelope is a message and a brace, or it is parsed in full (and perhaps refused there).
-            if data[-1] != BRACE:
-                return index
-            message = data[begin:-1]
+            if not data.startswith(envelope) or data[-1] != BRACE:
+                break
+            message, payload = data[begin:-1], data
             try:
                 parsed = orjson.loads(message)
-            except orjson.JSONDecodeError:
-                return index
-            # The second condition is the first one of `is_deeper`, without its call.
-            if type(parsed) is not dict or (len(message) > 2 * depth and is_deeper(message, depth)):
-                return index
-            if topic.subscriptions or topic.latching:
-                try:
-                    if filler is not None and (filler.parts or len(parsed) != filler.count):
-                        tail = filler.fill(parsed, room)
-                        # With white space between the last braces, the tail has no place.
-                        if tail is None or (tail and data[-2] != BRACE):
-                            data = b"%b%b}" % (envelope, orjson.dumps(parsed))
-                        elif tail:
-                            data = data[:-2] + tail
-                    self._deliver(topic, parsed, data, envelope, now)
-                except RefusedOperationError:
-                    return index
-        return len(messages)
+                # The second condition is the first one of `is_deeper`, without its call.
+                if type(parsed) is not dict or (len(message) > 2 * depth and is_deeper(message, depth)):
+                    break
+                if filler is not None and (filler.parts or len(parsed) != filler.count):
+                    tail = filler.fill(parsed, room)
+                    # With white space between the last braces, the tail has no place.
+                    if tail is None or (tail and data[-2] != BRACE):
+                        payload = b"%b%b}" % (envelope, orjson.dumps(parsed))
+                    elif tail:
+                        payload = data[:-2] + tail
+            except (orjson.JSONDecodeError, RefusedOperationError):
+                break
+            if len(payload) > longest:
+                break
+            payloads.append(payload)
+            messages_parsed.append(parsed)
+        return payloads, messages_parsed
 
     def distribute(self, topic: Topic, parsed: dict[str, Any], now: float) -> None:
         """Deliver a message to all subscribers of its topic."""
-        self._deliver(topic, parsed, orjson.dumps(parsed) + b"}", b"", now)
-
-    def _deliver(
-        self, topic: Topic, parsed: dict[str, Any], payload: bytes, prefix: bytes, now: float
-    ) -> None:
-        """Deliver a message; `payload` is its JSON between `prefix` and a closing brace."""
-        begin, dispatcher, subscriptions = len(prefix), self._dispatcher, topic.subscriptions
-        size = len(payload) - begin - 1
+        payload = orjson.dumps(parsed) + b"}"
         # Rewriting can lengthen a message (1e15 becomes 1000000000000000.0).
-        if size > topic.largest:
+        if len(payload) - 1 > topic.largest:
             raise RefusedOperationError(
                 f"the message for {topic.name} has more than {self._limits.message_bytes} bytes"
             )
+        self._deliver(topic, [payload], [parsed], b"", now)
+
+    def _deliver(
+        self, topic: Topic, payloads: list[bytes], parsed: list[dict[str, Any]], prefix: bytes, now: float
+    ) -> None:
+        """Deliver messages; a payload is a message's JSON between `prefix` and a closing brace."""
+        dispatcher, subscriptions = self._dispatcher, topic.subscriptions
         # A message that is not latched for its size also ends the latching of the one before.
         if topic.latching:
+            latched = payloads[-1][len(prefix) : -1]
             room = self._limits.latched_bytes - self._graph.latched_bytes + len(topic.latched or b"")
-            self._graph.latch(topic, payload[len(prefix) : -1] if size <= room else None)
-        dispatcher.work += _MESSAGE_WORK + 2 * len(subscriptions)
+            self._graph.latch(topic, latched if len(latched) <= room else None)
+        dispatcher.work += (_MESSAGE_WORK + 2 * len(subscriptions)) * len(payloads)
         # Subscribers that use the same name for the topic share one payload.
-        message: OutgoingMessage | None = None
+        encoded: list[OutgoingMessage] = []
         for client, subscription in subscriptions.items():
             if subscription.compression is _PLAIN:
                 if subscription.prefix != prefix:
-                    payload = subscription.prefix + payload[len(prefix) :]
+                    payloads = [subscription.prefix + payload[len(prefix) :] for payload in payloads]
                     prefix = subscription.prefix
                 lane = subscription.lane
-                client.outbox.offer(lane, payload, now)
+                client.outbox.offer_all(lane, payloads, now)
                 if lane.throttle:
                     dispatcher.schedule_release(client)
                 if not client.is_ready:
                     dispatcher.mark_ready(client)
             else:
-                message = message or self._message(topic, payload[len(prefix) : -1], parsed)
-                self._deliver_encoded(subscription, message, now)
+                encoded = encoded or [
+                    self._message(topic, payload[len(prefix) : -1], message)
+                    for payload, message in zip(payloads, parsed, strict=True)
+                ]
+                self._deliver_encoded(subscription, encoded, now)
 
     def _message(self, topic: Topic, data: bytes, parsed: dict[str, Any] | None) -> OutgoingMessage:
         return OutgoingMessage(
             data, parsed, topic.type, time.time_ns(), self._definitions, self._limits.message_bytes
         )
 
-    def _deliver_encoded(self, subscription: TopicSubscription, message: OutgoingMessage, now: float) -> None:
+    def _deliver_encoded(
+        self, subscription: TopicSubscription, messages: Sequence[OutgoingMessage], now: float
+    ) -> None:
         client, lane = subscription.client, subscription.lane
-        if not client.outbox.accepts(lane, now):
-            return
-        self._dispatcher.work += len(message.data) >> 6
-        try:
-            payload = message.payload(subscription.compression, subscription.name)
-        except BridgeError as error:
-            if lane.dropped == 0:  # reported once, because the topic's next messages fail in the same way
-                self._refuse(client, str(error), next(iter(subscription.options)))
-            lane.dropped += 1
-            return
-        self._dispatcher.offer(client, lane, payload, now)
+        outbox, compression, name = client.outbox, subscription.compression, subscription.name
+        for message in messages:
+            if lane.throttle and not outbox.accepts(lane, now):
+                continue
+            self._dispatcher.work += len(message.data) >> 6
+            try:
+                payload = message.payload(compression, name)
+            except BridgeError as error:
+                if lane.dropped == 0:  # reported once, because the topic's next messages fail in the same way
+                    self._refuse(client, str(error), next(iter(subscription.options)))
+                lane.dropped += 1
+                continue
+            outbox.offer(lane, payload, now)
+        self._dispatcher.schedule_release(client)
+        self._dispatcher.mark_ready(client)
 
     # --- subscribing
 
@@ -248,7 +268,7 @@ class Topics:
         subscription.options[own_id] = options
         self._apply_options(subscription)
         if is_new and topic.latched is not None and qos.get("durability") != "volatile":
-            self._deliver_encoded(subscription, self._message(topic, topic.latched, None), now)
+            self._deliver_encoded(subscription, [self._message(topic, topic.latched, None)], now)
 
     def unsubscribe(self, client: Client, operation: Operation, _now: float) -> None:
         """Perform `unsubscribe`."""

@@ -557,6 +557,7 @@ _ENDED = [b'{"op":"unadvertise","topic":"/b"}']  # nobody is subscribed to it
 @settings(max_examples=200)
 @given(st.lists(st.lists(published, max_size=3) | st.sampled_from((_AGAIN, _ENDED)), max_size=8))
 @example([[_ENVELOPES[0] + b"{}}", _ENVELOPES[0] + b"null}"]])
+@example([[_ENVELOPES[0] + b"{}}"], [_ENVELOPES[0] + b"{}}", b"", _ENVELOPES[0] + b"{}}"]])
 @example([[_ENVELOPES[3] + b"{}}"], _ENDED, [_ENVELOPES[3] + b"{}}"]])
 @example([[_ENVELOPES[0] + b"{}}"], [_ENVELOPES[0] + b'{"a":1}]', _ENVELOPES[0] + b'{"a":1}} ']])
 @example([[_ENVELOPES[12] + b'{"n":1},"topic":"/a"}', _ENVELOPES[12] + b'{"n":2}}']])

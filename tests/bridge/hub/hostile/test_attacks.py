@@ -247,12 +247,22 @@ def _replay(hub):
     return {"op": "subscribe", "topic": "/t", "id": 7}
 
 
-@pytest.mark.parametrize("prepare", [_resubscribe, _list_topics, _replay])
+def _publish_to_many(hub):
+    hub.connect()
+    for _ in range(1000):
+        hub.broker.receive(hub.connect().client, b'{"op":"subscribe","topic":"/t"}', 0.0)
+    return {"op": "publish", "topic": "/t", "type": "std_msgs/Empty", "msg": {}}
+
+
+@pytest.mark.parametrize("prepare", [_resubscribe, _list_topics, _replay, _publish_to_many])
 def test_a_turn_ends_after_a_bounded_amount_of_work(prepare):
-    hub = Harness(client_bytes=100 * MEBIBYTE)
+    hub = Harness(client_bytes=100 * MEBIBYTE, clients=2000)
     operation = prepare(hub)
     peer = next(iter(hub.broker.graph.clients.values()))
     messages = [json.dumps(operation | ({"id": index})).encode() for index in range(64)]
+    if prepare is _publish_to_many:  # with the type the first time, and then with an envelope that becomes known
+        del operation["type"]
+        messages[1:] = [json.dumps(operation).encode()] * 63
     if prepare is _resubscribe:
         messages = [json.dumps(operation).encode()] * 64
     turns = 0
