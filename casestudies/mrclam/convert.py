@@ -177,14 +177,8 @@ def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[l
     return sorted(found, key=lambda each: each.time), misread
 
 
-def windows(
-    track: Track, measured: Sequence[Measured], *, length_s: float = WINDOW_S
-) -> tuple[list[Window], Counter[str]]:
-    """Cut a robot's track into windows, and keep those in which it hardly moved and saw enough landmarks.
-
-    Returns:
-        The windows, and the number of others for each reason.
-    """
+def windows(track: Track, measured: Sequence[Measured]) -> tuple[list[Window], Counter[str]]:
+    """Return the seconds of a track in which the robot hardly moved and saw enough landmarks, and why others are not."""
     kept: list[Window] = []
     left_out: Counter[str] = Counter()
     if not measured:
@@ -192,9 +186,9 @@ def windows(
     begin = measured[0].time
     by_window: dict[int, list[Measured]] = {}
     for each in measured:
-        by_window.setdefault(math.floor((each.time - begin) / length_s), []).append(each)
+        by_window.setdefault(math.floor((each.time - begin) / WINDOW_S), []).append(each)
     for number, inside in by_window.items():
-        start, end = begin + number * length_s, begin + (number + 1) * length_s
+        start, end = begin + number * WINDOW_S, begin + (number + 1) * WINDOW_S
         if not track.known(start, end):
             left_out["without a reference"] += 1
         elif track.moved(start, end) >= MOST_MOVED_M:
@@ -224,10 +218,10 @@ def _wrapped(angle: float) -> float:
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
-def write_recording(path: Path, kept: Sequence[Window], landmarks: Sequence[int]) -> None:
+def write_recording(path: Path, kept: Sequence[Window]) -> None:
     """Write a file that `casestudies.mrclam.player` reads, or raise an OutputError."""
     heading = ["time_s", "ref_x_m", "ref_y_m", "ref_std_m", "heading_rad"]
-    heading += [name for number in landmarks for name in (f"range_{number}_m", f"bearing_{number}_rad")]
+    heading += [name for number in LANDMARKS for name in (f"range_{number}_m", f"bearing_{number}_rad")]
     rows = []
     for each in kept:
         row = [
@@ -237,7 +231,7 @@ def write_recording(path: Path, kept: Sequence[Window], landmarks: Sequence[int]
             f"{_REFERENCE_STD_M}",
             f"{each.heading:.4f}",
         ]
-        for number in landmarks:
+        for number in LANDMARKS:
             seen = each.seen.get(number)
             row += ["", ""] if seen is None else [f"{seen[0]:.3f}", f"{seen[1]:.4f}"]
         rows.append(row)
@@ -310,7 +304,7 @@ def convert(
             warn(f"robot {number}: nothing to write, {said}")
             continue
         path = output / f"ds{data_set}_robot{number}.csv"
-        write_recording(path, kept, sorted(positions))
+        write_recording(path, kept)
         print(f"wrote {path}: {said}", flush=True)
 
 

@@ -4,12 +4,11 @@ python -m casestudies.mrclam.player DATA_DIR/ds1_robot3.csv --uri ws://127.0.0.1
 """
 
 import contextlib
-import csv
 import math
-import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Any, Final
@@ -19,7 +18,7 @@ import typer
 from bridge.client import Publication, connect
 from bridge.client.protocol import RosVersion
 from bridge.stamps import header
-from casestudies import DEFAULT_URI, DataFileError, Uri
+from casestudies import DEFAULT_URI, Uri
 from casestudies.grid import Grid
 from casestudies.topics import Instance, Listener, listen
 from posteriors.errors import BadResultError, NoResultError
@@ -28,6 +27,8 @@ from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import check_writable, say, write_json
 from terminal.signals import run_async
+from toolchain.errors import ModelError
+from toolchain.learning import recording
 
 SIGHTINGS_TOPIC: Final = "/mrclam/sightings"
 SIGHTINGS_TYPE: Final = "mrclam_msgs/Sightings"
@@ -42,8 +43,7 @@ SIGHTINGS_MSG: Final = (
     + "".join(f"float64 range_{number}\nfloat64 bearing_{number}\n" for number in LANDMARKS)
 )
 
-_SIGHTING_COLUMN: Final = re.compile(r"range_(\d+)_m")
-_REFERENCE_COLUMNS: Final = ("time_s", "ref_x_m", "ref_y_m", "ref_std_m", "heading_rad")
+_REFERENCE_COLUMNS: Final = ("time_s", "ref_x_m", "ref_y_m")
 
 
 def area_grid(width: int = 32, height: int = 32) -> Grid:
@@ -72,22 +72,29 @@ class RecordedFrame:
 
 
 def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
-    """Read a file such as `ds1_robot3.csv`, or raise a DataFileError that names the damaged line."""
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = csv.reader(file, strict=True)
-            columns = next(rows, [])
-            landmarks = _landmarks(path, columns)
-            frames = tuple(_frames(path, columns, landmarks, rows))
-    except OSError as error:
-        raise DataFileError(
-            f"{path} cannot be read: {error.strerror or error}; the case study's page says where to get the data"
-        ) from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise DataFileError(f"{path} is not a CSV file: {error}") from None
-    if not frames:
-        raise DataFileError(f"{path} has a heading but no frames")
-    return frames
+    """Read a file such as `ds1_robot3.csv`, or raise a ModelError that names the wrong row or column."""
+    pairs = {landmark: (f"range_{landmark}_m", f"bearing_{landmark}_rad") for landmark in LANDMARKS}
+    columns = recording.read_recording(path, (*_REFERENCE_COLUMNS, *chain(*pairs.values()))).columns
+    frames = []
+    for number, row in enumerate(zip(*columns.values(), strict=True), start=1):
+        cells: dict[str, float] = {}
+        for column, cell in zip(columns, row, strict=True):
+            if isinstance(cell, float) and math.isfinite(cell):
+                cells[column] = cell
+            elif cell is not None or column in _REFERENCE_COLUMNS:
+                raise ModelError(f"{path}, row {number}: {column} must be a number, not {cell!r}")
+        sightings = []
+        for landmark, pair in pairs.items():
+            seen = [cells[column] for column in pair if column in cells]
+            if len(seen) == 1:
+                raise ModelError(
+                    f"{path}, row {number}: landmark {landmark} has a range or a bearing, but not both"
+                )
+            if seen:
+                sightings.append(Sighting(landmark=landmark, range_m=seen[0], bearing_rad=seen[1]))
+        time_s, x, y = (cells[column] for column in _REFERENCE_COLUMNS)
+        frames.append(RecordedFrame(number=number, time_s=time_s, x=x, y=y, sightings=tuple(sightings)))
+    return tuple(frames)
 
 
 def sightings_message(frame: RecordedFrame, header: Mapping[str, Any]) -> dict[str, Any]:
@@ -97,66 +104,6 @@ def sightings_message(frame: RecordedFrame, header: Mapping[str, Any]) -> dict[s
         message[f"range_{sighting.landmark}"] = sighting.range_m
         message[f"bearing_{sighting.landmark}"] = sighting.bearing_rad
     return message
-
-
-def _landmarks(path: Path, columns: Sequence[str]) -> tuple[int, ...]:
-    """Return the landmarks for which the file has columns."""
-    landmarks = tuple(int(match[1]) for column in columns if (match := _SIGHTING_COLUMN.fullmatch(column)))
-    wanted = [*_REFERENCE_COLUMNS, *(f"bearing_{landmark}_rad" for landmark in landmarks)]
-    missing = [column for column in wanted if column not in columns]
-    if missing or not landmarks:
-        raise DataFileError(
-            f"{path} is not a recording of sightings: its first line lacks the column "
-            f"{missing[0] if missing else 'range_N_m'}; name a file such as ds1_robot3.csv"
-        )
-    if unknown := set(landmarks) - set(LANDMARKS):
-        raise DataFileError(
-            f"{path} has sightings of landmark {min(unknown)}, but the landmarks are "
-            f"{LANDMARKS[0]} to {LANDMARKS[-1]}"
-        )
-    return landmarks
-
-
-def _frames(
-    path: Path, columns: Sequence[str], landmarks: Sequence[int], rows: Iterator[list[str]]
-) -> Iterator[RecordedFrame]:
-    for number, row in enumerate(rows, start=1):
-        where = f"{path}, line {number + 1}"
-        if len(row) != len(columns):
-            raise DataFileError(
-                f"{where} has {len(row)} values, but the heading has {len(columns)}: is the file truncated?"
-            )
-        cells = dict(zip(columns, row, strict=True))
-        sightings = []
-        for landmark in landmarks:
-            range_text, bearing_text = cells[f"range_{landmark}_m"], cells[f"bearing_{landmark}_rad"]
-            if bool(range_text) != bool(bearing_text):
-                raise DataFileError(f"{where}: landmark {landmark} has a range or a bearing, but not both")
-            if range_text:
-                sightings.append(
-                    Sighting(
-                        landmark=landmark,
-                        range_m=_number(range_text, where, f"range_{landmark}_m"),
-                        bearing_rad=_number(bearing_text, where, f"bearing_{landmark}_rad"),
-                    )
-                )
-        yield RecordedFrame(
-            number=number,
-            time_s=_number(cells["time_s"], where, "time_s"),
-            x=_number(cells["ref_x_m"], where, "ref_x_m"),
-            y=_number(cells["ref_y_m"], where, "ref_y_m"),
-            sightings=tuple(sightings),
-        )
-
-
-def _number(text: str, where: str, column: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise DataFileError(f"{where}: {column} must be a number, not {text!r}")
-    return value
 
 
 LOST_DISTANCE: Final = 9.0
@@ -299,8 +246,9 @@ app = CommandLine()
 
 @app.command(epilog="`python -m casestudies.mrclam.player data/ds1_robot3.csv --count 20`")
 def player(
-    recording: Annotated[
-        Path | None, typer.Argument(help="A file like ds1_robot3.csv.", show_default=False)
+    path: Annotated[
+        Path | None,
+        typer.Argument(help="A file like ds1_robot3.csv.", show_default=False, metavar="RECORDING"),
     ] = None,
     uri: Uri = DEFAULT_URI,
     topic: Annotated[str, typer.Option(help="Topic of the sightings.", metavar="TOPIC")] = SIGHTINGS_TOPIC,
@@ -323,9 +271,9 @@ def player(
     if print_msg:
         print(SIGHTINGS_MSG, end="")
         return
-    if recording is None:
+    if path is None:
         raise typer.BadParameter("name a file like ds1_robot3.csv", param_hint="RECORDING")
-    frames = read_recording(recording)[:count]
+    frames = read_recording(path)[:count]
     if numbers is not None:
         check_writable(numbers.parent)
     played: list[PlayedFrame] = []
@@ -335,7 +283,7 @@ def player(
         print(_line(frame), flush=True)
 
     async def body() -> None:
-        say(f"player: {len(frames)} frames of {recording} to {topic}, {uri}")
+        say(f"player: {len(frames)} frames of {path} to {topic}, {uri}")
         print(_HEADING, flush=True)
         await play(uri, frames, topic=topic, first_timeout_s=first_timeout, timeout_s=timeout, on_frame=show)
 
