@@ -1,24 +1,13 @@
 """Case studies, each with a model, a simulator or a data reader, and a page that describes it.
 
-This module has their common errors, and the common flags of their commands.
+This module has the common flags of their commands.
 """
 
-from typing import Annotated, ClassVar, Final
+from typing import Annotated, Final
 
 import typer
 
 from bridge.discovery import find_uri
-
-
-class CaseStudyError(Exception):
-    """Base class of the case studies' errors; `str()` is one sentence that says what to do."""
-
-    exit_code: ClassVar[int] = 2
-
-
-class DataFileError(CaseStudyError):
-    """A file of recorded data is missing or is not valid."""
-
 
 Uri = Annotated[
     str,

@@ -1,12 +1,12 @@
 """The posterior of a deployment for given readings, computed in this process: for notebooks and tests of models."""
 
-import difflib
 import time
 from collections.abc import Mapping
 from pathlib import Path
 
 from posteriors.errors import LabelError, PosteriorError
 from posteriors.posterior import Posterior
+from toolchain.bounded_files import nearest_name
 from toolchain.deployment import load_deployment
 
 
@@ -36,9 +36,9 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
     names = [variable.name for variable in deployment.variables]
     for name in readings:
         if name not in names:
-            near = difflib.get_close_matches(name, names, 1, 0.5)
-            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names)}"
-            raise LabelError(f"the deployment of {folder} has no variable {name!r}; {hint}")
+            raise LabelError(
+                f"the deployment of {folder} has no variable {name!r}; {nearest_name(name, names)}"
+            )
     if any(deployment.reading_shape(variable) for variable in deployment.variables):
         raise PosteriorError(
             f"the machine of {folder} has replicas or readings for each line: use machines.posterior with its image"

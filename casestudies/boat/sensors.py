@@ -12,7 +12,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from casestudies import CaseStudyError
 from casestudies.grid import Grid
 
 MAP_LOW: Final = -50.0
@@ -83,7 +82,7 @@ uint16 B3
 """
 
 
-class BadReadingError(CaseStudyError):
+class BadReadingError(Exception):
     """A message on the raw topic does not hold six numbers."""
 
 

@@ -6,7 +6,6 @@ python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR
 import csv
 import math
 import re
-import stat
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,11 +16,12 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from casestudies import DataFileError
 from casestudies.mrclam.player import LANDMARKS
 from terminal.command_line import CommandLine
 from terminal.errors import OutputError
 from terminal.output import check_writable, warn
+from toolchain.bounded_files import read_bounded
+from toolchain.errors import ModelError
 
 LARGEST_FILE: Final = 1 << 28
 """Maximum size of a file in bytes; the largest file of the data set has about 20 million."""
@@ -88,48 +88,31 @@ class Window:
 
 
 def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Read a file of the data set: numbers separated by spaces, comments after `#`.
+    """Yield the place of each line, for error messages, and its numbers, or raise a ModelError.
 
-    Yields:
-        Each line's place, for error messages, and its numbers.
-
-    Raises:
-        DataFileError: The file cannot be read, or a line does not contain these numbers.
+    In the files of the data set, numbers are separated by spaces, and comments begin with `#`.
     """
-    try:
-        if stat.S_ISFIFO(path.stat().st_mode):  # opening it would block until something writes to it
-            raise DataFileError(f"{path} is a pipe, not a file of the data set")
-        if path.stat().st_size > LARGEST_FILE:
-            raise DataFileError(
-                f"{path} is larger than {LARGEST_FILE >> 20} MiB, so it is not a file of the data set"
-            )
-        with path.open(encoding="utf-8") as file:
-            for number, line in enumerate(file, 1):
-                words = line.split("#", 1)[0].split()
-                if not words:
-                    continue
-                where = f"{path}, line {number}"
-                try:
-                    values = tuple(float(word) for word in words)
-                except ValueError:
-                    values = ()
-                if len(values) != len(names) or not all(map(math.isfinite, values)):
-                    raise DataFileError(f"{where}: expected {len(names)} numbers: {', '.join(names)}")
-                yield where, values
-    except OSError as error:
-        raise DataFileError(
-            f"{path} cannot be read: {error.strerror or error}; name the folder that the data set was unpacked into"
-        ) from None
-    except UnicodeDecodeError:
-        raise DataFileError(f"{path} is not text, so it is not a file of the data set") from None
+    text = read_bounded(path, LARGEST_FILE, ModelError).decode(errors="replace")
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split("#", 1)[0].split()
+        if not words:
+            continue
+        where = f"{path}, line {number}"
+        try:
+            values = tuple(float(word) for word in words)
+        except ValueError:
+            values = ()
+        if len(values) != len(names) or not all(map(math.isfinite, values)):
+            raise ModelError(f"{where}: expected {len(names)} numbers: {', '.join(names)}")
+        yield where, values
 
 
 def read_barcodes(folder: Path) -> dict[int, int]:
-    """Return the subject of each barcode (1 to 5: robots, 6 to 20: landmarks), or raise a DataFileError."""
+    """Return the subject of each barcode (1 to 5: robots, 6 to 20: landmarks), or raise a ModelError."""
     subjects: dict[int, int] = {}
     for where, (subject, barcode) in read_columns(folder / "Barcodes.dat", ("subject", "barcode")):
         if subject not in _SUBJECTS or barcode != int(barcode):
-            raise DataFileError(
+            raise ModelError(
                 f"{where}: expected a subject from {_SUBJECTS[0]} to {_SUBJECTS[-1]} and its barcode"
             )
         subjects[int(barcode)] = int(subject)
@@ -137,28 +120,28 @@ def read_barcodes(folder: Path) -> dict[int, int]:
 
 
 def read_positions(folder: Path) -> dict[int, tuple[float, float]]:
-    """Return the landmarks' positions in metres, from `Landmark_Groundtruth.dat`, or raise a DataFileError."""
+    """Return the landmarks' positions in metres, from `Landmark_Groundtruth.dat`, or raise a ModelError."""
     path = folder / "Landmark_Groundtruth.dat"
     names = ("subject", "x (m)", "y (m)", "deviation of x", "deviation of y")
     positions = {}
     for where, (subject, x, y, _, _) in read_columns(path, names):
         if subject not in LANDMARKS:
-            raise DataFileError(f"{where}: expected a landmark's number, {LANDMARKS[0]} to {LANDMARKS[-1]}")
+            raise ModelError(f"{where}: expected a landmark's number, {LANDMARKS[0]} to {LANDMARKS[-1]}")
         positions[int(subject)] = (x, y)
     if not positions:
-        raise DataFileError(f"{path} holds no landmark")
+        raise ModelError(f"{path} holds no landmark")
     return positions
 
 
 def read_track(folder: Path, robot: int) -> Track:
-    """Return a robot's track from `RobotN_Groundtruth.dat`, or raise a DataFileError."""
+    """Return a robot's track from `RobotN_Groundtruth.dat`, or raise a ModelError."""
     path = folder / f"Robot{robot}_Groundtruth.dat"
     names = ("time (s)", "x (m)", "y (m)", "orientation (rad)")
     rows = np.array([values for _, values in read_columns(path, names)], dtype=np.float64).reshape(-1, 4)
     if not len(rows):
-        raise DataFileError(f"{path} holds no positions")
+        raise ModelError(f"{path} holds no positions")
     if np.any(np.diff(rows[:, 0]) < 0):
-        raise DataFileError(f"{path}: its times do not rise")
+        raise ModelError(f"{path}: its times do not rise")
     return Track(rows[:, 0], rows[:, 1], rows[:, 2], np.unwrap(rows[:, 3]))
 
 
@@ -247,14 +230,14 @@ def _write(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) ->
 
 
 def robots_in(folder: Path) -> list[int]:
-    """Return the robots whose measurements are in the folder, or raise a DataFileError."""
+    """Return the robots whose measurements are in the folder, or raise a ModelError."""
     found = sorted(
         int(match[1])
         for path in folder.glob("Robot*_Measurement.dat")
         if (match := re.match(r"Robot(\d+)_", path.name))
     )
     if not found:
-        raise DataFileError(
+        raise ModelError(
             f"{folder} does not hold a RobotN_Measurement.dat: name the folder that the data set was unpacked into"
         )
     return found

@@ -12,7 +12,6 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 from bridge.errors import BridgeError
-from casestudies import CaseStudyError
 from services.child import ask_for_end_with_parent, own_command
 from services.errors import StackError
 from terminal.errors import ExitCode, StoppedError
@@ -211,7 +210,7 @@ def run_script(work: Callable[[], Awaitable[int]], limit: float) -> int:
     except StoppedError as stopped:
         print(stopped, file=sys.stderr)
         return stopped.exit_code
-    except (StackError, BridgeError, CaseStudyError, ToolchainError) as error:
+    except (StackError, BridgeError, ToolchainError) as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     except OSError as error:

@@ -5,11 +5,11 @@ import os
 
 import pytest
 
-from casestudies import DataFileError
 from casestudies.mrclam.convert import app, read_barcodes
 from casestudies.mrclam.model import read_landmarks
 from casestudies.mrclam.player import read_recording
 from tests.command_runner import invoke
+from toolchain.errors import ModelError
 
 T0 = 1248272272.0
 POSTS = {6: (5.0, 4.0), 7: (-1.0, 2.0), 8: (3.0, -4.0), 20: (-2.0, -2.0)}
@@ -133,5 +133,5 @@ def test_no_robot_and_no_window(data, tmp_path):
 
 def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "Barcodes.dat")
-    with pytest.raises(DataFileError, match=r"Barcodes\.dat"):
+    with pytest.raises(ModelError, match=r"Barcodes\.dat"):
         read_barcodes(tmp_path)
