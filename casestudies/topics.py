@@ -7,7 +7,7 @@ import os
 import time
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -129,8 +129,6 @@ class LossyPublication:
 
 TRUTH_TYPE: Final = "geometry_msgs/PoseStamped"
 
-_TRUTHS_KEPT = 4096
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Truth:
@@ -198,87 +196,31 @@ def read_truth(message: dict[str, Any], topic: str) -> Truth:
     return Truth(stamp_ns=pose.header.stamp, x=pose.pose.position.x, y=pose.pose.position.y)
 
 
-class Truths:
-    """Frames and true positions, matched in any order of arrival.
-
-    A frame waits for its truth until a newer truth or the next frame arrives. If no truth has exactly the
-    frame's stamp, the newest older one is used, if it is at most `tolerance_ns` older: a message without a
-    header is stamped only when it reaches the host.
-    """
-
-    def __init__(self, *, tolerance_ns: int = 0) -> None:
-        self._tolerance_ns = tolerance_ns
-        self._truths: deque[Truth] = deque(maxlen=_TRUTHS_KEPT)
-        self._untrue: deque[Instance] = deque()  # frames that still wait for their true pose
-
-    @property
-    def waits(self) -> bool:
-        """True while a frame waits for its truth."""
-        return bool(self._untrue)
-
-    def add_frame(self, heard: FrameOutcome) -> list[Instance]:
-        """Add a frame's outcome and return the instances that are now complete."""
-        self._untrue.append(Instance(heard=heard))
-        return self._resolve()
-
-    def add_truth(self, truth: Truth) -> list[Instance]:
-        """Add a true position and return the instances that are now complete."""
-        self._truths.append(truth)
-        return self._resolve()
-
-    def flush(self) -> list[Instance]:
-        """Return the frames that still wait for a truth, because it will not arrive."""
-        ended = [self._with_truth(instance) for instance in self._untrue]
-        self._untrue.clear()
-        return ended
-
-    def _resolve(self) -> list[Instance]:
-        ready: list[Instance] = []
-        while self._untrue:
-            report = self._untrue[0].report
-            waits = (
-                report is not None
-                and len(self._untrue) == 1
-                and bool(self._truths)
-                and self._truths[-1].stamp_ns < report.stamp_ns
-            )
-            if waits:
-                break
-            ready.append(self._with_truth(self._untrue.popleft()))
-        return ready
-
-    def _with_truth(self, instance: Instance) -> Instance:
-        if instance.report is None:
-            return instance
-        for truth in reversed(self._truths):
-            age_ns = instance.report.stamp_ns - truth.stamp_ns
-            if age_ns >= 0:
-                if age_ns > self._tolerance_ns:
-                    break
-                return Instance(heard=instance.heard, truth=truth, truth_age_ns=age_ns)
-        return instance
-
-
 _QUEUE_SIZE: Final = 256
 _PATIENCE_S: Final = 1.0
 """Seconds that a frame waits for its truth."""
 
 
 class Listener:
-    """The frames received and not yet returned by `next`; created by `listen`.
+    """The frames of a stack, each with its true position; created by `listen`.
+
+    If no truth has exactly the frame's stamp, the newest older one is used, if it is at most `tolerance_ns` older: a
+    message without a header is stamped only when it reaches the host.
 
     Attributes:
         route: The true positions received, the newest last.
     """
 
-    def __init__(self, heard: Posteriors, truths: Truths) -> None:
-        """Start without frames."""
+    def __init__(self, heard: Posteriors, tolerance_ns: int) -> None:
+        """Start without truths."""
         self.route: deque[Truth] = deque(maxlen=100_000)
         self._heard = heard
-        self._truths = truths
-        self._ready: deque[Instance] = deque()
-        self._failure: BadResultError | None = None
+        self._tolerance_ns = tolerance_ns
+        # Set by every truth; cleared by a frame whose truth did not come in time, so that later ones do not wait, too.
+        self._truths_come = False
         self._news = asyncio.Event()
+        # From `follow` on; it ends with the error of a message that is not a truth.
+        self._following: asyncio.Task[None] | None = None
 
     @property
     def announced_only(self) -> int:
@@ -286,50 +228,61 @@ class Listener:
         return self._heard.announced_only
 
     async def next(self, limit_s: float) -> Instance:
-        """Wait for the next frame.
+        """Wait for the next frame, then for its truth or a newer one.
 
         Raises:
             NoResultError: No frame arrived within the limit, in seconds.
-            BadResultError: A message was not a result.
+            BadResultError: A message was not a result, or not a true pose.
         """
-        now = asyncio.get_running_loop().time
-        end, flushing = now() + limit_s, now() + _PATIENCE_S
-        while not self._ready:
-            if self._failure is not None:
-                raise self._failure
-            if self._truths.waits and now() >= min(flushing, end):
-                self._ready.extend(self._truths.flush())
-            elif now() >= end:
-                raise await self._heard.no_result_error(limit_s)
-            else:
-                self._news.clear()
-                with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout_at(min(flushing, end) if self._truths.waits else end):
-                        await self._news.wait()
-        return self._ready.popleft()
+        hearing = asyncio.ensure_future(self._heard.next_frame(limit_s))
+        try:
+            followed = {hearing} if self._following is None else {hearing, self._following}
+            await asyncio.wait(followed, return_when=asyncio.FIRST_COMPLETED)
+            if self._following is not None and self._following.done():
+                self._following.result()
+            instance = Instance(heard=await hearing)
+        finally:
+            hearing.cancel()
+        if instance.report is not None:
+            await self._wait_for_truth(instance.report.stamp_ns)
+            for truth in reversed(self.route):
+                age_ns = instance.report.stamp_ns - truth.stamp_ns
+                if 0 <= age_ns <= self._tolerance_ns:
+                    return replace(instance, truth=truth, truth_age_ns=age_ns)
+                if age_ns > 0:
+                    break
+        return instance
 
-    async def follow_frames(self) -> None:
-        """Collect frames until the client is closed."""
-        while True:
-            try:
-                self._ready.extend(self._truths.add_frame(await self._heard.next_frame(None)))
-            except DisconnectedError:
-                return
-            except BadResultError as error:
-                self._failure = error
-            self._news.set()
+    async def _wait_for_truth(self, stamp_ns: int) -> None:
+        """Wait for a true position of this time, or a newer one."""
+        try:
+            async with asyncio.timeout(_PATIENCE_S):
+                while self._truths_come and self.route[-1].stamp_ns < stamp_ns:
+                    self._news.clear()
+                    await self._news.wait()
+        except TimeoutError:
+            self._truths_come = False
 
-    async def follow_truths(self, subscription: Subscription) -> None:
-        """Collect true positions until the subscription is closed."""
-        async for message in subscription:
-            try:
-                truth = read_truth(message.msg, message.topic)
-            except BadResultError as error:
-                self._failure = error
-            else:
-                self.route.append(truth)
-                self._ready.extend(self._truths.add_truth(truth))
-            self._news.set()
+    def add_truth(self, truth: Truth) -> None:
+        """Add a true position."""
+        self.route.append(truth)
+        self._truths_come = True
+        self._news.set()
+
+    @contextlib.asynccontextmanager
+    async def follow(self, subscription: Subscription) -> AsyncIterator[None]:
+        """Collect true positions within the context."""
+
+        async def collect() -> None:
+            async for message in subscription:
+                self.add_truth(read_truth(message.msg, message.topic))
+
+        self._following = asyncio.create_task(collect())
+        try:
+            yield
+        finally:
+            self._following.cancel()
+            await asyncio.gather(self._following, return_exceptions=True)
 
 
 @contextlib.asynccontextmanager
@@ -342,15 +295,9 @@ async def listen(
     """
     async with contextlib.AsyncExitStack() as stack:
         heard = await stack.enter_async_context(posteriors(ros, queue_size=_QUEUE_SIZE))
-        listener = Listener(heard, Truths(tolerance_ns=round(truth_tolerance_s * 1e9)))
-        followers = [asyncio.create_task(listener.follow_frames())]
+        listener = Listener(heard, round(truth_tolerance_s * 1e9))
         if truth_topic is not None:
             truths = ros.subscribe(truth_topic, TRUTH_TYPE, queue_size=_QUEUE_SIZE)
             await stack.enter_async_context(truths)
-            followers.append(asyncio.create_task(listener.follow_truths(truths)))
-        try:
-            yield listener
-        finally:
-            for follower in followers:
-                follower.cancel()
-            await asyncio.gather(*followers, return_exceptions=True)
+            await stack.enter_async_context(listener.follow(truths))
+        yield listener

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bridge.client import connect
-from casestudies.topics import Truth, Truths, listen, read_truth
+from casestudies.topics import Listener, Truth, listen, read_truth
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.frame_report import FrameReport
 from posteriors.posterior import Posterior
@@ -43,47 +43,76 @@ def told(instances):
     return [(i.report.number, i.truth.x if i.truth else None) for i in instances]
 
 
+class Heard:
+    """Frames in place of those of a server."""
+
+    def __init__(self, *frames):
+        self.frames = list(frames)
+
+    async def next_frame(self, _limit_s):
+        return self.frames.pop(0)
+
+
 @given(st.integers(1, 12), st.sets(st.integers(1, 12)))
 def test_frames_without_a_posterior_have_a_truth_too(frames, without):
-    truths = Truths()
-    heard = []
-    for number in range(1, frames + 1):
-        heard += truths.add_truth(truth(number))
-        one = frame(number)
-        heard += truths.add_frame(one.report if number in without else one)
+    async def hear():
+        listener = Listener(Heard(), 0)
+        heard = []
+        for number in range(1, frames + 1):
+            listener.add_truth(truth(number))
+            one = frame(number)
+            listener._heard.frames.append(one.report if number in without else one)
+            heard.append(await listener.next(PATIENCE))
+        return heard
+
+    heard = asyncio.run(hear())
     assert told(heard) == [(n, n) for n in range(1, frames + 1)]
     assert [i.posterior is None for i in heard] == [n in without for n in range(1, frames + 1)]
 
 
-def test_a_late_truth_is_waited_for_until_a_newer_one_or_the_next_frame_comes():
-    truths = Truths()
-    truths.add_truth(truth(1))
-    assert truths.add_frame(frame(2)) == []
-    assert truths.waits
-    assert told(truths.add_truth(truth(2))) == [(2, 2)]
-    truths.add_frame(frame(3))
-    assert told(truths.add_truth(truth(4))) == [(3, None)]
-    truths.add_frame(frame(5))
-    assert told(truths.add_frame(frame(6))) == [(5, None)]
-    assert told(truths.flush()) == [(6, None)]
-    assert truths.flush() == []
+async def test_a_late_truth_is_waited_for_until_a_newer_one_comes(monkeypatch):
+    monkeypatch.setattr("casestudies.topics._PATIENCE_S", PATIENCE)
+    listener = Listener(Heard(frame(2), frame(3)), 0)
+    listener.add_truth(truth(1))
+    heard = []
+    for newer in (2, 4):
+        waiting = asyncio.create_task(listener.next(PATIENCE))
+        done, _ = await asyncio.wait({waiting}, timeout=0.01)
+        assert not done
+        listener.add_truth(truth(newer))
+        heard.append(await waiting)
+    assert told(heard) == [(2, 2), (3, None)]
+
+
+async def test_frames_do_not_wait_for_truths_that_have_stopped(monkeypatch):
+    monkeypatch.setattr("casestudies.topics._PATIENCE_S", 0.01)
+    listener = Listener(Heard(frame(1), frame(2), frame(3), frame(4)), 0)
+    heard = [await listener.next(PATIENCE)]  # there was none at all
+    listener.add_truth(truth(1))
+    heard.append(await listener.next(PATIENCE))
+    monkeypatch.setattr("casestudies.topics._PATIENCE_S", 2 * PATIENCE)
+    async with asyncio.timeout(PATIENCE):
+        heard.append(await listener.next(PATIENCE))
+    listener.add_truth(truth(4))
+    heard.append(await listener.next(PATIENCE))
+    assert told(heard) == [(1, None), (2, None), (3, None), (4, 4)]
 
 
 @pytest.mark.parametrize(("tolerance_ns", "served"), [(50, True), (39, False)])
-def test_an_older_truth_serves_within_the_tolerance(tolerance_ns, served):
-    truths = Truths(tolerance_ns=tolerance_ns)
-    truths.add_truth(truth(1, stamp=960))
-    truths.add_frame(frame(1, stamp=1000))
-    (instance,) = truths.add_truth(truth(2, stamp=1030))
+async def test_an_older_truth_serves_within_the_tolerance(tolerance_ns, served):
+    listener = Listener(Heard(frame(1, stamp=1000)), tolerance_ns)
+    listener.add_truth(truth(1, stamp=960))
+    listener.add_truth(truth(2, stamp=1030))
+    instance = await listener.next(PATIENCE)
     assert told([instance]) == [(1, 1 if served else None)]
     assert instance.truth_age_ns == (40 if served else 0)
 
 
 def test_memory_is_bounded():
-    truths = Truths()
-    for number in range(10_000):
-        truths.add_truth(truth(number))
-    assert len(truths._truths) <= 4096
+    listener = Listener(Heard(), 0)
+    for number in range(100_010):
+        listener.add_truth(truth(number))
+    assert len(listener.route) == 100_000
 
 
 TRUTH = "/true"
