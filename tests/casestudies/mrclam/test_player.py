@@ -187,8 +187,8 @@ def test_the_median_counts_frames_without_a_result():
 @pytest.mark.process
 async def test_the_command_prints_a_line_a_frame_and_a_sum(tmp_path):
     path = tmp_path / "robot.csv"
-    lines = ["time_s,ref_x_m,ref_y_m,ref_std_m,heading_rad,range_6_m,bearing_6_rad"]
-    lines += [f"{f.number},{f.x!r},{f.y!r},0.04,0.1,{f.sightings[0].range_m},0.5" for f in FRAMES]
+    lines = [HEADING]
+    lines += [f"{f.number},{f.x!r},{f.y!r},0.04,0.1,{f.sightings[0].range_m},0.5{UNSEEN}" for f in FRAMES]
     path.write_text("\n".join(lines) + "\n")
 
     def answer(number, message):
