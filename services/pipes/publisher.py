@@ -52,8 +52,8 @@ def result_from_line(
     value = decoded(line, number, _Line, expected)
     found = len(value) if isinstance(value, list) else sum(len(board.counts) for board in value.boards)
     # results of another model with as many lines cannot be detected, because they do not name their deployment
-    # what a kind keeps of a frame, it checks itself
-    if found != count and (isinstance(value, list) or not any(board.kept for board in value.boards)):
+    kept = not isinstance(value, list) and any(board.kept for board in value.boards)
+    if found != count and not kept:
         raise InputLineError(f"{where} has {found} values; expected {expected}")
     if isinstance(value, list):
         return value
@@ -81,6 +81,12 @@ def result_from_line(
         )
         for board in value.boards
     ]
+    if kept:  # only the kind of machine knows how many results that makes
+        posterior = machine.kind.infer(boards, machine.variables).posterior
+        if posterior is not None and len(posterior) != count:
+            raise InputLineError(
+                f"{where} is a result of {len(posterior)} probabilities; expected {expected}"
+            )
     return FrameResult(value.number, encode_boards(boards), 0, 0, 0, 0), value.stamp_ns
 
 

@@ -7,6 +7,7 @@ import base64
 import io
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from posteriors.pairing import Pairing
 from posteriors.posterior import read_posterior
 from services.boards.deployed import images_of
 from services.boards.frames import decode_boards, result_record
+from services.errors import InputLineError
 from services.output.axes import Axis
 from services.output.posterior_file import record
 from services.output.posterior_output import line
@@ -161,12 +163,13 @@ def test_a_result_goes_through_a_pipe(folder, capsys, monkeypatch):
     frame = FrameInput(addresses=(1,), target_count=SAMPLES, max_cycles=2**32)
     boards = decode_boards(result)
     assert BM2.infer(boards).posterior.tolist() == BM2.posterior(machines, frame)[0].tolist()
+    other = SimpleNamespace(kind=BM2, results=3, replicas=1, variables=deployment.machine.variables)
+    with pytest.raises(InputLineError, match=r"line 4 .* 2 probabilities; expected .* 3 probabilities"):
+        result_from_line(printed, 4, other)
     spoilt = json.loads(printed)
     spoilt["boards"][0]["counts"].pop()
-    result, _ = result_from_line(json.dumps(spoilt).encode(), 1, deployment.machine)
     with pytest.raises(MachineError):
-        BM2.infer(decode_boards(result))
+        result_from_line(json.dumps(spoilt).encode(), 1, deployment.machine)
     spoilt["boards"][0]["kept"] = "AAAA"
-    result, _ = result_from_line(json.dumps(spoilt).encode(), 1, deployment.machine)
     with pytest.raises(MachineError):
-        BM2.infer(decode_boards(result))
+        result_from_line(json.dumps(spoilt).encode(), 1, deployment.machine)

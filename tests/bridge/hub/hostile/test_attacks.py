@@ -260,7 +260,9 @@ def test_a_turn_ends_after_a_bounded_amount_of_work(prepare):
     operation = prepare(hub)
     peer = next(iter(hub.broker.graph.clients.values()))
     messages = [json.dumps(operation | ({"id": index})).encode() for index in range(64)]
-    if prepare is _publish_to_many:  # with the type the first time, and then with an envelope that becomes known
+    if (
+        prepare is _publish_to_many
+    ):  # with the type the first time, and then with an envelope that becomes known
         del operation["type"]
         messages[1:] = [json.dumps(operation).encode()] * 63
     if prepare is _resubscribe:
