@@ -2,7 +2,7 @@
 
 from posteriors.emulation import posterior
 from posteriors.errors import BadResultError, LabelError, NoResultError, PosteriorError
-from posteriors.frame_report import BoardReport, FrameReport, StageTimes
+from posteriors.frame_report import BoardReport, FrameReport, StageTimes, VariableReading
 from posteriors.listening import Posteriors, listen, posteriors
 from posteriors.posterior import Posterior
 
@@ -16,6 +16,7 @@ __all__ = [
     "PosteriorError",
     "Posteriors",
     "StageTimes",
+    "VariableReading",
     "listen",
     "posterior",
     "posteriors",

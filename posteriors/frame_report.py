@@ -1,9 +1,11 @@
 """`/bm/frame`: the report of each frame, written and read with the same keys."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cache
 from operator import attrgetter
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import orjson
 from pydantic import BeforeValidator, Field, FiniteFloat, TypeAdapter
@@ -42,6 +44,25 @@ class BoardReport:
     replica_stopped: tuple[str, ...] = ()
 
 
+def _number_or_text(value: object) -> object:
+    try:
+        number = float(value) if isinstance(value, str) else math.nan
+    except ValueError:
+        return value
+    return number if math.isfinite(number) else value
+
+
+class VariableReading(NamedTuple):
+    """The reading of a variable in a frame."""
+
+    value: Annotated[float | str, BeforeValidator(_number_or_text)]
+    """As received, to nine digits; the name of a state, or `inf` for a clamped one, is text."""
+    address: int
+    """Address in the variable's column."""
+    age_ms: FiniteFloat
+    """Milliseconds from the receipt of its message to the sending of the report."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameReport:
     """A `/bm/frame` message; attributes that end in `_ns` are Unix times in nanoseconds."""
@@ -64,6 +85,10 @@ class FrameReport:
     boards: tuple[BoardReport, ...] = ()
     details: Mapping[str, str] = field(default_factory=dict)
     """Further values, whose keys depend on the kind of machine."""
+    missing: tuple[str, ...] = ()
+    """Names of the variables without a reading."""
+    readings: Mapping[str, VariableReading] = field(default_factory=dict)
+    """Readings by the names of their variables, without arrays."""
 
     @property
     def is_biased(self) -> bool:
@@ -82,7 +107,10 @@ _FRAME_KEYS: Final = {
     "received_ns": "%d",
     "sent_ns": "%d",
     **{f"{stage}_us": "%.1f" for stage in _STAGES},
+    "missing": "%s",
 }
+_READING: Final = "reading."
+"""Prefix of the keys of readings, before the name of the variable."""
 _BOARD_KEYS: Final = {"cycles": "%d", "counts_total": "%d", "reason": "%s"}
 _REPLICA_KEYS: Final = {"replica_cycles": "%s", "replica_reasons": "%s"}
 
@@ -109,12 +137,14 @@ def write_frame_report(report: FrameReport, ros_version: Literal[1, 2]) -> dict[
         % (
             *(not report.published or report.is_biased, _quoted(report.outcome), _quoted(report.deployment)),
             *(report.number, published, *_numbers(report), *_times(report.stages)),
+            _quoted(",".join(report.missing))[1:-1] if report.missing else "",
         )
     ]
-    if report.details:
-        pairs = [
-            f',{{"key":{_quoted(key)},"value":{_quoted(value)}}}' for key, value in report.details.items()
-        ]
+    pairs = [f',{{"key":{_quoted(key)},"value":{_quoted(value)}}}' for key, value in report.details.items()]
+    for name, (value, address, age_ms) in report.readings.items():
+        text = _quoted(value)[1:-1] if isinstance(value, str) else f"{value:.9g}"
+        pairs.append(f'{_reading_begin(name)}{text};{address};{age_ms:.1f}"}}')
+    if pairs:
         statuses[0] = f"{statuses[0].removesuffix(']}')}{''.join(pairs)}]}}"
     for index, board in enumerate(report.boards):
         reason = _quoted(board.stopped)
@@ -128,6 +158,12 @@ def write_frame_report(report: FrameReport, ros_version: Literal[1, 2]) -> dict[
         "header": header(report.stamp_ns, "bm", ros_version),
         "status": orjson.Fragment(f"[{','.join(statuses)}]"),
     }
+
+
+@cache
+def _reading_begin(name: str) -> str:
+    """Return the pair of a reading up to its value; the names are those of a deployment, so they are few."""
+    return f',{{"key":{_quoted(_READING + name)},"value":"'
 
 
 def _quoted(text: str) -> str:
@@ -179,7 +215,18 @@ def read_frame_report(message: dict[str, Any], heard_ns: int) -> FrameReport:
         "deployment": first.hardware_id,
         "stages": {stage: values[key] for stage in _STAGES if (key := f"{stage}_us") in values},
         "boards": [_board(each) for each in others],
-        "details": {key: value for key, value in values.items() if key not in _FRAME_KEYS},
+        "details": {
+            key: value
+            for key, value in values.items()
+            if key not in _FRAME_KEYS and not key.startswith(_READING)
+        },
+        "missing": [name for name in values.get("missing", "").split(",") if name],
+        "readings": {
+            # from the right, because the name of a state may have a semicolon
+            key.removeprefix(_READING): value.rsplit(";", 2)
+            for key, value in values.items()
+            if key.startswith(_READING)
+        },
     }
     return validated(_REPORT, report, FRAME_TOPIC, FRAME_TYPE)
 

@@ -325,6 +325,10 @@ class FrameFlow:
             received_tick=reading.received_tick,
             reading_sent_tick=reading.sent_tick,
             waited_ns=computing.sent - computing.waiting.arrived,
+            # arrays may be large, and a report has none
+            addresses=[-1 if isinstance(each, list) else each for each in reading.addresses],
+            values=reading.values,
+            ticks=reading.ticks,
         )
         if not self._at_publisher:
             self._published_at = time.monotonic()

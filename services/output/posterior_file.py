@@ -68,6 +68,10 @@ def record(frame: FrameOutcome, axes: list[Axis]) -> dict[str, Any]:
     Indices count from 0; `best_value` and `mean_value` exist if a deployment maps indices to values.
     """
     known: dict[str, Any] = {"frame": frame.number, "stamp_ns": frame.stamp_ns, "cycles": frame.cycles}
+    report = frame.report if isinstance(frame, Posterior) else frame
+    if report is not None:
+        readings = {name: reading._asdict() for name, reading in report.readings.items()}
+        known |= {"missing": report.missing, "readings": readings}
     if not isinstance(frame, Posterior):
         return known | {"outcome": frame.outcome}
     # names of states have no mean, and without a deployment there are only indices

@@ -3,6 +3,7 @@
 It has no sockets and no clock: messages go in, complete sets of addresses come out.
 """
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,7 @@ from bridge.fields import Field, all_missing
 from bridge.stamps import header_stamp_ns
 from services.errors import VariableError
 from services.pipeline.synchroniser import Synchroniser
-from services.sockets.records import Addresses, Reading
+from services.sockets.records import Addresses, Reading, Values
 from toolchain.deployment import Deployment, Variable
 from toolchain.deployment.address import to_address
 from toolchain.errors import ReadingError
@@ -41,24 +42,37 @@ class _SourceReader:
             self._prior is not None and not self._prior_optional
         )
 
-    def read(self, message: dict[str, Any]) -> tuple[Addresses, bytes]:
-        """Return a message's addresses and prior codes; a VariableError if a variable is missing or unusable."""
+    def read(self, message: dict[str, Any]) -> tuple[Addresses, Values, bytes]:
+        """Return a message's addresses, values and prior codes.
+
+        Raises:
+            VariableError: A variable is missing or unusable.
+        """
+        addresses: Addresses = []
+        values: Values = []
         try:
-            return [self._address(*each, message) for each in self._fields], self._prior_codes(message)
+            for variable, field in self._fields:
+                address, value = self._address(variable, field, message)
+                addresses.append(address)
+                values.append(None if address is None else _plain(value))
+            return addresses, values, self._prior_codes(message)
         except (BridgeError, ReadingError) as error:
             raise VariableError(f"{self.topic}: {error}") from error
 
-    def _address(self, variable: Variable, field: Field, message: dict[str, Any]) -> int | list[int] | None:
+    def _address(
+        self, variable: Variable, field: Field, message: dict[str, Any]
+    ) -> tuple[int | list[int] | None, object]:
+        """Return the address of a variable, and its value as received."""
         present, value = field.value(message)
         if not present and variable.on_missing == "error":
             # one error for all of them, because a message without one variable often lacks others too
             raise all_missing(self._missing(message), message)
         if variable.name not in self._arrays:
-            return to_address(variable, value)
+            return to_address(variable, value), value
         # imported here, because a subscriber of single numbers does not need NumPy
         from toolchain.deployment.address_array import to_addresses
 
-        return to_addresses(self._deployment, variable, value)
+        return to_addresses(self._deployment, variable, value), None
 
     def _missing(self, message: dict[str, Any]) -> list[Field]:
         return [
@@ -82,6 +96,16 @@ class _SourceReader:
             value, lines=machine.lines, prob_bits=machine.prob_bits, replicas=machine.replicas
         )
         return codes.astype("<u2").tobytes()
+
+
+def _plain(value: object) -> float | str | None:
+    """Return a usable reading as a record carries it."""
+    if isinstance(value, int | float):
+        try:
+            return float(value)
+        except OverflowError:  # an integer that was clamped
+            return math.inf if value > 0 else -math.inf
+    return value if isinstance(value, str) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,13 +173,14 @@ class FrameAssembler:
             VariableError: A variable is missing or unusable; the sentence names topic and variable.
         """
         stamp_ns = header_stamp_ns(message)
-        addresses, prior_codes = self._readers[source].read(message)
+        addresses, values, prior_codes = self._readers[source].read(message)
         taken = Reading(
             stamp_ns=received_ns if stamp_ns is None else stamp_ns,
             received_ns=received_ns,
             received_tick=received_tick,
             addresses=addresses,
             prior_codes=prior_codes,
+            values=values,
         )
         # without other topics, no stamp can be wrong
         if len(self._readers) == 1:
@@ -175,11 +200,14 @@ class FrameAssembler:
 
     def _joined(self, chosen: dict[int, Reading]) -> Reading:
         addresses: Addresses = [None] * self._width
+        values: Values = [None] * self._width
+        ticks = [0] * self._width
         prior_codes = b""
         for source, reading in chosen.items():
             prior_codes = prior_codes or reading.prior_codes
-            for column, address in zip(self._readers[source].columns, reading.addresses, strict=True):
-                addresses[column] = address
+            for at, column in enumerate(self._readers[source].columns):
+                addresses[column], values[column] = reading.addresses[at], reading.values[at]
+                ticks[column] = reading.received_tick
         self._since_pair = [0] * len(self._since_pair)
         # the latency of a frame counts from the message that completed it
         last = max(chosen.values(), key=lambda each: each.received_tick)
@@ -189,6 +217,8 @@ class FrameAssembler:
             received_tick=last.received_tick,
             addresses=addresses,
             prior_codes=prior_codes,
+            values=values,
+            ticks=ticks,
         )
 
     def needs(self, source: int) -> bool:

@@ -1,7 +1,7 @@
 """The posterior for the results of a frame, and the report of the frame."""
 
 from machines.kind import Inference
-from posteriors.frame_report import BoardReport, FrameReport, StageTimes
+from posteriors.frame_report import BoardReport, FrameReport, StageTimes, VariableReading
 from services.boards.frames import decode_boards
 from services.sockets.records import FrameResult, Publish
 from toolchain.deployment import Deployment
@@ -32,6 +32,8 @@ def report_of(
     # all times are of one monotonic clock, so what no process has measured was spent between them
     hops_ns = tick - publish.reading_sent_tick - publish.waited_ns - boards_ns
     reasons = deployment.machine.kind.reasons
+    names = [variable.name for variable in deployment.variables]
+    ticks = publish.ticks or [publish.received_tick] * len(names)
     return FrameReport(
         stamp_ns=publish.stamp_ns,
         outcome=inference.outcome,
@@ -64,4 +66,12 @@ def report_of(
             for index, (board, total) in enumerate(zip(inference.boards, inference.totals, strict=True))
         ),
         details=inference.details,
+        missing=tuple(
+            name for name, address in zip(names, publish.addresses, strict=False) if address is None
+        ),
+        readings={
+            name: VariableReading(value, address, (tick - at) / 1e6)
+            for name, value, address, at in zip(names, publish.values, publish.addresses, ticks, strict=False)
+            if value is not None and address is not None
+        },
     )

@@ -12,7 +12,7 @@ from pcie_shim.host.mini_cluster import FrameOutput
 from services.boards.deployed import DeployedBoards
 from services.errors import InputLineError
 from services.pipes.lines import blocking_lines, decoded
-from services.sockets.records import Addresses, FrameRequest
+from services.sockets.records import Addresses, FrameRequest, Values
 from terminal.output import print_json_line, say, say_if_slow
 
 
@@ -21,6 +21,7 @@ class LineReading(msgspec.Struct):
 
     addresses: Addresses
     stamp_ns: int | None = None
+    values: Values = []
     prior_codes: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 16)]] = []
 
 
@@ -54,14 +55,14 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
                 output = boards.run(frame)
             except FrameInputError as error:
                 raise InputLineError(f"line {number} of standard input: {error}") from error
-            print_json_line(_line(number, output, reading.stamp_ns, reasons))
+            print_json_line(_line(number, output, reading, reasons))
     finally:
         boards.close()
     return 0
 
 
 def _line(
-    number: int, output: FrameOutput, stamp_ns: int | None, reasons: Mapping[int, str]
+    number: int, output: FrameOutput, reading: LineReading, reasons: Mapping[int, str]
 ) -> dict[str, Any]:
     boards = []
     for board in output.boards:
@@ -76,4 +77,10 @@ def _line(
         if board.kept:
             values["kept"] = b64encode(board.kept).decode()
         boards.append(values)
-    return {"number": number, "stamp_ns": stamp_ns, "boards": boards}
+    return {
+        "number": number,
+        "stamp_ns": reading.stamp_ns,
+        "addresses": [-1 if isinstance(each, list) else each for each in reading.addresses],
+        "values": reading.values,
+        "boards": boards,
+    }

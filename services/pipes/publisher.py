@@ -13,7 +13,7 @@ from services.errors import InputLineError
 from services.pipeline.result_topics import ResultTopics
 from services.pipes.lines import decoded, lines
 from services.settings import Settings
-from services.sockets.records import FrameResult, Outcome, Publish
+from services.sockets.records import FrameResult, Outcome, Publish, Values
 from terminal.output import say
 from toolchain.deployment import Deployment, MachineSection
 
@@ -33,15 +33,15 @@ class _LineResult(msgspec.Struct):
     number: Unsigned
     boards: list[_LineBoard]
     stamp_ns: int | None = None
+    addresses: list[int | None] = []
+    values: Values = []
 
 
 _Line = _LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # JSON has no infinity
 
 
-def result_from_line(
-    line: bytes, number: int, machine: MachineSection
-) -> tuple[FrameResult, int | None] | list[float]:
-    """Return the value of a line: a result of `pcie-app` with the stamp of its reading, or probabilities.
+def result_from_line(line: bytes, number: int, machine: MachineSection) -> Publish | list[float]:
+    """Return the value of a line: a result of `pcie-app` with its reading, or probabilities.
 
     Raises:
         InputLineError: The line is neither.
@@ -87,7 +87,18 @@ def result_from_line(
             raise InputLineError(
                 f"{where} is a result of {len(posterior)} probabilities; expected {expected}"
             )
-    return FrameResult(value.number, encode_boards(boards), 0, 0, 0, 0), value.stamp_ns
+    # the reading was received elsewhere, so the times of its frame begin here
+    now, tick = time.time_ns(), time.monotonic_ns()
+    return Publish(
+        result=FrameResult(value.number, encode_boards(boards), 0, 0, 0, 0),
+        stamp_ns=value.stamp_ns or now,
+        received_ns=now,
+        received_tick=tick,
+        reading_sent_tick=tick,
+        waited_ns=0,
+        addresses=value.addresses,
+        values=value.values,
+    )
 
 
 async def publish_lines(settings: Settings, deployment: Deployment) -> int:
@@ -108,10 +119,7 @@ async def publish_lines(settings: Settings, deployment: Deployment) -> int:
                 await topics.publish_array(value)
                 outcomes[Outcome.PUBLISHED] += 1
                 continue
-            result, stamp_ns = value
-            # the reading was received elsewhere, so the times of its frame begin here
-            now, tick = time.time_ns(), time.monotonic_ns()
-            published = await topics.publish(Publish(result, stamp_ns or now, now, tick, tick, 0), look=False)
+            published = await topics.publish(value, look=False)
             outcomes[published.outcome] += 1
     published_count = outcomes.pop(Outcome.PUBLISHED, 0)
     others = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items())

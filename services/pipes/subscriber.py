@@ -81,7 +81,11 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
         while True:
             for reading in await next_readings():
                 codes = list(memoryview(reading.prior_codes).cast("H"))
-                line = {"stamp_ns": reading.stamp_ns, "addresses": reading.addresses}
+                line = {
+                    "stamp_ns": reading.stamp_ns,
+                    "addresses": reading.addresses,
+                    "values": reading.values,
+                }
                 print_json_line(line | ({"prior_codes": codes} if codes else {}))
                 printed += 1
                 if printed == count:

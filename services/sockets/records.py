@@ -131,6 +131,11 @@ Addresses = list[int | list[int] | None]
 If replicas or lines have their own readings, each is a flat list (row by row, -1 for a missing one).
 """
 
+Values = list[float | str | None]
+"""Values of a frame's readings as received, in the order of the variables, for its report; None for a missing
+reading, and for an array.
+"""
+
 
 class Reading(Record, tag="reading", frozen=True):
     """Subscriber to master: one complete set of addresses, with the newest stamp or receipt.
@@ -149,6 +154,9 @@ class Reading(Record, tag="reading", frozen=True):
     passed_over: int = 0
     unpaired: int = 0
     prior_codes: bytes = b""
+    values: Values = []
+    # Receipt of each variable's message; empty if all are of one message.
+    ticks: list[int] = []
 
 
 class Unusable(Record, tag="unusable", frozen=True):
@@ -203,6 +211,10 @@ class Publish(Record, tag="publish", frozen=True):
     reading_sent_tick: int
     # Time that the reading waited in the master for the boards.
     waited_ns: int
+    # The readings, for the report; an array is one address, -1.
+    addresses: list[int | None] = []
+    values: Values = []
+    ticks: list[int] = []
 
 
 class Published(Record, tag="published", frozen=True):

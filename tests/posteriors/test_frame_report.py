@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from posteriors import BadResultError, BoardReport, FrameReport, Posterior, StageTimes
+from posteriors import BadResultError, BoardReport, FrameReport, Posterior, StageTimes, VariableReading
 from posteriors.frame_report import read_frame_report, write_frame_report
 from posteriors.pairing import WAITING, Pairing
 from tests.posteriors.messages import JSON, report_message, status
@@ -50,6 +50,12 @@ REPORT = FrameReport(
         ),
     ),
     details={"samples": "9", 'of "b"': "100 % {x}"},
+    missing=("D2", 'B"2'),
+    readings={
+        "D1": VariableReading(71.25, 71, 3.5),
+        'of "a" %d': VariableReading('a "state"; 5', 2, 0.0),
+        "far": VariableReading("inf", 100, 1e9),
+    },
 )
 
 
@@ -66,7 +72,8 @@ def test_a_report_that_is_written_is_read_back_whole(ros_version):
     assert keys == [
         *("number", "published", "cycles", "counts_total", "received_ns", "sent_ns"),
         *("rosbridge_in_us", "local_hops_us", "waited_us", "register_writes_us", "compute_us"),
-        *("reads_us", "boards_compute_us", "rosbridge_out_us", "samples", 'of "b"'),
+        *("reads_us", "boards_compute_us", "rosbridge_out_us", "missing", "samples"),
+        *('of "b"', "reading.D1", 'reading.of "a" %d', "reading.far"),
     ]
 
 
@@ -87,6 +94,8 @@ def test_keys_may_be_absent_or_new():
         {"header": {"stamp": {"sec": 1, "nanosec": 1}}, "status": []},
         frame_message(cycles="many"),
         frame_message(reads_us="nan"),
+        frame_message(**{"reading.D1": "7"}),
+        frame_message(**{"reading.D1": "7;high;3"}),
     ],
 )
 def test_a_message_that_is_not_a_report_is_refused(message):
@@ -97,7 +106,9 @@ def test_a_message_that_is_not_a_report_is_refused(message):
 @given(
     st.dictionaries(st.sampled_from(["header", "status"]), JSON),
     st.dictionaries(
-        st.sampled_from(["number", "published", "cycles", "received_ns", "sent_ns", "compute_us"]),
+        st.sampled_from(
+            ["number", "published", "cycles", "received_ns", "sent_ns", "compute_us", "missing", "reading.D1"]
+        ),
         JSON.map(str),
     ),
 )

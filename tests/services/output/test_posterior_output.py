@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from posteriors.frame_report import FrameReport
+from posteriors.frame_report import FrameReport, VariableReading
 from posteriors.posterior import Posterior
 from services.errors import SettingsError
 from services.output import posterior_file
@@ -49,7 +49,13 @@ ROOMS = deployment(Dimension(label="room", size=3, states=("kitchen", "hall", "a
 def made(values, *labels, number=7):
     values = np.asarray(values, float)
     report = number and FrameReport(
-        stamp_ns=5, heard_ns=0, outcome="posterior", number=number, cycles=812, received_ns=1_000_000
+        stamp_ns=5,
+        heard_ns=0,
+        outcome="posterior",
+        number=number,
+        cycles=812,
+        received_ns=1_000_000,
+        readings={"D1": VariableReading(7.5, 7, 0.2)},
     )
     return Posterior(
         probabilities=tuple((values / values.sum()).ravel().tolist()),
@@ -60,7 +66,9 @@ def made(values, *labels, number=7):
     )
 
 
-EMPTY = FrameReport(stamp_ns=9, heard_ns=0, outcome="no posterior: impossible", number=8, published=False)
+EMPTY = FrameReport(
+    stamp_ns=9, heard_ns=0, outcome="no posterior: impossible", number=8, published=False, missing=("D2",)
+)
 
 
 class TestLine:
@@ -203,6 +211,8 @@ class TestFiles:
             "frame": 7,
             "stamp_ns": 5,
             "cycles": 812,
+            "missing": [],
+            "readings": {"D1": {"value": 7.5, "address": 7, "age_ms": 0.2}},
             "latency_us": 3210.0,
             "probability": 0.5,
             "best": {"y": 0, "x": 2},
@@ -213,7 +223,14 @@ class TestFiles:
             "sizes": [2, 3],
             "probabilities": [0, 0, 0.5, 0.125, 0, 0.375],
         }
-        assert empty == {"frame": 8, "stamp_ns": 9, "cycles": None, "outcome": "no posterior: impossible"}
+        assert empty == {
+            "frame": 8,
+            "stamp_ns": 9,
+            "cycles": None,
+            "missing": ["D2"],
+            "readings": {},
+            "outcome": "no posterior: impossible",
+        }
         assert last["frame"] == 9
 
     def test_states_and_no_deployment(self):

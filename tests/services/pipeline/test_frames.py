@@ -1,5 +1,6 @@
 """Frames: which messages make one, from one topic and from several."""
 
+import math
 import struct
 from contextlib import nullcontext
 
@@ -41,7 +42,7 @@ def stamped(ms, **values):
 def test_one_topic_every_message_is_a_frame_with_its_stamp():
     frames = FrameAssembler(deployment(variable("D1"), variable("D2")))
     (reading,) = frames.take(0, stamped(5, D2=7, deep={"D1": 3}), 11, 12)
-    assert reading.addresses == [3, 7]
+    assert (reading.addresses, reading.values) == ([3, 7], [3, 7])
     assert reading.stamp_ns == 100_005_000_000
     assert (reading.received_ns, reading.received_tick) == (11, 12)
     (reading,) = frames.take(0, {"D2": 1, "deep": {"D1": 1}}, 77, 0)
@@ -63,7 +64,22 @@ def test_missing_is_an_error_or_a_missing_address(message):
     with pytest.raises(VariableError, match=r"/t0: .*D1"):
         FrameAssembler(deployment(variable("D1"))).take(0, message, 0, 0)
     optional = FrameAssembler(deployment(variable("D1", on_missing="missing")))
-    assert optional.take(0, message, 0, 0)[0].addresses == [None]
+    (reading,) = optional.take(0, message, 0, 0)
+    assert (reading.addresses, reading.values) == ([None], [None])
+
+
+@pytest.mark.parametrize(
+    ("value", "address", "kept"),
+    [
+        *((True, 1, 1.0), (2.25, 2, 2.25), (10**400, 100, math.inf), (-(10**400), 0, -math.inf)),
+        ("hall", 1, "hall"),
+    ],
+)
+def test_values_are_kept_as_received(value, address, kept):
+    states = ("room", "hall", *map(str, range(99))) if value == "hall" else ()
+    frames = FrameAssembler(deployment(variable("D1", on_range="clamp", states=states)))
+    (reading,) = frames.take(0, {"D1": value}, 0, 0)
+    assert (reading.addresses, reading.values) == ([address], [kept])
 
 
 @pytest.mark.parametrize("value", ["12", 500, {"a": 1}, [1]])
@@ -77,7 +93,7 @@ def test_two_topics_are_paired_by_stamp():
     assert frames.take(0, stamped(0, D1=1), 1, 1) == []
     assert frames.take(0, stamped(100, D1=2), 2, 2) == []
     (reading,) = frames.take(1, stamped(100, D2=9), 3, 3)
-    assert reading.addresses == [2, 9]
+    assert (reading.addresses, reading.values, reading.ticks) == ([2, 9], [2, 9], [2, 3])
     assert reading.stamp_ns == 100_100_000_000
     assert frames.unpaired == 1  # the first one's time is over
     assert frames.take(1, stamped(101, D2=9), 4, 4) == []  # the second one is used

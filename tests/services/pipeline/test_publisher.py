@@ -5,11 +5,13 @@ from contextlib import asynccontextmanager
 from types import MappingProxyType
 from unittest.mock import Mock
 
+import msgspec
 import numpy as np
 import pytest
 
 from bridge.client import State
 from machines.kind import BoardResult
+from posteriors.frame_report import VariableReading
 from services.boards.frames import encode_boards
 from services.pipeline.connections import NotReceivableError
 from services.pipeline.inference import infer, report_of
@@ -264,3 +266,19 @@ def test_the_stages_of_a_report_are_the_whole_time_of_its_frame(boat):
     assert (stages.rosbridge_in, stages.waited, stages.rosbridge_out) == (20, 11, 4)
     assert (stages.register_writes, stages.compute, stages.reads, stages.boards_compute) == (3, 70, 5, 60)
     assert stages.local_hops == 300 - 120 - 11 - (3 + 70 + 5)  # what no process has measured
+
+
+def test_a_report_has_the_readings_with_their_ages(boat):
+    names = [variable.name for variable in boat.variables]
+    publish = msgspec.structs.replace(
+        result(boat, 1), received_tick=4_000_000, addresses=[3, None, -1], values=[3.2, None, None]
+    )
+    inference = infer(publish.result, boat)
+
+    def report(publish):
+        return report_of(publish, inference, boat, now=(1, 5_000_000), previous_out_ns=0)
+
+    assert report(publish).missing == (names[1],)
+    assert report(publish).readings == {names[0]: VariableReading(3.2, 3, 1.0)}
+    of_topics = msgspec.structs.replace(publish, ticks=[1_000_000, 0, 4_000_000])
+    assert report(of_topics).readings == {names[0]: VariableReading(3.2, 3, 4.0)}

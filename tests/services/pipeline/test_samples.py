@@ -158,10 +158,10 @@ def test_a_result_goes_through_a_pipe(folder, capsys, monkeypatch):
     with opened(folder, deployment) as boards:
         compute_lines(boards, 1)
     printed = capsys.readouterr().out.encode()
-    result, _ = result_from_line(printed, 1, deployment.machine)
+    result = result_from_line(printed, 1, deployment.machine)
     machines = [image.machine for image in images_of(deployment)]
     frame = FrameInput(addresses=(1,), target_count=SAMPLES, max_cycles=2**32)
-    boards = decode_boards(result)
+    boards = decode_boards(result.result)
     assert BM2.infer(boards).posterior.tolist() == BM2.posterior(machines, frame)[0].tolist()
     other = SimpleNamespace(kind=BM2, results=3, replicas=1, variables=deployment.machine.variables)
     with pytest.raises(InputLineError, match=r"line 4 .* 2 probabilities; expected .* 3 probabilities"):

@@ -22,9 +22,10 @@ BOAT = Path(__file__).parents[3] / "casestudies" / "boat"
 
 
 def test_a_reading():
-    line = b'{"addresses": [1, null, [1, -1]], "stamp_ns": 5, "prior_codes": [9, 2], "more": "ignored"}'
+    line = b'{"addresses": [1, null, [1, -1]], "stamp_ns": 5, "values": [7.5, null, "hall"], "prior_codes": [9, 2], "more": "ignored"}'
     reading = reading_from_line(line, 1)
     assert (reading.addresses, reading.stamp_ns, reading.prior_codes) == ([1, None, [1, -1]], 5, [9, 2])
+    assert reading.values == [7.5, None, "hall"]
 
 
 @pytest.mark.parametrize(
@@ -40,14 +41,18 @@ def test_a_line_that_is_not_a_reading_is_refused(line):
 
 
 def test_a_result_and_an_array():
-    counted, stamp = result_from_line(
-        b'{"number": 1, "boards": [{"counts": [1, 258], "cycles": 5, "reason": 1}]}', 1, of(2)
+    counted = result_from_line(
+        b'{"number": 1, "stamp_ns": 5, "addresses": [3, null], "values": [7.5, null],'
+        b' "boards": [{"counts": [1, 258], "cycles": 5, "reason": 1}]}',
+        1,
+        of(2),
     )
-    (one,) = decode_boards(counted)
-    assert (one.words, one.cycles, stamp) == (b"\1\0\0\0\2\1\0\0", 5, None)
+    (one,) = decode_boards(counted.result)
+    assert (one.words, one.cycles, counted.stamp_ns) == (b"\1\0\0\0\2\1\0\0", 5, 5)
+    assert (counted.addresses, counted.values) == ([3, None], [7.5, None])
     assert result_from_line(b"[0.25, 0.75]", 1, of(2)) == [0.25, 0.75]
-    counted, _ = result_from_line(board([1, 2, 3, 4], **OF_REPLICAS).encode(), 1, of(2, 2))
-    results = decode_boards(counted)
+    counted = result_from_line(board([1, 2, 3, 4], **OF_REPLICAS).encode(), 1, of(2, 2))
+    results = decode_boards(counted.result)
     assert results[0].replica_cycles == (9, 5)
     assert BM1.infer(results).posterior == pytest.approx([1 / 3, 2 / 3, 3 / 7, 4 / 7])
 
