@@ -10,10 +10,10 @@ from typing import Any, Final
 
 from casestudies.boat.sensors import BEACONS, map_grid
 from casestudies.grid import Grid
-from casestudies.pictures import new_figure, save_figure
 from casestudies.topics import Instance, Truth
 from posteriors.posterior import Posterior
 from terminal.errors import OutputError
+from terminal.pictures import new_figure, save_figure
 
 
 class StageKind(StrEnum):

@@ -16,6 +16,7 @@ from posteriors.errors import NoResultError
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import check_writable, say, warn, write_json
+from terminal.pictures import check_pictures_possible
 
 if TYPE_CHECKING:
     from casestudies.topics import Instance, Truth
@@ -252,12 +253,12 @@ def boat_viewer(
 
     It subscribes to /BMresults, /bm/frame and the topic of the true pose, and needs nothing else.
     """
-    from casestudies.pictures import check_pictures_possible
     from casestudies.topics import run_viewer
 
     viewer = Viewer(count)
     if out is not None:
-        check_pictures_possible(out)
+        check_pictures_possible("--out")
+        check_writable(out)
     if numbers is not None:
         check_writable(numbers.parent)
     watching = viewer.watch(

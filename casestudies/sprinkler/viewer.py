@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from bridge.client import Subscription, connect
 from bridge.errors import NoMessageError
 from casestudies import DEFAULT_URI, KEPT, Count, FirstTimeout, Timeout, Uri
-from casestudies.pictures import check_pictures_possible, new_figure, save_figure
 from casestudies.sprinkler.model import exact_rain
 from casestudies.topics import Readiness, run_viewer, serve_readiness
 from posteriors.errors import NoResultError
@@ -24,7 +23,8 @@ from posteriors.listening import posteriors
 from posteriors.posterior import SAMPLES_TOPIC, SAMPLES_TYPE, Posterior
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
-from terminal.output import say, warn
+from terminal.output import check_writable, say, warn
+from terminal.pictures import check_pictures_possible, new_figure, save_figure
 from toolchain.errors import counted
 
 PICTURE: Final = "sprinkler.png"
@@ -221,7 +221,8 @@ def sprinkler_viewer(
     """
     viewer = Viewer(count)
     if out is not None:
-        check_pictures_possible(out)
+        check_pictures_possible("--out")
+        check_writable(out)
     run_viewer(viewer.watch(uri, first_limit_s=first_timeout, limit_s=timeout), partial(viewer.finish, out))
 
 

@@ -6,13 +6,13 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from machines.parameters import RngKind
+from terminal.pictures import check_pictures_possible, new_figure, save_figure
 from toolchain.analysis import Sweep
 from toolchain.analysis.accuracy import measure
 from toolchain.analysis.emulation import EmulatedBoards
@@ -185,7 +185,6 @@ def _cell(value: float | None, form: str) -> str:
     return "-" if value is None else f"{value:{form}}"
 
 
-_DPI: Final = 75
 COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb")
 MARKERS: Final = "osD^v<>P"
 _SUFFIXES: Final = (".png", ".svg", ".pdf")
@@ -193,14 +192,9 @@ _KINDS_INSIDE: Final = 5
 """Maximum length of a legend inside the picture, because a longer one would cover points."""
 
 
-def check_pictures_possible(path: Path | None = None) -> None:
-    """Raise a BuildError before a long run if its picture cannot be drawn or written."""
-    if find_spec("matplotlib") is None:
-        raise BuildError(
-            "a plot needs matplotlib, which is not installed: run pip install matplotlib, or omit --plot"
-        )
-    if path is None:
-        return
+def check_plot(path: Path) -> None:
+    """Raise a BuildError or OutputError before a long run if its picture cannot be drawn or written."""
+    check_pictures_possible("--plot")
     if path.suffix not in _SUFFIXES:
         raise BuildError(
             f"{path} is not the name of a picture; expected a name that ends in {', '.join(_SUFFIXES)}"
@@ -218,7 +212,7 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
     largest = max((point.alms or 0.0 for point in shown), default=0.0) or 1.0
     kinds = sorted({(point.scale, point.rng) for point in shown})
     beside = len(kinds) > _KINDS_INSIDE
-    figure = new_figure((10.2 if beside else 7.2, 4.8))
+    figure = new_figure(10.2 if beside else 7.2, 4.8)
     axes = figure.subplots()
     for at, (scale, rng) in enumerate(kinds):
         of_kind = [point for point in shown if (point.scale, point.rng) == (scale, rng)]
@@ -252,23 +246,7 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
         figure.legend(loc="outside right center", fontsize="small", frameon=False)
     else:
         axes.legend(fontsize="small", frameon=False)
-    save_figure(figure, path)
-
-
-def new_figure(size: tuple[float, float]) -> Any:
-    """Return a matplotlib figure of a size in inches, or raise a BuildError."""
-    check_pictures_possible()
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=size, layout="constrained")
-
-
-def save_figure(figure: Any, path: Path) -> None:
-    """Write a picture without matplotlib's version, so that the file changes only with the drawing."""
-    try:
-        figure.savefig(path, dpi=_DPI, metadata={"Software": None} if path.suffix == ".png" else None)
-    except (OSError, ValueError) as reason:
-        raise BuildError(f"{path} cannot be written: {getattr(reason, 'strerror', None) or reason}") from None
+    save_figure(figure, path, dpi=75)
 
 
 @dataclass(frozen=True, slots=True)

@@ -110,7 +110,7 @@ def explore(
     from toolchain.analysis.readings import recorded_readings, sample_readings
 
     if plot is not None:
-        sweeps.check_pictures_possible(plot)
+        sweeps.check_plot(plot)
     device = device_named(readings.device)
     try:
         read = read_model(model, flags, bits)

@@ -183,10 +183,6 @@ def with_hash(deployment: Deployment) -> Deployment:
     return deployment.replace(hash=deployment_hash(deployment))
 
 
-_FORMER_KEYS: Final = ("integrity", "integrity_frames")
-"""Keys of earlier versions that were not part of the hash."""
-
-
 def load_deployment(directory: Path, *, images: bool = True, edited: bool = False) -> Deployment:
     """Read and check a deployment.
 
@@ -219,11 +215,6 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
         raise DeploymentVersionError(
             f"{path} {found}, and this version reads format {FORMAT}: build it again with 'toolchain build'"
         )
-    for key in _FORMER_KEYS:
-        if key in toml.tables:
-            raise toml.mistake(
-                (key,), f"'{key}' belonged to a check of the boards that was removed; delete this line"
-            )
     file = toml.validated(DeploymentFile)
     computed = deployment_hash(file)
     if computed != file.hash and not edited:

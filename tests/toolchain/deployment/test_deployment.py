@@ -215,12 +215,6 @@ def test_any_other_edit_is_found(folder, old, new):
     assert deployment_hash(boat())[:16] in refused(folder, DamagedDeploymentError)
 
 
-@pytest.mark.parametrize("key", ["integrity", "integrity_frames"])
-def test_a_key_of_an_earlier_version_is_to_be_deleted(folder, key):
-    edit(folder, "tolerance_s", f'{key} = "off"\ntolerance_s')
-    assert "delete this line" in refused(folder, place=(key,), line=7)
-
-
 @pytest.mark.parametrize("new", ["format = true", "format = 7\nwarp = true", ""])
 def test_another_format_is_reported_before_anything_else(folder, new):
     edit(folder, "format = 1\n", new + "\n")

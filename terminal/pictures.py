@@ -1,0 +1,31 @@
+"""Pictures: matplotlib without a display, if it is installed."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from terminal.errors import OutputError
+
+
+def check_pictures_possible(flag: str) -> None:
+    """Raise an OutputError if matplotlib is missing, so that a long run does not end without its pictures."""
+    if find_spec("matplotlib") is None:
+        raise OutputError(
+            f"{flag} needs matplotlib, which is not installed: run pip install matplotlib, or leave it out"
+        )
+
+
+def new_figure(width: float, height: float) -> Any:
+    """Return a figure of this size in inches, made without pyplot, which would need a display and keep state."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save_figure(figure: Any, path: Path, *, dpi: int = 130) -> None:
+    """Write a figure without matplotlib's version, so that the file changes only with the drawing, or raise an OutputError."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=dpi, metadata={"Software": None} if path.suffix == ".png" else None)
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}") from None
