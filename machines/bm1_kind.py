@@ -29,7 +29,7 @@ from machines.kind import (
     check_frame_value,
 )
 from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, RngKind, RngReset, SensorMode
-from machines.posterior import joint_posterior, posterior, posterior_of_lines
+from machines.posterior import posterior, posterior_of_lines, posteriors_of_replicas
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 _SENSOR_BITS_MAX: Final = 64  # columns whose widths fit into the capability registers
@@ -137,7 +137,10 @@ class BM1Kind(MachineKind):
         joint: npt.NDArray[np.float64] | None = None
         totals: list[int] = []
         if results and results[0].replica_cycles:
-            joint, totals = _joint_of_replicas(results)
+            of_boards = [board.counts for board in results]
+            totals = [int(each.sum(dtype=np.uint64)) for each in of_boards]
+            rows = posteriors_of_replicas(of_boards, [board.replica_cycles for board in results])
+            joint = None if rows is None else rows.ravel()
         else:
             counts = np.frombuffer(b"".join([board.words for board in results]), dtype="<u4")
             lines = [len(board.words) // 4 for board in results]
@@ -175,24 +178,6 @@ BM1: Final = BM1Kind()
 def _is_plain(parameters: BM1Parameters) -> bool:
     """Return whether a single machine has one input per column."""
     return parameters.replicas == 1 and parameters.sensor_mode is SensorMode.COLUMN
-
-
-def _joint_of_replicas(results: Sequence[BoardResult]) -> tuple[npt.NDArray[np.float64] | None, list[int]]:
-    """Return the posteriors of all replicas one after the other, and the sum of the counts of each board."""
-    replicas = len(results[0].replica_cycles)
-    counts = [np.frombuffer(board.words, dtype="<u4").reshape(replicas, -1) for board in results]
-    joints = [
-        joint_posterior(
-            [of_board[replica] for of_board in counts], [board.replica_cycles[replica] for board in results]
-        )
-        for replica in range(replicas)
-    ]
-    totals = [int(of_board.sum(dtype=np.uint64)) for of_board in counts]
-    if all(joint is None for joint in joints):
-        return None, totals
-    # a replica without a posterior has zeros, so that the others keep their places
-    lines = sum(of_board.shape[1] for of_board in counts)
-    return np.concatenate([np.zeros(lines) if joint is None else joint for joint in joints]), totals
 
 
 class _OnBoard(BoardMachine):

@@ -53,6 +53,24 @@ def posterior_of_lines(
     return np.divide(joint, total, out=joint) if total > 0 else None
 
 
+def posteriors_of_replicas(
+    counts: Sequence[npt.NDArray[np.uint32]], cycles: Sequence[Sequence[int]]
+) -> npt.NDArray[np.float64] | None:
+    """Return the `joint_posterior` of each replica, float64[replicas, all lines], or None if no replica has one.
+
+    There are uint32[replicas, lines], and the cycles of each replica, for each board. A replica without a posterior has
+    zeros, so that the others keep their places.
+    """
+    joints = [
+        joint_posterior([own[replica] for own in counts], [own[replica] for own in cycles])
+        for replica in range(len(counts[0]))
+    ]
+    if all(joint is None for joint in joints):
+        return None
+    lines = sum(own.shape[1] for own in counts)
+    return np.stack([np.zeros(lines) if joint is None else joint for joint in joints])
+
+
 Reading: TypeAlias = int | Sequence[int] | npt.NDArray[np.integer] | None
 """Reading of a sensor column: an address, an address or code per line (`sensor_mode`), or None if missing."""
 
@@ -117,22 +135,15 @@ def posterior(
             )
         )
     counts = [kernel.counts.reshape(parameters.replicas, -1) for kernel in kernels]
-    joints = [
-        joint_posterior(
-            [own[replica] for own in counts], [kernel.replica_cycles[replica] for kernel in kernels]
-        )
-        for replica in range(parameters.replicas)
-    ]
-    if all(joint is None for joint in joints):
+    rows = posteriors_of_replicas(counts, [kernel.replica_cycles for kernel in kernels])
+    if rows is None:
         cause = (
             "these readings select a code 0 on every line"
             if all(kernel.reason is StopReason.IMPOSSIBLE for kernel in kernels)
             else f"all counts are 0 after {max(kernel.cycles for kernel in kernels)} cycles"
         )
         raise NoPosteriorError(f"There is no posterior: {cause}.")
-    lines = sum(each.parameters.lines for each in machines)
-    rows = [np.zeros(lines) if joint is None else joint for joint in joints]
-    return rows[0] if parameters.replicas == 1 else np.stack(rows)
+    return rows[0] if parameters.replicas == 1 else rows
 
 
 def _inputs(parameters: BM1Parameters, readings: Sequence[Reading]) -> npt.NDArray[np.integer]:

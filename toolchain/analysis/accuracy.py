@@ -8,7 +8,7 @@ over frames have confidence intervals.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,6 +111,15 @@ class Cycles:
     median: Interval
     percentile_95: Interval
     worst: int
+
+    @classmethod
+    def of(cls, lengths: NDArray[np.float64]) -> Self:
+        """Return the statistics of frames, [frames] or [frames, banks]."""
+        return cls(
+            median=bootstrap(lengths, np.median),
+            percentile_95=bootstrap(lengths, lambda a, **k: np.quantile(a, 0.95, **k)),
+            worst=int(lengths.max()),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -278,11 +287,7 @@ class _Results:
             quantising=self.of_codes.summary(),
             sampling=self.of_sampling.summary(),
             z=z,
-            cycles=Cycles(
-                median=bootstrap(lengths, np.median),
-                percentile_95=bootstrap(lengths, lambda a, **k: np.quantile(a, 0.95, **k)),
-                worst=int(lengths.max()),
-            ),
+            cycles=Cycles.of(lengths),
         )
 
 

@@ -107,14 +107,11 @@ def run_chains(
         ends = ", ".join(f"{name} {count}" for name, count in sorted(reasons.items()))
         raise BuildError(f"none of the readings gives a posterior; boards stopped by: {ends}")
     distances, effective, r_hat, lengths = np.nan_to_num(np.array(rows), posinf=_INFINITE).T
-    percentile = bootstrap(lengths, lambda a, **k: np.quantile(a, 0.95, **k))
     sweeps = p.burn_in + samples if p.sample_every is SampleEvery.SWEEP else 0
     return Sampled(
         frames=len(rows),
         total_variation=None if model is None else bootstrap(distances, np.mean),
-        cycles=Cycles(
-            median=bootstrap(lengths, np.median), percentile_95=percentile, worst=int(lengths.max())
-        ),
+        cycles=Cycles.of(lengths),
         sweep_cycles=float(lengths.mean() / sweeps) if sweeps else 0.0,
         effective_samples=(float(np.median(effective)), float(effective.min())),
         r_hat=float(np.median(r_hat)),
