@@ -15,10 +15,8 @@ NumPy is imported when the first array is used (docs/how-to/listening.md).
 
 import asyncio
 import contextlib
-import threading
 from collections import deque
-from collections.abc import Callable, Coroutine, Iterator
-from concurrent.futures import Future
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from typing import Any, Final, Protocol, Self, TypeVar
 
 from bridge.client import Message, Ros, State, Subscription, connect
@@ -29,6 +27,7 @@ from posteriors.errors import BadResultError, NoResultError
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, read_frame_report
 from posteriors.pairing import WAITING, FrameOutcome, Pairing
 from posteriors.posterior import MAX_RESULT, RESULTS_TOPIC, RESULTS_TYPE, Posterior, read_posterior
+from terminal.health import in_thread
 
 QUEUE_SIZE: Final = 64
 """Default number of posteriors that wait for their reader."""
@@ -344,35 +343,20 @@ def listen(
 @contextlib.contextmanager
 def _loop_in_a_thread() -> Iterator[_RunInLoop]:
     """Run an event loop in its own thread within the context."""
-    started: Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = Future()
+    loops: list[asyncio.AbstractEventLoop] = []
 
-    async def until_stopped() -> None:
-        stop = asyncio.Event()
-        started.set_result((asyncio.get_running_loop(), stop))
-        await stop.wait()
-
-    def thread_main() -> None:
-        try:
-            asyncio.run(until_stopped())
-        except BaseException as error:
-            if started.done():
-                raise
-            started.set_exception(error)  # otherwise the caller would wait for a loop that never starts
-
-    thread = threading.Thread(target=thread_main, name="posteriors", daemon=True)
-    thread.start()
-    loop, stop = started.result()
+    @contextlib.asynccontextmanager
+    async def running() -> AsyncIterator[None]:
+        loops.append(asyncio.get_running_loop())
+        yield
 
     def run(work: Coroutine[Any, Any, Result]) -> Result:
-        future = asyncio.run_coroutine_threadsafe(work, loop)
+        future = asyncio.run_coroutine_threadsafe(work, loops[0])
         try:
             return future.result()
         except BaseException:
             future.cancel()
             raise
 
-    try:
+    with in_thread(running):
         yield run
-    finally:
-        loop.call_soon_threadsafe(stop.set)
-        thread.join()

@@ -194,7 +194,7 @@ def in_thread(serving: Callable[[], AbstractAsyncContextManager[None]]) -> Itera
         finally:
             loop.close()
 
-    thread = threading.Thread(target=run, name="status", daemon=True)
+    thread = threading.Thread(target=run, name="event loop", daemon=True)
     # signals must go to the main thread: a blocking call there would not return otherwise
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
     try:

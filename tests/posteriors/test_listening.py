@@ -187,7 +187,7 @@ class Calling:
 async def calling():
     async with FakeRosbridge() as fake:
         yield Calling(fake)
-    assert not [thread for thread in threading.enumerate() if thread.name == "posteriors"]
+    assert not [thread for thread in threading.enumerate() if thread.name == "event loop"]
 
 
 async def test_a_function_gets_each_in_the_callers_thread(calling):
@@ -200,7 +200,7 @@ async def test_a_function_gets_each_in_the_callers_thread(calling):
 
     assert await calling(function, count=3) == 3
     assert got == [1, 2, 3]
-    assert "posteriors" not in threads
+    assert "event loop" not in threads
 
 
 async def test_returning_false_ends_it_and_nothing_or_zero_does_not(calling):
@@ -271,11 +271,10 @@ def test_numpy_is_not_imported_before_it_is_wanted():
 
 
 def test_a_thread_without_a_loop_raises_in_the_caller(monkeypatch):
-    def run(work):
-        work.close()
+    def new_event_loop():
         raise OSError(errno.EMFILE, "Too many open files")
 
-    monkeypatch.setattr(asyncio, "run", run)
+    monkeypatch.setattr(asyncio, "new_event_loop", new_event_loop)
     with pytest.raises(OSError, match="Too many"):
         listen("ws://127.0.0.1:1", print)
 
