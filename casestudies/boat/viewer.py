@@ -2,11 +2,10 @@
 
 import math
 from collections import deque
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -26,74 +25,76 @@ SHARES_PICTURE: Final = "figure-4.5.png"
 HEADING: Final = "frame     true y, x     mean y, x  distance     cycles   time (ms)"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Line:
-    """The line printed for a frame. All pairs are (y, x), the order of the model; None is unknown.
+Numbers = dict[str, Any]
+"""A frame as a JSON object; None is unknown."""
+
+
+def numbers_of(instance: "Instance") -> Numbers:
+    """Return a frame in numbers, or raise an OutputError if its posterior is not over a map.
 
     `true_cell` and `mean` are indices of cells, from the lower left corner, as in the objects of `listen --json`;
-    `true_position` and `mean_value` are the positions in map units. `distance` is the distance in cells from the
+    `true_position` and `mean_value` are the positions in map units. `distance_cells` is the distance from the
     posterior's mean to the centre of the true cell.
     """
-
-    frame: int | None
-    true_position: tuple[float, float] | None
-    true_cell: tuple[int, int] | None
-    mean: tuple[float, float] | None
-    mean_value: tuple[float, float] | None
-    distance: float | None
-    cycles: int | None
-    time_ms: float | None
-    outcome: str
-
-    def __str__(self) -> str:
-        """Return the line, aligned with the columns of `HEADING`."""
-        frame = "-" if self.frame is None else str(self.frame)
-        true = "not known" if self.true_position is None else "{:.1f}, {:.1f}".format(*self.true_position)
-        if self.mean_value is None:
-            return f"{frame:>5}  {true:>12}  no posterior: {self.outcome or 'no reason given'}"
-        mean = "{:.1f}, {:.1f}".format(*self.mean_value)
-        distance = "-" if self.distance is None else f"{self.distance:.2f}"
-        cycles = "-" if self.cycles is None else str(self.cycles)
-        time = "-" if self.time_ms is None else f"{self.time_ms:.2f}"
-        return f"{frame:>5}  {true:>12}  {mean:>12}  {distance:>8}  {cycles:>9}  {time:>10}"
-
-
-def line_of(instance: "Instance") -> Line:
-    """Return the line for a frame, or raise an OutputError if its posterior is not over a map."""
     from casestudies.boat.pictures import posterior_grid
     from casestudies.boat.sensors import map_grid
 
-    grid = map_grid() if instance.posterior is None else posterior_grid(instance.posterior)
-    true_position = true_cell = mean = mean_value = None
-    if instance.truth is not None:
-        true_position = instance.truth.y, instance.truth.x
-        column, row = grid.cell(instance.truth.x, instance.truth.y)
-        true_cell = row, column
-    if instance.posterior is not None:
-        x, y = grid.mean(instance.posterior.probabilities)
-        mean_value = y, x
-        mean = (y - grid.y_low) / grid.cell_height - 0.5, (x - grid.x_low) / grid.cell_width - 0.5
-    report = instance.report
-    latency_us = instance.posterior.latency_us if instance.posterior else None
-    return Line(
-        frame=report.number if report else None,
-        true_position=true_position,
-        true_cell=true_cell,
-        mean=mean,
-        mean_value=mean_value,
-        distance=math.dist(true_cell, mean) if true_cell and mean else None,
-        cycles=report.cycles if report else None,
-        time_ms=None if latency_us is None else latency_us / 1000,
-        outcome=report.outcome if report else "",
+    truth, posterior, report = instance.truth, instance.posterior, instance.report
+    grid = map_grid() if posterior is None else posterior_grid(posterior)
+    places: Numbers = dict.fromkeys(
+        ("true_position", "true_position_age_ms", "true_cell", "mean", "mean_value", "distance_cells")
     )
+    if truth is not None:
+        column, row = grid.cell(truth.x, truth.y)
+        places["true_position"] = {"y": truth.y, "x": truth.x}
+        places["true_position_age_ms"] = instance.truth_age_ns / 1e6
+        places["true_cell"] = {"y": row, "x": column}
+    if posterior is not None:
+        x, y = grid.mean(posterior.probabilities)
+        mean = (y - grid.y_low) / grid.cell_height - 0.5, (x - grid.x_low) / grid.cell_width - 0.5
+        places["mean"] = dict(zip(("y", "x"), mean, strict=True))
+        places["mean_value"] = {"y": y, "x": x}
+        if truth is not None:
+            places["distance_cells"] = math.dist((row, column), mean)
+    latency_us = posterior.latency_us if posterior else None
+    return {
+        "frame": report.number if report else None,
+        "stamp_ns": report.stamp_ns if report else None,
+        **places,
+        "cycles": report.cycles if report else None,
+        "counts_total": report.counts_total if report else None,
+        "boards_compute_us": report.stages.boards_compute if report else None,
+        "time_ms": None if latency_us is None else latency_us / 1000,
+        "outcome": report.outcome if report else "",
+        "boards": [
+            {"name": b.name, "stopped": b.stopped, "cycles": b.cycles}
+            for b in (report.boards if report else ())
+        ],
+    }
+
+
+def line(numbers: Numbers) -> str:
+    """Return the line printed for a frame, aligned with the columns of `HEADING`."""
+
+    def shown(key: str, form: str, unknown: str = "-") -> str:
+        value = numbers[key]
+        if isinstance(value, dict):
+            return f"{value['y']:{form}}, {value['x']:{form}}"
+        return unknown if value is None else f"{value:{form}}"
+
+    start = f"{shown('frame', 'd'):>5}  {shown('true_position', '.1f', 'not known'):>12}"
+    if numbers["mean_value"] is None:
+        return f"{start}  no posterior: {numbers['outcome'] or 'no reason given'}"
+    times = f"{shown('cycles', 'd'):>9}  {shown('time_ms', '.2f'):>10}"
+    return f"{start}  {shown('mean_value', '.1f'):>12}  {shown('distance_cells', '.2f'):>8}  {times}"
 
 
 class Viewer:
-    """The frames of a run and their lines, from which the pictures are drawn.
+    """The frames of a run and their numbers, from which the pictures are drawn.
 
     Attributes:
         instances: The frames, the newest last; only the last `KEPT` if the viewer runs until Ctrl-C.
-        lines: The line of each.
+        numbers: The numbers of each.
         frames: The number of frames.
         results: The number of frames with a posterior.
     """
@@ -104,18 +105,17 @@ class Viewer:
         kept = KEPT if count is None else None
         self.instances: deque[Instance] = deque(maxlen=kept)
         self.route: tuple[Truth, ...] = ()
-        self.lines: deque[Line] = deque(maxlen=kept)
+        self.numbers: deque[Numbers] = deque(maxlen=kept)
         self.frames = 0
         self.results = 0
 
-    def add(self, instance: "Instance") -> Line:
+    def add(self, instance: "Instance") -> str:
         """Add a frame and return its line."""
-        line = line_of(instance)
         self.instances.append(instance)
-        self.lines.append(line)
+        self.numbers.append(numbers_of(instance))
         self.frames += 1
-        self.results += line.mean is not None
-        return line
+        self.results += instance.posterior is not None
+        return line(self.numbers[-1])
 
     async def watch(
         self, uri: str, *, truth_topic: str, truth_tolerance_s: float, first_limit_s: float, limit_s: float
@@ -140,10 +140,12 @@ class Viewer:
             print(HEADING, flush=True)
             try:
                 while self.count is None or self.results < self.count:
-                    print(self.add(await listener.next(limit_s if self.lines else first_limit_s)), flush=True)
+                    print(
+                        self.add(await listener.next(limit_s if self.numbers else first_limit_s)), flush=True
+                    )
                     readiness.record()
             except NoResultError as error:
-                if not self.lines:
+                if not self.numbers:
                     raise
                 raise NoResultError(f"after {_results(self.results)}, {error}") from None
             finally:
@@ -166,8 +168,10 @@ class Viewer:
 
     def medians(self) -> tuple[float | None, float | None]:
         """Return the median distance in cells and the median time in milliseconds, where they are known."""
-        distances = [line.distance for line in self.lines if line.distance is not None]
-        times = [line.time_ms for line in self.lines if line.time_ms is not None]
+        distances, times = (
+            [each[key] for each in self.numbers if each[key] is not None]
+            for key in ("distance_cells", "time_ms")
+        )
         return median(distances) if distances else None, median(times) if times else None
 
     def write_numbers(self, path: Path) -> None:
@@ -184,40 +188,9 @@ class Viewer:
                 {"stage": each.name, "part": each.part.value, "mean_us": each.mean_us, "share": each.share}
                 for each in stage_shares(self.instances)
             ],
-            "frames": [
-                _frame_numbers(line, instance)
-                for line, instance in zip(self.lines, self.instances, strict=True)
-            ],
+            "frames": list(self.numbers),
         }
         write_json(path, numbers)
-
-
-def _frame_numbers(line: Line, instance: "Instance") -> dict[str, object]:
-    """Return a frame as a JSON object."""
-    truth, report = instance.truth, instance.report
-    return {
-        "frame": line.frame,
-        "stamp_ns": report.stamp_ns if report else None,
-        "true_position": _by_label(line.true_position),
-        "true_position_age_ms": instance.truth_age_ns / 1e6 if truth else None,
-        "true_cell": _by_label(line.true_cell),
-        "mean": _by_label(line.mean),
-        "mean_value": _by_label(line.mean_value),
-        "distance_cells": line.distance,
-        "cycles": line.cycles,
-        "counts_total": report.counts_total if report else None,
-        "boards_compute_us": report.stages.boards_compute if report else None,
-        "time_ms": line.time_ms,
-        "outcome": line.outcome,
-        "boards": [
-            {"name": b.name, "stopped": b.stopped, "cycles": b.cycles}
-            for b in (report.boards if report else ())
-        ],
-    }
-
-
-def _by_label(pair: tuple[float, float] | None) -> dict[str, float] | None:
-    return None if pair is None else dict(zip(("y", "x"), pair, strict=True))
 
 
 def _results(number: int) -> str:

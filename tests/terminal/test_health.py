@@ -103,7 +103,9 @@ def test_nothing_is_served_without_a_directory(tmp_path, monkeypatch):
 
 def test_the_thread_takes_no_signals(tmp_path):
     with serving(tmp_path, status()):
-        thread = [each for each in threading.enumerate() if each.name == "event loop"][-1]  # others may end yet
+        thread = [each for each in threading.enumerate() if each.name == "event loop"][
+            -1
+        ]  # others may end yet
         lines = Path(f"/proc/self/task/{thread.native_id}/status").read_text().splitlines()
         blocked = next(line.split()[1] for line in lines if line.startswith("SigBlk"))
     assert int(blocked, 16) & (1 << 14)  # SIGTERM is 15
