@@ -45,18 +45,6 @@ class Grid:
         row = math.floor((y - self.y_low) / self.cell_height)
         return min(max(column, 0), self.width - 1), min(max(row, 0), self.height - 1)
 
-    def line(self, x: float, y: float) -> int:
-        """Return the machine's line of the cell that contains a point."""
-        column, row = self.cell(x, y)
-        return row * self.width + column
-
-    def centre(self, line: int) -> tuple[float, float]:
-        """Return the centre (x, y) of a line's cell, in the map's units, or raise an IndexError."""
-        if not 0 <= line < self.cells:
-            raise IndexError(f"line {line} of a grid of {self.cells} cells")
-        row, column = divmod(line, self.width)
-        return self.x_low + (column + 0.5) * self.cell_width, self.y_low + (row + 0.5) * self.cell_height
-
     def mean(self, posterior: Sequence[float]) -> tuple[float, float]:
         """Return the mean position (x, y) of a posterior over the cells' centres, in the map's units.
 

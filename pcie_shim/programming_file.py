@@ -11,9 +11,7 @@ not the date or the version of the tools.
 import hashlib
 import json
 import math
-import os
 import struct
-import time
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -39,6 +37,8 @@ MAX_IMAGE_BYTES: Final = 1 << 30
 
 _HEADER: Final = struct.Struct("<8sII32s")  # magic, length of the manifest, zero, SHA-256 of the manifest
 
+_Word: TypeAlias = Annotated[int, Field(ge=0, lt=2**32)]  # a number in a file is checked, a given one is not
+
 
 @dataclass(frozen=True)
 class Partition:
@@ -51,10 +51,10 @@ class Partition:
         total_lines: Lines of the whole model.
     """
 
-    index: int
-    count: int
-    line_offset: int
-    total_lines: int
+    index: _Word
+    count: _Word
+    line_offset: _Word
+    total_lines: _Word
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class Image:
         interface_sensors: Input words of the interface (thesis 3.2: 20).
         interface_results: Result words of the interface (thesis 3.2: 1200).
         model_hash: SHA-256 (hex) of the model; the same for all boards of a deployment.
-        build_date: Date of the build, ISO 8601 (see `build_date`).
+        build_date: Date of the build, ISO 8601.
         tool_version: Version of the toolchain.
 
     Raises:
@@ -140,17 +140,8 @@ class _Checked(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-_Word: TypeAlias = Annotated[int, Field(ge=0, lt=2**32)]
-
 # SHA-256 in hex, or the name of a kind: bounded, because errors quote them
 _Quoted: TypeAlias = Annotated[str, Field(max_length=64)]
-
-
-class _PartitionEntry(_Checked):
-    index: _Word
-    count: _Word
-    line_offset: _Word
-    total_lines: _Word
 
 
 class _Interface(_Checked):
@@ -173,7 +164,7 @@ class _Identity(_Checked, Generic[_Parameters]):
 
     machine: str
     parameters: _Parameters
-    partition: _PartitionEntry
+    partition: Partition
     interface: _Interface
     model_hash: _Quoted
     map_hash: _Quoted
@@ -202,17 +193,6 @@ class _Kind(BaseModel):
     """The part of `_Manifest` that is read before the kind of machine is known."""
 
     identity: _Named
-
-
-def build_date() -> str:
-    """Return the current time, or `SOURCE_DATE_EPOCH`, as ISO 8601 in UTC; an ImageError if that is not a time."""
-    epoch = os.environ.get("SOURCE_DATE_EPOCH")
-    try:
-        return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(None if epoch is None else int(epoch)))
-    except (ValueError, OverflowError, OSError):
-        raise ImageError(
-            f"SOURCE_DATE_EPOCH is {epoch!r}; it must be a number of seconds since 1970"
-        ) from None
 
 
 def tool_version() -> str:
@@ -269,11 +249,11 @@ def image_from_bytes(content: bytes, name: str = "the image") -> Image:
             f"{name} is damaged: the image hash is {manifest.identity.hash}, its manifest says "
             f"{manifest.image_hash}; build the deployment again"
         )
-    part, interface = manifest.identity.partition, manifest.identity.interface
+    interface = manifest.identity.interface
     try:
         return Image(
             machine=kind.machine(manifest.identity.parameters, sections),
-            partition=Partition(part.index, part.count, part.line_offset, part.total_lines),
+            partition=manifest.identity.partition,
             interface_sensors=interface.sensors,
             interface_results=interface.results,
             model_hash=manifest.identity.model_hash,
@@ -358,15 +338,12 @@ def _check_hash(name: str, what: str, data: bytes, expected: str, source: str) -
 
 
 def _manifest(image: Image, sections: list[tuple[str, npt.NDArray[Any]]]) -> _Manifest[Any]:
-    part = image.partition
     # the date and the version are outside: they do not change what the board computes
     parameters = image.kind.parameters
     identity = _Identity[parameters](  # type: ignore[valid-type]
         machine=image.kind.name,
         parameters=image.machine.parameters,
-        partition=_PartitionEntry(
-            index=part.index, count=part.count, line_offset=part.line_offset, total_lines=part.total_lines
-        ),
+        partition=image.partition,
         interface=_Interface(sensors=image.interface_sensors, results=image.interface_results),
         model_hash=image.model_hash,
         map_hash=image.map_hash,

@@ -84,11 +84,6 @@ class Simulation:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @property
-    def process(self) -> int:
-        """Process number of the child."""
-        return self._child.pid
-
     def close(self) -> None:
         """End the child, by force if it does not end at once."""
         with contextlib.suppress(OSError):

@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from casestudies.grid import Grid
+from tests.casestudies.cells import centre, line_at
 
 BOAT = Grid(x_low=-50, x_high=50, y_low=-50, y_high=50, width=32, height=32)
 
@@ -26,15 +27,15 @@ def grids(draw):
 def test_a_point_is_at_most_half_a_cell_from_its_cells_centre(grid, data):
     x = data.draw(st.floats(grid.x_low, grid.x_high))
     y = data.draw(st.floats(grid.y_low, grid.y_high))
-    centre_x, centre_y = grid.centre(grid.line(x, y))
+    centre_x, centre_y = centre(grid, line_at(grid, x, y))
     assert abs(centre_x - x) <= grid.cell_width / 2 * (1 + 1e-9)
     assert abs(centre_y - y) <= grid.cell_height / 2 * (1 + 1e-9)
 
 
 def test_lines_are_row_major_from_the_lower_left_corner():
-    assert BOAT.line(-49.9, -49.9) == 0
-    assert BOAT.line(49.9, -49.9) == 31
-    assert BOAT.line(-49.9, 49.9) == 31 * 32
+    assert line_at(BOAT, -49.9, -49.9) == 0
+    assert line_at(BOAT, 49.9, -49.9) == 31
+    assert line_at(BOAT, -49.9, 49.9) == 31 * 32
     assert BOAT.cell(0.1, -49.9) == (16, 0)
 
 

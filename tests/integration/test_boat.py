@@ -12,6 +12,7 @@ import pytest
 
 from casestudies.boat.model import model as boat_model
 from casestudies.boat.sensors import SENSOR_NAMES, map_grid
+from tests.casestudies.cells import line_at
 from tests.casestudies.figures import coverage, distances, means
 from tests.integration.conftest import PROGRAMMED, READING, build_boat, stamp_of
 from toolchain.deployment import load_deployment
@@ -65,7 +66,7 @@ async def test_frames_are_as_good_as_float64_fusion(stage, whole_boat, tmp_path)
         if at not in truths or at not in readings:
             continue  # the listener was late for the very first ones
         addresses = [to_address(variable, readings[at][variable.name]) for variable in variables]
-        lines.append(grid.line(truths[at]["x"], truths[at]["y"]))
+        lines.append(line_at(grid, truths[at]["x"], truths[at]["y"]))
         posteriors.append(result["data"])
         exact.append(exact_posterior(model, addresses))
     assert len(lines) >= FRAMES - 5

@@ -15,7 +15,7 @@ from machines.bm1_kind import BM1
 from machines.parameters import PriorMode, RngKind, RngReset, SensorMode
 from pcie_shim import programming_file, register_map
 from pcie_shim.errors import DamagedImageError, ImageError, ImageMismatchError
-from pcie_shim.programming_file import Image, build_date, image_bytes, image_from_bytes, read_image
+from pcie_shim.programming_file import Image, image_bytes, image_from_bytes, read_image
 from pcie_shim.register_layout import interface_room
 from tests.pcie_shim.boards import image, machine
 
@@ -200,16 +200,6 @@ def test_what_just_fits_is_accepted():
     assert image_from_bytes(image_bytes(largest)).partition == last.partition
     smallest = machine(1, lines=1, sensor_bits=(3,))
     dataclasses.replace(image(smallest), interface_sensors=1, interface_results=1)
-
-
-def test_the_build_date_repeats_where_it_is_asked_to(monkeypatch):
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
-    assert build_date() == "1970-01-02T00:00:00Z"
-    monkeypatch.setenv("SOURCE_DATE_EPOCH", "yesterday")
-    with pytest.raises(ImageError):
-        build_date()
-    monkeypatch.delenv("SOURCE_DATE_EPOCH")
-    assert build_date() > "2025"
 
 
 def test_tables_of_a_read_image_cannot_be_written():

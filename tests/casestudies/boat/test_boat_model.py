@@ -23,6 +23,7 @@ from casestudies.boat.sensors import (
     readings_message,
 )
 from casestudies.boat.simulator import Boat
+from tests.casestudies.cells import centre, line_at
 from tests.casestudies.figures import coverage, distances, means
 from tests.command_runner import invoke
 from toolchain.errors import ModelError
@@ -60,12 +61,12 @@ def test_shape_order_and_widths():
 def test_lines_are_the_grids_cells(line):
     row, column = divmod(line, 32)
     y, x = BOAT.searched
-    assert (x.value(column), y.value(row)) == pytest.approx(GRID.centre(line))
+    assert (x.value(column), y.value(row)) == pytest.approx(centre(GRID, line))
     assert (x.value(-0.5), y.value(31.5)) == pytest.approx((-50, 50))
 
 
 def test_tables_are_normals_around_distance_and_bearing():
-    centres = [GRID.centre(line) for line in range(GRID.cells)]
+    centres = [centre(GRID, line) for line in range(GRID.cells)]
     for away, around, beacon in zip(BOAT.known[:3], BOAT.known[3:], BEACONS, strict=True):
         means = np.array([distance(x, y, beacon) for x, y in centres])
         assert away.normal.mean == pytest.approx(means)
@@ -155,7 +156,7 @@ def test_float64_fusion_covers_the_truth(seed):
         boat.sail(0.5)
         readings = normalise(boat.measure())
         posteriors.append(exact_posterior(the_model, readings))
-        lines.append(grid.line(boat.x, boat.y))
+        lines.append(line_at(grid, boat.x, boat.y))
     exact = np.array(posteriors)
     assert coverage(lines, exact) == pytest.approx(0.95, abs=0.03)
     truth = np.stack(np.divmod(lines, grid.width)[::-1], axis=1)

@@ -17,6 +17,7 @@ from matplotlib.image import imread
 
 from casestudies.boat import viewer
 from casestudies.boat.sensors import map_grid
+from tests.casestudies.cells import line_at
 from tests.casestudies.pretend_stack import PretendStack, certain, frame_message
 from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge
@@ -66,7 +67,7 @@ def where_the_boat_is(fake):
         for op in fake.ops("publish", topic="/boat/true_pose"):
             if op["msg"]["header"]["stamp"] == message["header"]["stamp"]:
                 position = op["msg"]["pose"]["position"]
-                return certain(GRID.line(position["x"], position["y"]))
+                return certain(line_at(GRID, position["x"], position["y"]))
         raise AssertionError(f"no true pose has the stamp of {message}")
 
     return answer

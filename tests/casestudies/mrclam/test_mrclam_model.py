@@ -11,6 +11,7 @@ from casestudies.mrclam.model import Landmark, model, read_landmarks
 from casestudies.mrclam.player import area_grid
 from machines.encode import decode_code
 from scripts.benches.mrclam import LandmarkReading, unquantised_posterior
+from tests.casestudies.cells import centre
 from toolchain.building.quantise import quantise
 from toolchain.deployment.address import to_address
 from toolchain.errors import ModelError
@@ -70,13 +71,13 @@ def test_columns_alternate_and_may_all_be_missing(robot):
     assert nothing == pytest.approx(np.full(1024, 1 / 1024))
     for line in (0, 31, 500, 1023):
         x, y = robot.searched[1].value(line % 32), robot.searched[0].value(line // 32)
-        assert (x, y) == pytest.approx(GRID.centre(line))
+        assert (x, y) == pytest.approx(centre(GRID, line))
 
 
 @pytest.mark.parametrize("outlier", [None, 1])
 def test_bins_and_codes_are_as_accurate_as_raw_float64(robot, codes, outlier):
     random = np.random.default_rng(7)
-    cells = np.array([GRID.centre(line) for line in range(GRID.cells)])
+    cells = np.array([centre(GRID, line) for line in range(GRID.cells)])
     raw, binned, coded = [], [], []
     for _ in range(60):
         truth = random.uniform((-1, -6), (6, 6))
@@ -114,7 +115,7 @@ def test_unquantised_fusion_is_density_and_floor_at_the_centres(x, y, range_m, b
     )
     expected = []
     for line in range(20):
-        cx, cy = area_grid(5, 4).centre(line)
+        cx, cy = centre(area_grid(5, 4), line)
         product = 1.0
         if range_m is not None:
             product *= math.exp(-0.5 * ((range_m - math.dist((cx, cy), (x, y))) / 0.25) ** 2) + floor

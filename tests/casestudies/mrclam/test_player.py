@@ -23,6 +23,7 @@ from casestudies.mrclam.player import (
 )
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.posterior import Posterior
+from tests.casestudies.cells import centre
 from tests.casestudies.pretend_stack import PretendStack, certain
 from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge
@@ -92,7 +93,7 @@ GRID = area_grid()
 
 def recorded(number, line):
     """A frame whose reference position is the centre of a cell."""
-    x, y = GRID.centre(line)
+    x, y = centre(GRID, line)
     seen = (Sighting(landmark=6, range_m=float(line), bearing_rad=0.5),)
     return RecordedFrame(number=number, time_s=float(number), x=x, y=y, sightings=seen)
 

@@ -31,7 +31,7 @@ def test_garbage_is_an_error(tmp_path, answer):
     with Simulation(child(ECHO.format(answer=answer)), tmp_path) as simulation:
         with pytest.raises(SimulationError):
             simulation.read(0, 1)
-        assert not psutil.pid_exists(simulation.process)
+        assert not psutil.pid_exists(simulation._child.pid)
 
 
 @pytest.mark.thorough
@@ -60,13 +60,13 @@ def test_a_child_that_hangs_is_killed(tmp_path, monkeypatch):
     with Simulation(child("import time; time.sleep(1000)"), tmp_path) as simulation:
         with pytest.raises(SimulationError):
             simulation.run(10)
-        assert not psutil.pid_exists(simulation.process)
+        assert not psutil.pid_exists(simulation._child.pid)
 
 
 @pytest.mark.thorough
 def test_a_child_that_ignores_its_end_is_killed(tmp_path):
     with Simulation(child("import time; time.sleep(1000)"), tmp_path) as simulation:
-        process = simulation.process
+        process = simulation._child.pid
     assert not psutil.pid_exists(process)
 
 
