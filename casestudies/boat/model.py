@@ -4,6 +4,7 @@ Column order D1, D2, D3, B1, B2, B3; line = y * width + x from the lower left co
 """
 
 import math
+from typing import Literal
 
 import numpy as np
 
@@ -27,7 +28,12 @@ TURN = 360
 
 
 def model(
-    width: int = 32, height: int = 32, distance_step: int = 1, bearing_step: int = 1, array: bool = False
+    width: int = 32,
+    height: int = 32,
+    distance_step: int = 1,
+    bearing_step: int = 1,
+    array: bool = False,
+    on_missing: Literal["error", "missing"] = "missing",
 ) -> Model:
     """Return the boat's model; the likelihood of a cell is that of its centre.
 
@@ -39,6 +45,7 @@ def model(
         bearing_step: Degrees between distinguishable bearings; a divisor of 360.
         array: Whether readings are six numbers in a std_msgs/Float64MultiArray, in the order of the columns,
             instead of fields named after the sensors; for servers that accept only installed message types.
+        on_missing: Whether the other readings of a frame suffice (`missing`), or each is needed (`error`).
 
     Raises:
         ModelError: A grid without cells, or a step that does not fit.
@@ -63,6 +70,7 @@ def model(
                 step=distance_step,
                 bits=DISTANCE_BITS,
                 path=path[name],
+                on_missing=on_missing,
             )
         )
     for name, (beacon_x, beacon_y) in zip(BEARING_NAMES, BEACONS, strict=True):
@@ -75,6 +83,7 @@ def model(
                 step=bearing_step,
                 bits=BEARING_BITS,
                 path=path[name],
+                on_missing=on_missing,
             )
         )
     return Model(name="boat", searched=(rows, columns), known=tuple(known))

@@ -38,10 +38,14 @@ def normalise_bearing(raw: float) -> int:
     return math.floor(math.degrees(raw) + 0.5) % 360
 
 
-def normalise(raw: tuple[float, ...]) -> tuple[int, ...]:
-    """Return the machine's readings for raw readings, both in the order of `SENSOR_NAMES`."""
+def normalise(raw: tuple[float | None, ...]) -> tuple[int | None, ...]:
+    """Return the machine's readings for raw readings, both in the order of `SENSOR_NAMES`; None is a missing one."""
     return tuple(
-        normalise_distance(value) if name in DISTANCE_NAMES else normalise_bearing(value)
+        None
+        if value is None
+        else normalise_distance(value)
+        if name in DISTANCE_NAMES
+        else normalise_bearing(value)
         for name, value in zip(SENSOR_NAMES, raw, strict=True)
     )
 
@@ -49,7 +53,8 @@ def normalise(raw: tuple[float, ...]) -> tuple[int, ...]:
 async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) -> None:
     """Normalise messages until cancelled.
 
-    A message without six finite numbers is dropped, and each cause is reported once.
+    A message with anything else than finite numbers is dropped, and each cause is reported once. A missing reading stays
+    missing.
 
     Raises:
         BridgeError: No rosbridge server answers at the URI.

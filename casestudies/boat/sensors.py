@@ -12,13 +12,16 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from bridge.fields import Field
 from casestudies.grid import Grid
+from terminal.one_line import shown
 
 MAP_LOW: Final = -50.0
 """Lowest coordinate of the map, the square [MAP_LOW, MAP_HIGH]^2."""
 MAP_HIGH: Final = 50.0
 BEACONS: Final = ((-50.0, -50.0), (-50.0, 0.0), (0.0, -50.0))
 """Positions of the beacons: lower left corner, middle of the left side, middle of the lower side (4.1)."""
+BEACON_NAMES: Final = ("beacon1", "beacon2", "beacon3")
 DISTANCE_NAMES: Final = ("D1", "D2", "D3")
 BEARING_NAMES: Final = ("B1", "B2", "B3")
 SENSOR_NAMES: Final = DISTANCE_NAMES + BEARING_NAMES
@@ -57,6 +60,10 @@ SENSORS_TYPE: Final = "boat_msgs/Sensors"
 ARRAY_TYPE: Final = "std_msgs/Float64MultiArray"
 TRUE_POSE_TOPIC: Final = "/boat/true_pose"
 TRUE_POSE_TYPE: Final = "geometry_msgs/PoseStamped"
+SET_POSE_TOPIC: Final = "/boat/set_pose"
+"""Topic of poses where anybody may put the boat, of the same type as the true pose."""
+BEACONS_TOPIC: Final = "/boat/beacons"
+BEACONS_TYPE: Final = "visualization_msgs/MarkerArray"
 MAP_FRAME: Final = "map"
 
 RAW_MSG: Final = """\
@@ -83,7 +90,46 @@ uint16 B3
 
 
 class BadReadingError(Exception):
-    """A message on the raw topic does not hold six numbers."""
+    """A message on the raw topic holds something that is not a number."""
+
+
+class BadPoseError(Exception):
+    """A message on `/boat/set_pose` does not hold a position; `field` is the coordinate that is wrong."""
+
+    def __init__(self, field: str, value: object) -> None:
+        super().__init__(f"{field} must be a finite number, not {shown(repr(value))}")
+        self.field = field
+
+
+def read_set_pose(message: dict[str, Any]) -> tuple[float, float]:
+    """Return x and y of a geometry_msgs/PoseStamped, or raise a BadPoseError."""
+    found = []
+    for path in ("pose.position.x", "pose.position.y"):
+        value = Field(path).value(message)[1]
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise BadPoseError(path, value)
+        found.append(float(value))
+    return found[0], found[1]
+
+
+def beacon_markers(head: dict[str, Any]) -> dict[str, Any]:
+    """Return the beacons as a visualization_msgs/MarkerArray: a sphere for each, with its name."""
+    return {
+        "markers": [
+            {
+                "header": head,
+                "ns": "beacon",
+                "id": number,
+                "type": 2,  # SPHERE
+                "action": 0,  # ADD
+                "pose": true_pose(x, y, head)["pose"],
+                "scale": {"x": 3.0, "y": 3.0, "z": 3.0},
+                "color": {"r": 0.9, "g": 0.6, "b": 0.0, "a": 1.0},
+                "text": name,
+            }
+            for number, (name, (x, y)) in enumerate(zip(BEACON_NAMES, BEACONS, strict=True), 1)
+        ]
+    }
 
 
 def true_pose(x: float, y: float, head: dict[str, Any]) -> dict[str, Any]:
@@ -98,11 +144,12 @@ def true_pose(x: float, y: float, head: dict[str, Any]) -> dict[str, Any]:
 
 
 def readings_message(
-    values: Sequence[float], head: Mapping[str, Any] | None, *, array: bool
+    values: Sequence[float | None], head: Mapping[str, Any] | None, *, array: bool
 ) -> dict[str, Any]:
     """Return six readings, in the order of `SENSOR_NAMES`, as a message with this header, if any.
 
-    With `array` it is a std_msgs/Float64MultiArray, which does not have a header.
+    With `array` it is a std_msgs/Float64MultiArray, which does not have a header. A missing reading (None) is an absent
+    field, or null in an array, as rosbridge writes NaN.
     """
     if array:
         return {
@@ -110,16 +157,20 @@ def readings_message(
                 "dim": [{"label": "sensor", "size": len(values), "stride": len(values)}],
                 "data_offset": 0,
             },
-            "data": [float(value) for value in values],
+            "data": [None if value is None else float(value) for value in values],
         }
-    fields: dict[str, Any] = dict(zip(SENSOR_NAMES, values, strict=True))
+    named = zip(SENSOR_NAMES, values, strict=True)
+    fields: dict[str, Any] = {name: value for name, value in named if value is not None}
     return fields if head is None else {"header": dict(head), **fields}
 
 
 def read_raw(
     message: Mapping[str, Any], *, array: bool
-) -> tuple[tuple[float, ...], Mapping[str, Any] | None]:
-    """Return the six raw readings of a message and its header, if any, or raise a BadReadingError."""
+) -> tuple[tuple[float | None, ...], Mapping[str, Any] | None]:
+    """Return the six raw readings of a message and its header, if any, or raise a BadReadingError.
+
+    A reading that is absent, null or NaN is missing: None.
+    """
     if array:
         data = message.get("data")
         if not isinstance(data, list) or len(data) != len(SENSOR_NAMES):
@@ -129,9 +180,12 @@ def read_raw(
     else:
         named = {name: message.get(name) for name in SENSOR_NAMES}
         head = message.get("header")
-    values = []
+    values: list[float | None] = []
     for name, value in named.items():
+        if value is None or value != value:  # noqa: PLR0124 - NaN; math.isnan takes only numbers
+            values.append(None)
+            continue
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise BadReadingError(f"the raw reading {name} must be a finite number, not {value!r}")
+            raise BadReadingError(f"the raw reading {name} must be a finite number, or absent, not {value!r}")
         values.append(float(value))
     return tuple(values), head if isinstance(head, Mapping) else None

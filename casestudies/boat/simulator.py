@@ -1,44 +1,81 @@
-"""Simulator in place of Gazebo: a boat that sails between waypoints and publishes its sensors' readings."""
+"""Simulator in place of Gazebo: a boat that sails or is dragged, and publishes its sensors' readings.
+
+/boat/set_pose, services /boat/... ─▶ Boat ─▶ /boat/true_pose, /boat/raw at each step, and at once after a change
+"""
 
 import asyncio
+import contextlib
 import math
 import random
 import time
-from typing import Annotated
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from casestudies import DEFAULT_URI, Uri
 from casestudies.boat.sensors import (
     ARRAY_TYPE,
+    BEACON_NAMES,
     BEACONS,
+    BEACONS_TOPIC,
+    BEACONS_TYPE,
+    BEARING_NAMES,
     BEARING_SIGMA,
+    DISTANCE_NAMES,
+    LONGEST_DISTANCE,
     MAP_FRAME,
     MAP_HIGH,
     MAP_LOW,
     RAW_TOPIC,
     RAW_TYPE,
+    SENSOR_NAMES,
+    SET_POSE_TOPIC,
     TRUE_POSE_TOPIC,
     TRUE_POSE_TYPE,
+    BadPoseError,
+    beacon_markers,
     bearing,
     distance,
     distance_sigma,
+    read_set_pose,
     readings_message,
     true_pose,
 )
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
-from terminal.output import say
+from terminal.output import say, warn
 from terminal.signals import run_async
 
+if TYPE_CHECKING:
+    from bridge.client import Ros
+
+SWITCHES: Final = {
+    "sail": ("the boat sails along its waypoints", "the boat lies still"),
+    "noise": ("readings have the model's noise", "readings have no noise"),
+    **{
+        f"{name}/works": (f"{name} works", f"{name} is out of order: its distance and bearing are random")
+        for name in BEACON_NAMES
+    },
+    **{f"{name}/plugged": (f"{name} is plugged in", f"{name} is unplugged") for name in SENSOR_NAMES},
+}
+"""The switches, which are services below `/boat/`, and what holds when each is on and off. All are on at first."""
+_SWITCH_TYPE = "std_srvs/SetBool"
 _SHORE = 2.0  # waypoints are at least this far from the map's edge
 _SEEDS = 1_000_000
+# Minimum number of seconds between a reading and another one that a change causes: a mouse moves 1000 times a second.
+_SHORTEST = 0.02
+_POSE_BYTES = 65_536
 
 
 class Boat:
-    """A boat that starts in the middle of the map and is driven along random waypoints (thesis 4.1).
+    """The simulated world: a boat that starts in the middle of the map, its sensors and the beacons (thesis 4.1).
 
-    Two boats with the same seed sail the same route and measure the same readings.
+    Two boats with the same seed and the same switches sail the same route and measure the same readings.
+
+    Attributes:
+        switches: Whether each of `SWITCHES` is on. `put` turns `sail` off.
+        changed: Set when somebody has moved the boat or set a switch, until the next reading shows it.
     """
 
     def __init__(self, seed: int, speed: float) -> None:
@@ -48,10 +85,24 @@ class Boat:
         self.x = (MAP_LOW + MAP_HIGH) / 2
         self.y = (MAP_LOW + MAP_HIGH) / 2
         self._waypoint = self._next_waypoint()
+        self.switches = dict.fromkeys(SWITCHES, True)
+        self.changed = asyncio.Event()
+
+    def put(self, x: float, y: float) -> None:
+        """Put the boat at (x, y), or on the nearest shore if that is outside the map; it lies still there."""
+        self.x = min(max(x, MAP_LOW), MAP_HIGH)
+        self.y = min(max(y, MAP_LOW), MAP_HIGH)
+        self.switch("sail", on=False)
+
+    def switch(self, name: str, *, on: bool) -> str:
+        """Set one of `SWITCHES`, and return what now holds."""
+        self.switches[name] = on
+        self.changed.set()
+        return SWITCHES[name][0 if on else 1]
 
     def sail(self, seconds: float) -> None:
-        """Sail along the waypoints for that many seconds."""
-        left = self._speed * seconds
+        """Sail along the waypoints for that many seconds, unless the boat lies still."""
+        left = self._speed * seconds if self.switches["sail"] else 0.0
         while left > 0:
             to_go = math.dist((self.x, self.y), self._waypoint)
             if to_go > left:
@@ -62,18 +113,24 @@ class Boat:
             self.x, self.y = self._waypoint
             self._waypoint = self._next_waypoint()
 
-    def measure(self) -> tuple[float, ...]:
-        """Return noisy readings D1, D2, D3 (map units) and B1, B2, B3 (radians), with the model's noise.
+    def measure(self) -> tuple[float | None, ...]:
+        """Return readings D1, D2, D3 (map units) and B1, B2, B3 (radians), with the model's noise; None if unplugged.
 
         A distance may be negative or too long, and a bearing outside one turn; the normaliser corrects both.
         """
-        ranges = [distance(self.x, self.y, beacon) for beacon in BEACONS]
-        distances = [self._random.gauss(true, distance_sigma(true)) for true in ranges]
-        bearings = [
-            math.radians(self._random.gauss(bearing(self.x, self.y, beacon), BEARING_SIGMA))
-            for beacon in BEACONS
-        ]
-        return (*distances, *bearings)
+        noise = 1.0 if self.switches["noise"] else 0.0
+        measured: dict[str, float] = {}
+        for name, at, beacon in zip(DISTANCE_NAMES, BEACONS, BEACON_NAMES, strict=True):
+            true = distance(self.x, self.y, at)
+            measured[name] = self._random.gauss(true, noise * distance_sigma(true))
+            if not self.switches[f"{beacon}/works"]:
+                measured[name] = self._random.uniform(0, LONGEST_DISTANCE)
+        for name, at, beacon in zip(BEARING_NAMES, BEACONS, BEACON_NAMES, strict=True):
+            degrees = self._random.gauss(bearing(self.x, self.y, at), noise * BEARING_SIGMA)
+            if not self.switches[f"{beacon}/works"]:
+                degrees = self._random.uniform(0, 360)
+            measured[name] = math.radians(degrees)
+        return tuple(measured[name] if self.switches[f"{name}/plugged"] else None for name in SENSOR_NAMES)
 
     def _next_waypoint(self) -> tuple[float, float]:
         low, high = MAP_LOW + _SHORE, MAP_HIGH - _SHORE
@@ -92,7 +149,8 @@ async def simulate(
     """Sail and publish `count` readings, or publish until cancelled.
 
     Each step publishes the true pose and then the readings, with the same stamp, on `topic`: `boat_msgs/Raw`, or with
-    `array` std_msgs/Float64MultiArray. While the server is away the boat sails on.
+    `array` std_msgs/Float64MultiArray. So does a change of the boat from outside, at once. While the server is away
+    the boat sails on.
 
     Raises:
         BridgeError: No rosbridge server answers at the URI.
@@ -105,23 +163,93 @@ async def simulate(
     async with (
         serve_readiness("boat-simulator", readiness),
         connect(uri, retry=True, on_state=report_connection(uri)) as ros,
+        contextlib.AsyncExitStack() as at_the_end,
     ):
         ros_version = await ros.detect_ros_version()
         poses = LossyPublication(await ros.advertise(TRUE_POSE_TOPIC, TRUE_POSE_TYPE))
         type_ = ARRAY_TYPE if array else RAW_TYPE
         readings = LossyPublication(await ros.advertise(topic, type_))
-        refused = asyncio.ensure_future(report_refused(ros, topic, type_))
-        begin = time.monotonic()
-        step = 0
-        while count is None or step < count:
+        for work in (
+            report_refused(ros, topic, type_),
+            _show_beacons(ros),
+            _follow_poses(ros, boat),
+            _serve_switches(ros, boat),
+        ):
+            at_the_end.callback(asyncio.create_task(work).cancel)
+        due = time.monotonic()  # when the next step is, which a change does not delay
+        changed = False
+        published = 0
+        while count is None or published < count:
+            boat.changed.clear()
             head = header(time.time_ns(), MAP_FRAME, ros_version)
             await poses.publish(true_pose(boat.x, boat.y, head))
             if await readings.publish(readings_message(boat.measure(), head, array=array)):
                 readiness.record()
-            step += 1
-            boat.sail(1 / rate)
-            await asyncio.sleep(begin + step / rate - time.monotonic())
-        refused.cancel()
+            published += 1
+            if not changed:
+                boat.sail(1 / rate)
+                due += 1 / rate
+            changed = await _is_changed_before(due, boat)
+
+
+async def _is_changed_before(due: float, boat: Boat) -> bool:
+    """Wait until somebody changes the boat, at most until `due` (monotonic seconds), and return whether one did."""
+    try:
+        async with asyncio.timeout(due - time.monotonic()):
+            await asyncio.sleep(_SHORTEST)
+            await boat.changed.wait()
+    except TimeoutError:
+        return False
+    return True
+
+
+async def _show_beacons(ros: "Ros") -> None:
+    """Publish the beacons as markers, for those who come later too."""
+    from bridge.stamps import header
+    from casestudies.topics import LossyPublication
+
+    markers = LossyPublication(await ros.advertise(BEACONS_TOPIC, BEACONS_TYPE, latch=True))
+    await markers.publish(beacon_markers(header(time.time_ns(), MAP_FRAME, ros.ros_version)))
+
+
+async def _follow_poses(ros: "Ros", boat: Boat) -> None:
+    """Put the boat where messages on `/boat/set_pose` say; the first unusable ones of each kind are reported."""
+    from bridge.errors import TopicLeftOutError
+
+    reported: set[str] = set()
+    poses = ros.subscribe(SET_POSE_TOPIC, TRUE_POSE_TYPE, queue_size=1, max_bytes=_POSE_BYTES)
+    # a message that is too large for the connection ends the topic; the client has warned, and the boat sails on
+    with contextlib.suppress(TopicLeftOutError):
+        async for message in poses:
+            try:
+                boat.put(*read_set_pose(message.msg))
+            except BadPoseError as error:
+                if error.field not in reported:
+                    warn(f"a message on {SET_POSE_TOPIC} is refused: {error}")
+                    reported.add(error.field)
+
+
+async def _serve_switches(ros: "Ros", boat: Boat) -> None:
+    """Serve the switches, and warn if the server does not know their type."""
+    from casestudies.topics import SETTLED_S
+
+    def handler(name: str) -> Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]:
+        async def handle(request: dict[str, Any]) -> dict[str, Any]:
+            on = request.get("data")
+            if not isinstance(on, bool):
+                return {"success": False, "message": "`data` must be true or false, so nothing is changed"}
+            return {"success": True, "message": boat.switch(name, on=on)}
+
+        return handle
+
+    for name in SWITCHES:
+        await ros.advertise_service(f"/boat/{name}", _SWITCH_TYPE, handler(name))
+    await asyncio.sleep(SETTLED_S)
+    if await ros.service_type("/boat/sail") == "":
+        warn(
+            f"the server does not offer the boat's switches, services of type {_SWITCH_TYPE}: does it have std_srvs? "
+            "the boat sails on without them"
+        )
 
 
 app = CommandLine()
@@ -142,7 +270,10 @@ def boat_simulator(
         bool, typer.Option("--array", help="Publish std_msgs/Float64MultiArray instead of boat_msgs/Raw.")
     ] = False,
 ) -> int:
-    """Sail a boat about its map: publish noisy ranges and bearings, and the true pose on /boat/true_pose."""
+    """Sail a boat about its map: publish noisy ranges and bearings, and the true pose on /boat/true_pose.
+
+    A pose on /boat/set_pose moves the boat; services below /boat/ switch noise, beacons and sensors.
+    """
     chosen = random.SystemRandom().randrange(_SEEDS) if seed is None else seed
     say(f"boat-simulator: seed {chosen}, {rate:g} readings a second on {topic}, {uri}")
     return run_async(

@@ -13,13 +13,16 @@ from casestudies.boat.normaliser import app, normalise, normalise_bearing, norma
 from casestudies.boat.sensors import (
     BEACONS,
     BEARING_SIGMA,
+    LONGEST_DISTANCE,
     SENSOR_NAMES,
+    BadPoseError,
     BadReadingError,
     bearing,
     distance,
     distance_sigma,
     map_grid,
     read_raw,
+    read_set_pose,
     readings_message,
 )
 from casestudies.boat.simulator import Boat
@@ -52,7 +55,8 @@ def test_shape_order_and_widths():
     assert tuple(known.name for known in BOAT.known) == SENSOR_NAMES
     assert [known.table.shape for known in BOAT.known] == [(101, 1024)] * 3 + [(360, 1024)] * 3
     assert [known.bits for known in BOAT.known] == [7] * 3 + [9] * 3
-    assert [known.on_missing for known in BOAT.known] == ["error"] * 6
+    assert [known.on_missing for known in BOAT.known] == ["missing"] * 6
+    assert [known.on_missing for known in model(2, 2, on_missing="error").known] == ["error"] * 6
     assert [(d.label, d.size) for d in BOAT.searched] == [("y", 32), ("x", 32)]
     assert BOAT.prior_distribution == pytest.approx(np.full(1024, 1 / 1024))
 
@@ -148,6 +152,61 @@ def test_the_noise_is_the_models():
         assert statistics.stdev(bearings) == pytest.approx(BEARING_SIGMA, rel=0.06)
 
 
+def pose(x, y):
+    return {"pose": {"position": {"x": x, "y": y, "z": math.nan}}}
+
+
+def test_a_boat_that_is_put_somewhere_lies_still_until_it_sails_on():
+    boat = Boat(5, 60)
+    boat.put(*read_set_pose(pose(-20, 30.5)))
+    boat.sail(1.0)
+    assert (boat.x, boat.y) == (-20, 30.5)
+    boat.put(1e300, -51)
+    assert (boat.x, boat.y) == (50, -50)
+    assert boat.changed.is_set()
+    boat.switch("sail", on=True)
+    boat.sail(0.1)
+    assert math.dist((boat.x, boat.y), (50, -50)) == pytest.approx(6)
+
+
+@pytest.mark.parametrize(
+    ("message", "field"),
+    [
+        ({}, "pose.position.x"),
+        ({"pose": "here"}, "pose.position.x"),
+        ({"pose": {"position": {"y": 1.0}}}, "pose.position.x"),
+        (pose("1", 2), "pose.position.x"),
+        (pose(True, 2), "pose.position.x"),
+        (pose(1, math.nan), "pose.position.y"),
+        (pose(1, math.inf), "pose.position.y"),
+        (pose(1, [2.0]), "pose.position.y"),
+    ],
+)
+def test_a_place_that_is_no_place_is_refused(message, field):
+    with pytest.raises(BadPoseError, match=field):
+        read_set_pose(message)
+
+
+def test_switches_of_the_boat():
+    boat = Boat(5, 0)
+    boat.put(*BEACONS[1])
+    boat.switch("noise", on=False)
+    exact = (50, 0, math.hypot(50, 50), math.pi / 2, 0, math.radians(135))
+    assert boat.measure() == pytest.approx(exact)
+    boat.switch("D1/plugged", on=False)
+    boat.switch("B3/plugged", on=False)
+    assert [value is None for value in boat.measure()] == [True, *[False] * 4, True]
+    assert boat.switch("D1/plugged", on=True) != boat.switch("D1/plugged", on=False)
+    boat.switch("beacon2/works", on=False)
+    measured = [boat.measure() for _ in range(2000)]
+    for column, turn in ((1, LONGEST_DISTANCE), (4, 2 * math.pi)):
+        values = [each[column] for each in measured]
+        assert 0 <= min(values) < 0.01 * turn
+        assert 0.99 * turn < max(values) <= turn
+        assert statistics.fmean(values) == pytest.approx(turn / 2, rel=0.06)
+    assert {each[2] for each in measured} == {math.hypot(50, 50)}
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_float64_fusion_covers_the_truth(seed):
     the_model, grid, boat = model(), map_grid(), Boat(seed, 60)
@@ -203,12 +262,21 @@ def test_arrays_hold_the_numbers_in_the_columns_order():
     assert message["layout"]["dim"] == [{"label": "sensor", "size": 6, "stride": 6}]
 
 
-@pytest.mark.parametrize("bad", [None, "12", math.nan, math.inf, True, [1.0]])
+@pytest.mark.parametrize("bad", ["12", math.inf, True, [1.0]])
 def test_a_reading_that_is_not_a_number_is_refused_by_name(bad):
-    absent = {name: value for name, value in RAW.items() if name != "B2"}
-    for reading in (RAW | {"B2": bad}, absent):
-        with pytest.raises(BadReadingError, match="B2"):
-            read_raw(reading, array=False)
+    with pytest.raises(BadReadingError, match="B2"):
+        read_raw(RAW | {"B2": bad}, array=False)
+
+
+@pytest.mark.parametrize("missing", [{}, {"B2": None}, {"B2": math.nan}])
+def test_a_missing_reading_stays_missing(missing):
+    rest = {name: value for name, value in RAW.items() if name != "B2"}
+    whole = normalise(read_raw({"header": HEAD, **rest, **missing}, array=False)[0])
+    assert whole == (2, 0, 100, 0, None, 270)
+    assert list(readings_message(whole, HEAD, array=False)) == ["header", "D1", "D2", "D3", "B1", "B3"]
+    data = [missing.get(name, RAW[name]) if name != "B2" else missing.get("B2") for name in RAW]
+    again = normalise(read_raw({"data": data}, array=True)[0])
+    assert readings_message(again, None, array=True)["data"] == [2.0, 0.0, 100.0, 0.0, None, 270.0]
 
 
 @pytest.mark.parametrize("data", [None, [], [1.0] * 5, "AAAA"])

@@ -176,7 +176,7 @@ async def test_a_normaliser_says_what_went_wrong_once():
     async with FakeRosbridge() as fake, Process("normaliser", "--uri", fake.uri) as normaliser:
         await fake.wait_for_op("subscribe", topic="/boat/raw", timeout=PROCESS_PATIENCE)
         for _ in range(3):
-            await fake.publish("/boat/raw", {**good, "B2": None})
+            await fake.publish("/boat/raw", {**good, "B2": "north"})
         await fake.publish("/boat/raw", good)
         await fake.wait_for_op("publish", topic="/boat/sensors", timeout=PROCESS_PATIENCE)
         (sent,) = fake.ops("publish", topic="/boat/sensors")
