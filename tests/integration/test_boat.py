@@ -14,12 +14,13 @@ from casestudies.boat.model import model as boat_model
 from casestudies.boat.sensors import SENSOR_NAMES, map_grid
 from tests.casestudies.cells import line_at
 from tests.casestudies.figures import coverage, distances, means
-from tests.integration.conftest import PROGRAMMED, READING, build_boat, stamp_of
+from tests.integration.conftest import PROGRAMMED, READING, ROOT, Robot, build_boat, stamp_of, until
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.models.model import exact_posterior
 
 LISTENER = str(Path(__file__).with_name("roslibpy_listener.py"))
+HAND = str(Path(__file__).with_name("roslibpy_hand.py"))
 FRAMES, SEED = 400, 20261121
 
 
@@ -86,3 +87,73 @@ async def test_roslibpy_as_the_robot(stage, boat, tmp_path):
     assert await robot.end() == 0, robot.err
     (result,) = heard(tmp_path / "heard")["/BMresults"]
     assert abs(sum(result["data"]) - 1) < 1e-9
+
+
+def values_of(report):
+    return {pair["key"]: pair["value"] for pair in report["status"][0]["values"]}
+
+
+def reading_of(values, name):
+    """Value and address of a reading in a report."""
+    value, address, _age = values[f"reading.{name}"].split(";")
+    return float(value), int(address)
+
+
+@pytest.mark.process
+async def test_the_posterior_follows_what_is_done_to_the_world(stage, tmp_path):
+    """A sensor is unplugged, the boat is dragged, and a beacon fails, by another client of the same hub."""
+    _, uri = await stage.hub()
+    deployment = build_boat(tmp_path / "deployment", cells=16)
+    model, grid = boat_model(16, 16), map_grid(16, 16)
+    environment = {"PYTHONPATH": str(ROOT)}
+
+    async def do(name, message):
+        hand = stage.start(sys.executable, HAND, uri, name, json.dumps(message), environment=environment)
+        assert await hand.end() == 0, hand.err
+        return json.loads(hand.out) if hand.out else None
+
+    async with Robot(uri) as robot:
+        stage.start("master", "--loop", "-d", str(deployment), "--uri", uri)
+        stage.start("boat-normaliser", "--uri", uri)
+        await stage.start("boat-simulator", "--uri", uri, "--rate", "10", "--seed", "5").says("seed")
+        await robot.have(2)
+
+        assert (await do("/boat/D1/plugged", {"data": False}))["success"] is True
+
+        def without_d1():
+            paired = [(values_of(report), result["data"]) for report, result in robot.paired]
+            return [each for each in paired if each[0]["missing"] == "D1"]
+
+        await until(lambda: len(without_d1()) >= 10, lambda: f"{robot.frames[-1:]}")
+        apart = []
+        for values, posterior in without_d1():
+            assert "reading.D1" not in values
+            addresses = [None, *(reading_of(values, name)[1] for name in SENSOR_NAMES[1:])]
+            apart.append(np.abs(np.array(posterior) - exact_posterior(model, addresses)).sum() / 2)
+        assert np.mean(apart) <= 0.1
+
+        await do("/boat/noise", {"data": False})
+        await do("/boat/set_pose", {"pose": {"position": {"x": 20.0, "y": -30.0}}})
+        exact = {"D2": 76, "D3": 28, "B1": 16, "B2": 337, "B3": 45}
+
+        def is_there():
+            report, result = robot.paired[-1]
+            values = values_of(report)
+            return (
+                all(reading_of(values, name)[0] == value for name, value in exact.items())
+                and np.hypot(*np.subtract(grid.mean(result["data"]), (20, -30))) < 10
+            )
+
+        await until(is_there, lambda: f"{robot.frames[-1:]}")
+
+        await do("/boat/beacon3/works", {"data": False})
+        done = len(robot.frames)
+
+        def readings():
+            return {
+                name: {reading_of(values_of(report), name)[0] for report in robot.frames[done:]}
+                for name in SENSOR_NAMES[1:]
+            }
+
+        await until(lambda: len(readings()["D3"]) >= 3)
+        assert {name for name, values in readings().items() if len(values) > 1} == {"D3", "B3"}
