@@ -57,6 +57,10 @@ _HANDSHAKES: Final = 64
 _LOG_LINES: Final = 10
 _LOG_PERIOD: Final = 10.0
 _LAST_PORT: Final = 65535
+_FOR_BROWSERS: Final = """\
+This port is a rosbridge server (hub) for WebSocket clients, such as robots and roslibpy. It has no page.
+Where the command `dashboard` runs, the page is at http://127.0.0.1:8080
+"""
 
 
 async def serve_hub(
@@ -302,6 +306,9 @@ class _Connection(WebSocketTransport):
         """Admit the client, or refuse it."""
         protocol, request = self._server_protocol, cast("Request", event)
         response = protocol.accept(request)
+        if response.status_code == HTTPStatus.UPGRADE_REQUIRED:
+            response = protocol.reject(HTTPStatus.UPGRADE_REQUIRED, _FOR_BROWSERS)
+            response.headers["Upgrade"] = "websocket"
         if response.status_code == HTTPStatus.SWITCHING_PROTOCOLS:
             refusal = self._hub.access.refusal(request, loopback=self._hub.loopback)
             if refusal is HTTPStatus.FORBIDDEN:

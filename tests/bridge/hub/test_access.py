@@ -102,6 +102,21 @@ async def test_a_request_names_one_host(hosts):
         assert (await raw.ended()).startswith(b"HTTP/1.1 403 ")
 
 
+@pytest.mark.parametrize("origin", ["", "Origin: https://evil.example\r\n"])
+async def test_a_browser_is_told_where_the_page_is_and_nothing_else(origin):
+    """Whoever asks reads the same text, and is no client."""
+    async with running_hub(access=AccessPolicy(tokens=(TOKEN,))) as port:
+        raw = await RawClient.connect(port, handshake=False)
+        request = f"GET /?token={TOKEN} HTTP/1.1\r\nHost: robot.example:{port}\r\n{origin}\r\n"
+        raw.writer.write(request.encode())
+        head, _, body = (await raw.ended()).partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 426 ")
+    assert b"\r\nContent-Type: text/plain" in head
+    assert b"\r\nUpgrade: websocket" in head
+    assert b"http://127.0.0.1:8080" in body
+    assert all(word not in head + body for word in (TOKEN.encode(), b"robot.example", b"evil"))
+
+
 async def test_without_a_list_no_page_but_of_this_machine_is_let_in():
     async with running_hub() as port:
         raw = await RawClient.connect(port, handshake=False)
