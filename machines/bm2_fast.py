@@ -25,7 +25,7 @@ from numba import types
 from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, pack, unpack
 from machines.bm2_kernel import BM2Kernel
 from machines.errors import MachineError
-from machines.fast_code import jit, jump
+from machines.fast_code import image, jit, jump
 from machines.parameters import CYCLES_MAX, RngKind, SampleEvery, Sequencer
 from machines.rng import LFSR, POLYNOMIALS, Words, jump_tables
 
@@ -292,8 +292,6 @@ def moves_of(parameters: BM2Parameters, known: int, sequencer: Sequencer) -> Mov
 
 _0: Final = np.uint64(0)
 _1: Final = np.uint64(1)
-_8: Final = np.uint64(8)
-_BYTE: Final = np.uint64(255)
 _32: Final = np.uint64(32)
 _LOW_WORD: Final = np.uint64(2**32 - 1)
 _ALL: Final = np.uint64(2**CHUNK - 1)
@@ -399,16 +397,6 @@ def first_one(builder: Any, word: Any) -> Any:
 
 
 @jit
-def _image(map_: Words, state: np.uint64) -> np.uint64:
-    """Return the image of a state under a linear map."""
-    image = np.uint64(0)
-    for byte in range(map_.shape[1]):
-        image ^= map_[0, byte, state & _BYTE]
-        state >>= _8
-    return image
-
-
-@jit
 def fill(wiring: Wiring, numbers: npt.NDArray[np.uint16], generators: Words, ones: int) -> None:
     """Compute the first block of a chain's numbers."""
     exponents = wiring.exponents
@@ -416,7 +404,7 @@ def fill(wiring: Wiring, numbers: npt.NDArray[np.uint16], generators: Words, one
         state = generators[cde]
         for t in range(exponents[0]):
             numbers[cde, t] = np.int64(state) & ones
-            state = _image(wiring.clock, state)
+            state = image(wiring.clock, 0, state)
         for t in range(exponents[0], exponents[0] * CHUNK):
             number = numbers[cde, t - exponents[0]]
             for i in range(1, 4):
@@ -513,7 +501,7 @@ def run_chain(  # noqa: PLR0915 - a call of a function takes longer than a move
                 control[BURN_IN] -= control[BURN_IN] > 0
             control[PLACE] = place
             if random:
-                control[ORDER] = np.int64(_image(order_clock, np.uint64(control[ORDER])))
+                control[ORDER] = np.int64(image(order_clock, 0, np.uint64(control[ORDER])))
                 place = (control[ORDER] * sweep_moves) >> 16
             first_bit = first[np.uint64(place)]
             count_of_bits = first[np.uint64(place + 1)] - first_bit

@@ -254,13 +254,13 @@ _popcount = cast("Callable[[np.uint64], int]", intrinsic(_popcount_code))
 
 
 @jit
-def _image(maps: Words, which: int, state: np.uint64) -> np.uint64:
+def image(maps: Words, which: int, state: np.uint64) -> np.uint64:
     """Return the image of a state under one of several linear maps."""
-    image = _0
+    found = _0
     for byte in range(maps.shape[1]):
-        image ^= maps[which, byte, state & _BYTE]
+        found ^= maps[which, byte, state & _BYTE]
         state >>= _8
-    return image
+    return found
 
 
 @jit
@@ -270,7 +270,7 @@ def jump(jumps: Words, states: Words, clocks: int, later: Words) -> None:
         state = states[column]
         for bit in range(jumps.shape[0]):
             if (clocks >> bit) & 1:
-                state = _image(jumps, bit, state)
+                state = image(jumps, bit, state)
         later[column] = state
 
 
