@@ -68,7 +68,7 @@ class Running:
     """A command of ours as a process, its output in files."""
 
     def __init__(self, where, run, *command, environment=None):
-        self.name = command[0]
+        self.name = Path(command[0]).name
         self._out = where / f"{self.name}-{uuid.uuid4().hex[:6]}.out"
         self._err = self._out.with_suffix(".err")
         with self._out.open("wb") as out, self._err.open("wb") as err:
@@ -387,15 +387,20 @@ def only_error(running):
     return running.err.splitlines()[-1]
 
 
-async def until_subscribed(uri, topic):
-    """Wait until somebody hears a topic at a hub."""
+async def until_rosapi(uri, question, is_wanted, **args):
+    """Wait until rosapi's answer at a hub is as wanted."""
     async with asyncio.timeout(PROCESS_PATIENCE), websockets.connect(uri, open_timeout=None) as asking:
         while True:
-            call = {"op": "call_service", "service": "/rosapi/subscribers", "args": {"topic": topic}}
+            call = {"op": "call_service", "service": f"/rosapi/{question}", "args": args}
             await asking.send(json.dumps(call))
-            if json.loads(await asking.recv())["values"]["subscribers"]:
+            if is_wanted(json.loads(await asking.recv())["values"]):
                 return
             await asyncio.sleep(0.02)
+
+
+async def until_subscribed(uri, topic):
+    """Wait until somebody hears a topic at a hub."""
+    await until_rosapi(uri, "subscribers", lambda answer: answer["subscribers"], topic=topic)
 
 
 async def status_of(runs, name):

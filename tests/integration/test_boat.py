@@ -14,7 +14,17 @@ from casestudies.boat.model import model as boat_model
 from casestudies.boat.sensors import SENSOR_NAMES, map_grid
 from tests.casestudies.cells import line_at
 from tests.casestudies.figures import coverage, distances, means
-from tests.integration.conftest import PROGRAMMED, READING, ROOT, Robot, build_boat, stamp_of, until
+from tests.integration.conftest import (
+    PROGRAMMED,
+    READING,
+    ROOT,
+    Robot,
+    build_boat,
+    stamp_of,
+    until,
+    until_rosapi,
+    until_subscribed,
+)
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.models.model import exact_posterior
@@ -117,8 +127,15 @@ async def test_the_posterior_follows_what_is_done_to_the_world(stage, tmp_path):
         stage.start("boat-normaliser", "--uri", uri)
         await stage.start("boat-simulator", "--uri", uri, "--rate", "10", "--seed", "5").says("seed")
         await robot.have(2)
+        await until_subscribed(uri, "/boat/set_pose")
+        await until_rosapi(uri, "services", lambda answer: "/boat/B3/plugged" in answer["services"])
 
-        assert (await do("/boat/D1/plugged", {"data": False}))["success"] is True
+        # the example of the boat's page, which drags the boat and unplugs D1
+        page = (ROOT / "docs/case-studies/boat.md").read_text()
+        example = page.split("```python\n")[1].split("```")[0].replace("9090", uri.rpartition(":")[2])
+        hand = stage.start(sys.executable, "-c", example)
+        assert await hand.end() == 0, hand.err
+        assert hand.out == "D1 is unplugged\n"
 
         def without_d1():
             paired = [(values_of(report), result["data"]) for report, result in robot.paired]
