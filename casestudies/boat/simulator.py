@@ -242,10 +242,13 @@ async def _serve_switches(ros: "Ros", boat: Boat) -> None:
 
         return handle
 
+    statuses = len(ros.statuses)
     for name in SWITCHES:
         await ros.advertise_service(f"/boat/{name}", _SWITCH_TYPE, handler(name))
     await asyncio.sleep(SETTLED_S)
-    if await ros.service_type("/boat/sail") == "":
+    known = await ros.service_type("/boat/sail")
+    # a server without rosapi may have sent its refusals as statuses
+    if known == "" or (known is None and len(ros.statuses) > statuses):
         warn(
             f"the server does not offer the boat's switches, services of type {_SWITCH_TYPE}: does it have std_srvs? "
             "the boat sails on without them"

@@ -12,6 +12,7 @@ import pytest
 import websockets
 
 from casestudies import topics
+from casestudies.boat import simulator
 from casestudies.boat.sensors import BEACONS, SENSOR_NAMES, SET_POSE_TOPIC
 from casestudies.boat.simulator import SWITCHES, Boat, simulate
 from tests.fake_rosbridge import FakeRosbridge
@@ -80,6 +81,15 @@ async def test_a_pose_and_a_switch_show_at_once(tmp_path, monkeypatch):
     assert found == [(number, f"beacon{number}", 2, *at) for number, at in enumerate(BEACONS, 1)]
 
 
+async def test_changes_right_after_a_reading_wait(tmp_path, monkeypatch):
+    monkeypatch.setattr(simulator, "_SHORTEST", 1e6)
+    async with FakeRosbridge(rosapi=True) as fake, simulated(fake, tmp_path, monkeypatch):
+        await fake.publish(SET_POSE_TOPIC, pose(20.0, -30.0))
+        for on in (False, True, False):  # each answer comes after a reading that the one before caused
+            await call(fake, "/boat/noise", {"data": on})
+        assert len(fake.ops("publish", topic="/boat/raw")) == 1
+
+
 async def test_an_unplugged_sensor_is_null_in_an_array(tmp_path, monkeypatch):
     async with FakeRosbridge(rosapi=True) as fake, simulated(fake, tmp_path, monkeypatch, array=True):
         await call(fake, "/boat/B1/plugged", {"data": False})
@@ -104,14 +114,31 @@ async def test_hostile_poses_are_refused_with_a_line_for_each_coordinate(tmp_pat
     assert "\x1b" not in said
 
 
-@pytest.mark.parametrize(("type_", "warnings"), [("", 1), ("std_srvs/srv/SetBool", 0)])
-async def test_a_server_without_std_srvs_is_reported(type_, warnings, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("known", "status", "warnings"),
+    [
+        ({"type": ""}, False, 1),
+        ({"type": "std_srvs/srv/SetBool"}, True, 0),
+        ("no rosapi", True, 1),
+        ("no rosapi", False, 0),
+    ],
+)
+async def test_a_server_without_std_srvs_is_reported(known, status, warnings, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(topics, "SETTLED_S", 0)
+    asked = asyncio.Event()
     async with FakeRosbridge(rosapi=True) as fake:
-        asked = asyncio.Event()
-        fake.serve("/rosapi/service_type", lambda _args: asked.set() or {"type": type_})
+
+        def details(_args):  # asked for when the first service is advertised
+            if status:
+                told.append(asyncio.create_task(fake.say('{"op": "status", "level": "error", "msg": "no"}')))
+            return "unknown"
+
+        told = []
+        fake.serve("/rosapi/service_response_details", details)
+        fake.serve("/rosapi/service_type", lambda _args: asked.set() or known)
         async with simulated(fake, tmp_path, monkeypatch):
             await asked.wait()
             await fake.publish(SET_POSE_TOPIC, pose(1, 2))
             await reading(fake, 2)
-    assert capsys.readouterr().err.count("warning: ") == warnings
+        await asyncio.gather(*told)
+    assert capsys.readouterr().err.count("std_srvs/SetBool") == warnings
