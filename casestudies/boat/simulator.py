@@ -65,7 +65,7 @@ _SHORE = 2.0  # waypoints are at least this far from the map's edge
 _SEEDS = 1_000_000
 # Minimum number of seconds between a reading and another one that a change causes: a mouse moves 1000 times a second.
 _SHORTEST = 0.02
-_POSE_BYTES = 65_536
+_POSE_BYTES = 65_536  # a larger message on the topic of poses is no pose, and is discarded
 
 
 class Boat:
