@@ -104,6 +104,8 @@ class AdvertisedTopic:
     uri: str
     name: str
     type: str
+    key: str = ""
+    """Its key in `[topics]`, which switches it off; empty for a topic that is always on."""
 
 
 async def refusals(topics: Iterable[AdvertisedTopic], *, settled: bool) -> dict[str, str]:
@@ -128,11 +130,16 @@ async def _refusal(topic: AdvertisedTopic, *, settled: bool) -> str:
     if known and not same_type(known, topic.type):
         return (
             f"{topic.name} cannot be received at {topic.uri}: it is {known[:80]} there, not {topic.type}; "
-            "end the other publisher, or build with another output topic"
+            f"end the other publisher, or {_way_out(topic, 'build with another output topic')}"
         )
     if not known and settled:
         return (
             f"{topic.name} cannot be received at {topic.uri}: the server does not know it although it was advertised; "
             f"does its topics_glob allow the topic, and does it have {topic.type.partition('/')[0]}?"
+            + (f" Otherwise {_way_out(topic, '')}" if topic.key else "")
         )
     return ""
+
+
+def _way_out(topic: AdvertisedTopic, otherwise: str) -> str:
+    return f"set {topic.key} = false under [topics] in deployment.toml" if topic.key else otherwise

@@ -114,9 +114,12 @@ class Publisher(Service):
     async def _check_delivery(self, *, settled: bool) -> None:
         """Report each topic that no server passes on, once; a NotReceivableError in a run of one frame."""
         topics = self._topics.advertised
-        refused = await refusals(
-            [*topics, *([self._topics.reports] if self._topics.reports else [])], settled=settled
-        )
+        asked = [*topics, *([self._topics.reports] if self._topics.reports else [])]
+        # each question takes a server time, which the first result would have to wait for
+        if settled:
+            asked += self._topics.standard.advertised
+        refused = await refusals(asked, settled=settled)
+        self._topics.standard.refused = refused.keys()
         if self._once and all(topic.name in refused for topic in topics):
             raise NotReceivableError(refused[topics[0].name])
         for name in refused.keys() - self._refused.keys():
@@ -159,4 +162,6 @@ class Publisher(Service):
             self._where = where
             self._link.keep(Ready(where))
             self._draining = False
-            await until_one_ends(self._publish_waiting(), self._keep_checking())
+            await until_one_ends(
+                self._publish_waiting(), self._keep_checking(), self._topics.standard.keep_reporting()
+            )

@@ -16,6 +16,7 @@ from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, write_frame_report
 from posteriors.posterior import MAX_RESULT, SAMPLES_TOPIC, SAMPLES_TYPE, posterior_layout, samples_layout
 from services.pipeline.connections import AdvertisedTopic, OnState, connect_all
 from services.pipeline.inference import infer, report_of
+from services.pipeline.standard_topics import StandardTopics
 from services.settings import Settings
 from services.sockets.records import Outcome, Publish, Published
 from terminal.logs import get_logger
@@ -44,6 +45,7 @@ class ResultTopics:
     Attributes:
         rosbridges: The connections by URI.
         advertised: The output topics, once they are advertised; `reports` is the topic of the frame reports.
+        standard: The topics for robot tools, which follow a result.
     """
 
     def __init__(self, settings: Settings, deployment: Deployment) -> None:
@@ -64,6 +66,7 @@ class ResultTopics:
         self.rosbridges: dict[str, Ros] = {}
         self.advertised: list[AdvertisedTopic] = []
         self.reports: AdvertisedTopic | None = None
+        self.standard = StandardTopics(settings, deployment, ROLE)
 
     @contextlib.asynccontextmanager
     async def opened(self, on_state: OnState | None = None) -> AsyncIterator[str]:
@@ -83,6 +86,8 @@ class ResultTopics:
                 self._samples = await first.advertise(SAMPLES_TOPIC, SAMPLES_TYPE)
             self._ros_version = await first.detect_ros_version() or 2
             self.reports = AdvertisedTopic(first, uris[0], FRAME_TOPIC, FRAME_TYPE)
+            await self.standard.open(first, uris[0], self._ros_version)
+            stack.callback(self.standard.flush)
             topics = ", ".join(output.topic for output in deployment.outputs)
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
@@ -145,6 +150,8 @@ class ResultTopics:
         if look and published.outcome is Outcome.PUBLISHED and inference.posterior is not None:
             seen = await self._seen(inference.posterior.tolist(), self._settings.seen_timeout)
             published = msgspec.structs.replace(published, seen=seen)
+            # the run is about to end
+            self.standard.flush()
         return published
 
     def publish_now(self, publish: Publish, inference: Inference | None = None) -> Published:
@@ -178,6 +185,7 @@ class ResultTopics:
                     missed += not _sent(publication, {"layout": self._layout, "data": posterior})
         now = time.monotonic_ns()
         self._previous_out_ns = now - started
+        self.standard.offer(publish, inference)
         outcome = Outcome.PUBLISHED if posterior is not None else Outcome.NO_POSTERIOR
         # a frame without a posterior has only its report
         if missed == len(self._outputs) or (posterior is None and not reported):

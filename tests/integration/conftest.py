@@ -147,10 +147,10 @@ class Stage:
                 pair[1].bind(("127.0.0.1", port + 1))
                 return port
 
-    async def hub(self, port=0):
+    async def hub(self, port=0, ros_version="1"):
         """A hub and its address; another one may follow it at its port."""
         port = port or self.place()
-        hub = self.start("hub", "--port", str(port))
+        hub = self.start("hub", "--port", str(port), "--ros-version", ros_version)
         return hub, (await hub.says(r"ws://\S+"))[0]
 
     def processes(self):

@@ -3,7 +3,7 @@
     python roslibpy_listener.py URI FILE COUNT [READING]
 
 Publishes a reading, given as JSON, again and again. Writes one JSON line per message heard, and ends after COUNT
-results.
+results; with a reading, also after a message on each of the topics for robot tools.
 """
 
 import json
@@ -22,6 +22,13 @@ TOPICS = {
 }
 
 
+FOR_TOOLS = {
+    "/bm/counts": "std_msgs/UInt32MultiArray",
+    "/bm/posterior": "nav_msgs/OccupancyGrid",
+    "/bm/pose": "geometry_msgs/PoseWithCovarianceStamped",
+    "/bm/decision": "diagnostic_msgs/DiagnosticArray",
+    "/diagnostics": "diagnostic_msgs/DiagnosticArray",
+}
 PATIENCE = 86_400.0
 """Seconds; a test that no longer waits for it kills it."""
 
@@ -39,12 +46,16 @@ def main(uri, file, count, reading=""):
             nonlocal results
             heard.append((topic, msg))
             results += topic == "/BMresults"
-            if results >= count:
+            if results >= count and awaited <= {topic for topic, _ in heard}:
                 enough.set()
 
         return take
 
-    topics = [roslibpy.Topic(ros, topic, type_) for topic, type_ in TOPICS.items()]
+    awaited = set(FOR_TOOLS) if reading else set()
+    topics = [
+        roslibpy.Topic(ros, topic, type_)
+        for topic, type_ in ((FOR_TOOLS if reading else {}) | TOPICS).items()
+    ]
     for topic in topics:
         topic.subscribe(keep(topic.name))
     print("listening", file=sys.stderr, flush=True)

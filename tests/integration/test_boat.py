@@ -87,20 +87,49 @@ async def test_frames_are_as_good_as_float64_fusion(stage, whole_boat, tmp_path)
     assert np.abs(ours - theirs).sum(axis=1).mean() / 2 <= 0.06
 
 
+def values_of(report):
+    return {pair["key"]: pair["value"] for pair in report["status"][0]["values"]}
+
+
 @pytest.mark.process
-async def test_roslibpy_as_the_robot(stage, boat, tmp_path):
-    _, uri = await stage.hub()
+@pytest.mark.parametrize("ros_version", ["1", "2"])
+async def test_roslibpy_as_the_robot(stage, boat, tmp_path, ros_version):
+    _, uri = await stage.hub(ros_version=ros_version)
     reading = json.dumps(READING)
     robot = stage.start(sys.executable, LISTENER, uri, str(tmp_path / "heard"), "1", reading)
     master = stage.start("master", "--once", "--fused", "-d", str(boat), "--uri", uri)
     assert await master.end() == 0, master.err
     assert await robot.end() == 0, robot.err
-    (result,) = heard(tmp_path / "heard")["/BMresults"]
+    messages = heard(tmp_path / "heard")
+    (result,) = messages["/BMresults"]
     assert abs(sum(result["data"]) - 1) < 1e-9
-
-
-def values_of(report):
-    return {pair["key"]: pair["value"] for pair in report["status"][0]["values"]}
+    (frame,) = messages["/bm/frame"]
+    report = values_of(frame)
+    assert report["missing"] == ""
+    assert {name: report[f"reading.{name}"].rsplit(";", 1)[0] for name in READING} == {
+        name: f"{value};{value}" for name, value in READING.items()
+    }
+    # the same posterior on the topics for robot tools
+    posterior = np.array(result["data"])
+    grid, pose = messages["/bm/posterior"][0], messages["/bm/pose"][0]
+    assert grid["header"]["stamp"] == frame["header"]["stamp"]
+    assert ("secs" in grid["header"]["stamp"]) == (ros_version == "1")
+    assert grid["data"] == np.rint(98 * posterior / posterior.max()).tolist()
+    assert (grid["info"]["width"], grid["info"]["height"], grid["info"]["resolution"]) == (8, 8, 12.5)
+    assert grid["info"]["origin"]["position"] == {"x": -50, "y": -50, "z": 0}
+    centres = np.arange(-43.75, 50, 12.5)
+    assert pose["pose"]["pose"]["position"]["x"] == pytest.approx(
+        posterior.reshape(8, 8).sum(axis=0) @ centres
+    )
+    (counts,) = messages["/bm/counts"]
+    assert (len(counts["data"]), counts["layout"]["dim"][0]["size"]) == (64, 4)
+    decision = values_of(messages["/bm/decision"][0])
+    assert (decision["valid"], float(decision["probability"])) == (
+        "true",
+        pytest.approx(posterior.max(), 1e-5),
+    )
+    names = {each["name"] for each in messages["/diagnostics"][-1]["status"]}
+    assert {"rosbayes: board 3", "rosbayes: publisher", "rosbayes: pcie-app"} <= names
 
 
 def reading_of(values, name):

@@ -23,6 +23,7 @@ from toolchain.deployment.sections import (
     Section,
     Sequence,
     Source,
+    Topics,
     Variable,
     WrittenPrior,
     names_differ,
@@ -50,6 +51,7 @@ class DeploymentFile(Section):
     prior: WrittenPrior | None = Field(default=None, exclude_if=lambda prior: prior is None)
     boards: Sequence[BoardSection] = Field(validation_alias="board", min_length=1)
     outputs: Sequence[Output] = Field(default=(Output(),), validation_alias="output")
+    topics: Topics = Field(default=Topics(), exclude_if=lambda topics: topics == Topics())
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:
@@ -173,6 +175,7 @@ def deployment_hash(deployment: DeploymentFile) -> str:
             "sources": {"__all__": {"uri", "compression", "topic_bytes"}},
             "boards": {"__all__": {"endpoint"}},
             "outputs": {"__all__": {"uri"}},
+            "topics": True,
         },
     )
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
@@ -220,7 +223,7 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
     if computed != file.hash and not edited:
         raise DamagedDeploymentError(
             f"{path} is not as it was built: its hash is {computed[:16]}, "
-            f"but it names {file.hash[:16] or 'none'}; only URIs, endpoints, compression and topic_bytes may be edited: "
+            f"but it names {file.hash[:16] or 'none'}; only URIs, endpoints, compression, topic_bytes and [topics] may be edited: "
             "build it again with 'toolchain build', or keep the edit with 'toolchain regenerate deployment'"
         )
     deployment = Deployment(**dict(file), directory=directory)

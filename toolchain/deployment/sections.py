@@ -423,6 +423,16 @@ class Output(Section):
         return websocket_uri(uri) if uri else uri
 
 
+class Topics(Section):
+    """`[topics]`: whether each topic for robot tools is published; None leaves it to the deployment."""
+
+    counts: bool | None = None
+    posterior: bool | None = None
+    pose: bool | None = None
+    decision: bool | None = None
+    diagnostics: bool | None = None
+
+
 def parse_interface(text: str) -> tuple[int, int]:
     """Return the inputs and results of an interface such as `20x1200` (thesis 3.2), or raise a ValueError."""
     match = _INTERFACE.fullmatch(text)

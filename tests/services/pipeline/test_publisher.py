@@ -17,6 +17,7 @@ from services.pipeline.connections import NotReceivableError
 from services.pipeline.inference import infer, report_of
 from services.pipeline.publisher import Publisher
 from services.pipeline.result_topics import ResultTopics
+from services.pipeline.standard_topics import StandardTopics
 from services.settings import Settings
 from services.sockets.records import Begin, FrameResult, Notice, Outcome, Publish, Published, Rosbridge
 from tests.fake_rosbridge import FakeRosbridge
@@ -61,6 +62,7 @@ class FakeTopics:
     reports = None
 
     def __init__(self):
+        self.standard = StandardTopics(Settings(), Mock(), "publisher")
         self.published = []
         self.allowed = asyncio.Semaphore(0)
 

@@ -199,6 +199,18 @@ def test_uris_and_endpoints_may_be_edited(folder):
     assert after.output_uri(after.outputs[0]) == "robot:Robot 7"
 
 
+def test_topics_for_tools_are_not_part_of_the_hash(folder):
+    before = load_deployment(folder, images=False)
+    path = folder / "deployment.toml"
+    path.write_text(path.read_text() + "\n[topics]\npose = false\n")
+    after = load_deployment(folder, images=False)
+    assert after.hash == before.hash
+    assert (after.topics.pose, after.topics.counts, before.topics.pose) == (False, None, None)
+    assert write_deployment(folder, after) == load_deployment(folder, images=False) == after
+    edit(folder, "pose = false", "poses = false")
+    assert "did you mean 'pose'?" in refused(folder)
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [

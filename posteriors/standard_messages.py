@@ -1,0 +1,251 @@
+"""Topics that robot tools show by themselves: counts, grid, pose, decision and health as standard ROS messages.
+
+Conversions only: `services/pipeline/standard_topics.py` publishes them (docs/reference/topics.md).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
+
+import numpy as np
+
+from bridge.stamps import header, stamp
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from machines.kind import BoardResult
+    from toolchain.deployment import Deployment, Dimension
+
+MAP_FRAME: Final = "map"
+"""The frame of grid and pose, in which the searched variables are coordinates."""
+MOST_OCCUPIED: Final = 98
+"""Value of the most probable cell: rviz paints 99 and 100 as obstacles."""
+_HEADING_VARIANCE: Final = math.pi**2 / 3
+"""Variance of an angle that is uniform over the circle: a grid has no heading."""
+_METRES: Final = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "km": 1000.0}
+
+RosVersion = Literal[1, 2]
+Values = Mapping[str, object]
+
+
+class Level(IntEnum):
+    """Levels of a diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+class PlaneAxis(NamedTuple):
+    """A coordinate of a plane: the centre of the first cell and the distance of neighbouring centres."""
+
+    first: float
+    step: float
+    size: int
+
+
+class Plane(NamedTuple):
+    """The plane of two searched variables."""
+
+    x: PlaneAxis
+    y: PlaneAxis
+    x_is_last: bool
+    """True if x is the last, fastest dimension of the posterior."""
+
+    @classmethod
+    def of(cls, dimensions: Sequence[Dimension]) -> Self:
+        """Return the plane of a deployment's searched variables.
+
+        x and y are the variables of these names; with other names, the last one is x. Lengths become metres.
+
+        Raises:
+            ValueError: They span no plane; the sentence says why.
+        """
+        if len(dimensions) != 2:
+            raise ValueError(f"there are {len(dimensions)} searched variables, not two")
+        if named := [each.label for each in dimensions if each.states]:
+            raise ValueError(f"the values of {named[0]} are names")
+        slow, fast = dimensions
+        x_is_last = (slow.label.lower(), fast.label.lower()) != ("x", "y")
+        x, y = (fast, slow) if x_is_last else (slow, fast)
+        return cls(_axis(x), _axis(y), x_is_last)
+
+    @property
+    def has_square_cells(self) -> bool:
+        """True if both steps are equal, as in every OccupancyGrid."""
+        return math.isclose(abs(self.x.step), abs(self.y.step), rel_tol=1e-6)
+
+    def cells(self, posterior: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a posterior as float64[y, x]."""
+        if self.x_is_last:
+            return posterior.reshape(self.y.size, self.x.size)
+        return posterior.reshape(self.x.size, self.y.size).T
+
+
+def _axis(dimension: Dimension) -> PlaneAxis:
+    metres = _METRES.get(dimension.unit, 1.0)
+    return PlaneAxis(dimension.offset * metres, dimension.step * metres, dimension.size)
+
+
+def has_coordinates(dimensions: Sequence[Dimension]) -> bool:
+    """Return whether the searched variables are two lengths or numbers without unit, more than mere indices."""
+    return len(dimensions) == 2 and all(
+        not each.states and (each.unit in _METRES or (not each.unit and (each.offset, each.step) != (0, 1)))
+        for each in dimensions
+    )
+
+
+# --- posteriors ---------------------------------------------------------------------------------
+
+
+def counts_message(boards: Sequence[BoardResult]) -> dict[str, Any]:
+    """Return the result words of the boards as a std_msgs/UInt32MultiArray, a row for each board.
+
+    A row that is shorter than the longest is filled up with zeros.
+    """
+    rows = [np.frombuffer(board.words, "<u4") for board in boards]
+    width = max((len(row) for row in rows), default=0)
+    counts = np.zeros((len(rows), width), np.uint32)
+    for at, row in enumerate(rows):
+        counts[at, : len(row)] = row
+    dimensions = [
+        {"label": "board", "size": len(rows), "stride": counts.size},
+        {"label": "count", "size": width, "stride": width},
+    ]
+    return {"layout": {"dim": dimensions, "data_offset": 0}, "data": counts.ravel()}
+
+
+def grid_message(
+    posterior: NDArray[np.float64], plane: Plane, stamp_ns: int, ros_version: RosVersion
+) -> dict[str, Any]:
+    """Return a posterior as a nav_msgs/OccupancyGrid, whose cells must be square.
+
+    The value of a cell is `round(98 p / p_max)`, at `y * width + x`; x and y increase, whatever the sign of
+    their steps.
+    """
+    cells = plane.cells(posterior)[:: -1 if plane.y.step < 0 else 1, :: -1 if plane.x.step < 0 else 1]
+    data = np.rint(cells * (MOST_OCCUPIED / posterior.max())).astype(np.int8)
+    resolution = abs(plane.x.step)
+    x, y = (
+        min(axis.first, axis.first + (axis.size - 1) * axis.step) - resolution / 2
+        for axis in (plane.x, plane.y)
+    )
+    return {
+        "header": header(stamp_ns, MAP_FRAME, ros_version),
+        "info": {
+            "map_load_time": stamp(stamp_ns, ros_version),
+            "resolution": resolution,
+            "width": plane.x.size,
+            "height": plane.y.size,
+            "origin": _pose(x, y),
+        },
+        "data": data.ravel(),
+    }
+
+
+def pose_message(
+    posterior: NDArray[np.float64], plane: Plane, stamp_ns: int, ros_version: RosVersion
+) -> dict[str, Any]:
+    """Return the mean and the covariance of a posterior as a geometry_msgs/PoseWithCovarianceStamped."""
+    cells = plane.cells(posterior)
+    across, down = cells.sum(axis=0), cells.sum(axis=1)
+    total = across.sum()
+    xs, ys = (axis.first + axis.step * np.arange(axis.size) for axis in (plane.x, plane.y))
+    x, y = float(across @ xs / total), float(down @ ys / total)
+    xs, ys = xs - x, ys - y
+    covariance = np.zeros((6, 6))
+    covariance[0, 0], covariance[1, 1] = across @ xs**2 / total, down @ ys**2 / total
+    covariance[0, 1] = covariance[1, 0] = ys @ cells @ xs / total
+    covariance[5, 5] = _HEADING_VARIANCE
+    return {
+        "header": header(stamp_ns, MAP_FRAME, ros_version),
+        "pose": {"pose": _pose(x, y), "covariance": covariance.ravel()},
+    }
+
+
+def _pose(x: float, y: float) -> dict[str, Any]:
+    return {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
+
+
+# --- diagnostics --------------------------------------------------------------------------------
+
+
+def diagnostics(
+    statuses: Iterable[dict[str, Any]], stamp_ns: int, frame_id: str, ros_version: RosVersion
+) -> dict[str, Any]:
+    """Return a diagnostic_msgs/DiagnosticArray."""
+    return {"header": header(stamp_ns, frame_id, ros_version), "status": list(statuses)}
+
+
+def status(name: str, level: Level, message: str, hardware_id: str, values: Values) -> dict[str, Any]:
+    """Return a diagnostic_msgs/DiagnosticStatus; values of None are left out."""
+    return {
+        "level": int(level),
+        "name": f"rosbayes: {name}",
+        "message": message,
+        "hardware_id": hardware_id,
+        "values": [{"key": key, "value": str(value)} for key, value in values.items() if value is not None],
+    }
+
+
+def decision_statuses(
+    posterior: NDArray[np.float64] | None, deployment: Deployment, *, why: str, number: int, age_ms: float
+) -> list[dict[str, Any]]:
+    """Return a status with the most probable value, for each replica.
+
+    Args:
+        posterior: float64[replicas * lines], or None without one.
+        deployment: The names, values and units of the searched variables.
+        why: The reason why the decision is not valid; empty if it is.
+        number: Number of the frame.
+        age_ms: Milliseconds since the receipt of the reading.
+    """
+    replicas = deployment.machine.replicas
+    rows = [None] * replicas if posterior is None else posterior.reshape(replicas, -1)
+    statuses = []
+    for replica, row in enumerate(rows):
+        decided = row is not None and bool(row.any())
+        reason = why or ("" if decided else "all counts of this replica are 0")
+        values: dict[str, object] = {}
+        message = reason
+        if row is not None and decided:
+            best = _best(row, deployment.searched)
+            values = best | _certainty(row)
+            message = ", ".join(f"{label.removeprefix('value.')} {value}" for label, value in best.items())
+        values |= {
+            "valid": "false" if reason else "true",
+            "why": reason,
+            "age_ms": f"{age_ms:.1f}",
+            "number": number,
+        }
+        name = f"decision of replica {replica}" if replicas > 1 else "decision"
+        statuses.append(status(name, Level.WARN if reason else Level.OK, message, deployment.name, values))
+    return statuses
+
+
+def _best(row: NDArray[np.float64], dimensions: Sequence[Dimension]) -> dict[str, object]:
+    """Return the most probable value of each variable: the name of a state, or a number with its unit."""
+    indices = np.unravel_index(int(row.argmax()), [each.size for each in dimensions])
+    return {
+        f"value.{each.label}": each.states[index]
+        if each.states
+        else f"{each.value(int(index)):.9g} {each.unit}".rstrip()
+        for each, index in zip(dimensions, indices, strict=True)
+    }
+
+
+def _certainty(row: NDArray[np.float64]) -> dict[str, object]:
+    """Return the largest probability, its margin to the second largest, and the entropy."""
+    row = row / row.sum()
+    second, first = np.partition(row, -2)[-2:] if row.size > 1 else (0.0, row[0])
+    possible = row[row > 0]
+    return {
+        "probability": f"{first:.6g}",
+        "margin": f"{first - second:.6g}",
+        "entropy_bits": f"{abs(float(possible @ np.log2(possible))):.6g}",
+    }

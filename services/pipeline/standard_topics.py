@@ -1,0 +1,272 @@
+"""Topics for robot tools, published behind the results.
+
+    publish_now ──▶ offer ──next turn of the loop, or a timer──▶ _send ──▶ /bm/counts, /bm/posterior, /bm/pose, /bm/decision
+    status sockets ──once a second──▶ keep_reporting ──────────▶ /diagnostics
+
+A result never waits for them: only the newest frame is kept, and a fault costs a warning.
+"""
+
+import asyncio
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final, Literal, NoReturn
+
+from bridge.client import Publication, Ros, State
+from bridge.errors import DisconnectedError, SlowPeerError
+from machines.kind import Inference
+from posteriors.frame_report import FRAME_TYPE
+from posteriors.standard_messages import (
+    Level,
+    Plane,
+    counts_message,
+    decision_statuses,
+    diagnostics,
+    grid_message,
+    has_coordinates,
+    pose_message,
+    status,
+)
+from services.pipeline.connections import AdvertisedTopic
+from services.settings import Settings
+from services.sockets.records import Publish
+from services.sockets.status import ProcessStatus, SilentProcess, StackStatus, ask_stack
+from terminal.logs import get_logger
+from toolchain.deployment import Deployment
+
+INTERVAL: Final = 0.1
+"""Minimum number of seconds between two messages of a topic, because the hub's work for them delays readings."""
+_HEALTH_INTERVAL: Final = 1.0
+
+_TYPES: Final = {
+    "counts": ("/bm/counts", "std_msgs/UInt32MultiArray"),
+    "posterior": ("/bm/posterior", "nav_msgs/OccupancyGrid"),
+    "pose": ("/bm/pose", "geometry_msgs/PoseWithCovarianceStamped"),
+    "decision": ("/bm/decision", FRAME_TYPE),
+    "diagnostics": ("/diagnostics", FRAME_TYPE),
+}
+"""Topics and types by their keys in `[topics]`."""
+
+_Make = Callable[[], dict[str, Any] | None]
+"""Function that makes a message, or nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """A published frame."""
+
+    publish: Publish
+    inference: Inference
+    tick: int
+    """Monotonic time of its publication, in ns."""
+
+
+class StandardTopics:
+    """The topics for robot tools on one server.
+
+    Attributes:
+        advertised: Those that are published, once `open` has advertised them.
+        refused: Names of topics that the server does not pass on, which get no messages.
+    """
+
+    def __init__(self, settings: Settings, deployment: Deployment, role: str) -> None:
+        self._settings = settings
+        self._deployment = deployment
+        self._log = get_logger(role, settings.log_level)
+        # From `open` on: the server, the form of its stamps, and publications by key; a faulty one is removed.
+        self._ros: Ros | None = None
+        self._ros_version: Literal[1, 2] = 2
+        self._publications: dict[str, Publication] = {}
+        # Of a deployment whose grid or pose is published.
+        self._plane: Plane | None = None
+        # The last frame, and whether it still has to be sent; `_timer` then calls `_send`.
+        self._last: _Frame | None = None
+        self._waiting = False
+        self._timer: asyncio.Handle | None = None
+        # When frames were sent last (monotonic, s).
+        self._sent_at = 0.0
+        # The last status of the run's processes, if there is a run directory, and the levels published last.
+        self._stack: StackStatus | None = None
+        self._levels: list[int] = []
+        self.advertised: list[AdvertisedTopic] = []
+        self.refused: Iterable[str] = ()
+
+    async def open(self, ros: Ros, uri: str, ros_version: Literal[1, 2]) -> None:
+        """Advertise the topics of the deployment."""
+        self._ros, self._ros_version = ros, ros_version
+        for key in self._chosen():
+            topic, type_name = _TYPES[key]
+            self._publications[key] = await ros.advertise(topic, type_name, queue_size=1)
+            self.advertised.append(AdvertisedTopic(ros, uri, topic, type_name, key))
+
+    def _chosen(self) -> Iterator[str]:
+        """Yield the keys of the topics that are on; log why one that is switched on stays off."""
+        deployment, searched = self._deployment, self._deployment.searched
+        is_map = has_coordinates(searched) and deployment.machine.replicas == 1
+        for key, wanted in dict(deployment.topics).items():
+            of_plane = key in {"posterior", "pose"}
+            if wanted is False or (wanted is None and of_plane and not is_map):
+                continue
+            if of_plane:
+                try:
+                    self._plane = _plane(deployment, square=key == "posterior")
+                except ValueError as why:
+                    self._log.info(f"{_TYPES[key][0]} is not published: {why}")
+                    continue
+            yield key
+
+    def offer(self, publish: Publish, inference: Inference) -> None:
+        """Send the topics of a frame later, unless a newer one takes its place."""
+        self._last, self._waiting = _Frame(publish, inference, time.monotonic_ns()), True
+        if self._timer is None and self._publications:
+            loop = asyncio.get_running_loop()
+            wait = self._sent_at + INTERVAL - time.monotonic()
+            self._timer = loop.call_soon(self._send) if wait <= 0 else loop.call_later(wait, self._send)
+
+    def flush(self) -> None:
+        """Send now what waits, and the health, because the run is about to end."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self._send()
+        self._publish("diagnostics", self._health)
+
+    def _send(self) -> None:
+        self._timer, frame = None, self._last
+        if not self._waiting or frame is None or self._ros is None or self._ros.state is not State.CONNECTED:
+            return
+        if any(each.must_wait for each in self._publications.values()):
+            self._timer = asyncio.get_running_loop().call_later(INTERVAL, self._send)
+            return
+        self._waiting, self._sent_at = False, time.monotonic()
+        with self._ros.together():
+            for key, make in self._messages(frame).items():
+                self._publish(key, make)
+
+    def _messages(self, frame: _Frame) -> Mapping[str, _Make]:
+        """Return the functions that make the messages of a frame."""
+        publish, inference = frame.publish, frame.inference
+        make: dict[str, _Make] = {
+            "counts": partial(counts_message, inference.boards),
+            "decision": partial(self._decision, publish, inference),
+        }
+        if inference.posterior is not None and self._plane is not None:
+            of_plane = inference.posterior, self._plane, publish.stamp_ns, self._ros_version
+            make |= {"posterior": partial(grid_message, *of_plane), "pose": partial(pose_message, *of_plane)}
+        return make | {"diagnostics": self._changed_health}
+
+    def _publish(self, key: str, make: _Make) -> None:
+        """Publish a message, if there is one; a topic with a fault is left out from now on."""
+        publication = self._publications.get(key)
+        if publication is None or publication.topic in self.refused:
+            return
+        try:
+            if (message := make()) is not None:
+                publication.publish_nowait(message)
+        except (DisconnectedError, SlowPeerError):
+            pass
+        except Exception as error:
+            del self._publications[key]
+            self._log.warning(
+                f"{publication.topic} is no longer published: {error!r}; results go on ({key} = false under [topics] "
+                "switches it off)"
+            )
+
+    def _decision(self, publish: Publish, inference: Inference) -> dict[str, Any]:
+        statuses = decision_statuses(
+            inference.posterior,
+            self._deployment,
+            why="" if _is_sound(inference) else inference.outcome,
+            number=publish.result.number,
+            age_ms=(time.monotonic_ns() - publish.received_tick) / 1e6,
+        )
+        return diagnostics(statuses, publish.stamp_ns, "bm", self._ros_version)
+
+    # --- health --------------------------------------------------------------------------------
+
+    async def keep_reporting(self) -> NoReturn:
+        """Publish the health of boards and services once a second."""
+        directory = self._settings.run_directory
+        while True:
+            if directory is not None and "diagnostics" in self._publications:
+                self._stack = await ask_stack(directory)
+            if self._ros is not None and self._ros.state is State.CONNECTED:
+                self._publish("diagnostics", self._health)
+            await asyncio.sleep(_HEALTH_INTERVAL)
+
+    def _health(self) -> dict[str, Any]:
+        boards = list(self._boards())
+        self._levels = [each["level"] for each in boards]
+        return diagnostics([*boards, *self._services()], time.time_ns(), "", self._ros_version)
+
+    def _changed_health(self) -> dict[str, Any] | None:
+        """Return the health if the level of a board differs from the published one, which is due only each second."""
+        return None if [each["level"] for each in self._boards()] == self._levels else self._health()
+
+    def _boards(self) -> Iterator[dict[str, Any]]:
+        """Yield the status of each board: its part of the last frame, and what pcie-app says of it."""
+        frame, deployment = self._last, self._deployment
+        processes = self._stack.processes if self._stack else []
+        known = {each.index: each for process in processes for each in process.boards}
+        reasons = deployment.machine.kind.reasons
+        silence_s = self._settings.ready_timeout
+        for at, board in enumerate(deployment.boards):
+            level, message = Level.STALE, "no frame yet"
+            values: dict[str, object] = {"image": board.image_hash}
+            if frame is not None:
+                result, number = frame.inference.boards[at], frame.publish.result.number
+                level, message = Level.OK, reasons[result.reason]
+                values |= {"frame": number, "cycles": result.cycles, "reason": message}
+                if not _is_sound(frame.inference):
+                    level = Level.WARN
+                if time.monotonic_ns() - frame.tick > silence_s * 1e9:
+                    level, message = Level.STALE, f"no frame for {silence_s:g} s"
+            if there := known.get(at):
+                values |= {"endpoint": there.endpoint, "state": there.state, "restarts": there.restarts}
+                if there.why:
+                    level, message = Level.ERROR, there.why
+            yield status(f"board {at}", level, message, f"board{at}", values)
+
+    def _services(self) -> Iterator[dict[str, Any]]:
+        """Yield the status of each other process of the run."""
+        stack = self._stack
+        boards = {f"board{at}" for at in range(len(self._deployment.boards))}
+        every: list[ProcessStatus | SilentProcess] = [*stack.processes, *stack.silent] if stack else []
+        for process in every:
+            if process.name in boards:
+                continue
+            level, values = Level.STALE, {}
+            if isinstance(process, ProcessStatus):
+                level = Level.ERROR if not process.alive else Level.OK if process.ready else Level.WARN
+                values = _numbers(process)
+            yield status(process.name, level, process.why, process.name, values)
+
+
+def _plane(deployment: Deployment, *, square: bool) -> Plane:
+    """Return the plane of the searched variables, or raise a ValueError that says why there is none."""
+    if deployment.machine.replicas > 1:
+        raise ValueError("the deployment has replicas")
+    plane = Plane.of(deployment.searched)
+    if square and not plane.has_square_cells:
+        steps = f"{abs(plane.x.step):g} along x and {abs(plane.y.step):g} along y"
+        raise ValueError(f"its cells would not be square ({steps})")
+    return plane
+
+
+def _is_sound(inference: Inference) -> bool:
+    """Return whether there is a posterior, and no board ended early."""
+    return inference.posterior is not None and "ended_early" not in inference.details
+
+
+def _numbers(process: ProcessStatus) -> dict[str, object]:
+    values: dict[str, object] = {
+        "pid": process.pid,
+        "version": process.version,
+        "uptime_s": f"{process.uptime_s:.0f}",
+        "cpu_percent": process.cpu_percent,
+        "memory_bytes": process.memory_bytes,
+    }
+    if (frames := process.frames) is not None:
+        values |= {"completed": frames.completed, "per_second": frames.rate}
+        values |= {f"lost: {reason}": count for reason, count in frames.lost.items()}
+    return values
