@@ -333,9 +333,7 @@ _define(operator.invert, "not_", 1)
 def in_llvm(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that makes a compiled function of one that writes its LLVM code.
 
-    Args:
-        result: Type of the result.
-        kinds: Types of the arguments; None for any array, of which the code gets the address of the data.
+    `kinds` are the types of the arguments; None for any array, of which the code gets the address of the data.
     """
 
     def decorate(write: Callable[..., Any]) -> Any:

@@ -8,16 +8,9 @@ from machines.parameters import PROB_BITS_MAX
 
 
 def encode_probability(p: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.uint16]:
-    """Return the code of the nearest probability that a cell can represent; ties are rounded up.
+    """Return the codes of the nearest probabilities that a cell can represent, in the same shape; ties are rounded up.
 
-    A cell of W bits represents k / 2**W for 0 <= k <= 2**W - 2, and 1 with the all-ones code.
-
-    Args:
-        p: Probabilities from 0 to 1, of any shape.
-        prob_bits: Bits of a code (W), 1 to 16.
-
-    Returns:
-        uint16 codes, of the same shape.
+    A cell of W bits, 1 to 16, represents k / 2**W for 0 <= k <= 2**W - 2, and 1 with the all-ones code.
 
     Raises:
         ParameterError: A probability is not from 0 to 1 (or is NaN), or `prob_bits` is out of range.

@@ -108,10 +108,7 @@ class Posteriors:
             self.without_posterior += 1
 
     async def next(self, timeout: float | None) -> Posterior:
-        """Wait for one posterior.
-
-        Args:
-            timeout: Seconds; None for no limit.
+        """Wait for one posterior, `timeout` seconds at most; None for no limit.
 
         Raises:
             NoResultError: None arrived in time.

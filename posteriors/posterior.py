@@ -143,13 +143,9 @@ class Posterior:
         return means
 
     def marginal(self, *labels: str) -> "NDArray[np.float64]":
-        """Return the marginal posterior of some of the searched variables.
+        """Return the marginal posterior of some of the searched variables, without repetition.
 
-        Args:
-            labels: The variables, without repetition.
-
-        Returns:
-            A float64 array with one dimension for each label, in the order given.
+        The float64 array has one dimension for each label, in the order given.
 
         Raises:
             LabelError: A variable is not searched; the sentence suggests the nearest name.

@@ -94,12 +94,9 @@ async def until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
 
 
 def run_async(main: Coroutine[Any, Any, int | None]) -> int:
-    """Run a coroutine on uvloop until it ends or a signal cancels it.
+    """Run a coroutine on uvloop until it ends or a signal cancels it, and return its exit code.
 
     Its `finally` clauses clean up before this function returns.
-
-    Returns:
-        The coroutine's exit code.
 
     Raises:
         StoppedError: A signal ended it.

@@ -98,15 +98,9 @@ def verilog(
     more_sources: Sequence[str] = (),
     generics: Mapping[str, int | str] | None = None,
 ) -> str:
-    """Return a board's hardware as Verilog, from the package of parameters in a folder.
+    """Return a board's hardware as Verilog, from the package of parameters in a folder, in which GHDL works.
 
-    Args:
-        folder: Working folder of GHDL.
-        top: Top-level entity.
-        table: Verilog of `bm1_table`.
-        hdl: Folder of the VHDL.
-        more_sources: Further VHDL files, relative to `hdl`.
-        generics: Generics of the top-level entity.
+    `table` is the Verilog of `bm1_table`; `more_sources` are VHDL files relative to `hdl`, the folder of the VHDL.
 
     Raises:
         HardwareToolError: GHDL is not installed or failed.
@@ -223,11 +217,8 @@ def check_tools(simulator: Simulator) -> None:
 def compiled(image: Image, simulator: Simulator, folder: Path, on_compile: Callable[[str], None]) -> Compiled:
     """Return the simulation of an image's hardware, compiled unless it is in the folder already.
 
-    Args:
-        image: Image of the board.
-        simulator: The simulator.
-        folder: Folder of compiled hardware, which is created; nobody else may be able to change it.
-        on_compile: Called with a sentence before a compilation.
+    The folder is created; nobody else may be able to change it. `on_compile` is called with a sentence before a
+    compilation.
 
     Raises:
         HardwareToolError: A tool is missing or failed, the machine exists only in emulation, or the folder

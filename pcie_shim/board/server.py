@@ -120,18 +120,12 @@ def serve_board(
     pin: bool = True,
     on_ready: Callable[[Board], None] | None = None,
 ) -> None:
-    """Serve one board, initially blank, until `stop` is set; then remove the socket files.
+    """Serve board number `index`, emulated by default and initially blank, until `stop`; then remove the socket files.
 
-    Args:
-        endpoint: Endpoint of the registers; `Endpoint.programming` is the programming port.
-        index: Number of the board, for the greeting.
-        stop: Ends the loop.
-        board: The board; None for an emulated one.
-        pin: Pin this thread to one of its allowed cores, number `index` modulo their number. Boards compute
-            for tenths of a millisecond, too short for Linux to distribute the threads woken by one host over
-            the cores: without pinning, the boards of a mini-cluster would compute one after the other. The
-            thread also gets the policy SCHED_BATCH, so that it does not preempt others when it wakes.
-        on_ready: Called with the board when both sockets are listening.
+    With `pin`, this thread is pinned to one of its allowed cores, number `index` modulo their number. Boards compute
+    for tenths of a millisecond, too short for Linux to distribute the threads woken by one host over the cores:
+    without pinning, the boards of a mini-cluster would compute one after the other. The thread also gets the policy
+    SCHED_BATCH, so that it does not preempt others when it wakes. `on_ready` is called when both sockets are listening.
 
     Raises:
         EndpointError: The endpoint is invalid or in use.

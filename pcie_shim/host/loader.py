@@ -17,18 +17,10 @@ PART_BYTES: Final = 4 * framing.MAX_PAYLOAD_WORDS
 def program(
     endpoint: Endpoint | str, image: Image | Path, *, timeout: float = 30.0, token: bytes = framing.NO_TOKEN
 ) -> str:
-    """Program a board, and read back its identity.
+    """Program the board whose registers are at an endpoint, and return the image hash that it reads back.
 
-    The file and the board's register map are checked before the board is changed.
-
-    Args:
-        endpoint: Endpoint of the board's registers, from which the programming port follows.
-        image: An image, or the path of a programming file.
-        timeout: Seconds for each step: connecting, transferring the file, loading the machine.
-        token: The token of this host's link to the board, if it has one.
-
-    Returns:
-        The image hash that the board reads back.
+    The file and the board's register map are checked before the board is changed. Connecting, transferring the file
+    and loading the machine may each take `timeout` seconds. `token` is that of this host's link to the board, if any.
 
     Raises:
         ImageError: The file is missing, damaged, or for another register map.

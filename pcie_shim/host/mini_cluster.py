@@ -117,13 +117,9 @@ class MiniCluster:
     ) -> Self:
         """Open all boards: check identity, liveness and image, program blank boards, and reset the machines.
 
-        Args:
-            endpoints: Endpoints of the boards, in the order of the partition.
-            images: The boards' images.
-            timeout: Seconds for a board to listen, and for each of its answers.
-            slack: Seconds that a frame may take beyond the time for its cycles at the speed of the boards.
-            reprogram: Program boards with another image, now and whenever they are reopened, instead of refusing
-                them.
+        The endpoints are in the order of the partition. A board has `timeout` seconds to listen, and for each answer;
+        a frame has `slack` seconds beyond the time for its cycles at the speed of the boards. With `reprogram`, boards
+        with another image are programmed, now and whenever they are reopened, instead of being refused.
 
         Raises:
             EndpointError: An endpoint is invalid.

@@ -187,10 +187,7 @@ def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
 
 
 async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) -> int:
-    """Print the status of a run, once or every second.
-
-    Returns:
-        0 if everything is ready, otherwise 6.
+    """Print the status of a run, once or every second; return 0 if everything is ready, otherwise 6.
 
     Raises:
         SettingsError: No process answers, or a master is needed and does not answer, and `watch` is false.

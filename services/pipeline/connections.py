@@ -111,9 +111,7 @@ class AdvertisedTopic:
 async def refusals(topics: Iterable[AdvertisedTopic], *, settled: bool) -> dict[str, str]:
     """Return, by topic, why topics cannot be received, according to rosapi.
 
-    Args:
-        topics: The topics.
-        settled: Whether the servers have had time to register them.
+    `settled`: the servers have had time to register them.
     """
     asked = list(topics)
     found = await asyncio.gather(*(_refusal(topic, settled=settled) for topic in asked))

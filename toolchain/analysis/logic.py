@@ -164,11 +164,7 @@ def state_bits(p: BM1Parameters, table_length: int) -> int:
 
 
 def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH) -> Logic:
-    """Return the logic of a machine, without memories.
-
-    Args:
-        parameters: The parameters of the machine on one board.
-        table_length: Length of the table of random numbers, if one is used.
+    """Return the logic of a machine on one board, without memories.
 
     Raises:
         BuildError: The generators exist only in emulation.

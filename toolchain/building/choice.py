@@ -15,11 +15,7 @@ def model_for(
 ) -> tuple[Model | NetworkModel, str]:
     """Return the model for the machine that the options ask for, and the reason for its kind, as a clause.
 
-    Args:
-        source: A naive fusion, or any question.
-        options: The options, with the choice of the machine.
-        bits: Address bits of a BM1's columns, as `NAME=BITS`.
-        device: FPGA of the boards of a BM1, or None.
+    `bits` (address bits of columns, as `NAME=BITS`) and the FPGA `device` are for a BM1.
 
     Raises:
         ToolchainError: The machine cannot be built, or a flag is for the other machine.

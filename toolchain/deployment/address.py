@@ -12,16 +12,10 @@ _SHOWN = 60
 
 
 def to_address(variable: Variable, value: object) -> int | None:
-    """Return the address of one reading in its variable's column.
+    """Return the address of one reading, 0 to `variable.values - 1`, in its column; None for a missing reading.
 
-    Args:
-        variable: Offset, step, period, number of supported addresses, and the treatment of readings that are
-            out of range or missing.
-        value: The value of the field. `None` (null or an absent field), NaN and an empty array are missing
-            readings. Booleans are 0 and 1. Strings are never numbers, but may be names of states.
-
-    Returns:
-        The address, 0 to `variable.values - 1`, or `None` for a missing reading.
+    `None` (null or an absent field), NaN and an empty array are missing readings. Booleans are 0 and 1. Strings
+    are never numbers, but may be names of states.
 
     Raises:
         ReadingMissingError: The reading is missing and `on_missing` is `error`.

@@ -21,16 +21,11 @@ from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError
 
 
 def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Scale) -> NDArray[np.uint16]:
-    """Return the codes of the likelihoods of a frame, one per line (`sensor_mode = threshold`).
+    """Return the codes of one sensor's likelihoods in a frame, one per line (`sensor_mode = threshold`).
 
-    Args:
-        likelihoods: float64[..., lines] of one sensor: P(its reading | S = line).
-        prob_bits: Bits of a code (W), 1 to 16.
-        scale: `column`: each row is divided by its maximum, because only ratios matter; `none`: values up to
-            1 are encoded unchanged.
-
-    Returns:
-        uint16 codes of the same shape.
+    The likelihoods are float64[..., lines]: P(its reading | S = line); the codes have the same shape. With the
+    scale `column`, each row is divided by its maximum, because only ratios matter; with `none`, values up to 1
+    are encoded unchanged.
 
     Raises:
         ReadingError: A likelihood is not a probability, or a whole row is 0.
@@ -54,12 +49,9 @@ def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Sc
 def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int = 1) -> NDArray[np.uint16]:
     """Return the codes of a written prior, uint16[lines]; only the ratios of its numbers matter.
 
-    Args:
-        prior: One number per line of the machine, such as a posterior of an earlier frame. With replicas,
-            it is the prior of all of them, unless there are `replicas` times as many numbers, one prior for each.
-        lines: Lines of the machine, over all boards.
-        prob_bits: Bits of a code (W), 1 to 16.
-        replicas: Machines on a board. With several, uint16[replicas, lines] is returned.
+    The prior has one number per line of the machine, over all boards, such as a posterior of an earlier frame. With
+    replicas, it is the prior of all of them, unless there are `replicas` times as many numbers, one prior for each;
+    then uint16[replicas, lines] is returned.
 
     Raises:
         ReadingError: The number of values is wrong, a value is not a probability, or all values are 0.
@@ -89,18 +81,12 @@ MISSING: Final = -1
 
 
 def to_addresses(deployment: Deployment, variable: Variable, value: object) -> list[int] | None:
-    """Return the addresses (`threshold`: codes) of one variable's readings in a frame.
+    """Return the addresses (`threshold`: codes) of one variable's readings in a frame; None if all are missing.
 
-    Args:
-        deployment: The source of the shape, `deployment.reading_shape(variable)`.
-        variable: As for `toolchain.deployment.address.to_address`.
-        value: The value of the field: a flat array, or one with the shape; bytes (`uint8[]`) as bytes or as
-            base64. With `None` or an empty array, all readings are missing; null and NaN are single missing
-            readings.
-
-    Returns:
-        One address per element of the shape, row by row; `MISSING` in all lines of a missing reading. `None`
-        if every reading is missing.
+    The value of the field is a flat array, or one with the shape `deployment.reading_shape(variable)`; bytes
+    (`uint8[]`) as bytes or as base64. With `None` or an empty array, all readings are missing; null and NaN are
+    single missing readings. There is one address per element of the shape, row by row; `MISSING` in all lines of a
+    missing reading.
 
     Raises:
         ReadingError: The array has another length, or contains an unusable reading, which the sentence names.

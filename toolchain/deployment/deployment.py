@@ -187,13 +187,10 @@ def with_hash(deployment: Deployment) -> Deployment:
 
 
 def load_deployment(directory: Path, *, images: bool = True, edited: bool = False) -> Deployment:
-    """Read and check a deployment.
+    """Read and check the deployment in a folder written by `toolchain build`.
 
-    Args:
-        directory: The folder written by `toolchain build`.
-        images: True to read the images and compare their hashes; without them, a process starts without
-            NumPy.
-        edited: True to accept an edited `deployment.toml`, whose hash does not match its content.
+    Without `images`, they are not read and compared with their hashes, and a process starts without NumPy. With
+    `edited`, a `deployment.toml` whose hash does not match its content is accepted.
 
     Raises:
         DeploymentError: The deployment is absent, not TOML, or has a wrong key or value.

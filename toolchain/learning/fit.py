@@ -174,13 +174,10 @@ def _normals(
 def mixture(
     residuals: Sequence[NDArray[np.float64]], widths: Sequence[float], *, bias: bool, least_sigma: float
 ) -> tuple[float, float, list[float]]:
-    """Fit one normal and, for each variable, the share of uniform outliers.
+    """Fit one normal and, for each variable, the share of uniform outliers: mean, standard deviation and shares.
 
     `residuals` are readings minus expectations; outliers are uniform in the width of their variable. Without
     `bias`, the mean is 0.
-
-    Returns:
-        The mean, the standard deviation and the shares.
     """
     everything = np.concatenate(residuals)
     mean = float(np.median(everything)) if bias else 0.0

@@ -39,12 +39,9 @@ class Recording:
 
 
 def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0.1) -> Recording:
-    """Return the named columns of a recording.
+    """Return the named columns of a recording: a CSV file (`.csv`), an MCAP file, a ROS 1 bag or a ROS 2 bag's folder.
 
-    Args:
-        path: A CSV file (`.csv`), or an MCAP file, a ROS 1 bag or a ROS 2 bag's folder.
-        columns: The columns; in a bag, the topic of the first one defines the rows.
-        tolerance_s: Maximum time in seconds between a row and messages of other topics in a bag.
+    In a bag, the topic of the first column defines the rows; messages of other topics may be `tolerance_s` apart.
 
     Raises:
         ModelError: The recording is missing, damaged, lacks a column (the sentence lists its columns), or has

@@ -29,13 +29,11 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
 
 
 def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
-    """Return the model or the question of a case study's folder.
+    """Return the model or the question of a folder with a `model.py`, or of that file itself.
 
-    Args:
-        case: A folder with a `model.py`, or that file itself. It defines `model(...)`, which returns a
-            `toolchain.models.Model` or a `toolchain.models.Question`. It can import modules in its folder.
-        settings: Values for the parameters of `model()` as text; each is converted to the annotated type of
-            its parameter (int, float, bool, str, Path, an Enum, a Literal).
+    It defines `model(...)`, which returns a `toolchain.models.Model` or a `toolchain.models.Question`, and can import
+    modules in its folder. The settings are values for the parameters of `model()` as text; each is converted to the
+    annotated type of its parameter (int, float, bool, str, Path, an Enum, a Literal).
 
     Raises:
         ModelError: The folder or file does not exist, a parameter or value is unknown or missing, `model.py`

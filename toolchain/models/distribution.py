@@ -287,12 +287,7 @@ Factor: TypeAlias = Distribution | Potential
 
 
 def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) -> Distribution:
-    """Return P(symbol | given) from numbers.
-
-    Args:
-        symbol: The symbol.
-        values: float64[size of the symbol, size of each given].
-        given: The symbols that it depends on.
+    """Return P(symbol | given) from numbers, float64[size of the symbol, size of each given].
 
     Raises:
         ModelError: The shape is wrong, a number is not a probability, or a column does not sum to 1.
@@ -363,10 +358,8 @@ def conditional_normal(
 def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distribution:
     """Return P(symbol | given) for a function of the given symbols: 1 at its value, 0 elsewhere.
 
-    Args:
-        symbol: The symbol; with `on_range = clamp`, values beyond its ends become the ends.
-        given: The symbols of which it is a function.
-        value: The function of the given symbols' values as numbers.
+    The function gets the given symbols' values as numbers. With `on_range = clamp`, values beyond the ends of the
+    symbol become the ends.
 
     Raises:
         ModelError: The function returns a value that the symbol does not have.
@@ -395,11 +388,7 @@ def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distrib
 
 
 def potential(symbols: Sequence[Symbol], values: ArrayLike) -> Potential:
-    """Return a factor that is not a distribution itself, as in a Markov network.
-
-    Args:
-        symbols: The symbols of which it is a function.
-        values: float64[size of each symbol], from 0.
+    """Return a factor that is not a distribution itself, as in a Markov network; its values are float64[size of each symbol], from 0.
 
     Raises:
         ModelError: The shape is wrong, or a number is negative, infinite or NaN.

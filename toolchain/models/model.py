@@ -309,16 +309,11 @@ def _first(reason: ValidationError) -> str:
 def exact_posterior(
     model: Model, addresses: Sequence[int | NDArray[np.int64] | None], *, prior_address: int | None = None
 ) -> NDArray[np.float64]:
-    """Return P(S | readings) of the unquantised model.
+    """Return P(S | readings) of the unquantised model, float64[lines].
 
-    Args:
-        model: The model.
-        addresses: One per known variable, in the order of the columns; None for a missing reading. If lines
-            have their own readings (`sensor_mode = cell`), int64[lines] per variable.
-        prior_address: The row of the selected prior; None for the prior without a selection.
-
-    Returns:
-        float64[lines], summing to 1.
+    There is an address per known variable, in the order of the columns; None for a missing reading. If lines have
+    their own readings (`sensor_mode = cell`), it is int64[lines]. `prior_address` is the row of the selected prior;
+    None for the prior without a selection.
 
     Raises:
         ModelError: The number of addresses is wrong, an address is not supported, or the readings are

@@ -61,8 +61,7 @@ class NetworkModel:
     def exact(self, addresses: Sequence[int | None]) -> NDArray[np.float64]:
         """Return the exact posterior of the searched variables together, float64[lines], the first one slowest.
 
-        Args:
-            addresses: One per known variable; None for a missing reading.
+        There is an address per known variable; None for a missing reading.
 
         Raises:
             ModelError: The readings have the probability 0, or inference needs a table above the limit.
