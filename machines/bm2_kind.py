@@ -315,7 +315,6 @@ class Kept(msgspec.Struct, array_like=True):
     """The record of one board's chain in a frame, in addition to its last result words.
 
     Attributes:
-        parameters: The parameters of its machine.
         samples: Samples drawn so far.
         unused: Those of them that are in no histogram.
         timed_out_bit: The bit on which the CDEs did not agree; -1: none.

@@ -47,11 +47,7 @@ PREPARED_CYCLES: Final = 2**14
 
 
 class FastBM1(BM1Kernel):
-    """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4).
-
-    Args:
-        machine: The machine to run.
-        kept_bytes: Maximum size of the cache; 0 for no cache.
+    """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4); the cache may be of size 0.
 
     Raises:
         MachineError: The generators of the machine are not LFSRs, or are not shared.

@@ -114,12 +114,9 @@ class StaleHandleError(AccessError):
 
 
 class BoardError(PcieShimError):
-    """A board of the mini-cluster on which a frame failed, or that cannot be opened.
+    """Board number `board`, from 0, of the mini-cluster, on which a frame failed, or that cannot be opened.
 
     `__cause__` is the LinkError or ImageError, which also decides the exit code.
-
-    Attributes:
-        board: The board's number in the mini-cluster, from 0.
     """
 
     def __init__(self, sentence: str, *, board: int, exit_code: int = 5) -> None:

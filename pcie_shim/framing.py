@@ -211,13 +211,7 @@ NO_TOKEN: Final = bytes(8)
 
 
 class ProgramBegin(NamedTuple):
-    """A loader's announcement of a programming file.
-
-    Attributes:
-        size: Size of the file in bytes.
-        sha256: SHA-256 of the file.
-        token: The token of the loader's link to the board, or `NO_TOKEN`.
-    """
+    """A loader's announcement of a file of `size` bytes; the token is that of its link to the board, or `NO_TOKEN`."""
 
     size: int
     sha256: bytes

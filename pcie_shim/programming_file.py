@@ -42,14 +42,7 @@ _Word: TypeAlias = Annotated[int, Field(ge=0, lt=2**32)]  # a number in a file i
 
 @dataclass(frozen=True)
 class Partition:
-    """The lines of the model on one board.
-
-    Attributes:
-        index: Number of this part, from 0.
-        count: Number of parts (boards).
-        line_offset: First line of this part in the whole model.
-        total_lines: Lines of the whole model.
-    """
+    """The lines of the model on board `index`, from 0, of `count`; they begin at `line_offset`, of `total_lines`."""
 
     index: _Word
     count: _Word
@@ -68,7 +61,6 @@ class Image:
         interface_results: Result words of the interface (thesis 3.2: 1200).
         model_hash: SHA-256 (hex) of the model; the same for all boards of a deployment.
         build_date: Date of the build, ISO 8601.
-        tool_version: Version of the toolchain.
 
     Raises:
         ImageError: The machine is larger than the interface, or the interface than the register map, or the

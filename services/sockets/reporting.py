@@ -93,11 +93,8 @@ class ServiceManager:
 class Report:
     """The status of a process with its identity, rate, CPU time, memory and latencies.
 
-    Args:
-        name: Name of the process.
-        get_status: Returns its status.
-        is_alive: Returns whether it makes progress; needed only if this is not evident from an answer.
-        stages: Returns the latencies of the stages of its frames.
+    `is_alive` returns whether it makes progress; needed only if this is not evident from an answer. `stages` returns
+    the latencies of the stages of its frames.
     """
 
     def __init__(

@@ -89,7 +89,6 @@ class ZScores:
 
     Attributes:
         cycles: The length c.
-        counts: Number of counts.
         draws: Number of independent draws of random numbers, the banks, for the intervals.
         rms: Root mean square: 1 for independent bits, 1.6 if the variance is 2.6 times as large.
         mean: 0 if the counts are unbiased.
@@ -127,7 +126,6 @@ class Accuracy:
     """Accuracy and cycles of a machine on some readings.
 
     Attributes:
-        frames: Number of frames.
         posteriors: Number of posteriors: one per frame, or one per replica of a frame.
         banks: Number of seed sets with which each was run.
         impossible: Share of posteriors for which no line can count, although the model, if any, has a posterior.
@@ -137,7 +135,6 @@ class Accuracy:
         quantising: Exact inference on the codes against the model; None without a model.
         sampling: The machine against exact inference on its codes.
         z: Counts compared with equation 2.1; None if no line counts often enough.
-        cycles: Cycles of a frame.
     """
 
     frames: int

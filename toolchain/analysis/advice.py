@@ -51,16 +51,12 @@ class Candidate:
     """A machine for a question; without numbers if it is refused.
 
     Attributes:
-        machine: BM1 or BM2.
         refused: The reason why it cannot answer the question; empty if it can.
-        prob_bits: Bits of its codes.
         setting: Its target count (BM1) or samples (BM2).
         total_variation: Mean distance from exact inference with this setting.
         cycles: Cycles of a frame, in the median.
         seconds: The time of these cycles at the clock.
-        boards: Number of boards that hold it.
-        alms: Estimated logic of one board.
-        blocks: Estimated memory blocks of one board.
+        alms, blocks: Estimated logic and memory blocks of one of its boards.
         unfit: The reason why a board of this device cannot hold it; empty if it can.
     """
 

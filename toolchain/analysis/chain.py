@@ -51,9 +51,7 @@ def agreement(
 class ExactChain:
     """The chain over the states of the unknown bits; bit i of a state's index is the i-th unknown bit.
 
-    Args:
-        machine: A machine with at most `MOST_BITS` unknown bits.
-        evidence: The values of the known variables, by variable.
+    The evidence is the values of the known variables; at most `MOST_BITS` bits are unknown.
     """
 
     def __init__(self, machine: BM2Machine, evidence: Mapping[int, int]) -> None:
