@@ -84,7 +84,7 @@ class BM2Kind(MachineKind):
         words = parameters.state_words
         if parameters.stream * words > STREAM_WORDS_MAX:
             raise ParameterError(
-                f"stream is {parameters.stream}; a board has room for {STREAM_WORDS_MAX // words} states of {words} words."
+                f"stream is {parameters.stream}; a board has room for {STREAM_WORDS_MAX // words} states of this machine."
             )
         answer = {"RESULTS": parameters.result_words} | dict.fromkeys(_ANSWER, 1)
         if parameters.stream:
@@ -237,11 +237,7 @@ def kernels_of(machines: Sequence[BM2Machine]) -> list[BM2Kernel]:
 
 
 def run_batches(kernels: Sequence[BM2Kernel], frame: FrameInput) -> list[BoardResult]:
-    """Run a frame on the kernels of all boards, one after the other, in the batches in which boards run it.
-
-    Raises:
-        StartError: The frame does not fit the machines.
-    """
+    """Run a frame on the kernels of all boards, in the batches in which boards run it; a StartError if it does not fit."""
     starts, settings = _OnHost([kernel.machine for kernel in kernels]).starts(frame)
     first, *others = _batch_ends(settings.target_count)
     results = []

@@ -29,11 +29,7 @@ def encode_probability(p: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.uint1
 
 
 def decode_code(codes: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.float64]:
-    """Return the probability of a code as float64: code / 2**W, and 1 for the all-ones code.
-
-    Raises:
-        ParameterError: A code has more bits, or `prob_bits` is not 1 to 16.
-    """
+    """Return the probability of a code, code / 2**W, and 1 for the all-ones code; a ParameterError if it has more bits."""
     _check_bits(prob_bits)
     array = np.asarray(codes)
     ones = (1 << prob_bits) - 1

@@ -95,11 +95,7 @@ def parse_endpoint(text: str) -> Endpoint:
 
 
 def listen(endpoint: Endpoint) -> socket.socket:
-    """Return a listening socket; a unix socket has mode 0600 and replaces a stale one.
-
-    Raises:
-        EndpointError: Another process listens there, or the system refuses.
-    """
+    """Return a listening socket, or raise an EndpointError; a unix socket has mode 0600 and replaces a stale one."""
     try:
         if not endpoint.path:
             family = socket.AF_INET6 if ":" in endpoint.host else socket.AF_INET

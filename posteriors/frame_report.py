@@ -199,11 +199,7 @@ _REPORT: Final = TypeAdapter(FrameReport)
 
 
 def read_frame_report(message: dict[str, Any], heard_ns: int) -> FrameReport:
-    """Return the report in a diagnostic_msgs/DiagnosticArray; keys may be absent.
-
-    Raises:
-        BadResultError: The message has no stamp or no status, or one of its values is not a number.
-    """
+    """Return the report in a diagnostic_msgs/DiagnosticArray, or raise a BadResultError; keys may be absent."""
     array = validated(_ARRAY, message, FRAME_TOPIC, FRAME_TYPE)
     first, *others = array.status
     values = first.by_key()

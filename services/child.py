@@ -329,13 +329,7 @@ def ask_for_end_with_parent() -> None:
 
 
 def end_with_parent() -> None:
-    """In a child: exit with the parent, even after SIGKILL.
-
-    Does nothing in a process without a rosbayes parent.
-
-    Raises:
-        StoppedError: The parent has already ended.
-    """
+    """In a child of rosbayes: exit with the parent, even after SIGKILL; a StoppedError if it has already ended."""
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None or not parent.isdigit():
         return

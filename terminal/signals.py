@@ -94,12 +94,9 @@ async def until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
 
 
 def run_async(main: Coroutine[Any, Any, int | None]) -> int:
-    """Run a coroutine on uvloop until it ends or a signal cancels it, and return its exit code.
+    """Run a coroutine on uvloop, and return its exit code; a StoppedError if a signal cancelled it.
 
     Its `finally` clauses clean up before this function returns.
-
-    Raises:
-        StoppedError: A signal ended it.
     """
 
     async def guarded() -> int:

@@ -98,12 +98,9 @@ def verilog(
     more_sources: Sequence[str] = (),
     generics: Mapping[str, int | str] | None = None,
 ) -> str:
-    """Return a board's hardware as Verilog, from the package of parameters in a folder, in which GHDL works.
+    """Return a board's hardware as Verilog, or raise a HardwareToolError; the package of parameters is in the folder.
 
     `table` is the Verilog of `bm1_table`; `more_sources` are VHDL files relative to `hdl`, the folder of the VHDL.
-
-    Raises:
-        HardwareToolError: GHDL is not installed or failed.
     """
     # without its entity, the table's component remains unbound: a black box
     names = [name for name in SOURCES if name != "bm1_table.vhd"]

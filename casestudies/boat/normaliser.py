@@ -51,13 +51,10 @@ def normalise(raw: tuple[float | None, ...]) -> tuple[int | None, ...]:
 
 
 async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) -> None:
-    """Normalise messages until cancelled.
+    """Normalise messages until cancelled; a BridgeError if no server answers at the URI.
 
     A message with anything else than finite numbers is dropped, and each cause is reported once. A missing reading stays
     missing.
-
-    Raises:
-        BridgeError: No rosbridge server answers at the URI.
     """
     from bridge.client import connect
     from casestudies.topics import LossyPublication, Readiness, report_refused, serve_readiness

@@ -146,14 +146,11 @@ async def simulate(
     array: bool = False,
     count: int | None = None,
 ) -> None:
-    """Sail and publish `count` readings, or publish until cancelled.
+    """Sail and publish `count` readings, or until cancelled; a BridgeError if no server answers at the URI.
 
     Each step publishes the true pose and then the readings, with the same stamp, on `topic`: `boat_msgs/Raw`, or with
     `array` std_msgs/Float64MultiArray. So does a change of the boat from outside, at once. While the server is away
     the boat sails on.
-
-    Raises:
-        BridgeError: No rosbridge server answers at the URI.
     """
     from bridge.client import connect
     from bridge.stamps import header

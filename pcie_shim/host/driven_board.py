@@ -222,11 +222,7 @@ class DrivenBoard:
         link.post(writes)
 
     def receive(self) -> bool:
-        """Receive once, after a poll; return whether the board is done.
-
-        Raises:
-            LinkError: The link broke, or the board's answer is wrong, early or repeated.
-        """
+        """Receive once, after a poll; return whether the board is done. A LinkError if it broke, or the answer is wrong."""
         link = self.open_link
         done = link.receive_done()
         is_done = done is not None

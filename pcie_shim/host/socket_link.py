@@ -125,11 +125,7 @@ class SocketLink:
             self._give_up(error)
 
     def _authenticate(self, frame: Frame, deadline: float, connect_timeout: float) -> Frame:
-        """Prove to the board that this host has the key, check the board's proof, and return the greeting's frame.
-
-        Raises:
-            KeyRefusedError: One of the two has no key, or the keys differ.
-        """
+        """Prove to the board that this host has the key, check its proof, and return its greeting, or raise a KeyRefusedError."""
         key = self.endpoint.key
         if frame.operation != framing.AUTHENTICATE:
             if key and frame.operation == framing.GREET:

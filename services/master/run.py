@@ -68,11 +68,7 @@ class Master:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def run(self) -> int:
-        """Start missing peers, move frames until the end of the run, and stop the peers that were started.
-
-        Raises:
-            StackError: The error that ended the run, with its exit code.
-        """
+        """Start missing peers, move frames, and stop the peers that were started; a StackError if an error ended the run."""
         settings, peers = self._settings, self._peers
         sockets = contextlib.AsyncExitStack()
         try:

@@ -43,11 +43,7 @@ class _SourceReader:
         )
 
     def read(self, message: dict[str, Any]) -> tuple[Addresses, Values, bytes]:
-        """Return a message's addresses, values and prior codes.
-
-        Raises:
-            VariableError: A variable is missing or unusable.
-        """
+        """Return a message's addresses, values and prior codes; a VariableError if a variable is missing or unusable."""
         addresses: Addresses = []
         values: Values = []
         try:

@@ -41,11 +41,7 @@ _Line = _LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # JSON has no 
 
 
 def result_from_line(line: bytes, number: int, machine: MachineSection) -> Publish | list[float]:
-    """Return the value of a line: a result of `pcie-app` with its reading, or probabilities.
-
-    Raises:
-        InputLineError: The line is neither.
-    """
+    """Return the value of a line: a result of `pcie-app` with its reading, or probabilities; otherwise an InputLineError."""
     where = f"line {number} of standard input"
     count, replicas, reasons = machine.results, machine.replicas, machine.kind.reasons
     expected = f"a result of pcie-app or an array of {count} probabilities"

@@ -340,12 +340,7 @@ def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint
 
 
 def board_endpoint(text: str, where: str, settings: Settings) -> Endpoint:
-    """Return the endpoint of a board, with the key of the settings if it is on TCP.
-
-    Raises:
-        SettingsError: It is not an endpoint.
-        CredentialsError: The key cannot be used.
-    """
+    """Return the endpoint of a board, with the key of the settings on TCP; a SettingsError or CredentialsError if wrong."""
     endpoint = endpoint_from(text, where)
     if not endpoint.host or settings.key_file is None:
         return endpoint

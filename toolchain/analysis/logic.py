@@ -164,11 +164,7 @@ def state_bits(p: BM1Parameters, table_length: int) -> int:
 
 
 def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH) -> Logic:
-    """Return the logic of a machine on one board, without memories.
-
-    Raises:
-        BuildError: The generators exist only in emulation.
-    """
+    """Return the logic of a machine on a board, without memories; a BuildError if its generators are only emulated."""
     p = parameters
     if p.rng is RngKind.IDEAL:
         raise BuildError("rng = ideal exists only in emulation; use an LFSR")

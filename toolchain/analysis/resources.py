@@ -79,7 +79,7 @@ def estimate(parameters: BM1Parameters, device: Device, *, table_length: int = L
 
 
 def boards_needed(
-    parameters: BM1Parameters, device: Device, *, largest_lines: int = 4096, table_length: int = LENGTH
+    parameters: BM1Parameters, device: Device, *, table_length: int = LENGTH
 ) -> tuple[int, str]:
     """Return the minimum number of boards for a machine, and why, as a sentence; or raise a BuildError."""
 
@@ -87,7 +87,7 @@ def boards_needed(
         return estimate(replace(parameters, lines=lines), device, table_length=table_length)
 
     room = interface_room(BM1.registers(parameters))
-    largest_lines = min(largest_lines, room[1] // parameters.replicas)
+    largest_lines = room[1] // parameters.replicas
     if parameters.sensor_mode is not SensorMode.COLUMN and parameters.sensors:
         largest_lines = min(largest_lines, room[0] // (parameters.replicas * parameters.sensors))
     possible = range(1, min(parameters.lines, largest_lines) + 1)

@@ -64,14 +64,9 @@ def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was aske
             chains=options.partitions,
             **machine_options(options, BM2_KEYS),
         )
+        KINDS["BM2"]().registers(parameters)  # refuses a stream that is too long
     except ParameterError as reason:
         raise refused_parameter(reason) from reason
-    room = rm.STREAM.words // parameters.state_words
-    if parameters.stream > room:
-        raise BuildError(
-            f"--stream {parameters.stream}: a sample of this model has {counted(parameters.state_words, 'word')}, and the "
-            f"register map has room for {room} samples"
-        )
     target_count, max_cycles = (option(key, options, BM2Section) for key in ("target_count", "max_cycles"))
     if options.max_cycles is None:  # a move takes 3 to 6 cycles in the mean, unless zeros are clipped
         moves = (parameters.burn_in + target_count) * parameters.state_bits

@@ -15,10 +15,8 @@ def model_for(
 ) -> tuple[Model | NetworkModel, str]:
     """Return the model for the machine that the options ask for, and the reason for its kind, as a clause.
 
-    `bits` (address bits of columns, as `NAME=BITS`) and the FPGA `device` are for a BM1.
-
-    Raises:
-        ToolchainError: The machine cannot be built, or a flag is for the other machine.
+    `bits` (address bits of columns, as `NAME=BITS`) and the FPGA `device` are for a BM1. A ToolchainError if
+    the machine cannot be built, or a flag is for the other machine.
     """
     refusal = source.refusal() if isinstance(source, Question) else None
     choice = options.machine

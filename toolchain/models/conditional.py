@@ -85,10 +85,7 @@ def wrapped_normal(
 ) -> Known:
     """Return a known variable on a circle of `values * step` that is a wrapped normal given S.
 
-    The arguments are those of `normal`: `values` are the bins of a turn, and a mean may lie in any turn.
-
-    Raises:
-        ModelError: A sigma, step, floor, share or number of values that is not positive.
+    Arguments and errors are those of `normal`: `values` are the bins of a turn, and a mean may lie in any turn.
     """
     shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
     table = wrapped_normal_table(name, shape, values=values, offset=offset, step=step)

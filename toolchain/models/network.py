@@ -61,10 +61,8 @@ class NetworkModel:
     def exact(self, addresses: Sequence[int | None]) -> NDArray[np.float64]:
         """Return the exact posterior of the searched variables together, float64[lines], the first one slowest.
 
-        There is an address per known variable; None for a missing reading.
-
-        Raises:
-            ModelError: The readings have the probability 0, or inference needs a table above the limit.
+        There is an address per known variable; None for a missing reading. A ModelError if the readings have the
+        probability 0, or inference needs a table above the limit.
         """
         asked = [each.label for each in self.searched]
         sizes = dict(zip(self.names, self.cardinalities, strict=True))

@@ -336,7 +336,7 @@ def test_no_machine_is_advised_that_cannot_be_built(network):
         (["--rng", "lfsr16"], ["lfsr16"]),
         (["--sequencer", "coloured", "--literal"], ["--sequencer coloured is not possible with --literal;"]),
         (["--steps-per-clock", "3"], ["--steps-per-clock is 3", "power of two"]),
-        (["--stream", "5000"], ["--stream 5000", "room for 4096 samples"]),
+        (["--stream", "5000"], ["--stream is 5000", "room for 4096 states of this machine"]),
         (["--samples", "0"], ["--samples is 0"]),
         (["--interface", "1x3"], ["interface 1x3", "use --interface 1x16"]),
     ],
