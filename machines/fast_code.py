@@ -175,10 +175,6 @@ _I64: Final = ir.IntType(WORD_BITS)
 _BLOCK: Final = ir.VectorType(_I64, BLOCK_WORDS)
 
 
-def _constant_block(word: int) -> ir.Constant:
-    return ir.Constant(_BLOCK, [ir.Constant(_I64, word)] * BLOCK_WORDS)
-
-
 def _block_pointer(builder: Any, data: Any, place: Any) -> Any:
     """Return the address of the block of words that begins at an index of an array."""
     return builder.bitcast(builder.gep(data, [place]), _BLOCK.as_pointer())
@@ -223,7 +219,7 @@ def _fill_code(_context: Any, _code: Any, inverted: Any, words: Any, _place: Any
 
     def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         shown, into = (context.make_array(signature.args[i])(context, builder, arguments[i]) for i in (1, 2))
-        less = cgutils.alloca_once_value(builder, _constant_block(0))
+        less = cgutils.alloca_once_value(builder, ir.Constant(_BLOCK, [ir.Constant(_I64, 0)] * BLOCK_WORDS))
         with cgutils.for_range(builder, builder.extract_value(shown.shape, 0)) as loop:
             first = builder.mul(loop.index, ir.Constant(_I64, BLOCK_WORDS))
             zeros = _load_block(builder, shown.data, first)

@@ -1,10 +1,5 @@
 """Frames of the link, without sockets: encoding and decoding (docs/reference/boards.md has the wire format).
 
-     0        2          3      4         8        12       16      20
-    ┌────────┬──────────┬──────┬─────────┬────────┬────────┬───────┬───────────────┐
-    │ "BM"   │ operation│ flags│ sequence│ address│ count  │ CRC-32│ count words   │
-    └────────┴──────────┴──────┴─────────┴────────┴────────┴───────┴───────────────┘
-
 All numbers are little-endian. The CRC covers the other 16 bytes of the header and the words. Read requests and
 replies to writes have a count and no words. The framing corresponds to the data link layer of thesis 2.3, which adds
 sequence numbers and CRCs to read and write requests. `FrameDecoder` uses one buffer as long as the link is open.

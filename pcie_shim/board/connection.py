@@ -1,11 +1,7 @@
 """Connections to the two ports of a board: frames in order, refusals, and the proof of the key.
 
-host                                      board
-  │◀─ GREET, or AUTHENTICATE with a key ────│
-  │── READ, WRITE, ... sequence 1, 2, 3 ───▶│ handled by the server, which answers
-  │◀─ reply with the same sequence ─────────│
-  │◀─ ERROR: the access is refused ─────────│ the connection stays
-  │◀─ ERROR BAD_FRAME ──────────────────────│ not a frame, or out of order: it is closed
+`pcie_shim.host.socket_link` shows the frames. A connection is closed after ERROR BAD_FRAME (the bytes are not a frame,
+or it is out of order), but stays after the other refusals.
 """
 
 import hmac

@@ -13,11 +13,11 @@ from rich.live import Live
 from rich.text import Text
 
 from posteriors.errors import LabelError
-from posteriors.frame_report import FrameReport
 from posteriors.pairing import FrameOutcome
 from posteriors.posterior import Posterior
 from services.output.axes import Axis, in_words, printable
 from services.output.posterior_file import record
+from terminal.one_line import one_line
 from terminal.output import print_json_line
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def line(frame: FrameOutcome, axes: list[Axis]) -> str:
     """Return the line of one frame."""
     number = "-" if frame.number is None else str(frame.number)
     if not isinstance(frame, Posterior):
-        return f"frame {number}: {_outcome(frame)}"
+        return f"frame {number}: {one_line(frame.outcome)}"
     # replicas are separate posteriors, so a mean over all of them is meaningless
     if frame.replicas > 1:
         parts = [f"frame {number}: {frame.replicas} replicas"]
@@ -63,12 +63,8 @@ def line(frame: FrameOutcome, axes: list[Axis]) -> str:
     if frame.latency_us is not None:
         parts.append(f"{frame.latency_us / 1000:.2f} ms")
     if frame.report is not None and frame.report.is_biased:
-        parts.append(_outcome(frame.report))
+        parts.append(one_line(frame.report.outcome))
     return "; ".join(parts)
-
-
-def _outcome(report: FrameReport) -> str:
-    return report.outcome if report.outcome.isprintable() else repr(report.outcome)
 
 
 def _best(posterior: Posterior, axes: list[Axis]) -> str:
@@ -104,7 +100,7 @@ def drawing() -> Iterator[Show]:
     """Draw one picture that is updated on a terminal, and separate pictures elsewhere."""
     # labels come from the robot's side, so neither brackets nor numbers in them are formatted
     console = Console(highlight=False, markup=False)
-    colour = in_colour(console)
+    colour = console.color_system is not None and not console.no_color  # NO_COLOR disables it
     rows = max(console.height - _WORDS, 2) if console.is_terminal else ROWS
 
     def drawn(frame: FrameOutcome, axes: list[Axis]) -> Group | Text:
@@ -139,11 +135,6 @@ def drawing() -> Iterator[Show]:
 
 
 # --- pictures ---------------------------------------------------------------------------------------
-
-
-def in_colour(console: Console) -> bool:
-    """Return whether a console supports colours and the user has not disabled them (NO_COLOR)."""
-    return console.color_system is not None and not console.no_color
 
 
 def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool, rows: int = ROWS) -> Text:

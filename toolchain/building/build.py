@@ -29,6 +29,7 @@ from toolchain.building.machine import (
     BoardLayout,
     MachinePlan,
     board_layout,
+    size_text,
     split,
     whole_machine,
 )
@@ -194,7 +195,7 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
             searched=model.searched,
             machine=section(
                 lines=model.lines,
-                interface=layout.interface_text,
+                interface=size_text(layout.interface),
                 target_count=plan.target_count,
                 max_cycles=plan.max_cycles,
                 **own,

@@ -189,11 +189,6 @@ class BoardLayout:
     reason: str
     """The reason for an interface that is not the default, as a clause; otherwise empty."""
 
-    @property
-    def interface_text(self) -> str:
-        """The interface as in `deployment.toml`."""
-        return _size_text(self.interface)
-
 
 def board_layout(
     parameters: BM1Parameters, partitions: int, interface: tuple[int, int] | None
@@ -231,21 +226,22 @@ def fitted_layout(
     if asked is None:
         default = DEFAULT_INTERFACE
         fitted = (max(needed[0], default[0]), max(needed[1], default[1]))
-        reason = "" if fitted == default else f", larger than the default {_size_text(default)}: {sentence}"
+        reason = "" if fitted == default else f", larger than the default {size_text(default)}: {sentence}"
         return BoardLayout(blocks=blocks, interface=fitted, reason=reason)
     if not _is_within(asked, room):
         raise BuildError(
-            f"the interface {_size_text(asked)} is larger than the register map's {_size_text(room)}"
+            f"the interface {size_text(asked)} is larger than the register map's {size_text(room)}"
         )
     if not _is_within(needed, asked):
         enough = (max(needed[0], asked[0]), max(needed[1], asked[1]))
         raise BuildError(
-            f"the model is larger than the interface {_size_text(asked)}: {sentence}; use --interface {_size_text(enough)} or leave it out"
+            f"the model is larger than the interface {size_text(asked)}: {sentence}; use --interface {size_text(enough)} or leave it out"
         )
     return BoardLayout(blocks=blocks, interface=asked, reason=", as asked for")
 
 
-def _size_text(size: tuple[int, int]) -> str:
+def size_text(size: tuple[int, int]) -> str:
+    """Return the size of an interface as in `deployment.toml`."""
     return f"{size[0]}x{size[1]}"
 
 
