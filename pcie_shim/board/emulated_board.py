@@ -42,11 +42,7 @@ _ALIGNMENT: Final = 4096  # chunks end between the blocks of a fast kernel
 
 
 class RefusedError(PcieShimError):
-    """Raised when the board refuses an access.
-
-    Attributes:
-        code: The error code for the host.
-    """
+    """Raised when the board refuses an access; `code` is the error code for the host."""
 
     def __init__(self, code: ErrorCode, detail: str) -> None:
         super().__init__(detail)

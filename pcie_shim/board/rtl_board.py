@@ -36,11 +36,7 @@ class RtlBoard:
     """
 
     def __init__(self, simulate: Callable[[Image], Simulation]) -> None:
-        """Create a blank board.
-
-        Args:
-            simulate: Compiles and starts the simulation of an image's hardware, or raises a SimulationError.
-        """
+        """Create a blank board; `simulate` compiles and starts an image's hardware, or raises a SimulationError."""
         self._simulate = simulate
 
         # While there is no simulation, this one answers.
@@ -236,13 +232,7 @@ class RtlBoard:
 
 
 class _Preparation(threading.Thread):
-    """The compilation and start of an image's hardware, in the background.
-
-    Attributes:
-        identity: Hash and partition of the image.
-        simulation: The started simulation, once its thread has ended.
-        error: The reason why there is none.
-    """
+    """The compilation and start of an image's hardware, in a thread; then there is a simulation, or an error."""
 
     def __init__(self, simulate: Callable[[Image], Simulation], image: Image) -> None:
         super().__init__(daemon=True, name="compilation")

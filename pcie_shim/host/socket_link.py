@@ -267,7 +267,11 @@ class SocketLink:
 
     def receive_done(self) -> Done | None:
         """Receive once, after a poll; return the board's answer if it is complete."""
-        self._receive_some()
+        self._check_open()
+        try:
+            self._fill()
+        except LinkClosedError as error:
+            self._give_up(error)
         return self.take_done()
 
     def take_done(self) -> Done | None:
@@ -317,28 +321,22 @@ class SocketLink:
         while (frame := self._decoder.next_frame()) is None:
             if time.monotonic() > deadline:
                 raise self.timeout_error(timeout, what)
-            try:
-                count = self._socket.recv_into(self._decoder.room())
-            except BlockingIOError:
-                raise self.timeout_error(timeout, what) from None
-            except OSError as error:
-                raise self._closed_error(error.strerror or str(error)) from error
-            if count == 0:
-                raise self._closed_error("it closed the link")
-            self._decoder.received(count)
+            if not self._fill():
+                raise self.timeout_error(timeout, what)
         return frame
 
-    def _receive_some(self) -> None:
-        self._check_open()
+    def _fill(self) -> bool:
+        """Receive once; return False if nothing came within the timeout of the socket."""
         try:
             count = self._socket.recv_into(self._decoder.room())
         except BlockingIOError:
-            return
+            return False
         except OSError as error:
-            self._give_up(self._closed_error(error.strerror or str(error)))
+            raise self._closed_error(error.strerror or str(error)) from error
         if count == 0:
-            self._give_up(self._closed_error("it closed the link"))
+            raise self._closed_error("it closed the link")
         self._decoder.received(count)
+        return True
 
     def _interrupt(self, frame: Frame) -> Done:
         if frame.words < DONE_BLOCK.size // 4:
