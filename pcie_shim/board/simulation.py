@@ -44,11 +44,7 @@ class Answer(NamedTuple):
 
 
 class Simulation:
-    """A running simulation.
-
-    Attributes:
-        speed: Clocks per second while the machine runs; 0 until it is measured.
-    """
+    """A running simulation; `speed` is in clocks per second while the machine runs, and 0 until it is measured."""
 
     def __init__(self, command: Sequence[str], folder: Path) -> None:
         """Start the child, or raise a SimulationError; its first answer may take START_S."""

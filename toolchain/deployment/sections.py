@@ -141,6 +141,7 @@ def names_differ(kind: str, names: list[str]) -> None:
 _WORD_MAX: Final = 2**32 - 1
 """Maximum value of a register."""
 _INTERFACE: Final = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,5})")
+_AN_INTERFACE: Final = "an interface; expected inputs x results, such as '20x1200'"
 
 
 class Stop(StrEnum):
@@ -252,14 +253,8 @@ class CommonSection(Section):
 
     type: str
     lines: int = Field(ge=1)
-    interface: str = "20x1200"
+    interface: Annotated[str, _matching(_INTERFACE, _AN_INTERFACE)] = "20x1200"
     prob_bits: int = Field(ge=1, le=16)
-
-    @field_validator("interface")
-    @classmethod
-    def _inputs_by_results(cls, text: str) -> str:
-        parse_interface(text)
-        return text
 
     @property
     def kind(self) -> "MachineKind":
@@ -415,12 +410,7 @@ class Output(Section):
 
     topic: Topic = "/BMresults"
     type: Literal["std_msgs/Float64MultiArray"] = "std_msgs/Float64MultiArray"
-    uri: str = ""
-
-    @field_validator("uri")
-    @classmethod
-    def _uri_or_nothing(cls, uri: str) -> str:
-        return websocket_uri(uri) if uri else uri
+    uri: Annotated[str, AfterValidator(lambda uri: uri and websocket_uri(uri))] = ""
 
 
 class Topics(Section):
@@ -437,5 +427,5 @@ def parse_interface(text: str) -> tuple[int, int]:
     """Return the inputs and results of an interface such as `20x1200` (thesis 3.2), or raise a ValueError."""
     match = _INTERFACE.fullmatch(text)
     if not match:
-        raise ValueError(f"{text!r} is not an interface; expected inputs x results, such as '20x1200'")
+        raise ValueError(f"{text!r} is not {_AN_INTERFACE}")
     return int(match[1]), int(match[2])
