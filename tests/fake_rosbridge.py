@@ -14,7 +14,7 @@ It behaves as real servers do (A: rosbridge_suite on ROS 1, B: on ROS 2, R: rosb
 
 * a subscription without a type, to a topic that nobody has advertised, is forgotten (A, B, R);
 * a `throttle_rate` that is not an int ends a subscription (A and B silently, R with a status);
-* errors are not reported (A, B), unless `statuses` (R: `{"op": "status", "level": "error", ...}`);
+* errors are not reported (A, B), unless `statuses` (R: `{"op": "status", "level": "error", "id": ...}`);
 * a client that subscribes to a topic by two ids gets its first message twice (B);
 * type names of the ROS 2 form are refused (A), with `ros=1`; rosapi, if present, answers as in that ROS version;
 * a subscription made before a best-effort publisher started never hears it (B: `MultiSubscriber.__init__` in
@@ -270,9 +270,9 @@ class FakeRosbridge:
         else:
             await method(client, op)
 
-    async def _complain(self, client, reason):
+    async def _complain(self, client, reason, **names):
         if self.statuses:
-            await self._say(client, {"op": "status", "level": "error", "msg": reason})
+            await self._say(client, {"op": "status", "level": "error", "msg": reason, **names})
 
     async def _say(self, client, data):
         if isinstance(data, dict):
@@ -300,6 +300,7 @@ class FakeRosbridge:
     async def _op_advertise(self, client, op):
         topic, type_name = _slashed(op.get("topic")), op.get("type")
         if topic in self.refused_topics:
+            await self._complain(client, "install the package of its type", id=op.get("id"))
             return
         if not self._is_type(type_name):
             await self._complain(client, f"cannot load type {type_name!r}")

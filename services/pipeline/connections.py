@@ -108,6 +108,16 @@ class AdvertisedTopic:
     """Its key in `[topics]`, which switches it off; empty for a topic that is always on."""
 
 
+def reported_refusals(topics: Iterable[AdvertisedTopic]) -> dict[str, str]:
+    """Return, by topic, why topics cannot be received, according to a server that reports refused operations."""
+    return {
+        topic.name: f"{topic.name} cannot be received at {topic.uri}: {shown(status.text[:200])}; {_way_out(topic)}"
+        for topic in topics
+        for status in topic.ros.statuses
+        if status.operation.startswith(f"advertise:{topic.name}:")
+    }
+
+
 async def refusals(topics: Iterable[AdvertisedTopic], *, settled: bool) -> dict[str, str]:
     """Return, by topic, why topics cannot be received, according to rosapi.
 
@@ -128,16 +138,19 @@ async def _refusal(topic: AdvertisedTopic, *, settled: bool) -> str:
     if known and not same_type(known, topic.type):
         return (
             f"{topic.name} cannot be received at {topic.uri}: it is {known[:80]} there, not {topic.type}; "
-            f"end the other publisher, or {_way_out(topic, 'build with another output topic')}"
+            f"end the other publisher, or {_way_out(topic)}"
         )
     if not known and settled:
         return (
             f"{topic.name} cannot be received at {topic.uri}: the server does not know it although it was advertised; "
             f"does its topics_glob allow the topic, and does it have {topic.type.partition('/')[0]}?"
-            + (f" Otherwise {_way_out(topic, '')}" if topic.key else "")
+            + (f" Otherwise {_way_out(topic)}" if topic.key else "")
         )
     return ""
 
 
-def _way_out(topic: AdvertisedTopic, otherwise: str) -> str:
-    return f"set {topic.key} = false under [topics] in deployment.toml" if topic.key else otherwise
+def _way_out(topic: AdvertisedTopic) -> str:
+    """Return what to do about a topic that cannot be received."""
+    if topic.key:
+        return f"set {topic.key} = false under [topics] in deployment.toml"
+    return "build with another output topic"

@@ -18,6 +18,7 @@ from services.pipeline.connections import (
     NotReceivableError,
     reconnect_now,
     refusals,
+    reported_refusals,
 )
 from services.pipeline.result_topics import RESULTS_DEPTH, ROLE, ResultTopics
 from services.settings import Settings
@@ -116,10 +117,11 @@ class Publisher(Service):
         topics = self._topics.advertised
         asked = [*topics, *([self._topics.reports] if self._topics.reports else [])]
         # each question takes a server time, which the first result would have to wait for
+        standard = self._topics.standard
         if settled:
-            asked += self._topics.standard.advertised
-        refused = await refusals(asked, settled=settled)
-        self._topics.standard.refused = refused.keys()
+            asked += standard.advertised
+        refused = await refusals(asked, settled=settled) | reported_refusals(standard.advertised)
+        standard.refused |= refused.keys()
         if self._once and all(topic.name in refused for topic in topics):
             raise NotReceivableError(refused[topics[0].name])
         for name in refused.keys() - self._refused.keys():

@@ -8,7 +8,7 @@ A result never waits for them: only the newest frame is kept, and a fault costs 
 
 import asyncio
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, Literal, NoReturn
@@ -67,7 +67,7 @@ class StandardTopics:
 
     Attributes:
         advertised: Those that are published, once `open` has advertised them.
-        refused: Names of topics that the server does not pass on, which get no messages.
+        refused: Names of topics that the server did not pass on when it was asked, which get no more messages.
     """
 
     def __init__(self, settings: Settings, deployment: Deployment, role: str) -> None:
@@ -90,7 +90,7 @@ class StandardTopics:
         self._stack: StackStatus | None = None
         self._levels: list[int] = []
         self.advertised: list[AdvertisedTopic] = []
-        self.refused: Iterable[str] = ()
+        self.refused: set[str] = set()
 
     async def open(self, ros: Ros, uri: str, ros_version: Literal[1, 2]) -> None:
         """Advertise the topics of the deployment."""
@@ -129,6 +129,8 @@ class StandardTopics:
         if self._timer is not None:
             self._timer.cancel()
         self._send()
+        if self._timer is not None:  # the server is slow
+            self._timer.cancel()
         self._publish("diagnostics", self._health)
 
     def _send(self) -> None:

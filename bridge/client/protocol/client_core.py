@@ -149,7 +149,9 @@ class ClientCore:
                 return self.services.receive(operation, data)
             case "status":
                 return StatusReceived(
-                    text_of(operation.get("level")) or "error", text_of(operation.get("msg"))
+                    text_of(operation.get("level")) or "error",
+                    text_of(operation.get("msg")),
+                    text_of(operation.get("id")),
                 )
             case "action_feedback" | "action_result":
                 return self.goals.receive(operation, data)

@@ -84,6 +84,8 @@ class StatusReceived:
 
     level: str
     text: str
+    operation: str = ""
+    """The id of the operation, if the server repeats it."""
 
 
 @dataclass(frozen=True, slots=True)

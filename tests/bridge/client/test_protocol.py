@@ -252,15 +252,20 @@ def test_calls_are_bounded_and_they_and_requests_end_with_the_connection():
 
 
 @pytest.mark.parametrize(
-    ("operation", "level", "text"),
+    ("operation", "level", "text", "of"),
     [
-        ({"level": "error", "msg": "bad type"}, "error", "bad type"),
-        ({"level": "info", "msg": {"a": 1}}, "info", '{"a":1}'),
-        ({}, "error", ""),
+        (
+            {"level": "error", "msg": "bad type", "id": "advertise:/a:1"},
+            "error",
+            "bad type",
+            "advertise:/a:1",
+        ),
+        ({"level": "info", "msg": {"a": 1}}, "info", '{"a":1}', ""),
+        ({}, "error", "", ""),
     ],
 )
-def test_status_messages_are_taken(operation, level, text):
-    assert tell(connected(), op="status", **operation) == StatusReceived(level, text)
+def test_status_messages_are_taken(operation, level, text, of):
+    assert tell(connected(), op="status", **operation) == StatusReceived(level, text, of)
 
 
 def wrapped(inner):

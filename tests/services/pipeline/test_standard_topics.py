@@ -135,6 +135,18 @@ async def test_a_type_that_the_server_lacks_is_one_warning(boat, link, monkeypat
             assert "posterior = false under [topics]" in notice.sentence
 
 
+async def test_a_server_without_rosapi_may_report_a_refusal(boat, link):
+    async with FakeRosbridge(statuses=True) as fake:
+        fake.refused_topics = {"/bm/posterior"}
+        publisher = Publisher(Settings(uri=fake.uri), boat, link.make)
+        async with running(publisher, link):
+            (notice,) = link.of(Notice)
+            assert "posterior = false under [topics]" in notice.sentence
+            link.take(result(boat, 1))
+            await fake.wait_for_op("publish", topic="/bm/pose")
+            assert "/bm/posterior" not in published(fake)
+
+
 async def test_a_run_of_one_frame_publishes_them_before_it_ends(boat, link):
     async with FakeRosbridge() as fake:
         publisher = Publisher(Settings(uri=fake.uri), boat, link.make)
