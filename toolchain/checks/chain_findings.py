@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machines.bm2 import BM2Machine, unpack
-from machines.parameters import PROB_BITS_MAX, RngKind, RngReset, SampleEvery
+from machines.parameters import PROB_BITS_MAX, RngKind, SampleEvery
 from machines.rng import LFSR
 from toolchain.analysis.chain import ChainError, agreement, chain_error
 from toolchain.analysis.logic import BLOCK_SHAPES, blocks_of, device_named
 from toolchain.building.bm2_machine import clipped
 from toolchain.checks.findings import Check, Finding, Severity, error, note, reading, warning
-from toolchain.checks.generators import relations
+from toolchain.checks.generators import fresh_numbers, relations
 from toolchain.deployment import Deployment
 from toolchain.models.network import NetworkModel
 
@@ -285,20 +285,9 @@ def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]
     p, about = chain.machine.parameters, f"rng = {chain.machine.parameters.rng}"
     width, boards, sets = p.rng.lfsr_bits, p.chains, p.rng_banks * p.chains
     wider = "" if p.rng is RngKind.LFSR32 else "--rng lfsr32, or "
-    if p.rng_banks == 1 and p.rng_reset is RngReset.BANK:
-        what = (
-            "every frame uses the same random numbers, so averaging over frames does not remove their error"
-        )
-        yield warning(Check.RNG_BANKS, "rng_banks = 1", what, "use --rng-banks 16, or --rng-reset free")
+    yield from fresh_numbers(p, "this biases all samples")
     if width is None:
         return
-    if p.steps_per_clock < p.prob_bits:
-        what = (
-            f"numbers of {p.prob_bits} bits share bits with those of the next cycle, which biases all samples"
-        )
-        yield warning(
-            Check.RNG_STEPS, f"steps_per_clock = {p.steps_per_clock}", what, "omit --steps-per-clock"
-        )
     seeds = LFSR(p.rng).seeds(np.arange(sets * p.cdes, dtype=np.uint64))
     own, counts = np.unique(seeds, return_counts=True)
     if own.size < seeds.size:

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machines.bm1 import BM1Machine
-from machines.parameters import RngKind, RngReset
+from machines.bm2 import BM2Parameters
+from machines.parameters import BM1Parameters, RngKind, RngReset
 from machines.rng import LFSR
 from toolchain.checks.findings import Check, CheckedMachine, Finding, Severity, error, note, warning
 from toolchain.outputs.memories import seed_words
@@ -34,30 +35,27 @@ def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
             "use an LFSR for a board",
         )
         return
-    if parameters.rng_banks == 1 and parameters.rng_reset is RngReset.BANK:
-        yield warning(
-            Check.RNG_BANKS,
-            "rng_banks = 1",
-            "every frame uses the same random numbers, so averaging over frames does not remove their error",
-            "use --rng-banks 16, or --rng-reset free",
-        )
+    yield from fresh_numbers(parameters, "means are correct, but counts vary up to 2.6 times as much")
     width = parameters.rng.lfsr_bits
     length = 2**width - 1 if width is not None else len(_table(machine.board))
     yield from _period(machine, length)
     if width is None:
         yield from _table_numbers(machine)
         return
-    if parameters.steps_per_clock < parameters.prob_bits:
-        yield warning(
-            Check.RNG_STEPS,
-            f"steps_per_clock = {parameters.steps_per_clock}",
-            (
-                f"numbers of {parameters.prob_bits} bits share {parameters.prob_bits - parameters.steps_per_clock} bits "
-                "with those of the next cycle: means are correct, but counts vary up to 2.6 times as much"
-            ),
-            "omit --steps-per-clock, except for the thesis's machine",
-        )
     yield from _relations(machine)
+
+
+def fresh_numbers(p: BM1Parameters | BM2Parameters, effect: str) -> Iterator[Finding]:
+    """Find random numbers that every frame uses again, or that share bits with those of the next cycle, to this effect."""
+    if p.rng_banks == 1 and p.rng_reset is RngReset.BANK:
+        what = (
+            "every frame uses the same random numbers, so averaging over frames does not remove their error"
+        )
+        yield warning(Check.RNG_BANKS, "rng_banks = 1", what, "use --rng-banks 16, or --rng-reset free")
+    if p.rng.lfsr_bits is not None and p.steps_per_clock < p.prob_bits:
+        what = f"numbers of {p.prob_bits} bits share {p.prob_bits - p.steps_per_clock} bits with those of the next cycle: {effect}"
+        advice = "omit --steps-per-clock, except for the thesis's machine"
+        yield warning(Check.RNG_STEPS, f"steps_per_clock = {p.steps_per_clock}", what, advice)
 
 
 def _period(machine: CheckedMachine, length: int) -> Iterator[Finding]:
