@@ -1,13 +1,14 @@
 """Many chains of a BM2 at a time, each with the same results as a kernel of its own, bit for bit.
 
 Chains of a small network are sliced: bit i of a vector belongs to chain i, and a cycle is a list of logical
-operations on vectors. Each CDE makes a bit in every context (values of the other bits of its factor), and a chain
-takes that of its own state; a bit is written in the chains that point at it. Other chains run one by one.
+operations on vectors. Each CDE makes a bit in every context (values of the other unknown bits), and a chain takes that
+of its own state; a bit is written in the chains that point at it. Chains of a large network go in step: they make the
+same move, each in cycles of its own, and 8 of them share what finds the first agreement. Others run one by one.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import accumulate
+from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -15,35 +16,24 @@ import numpy.typing as npt
 from llvmlite import ir
 from numba import types
 
+from machines import bm2_fast as fast
 from machines import make_bm2_kernel
-from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, unpack
-from machines.bm2_fast import VECTOR, Integers, aligned, in_llvm, load, splat, store
+from machines.bm2 import BM2Machine, BM2Start, BM2StopReason, pack, unpack
+from machines.bm2_fast import CHUNK, VECTOR, Integers, Moves, Wiring, aligned, below, load, some, splat, store
 from machines.bm2_kernel import BM2Kernel, check_bm2_start
 from machines.errors import ParameterError, StartError
 from machines.fast_code import jit
 from machines.parameters import RngReset, SampleEvery, Sequencer
 from machines.rng import LFSR, POLYNOMIALS, Words, generator_numbers
 
-SLICE: Final = 512
-"""Number of chains in a vector."""
-
-SLICED_MIN: Final = 32
-"""Minimum number of chains to be sliced; fewer are faster one by one."""
-
-CONTEXTS_MAX: Final = 128
-"""Maximum number of contexts, over all CDEs, of sliced chains."""
-
-COUNTERS_MAX: Final = 64
-"""Maximum number of counters of sliced chains."""
-
-STEPS_MAX: Final = 32
-"""Maximum of `steps_per_clock` of sliced chains, whose generators make every step."""
-
-CYCLES: Final = 8
-"""Number of cycles of sliced chains whose random bits are made together."""
-
-LOW_PLANES: Final = 3
-"""Number of a counter's lowest bits; they overflow at most once in `CYCLES` cycles."""
+SLICE: Final = 512  # chains in a vector
+SLICED_MIN: Final = 64  # chains to be sliced; fewer are faster in step
+UNKNOWN_MAX: Final = 4  # unknown bits of sliced chains, of which each state but one has a counter
+CYCLES: Final = 8  # cycles of sliced chains whose random bits are made together
+LOW_PLANES: Final = 3  # a counter's lowest bits; they overflow at most once in `CYCLES` cycles
+LANES: Final = 8  # chains in step that share a vector, a word each
+PARTS: Final = 2  # such vectors; the numbers of more chains would not fit a core's cache
+IN_STEP: Final = PARTS * LANES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,6 +50,20 @@ class ChainResult:
     rng_state: Words
 
 
+class _Circuit(NamedTuple):
+    """The operations of a cycle of sliced chains."""
+
+    unknown: Integers  # the unknown bits; a place is one in this array
+    cdes: Integers  # [pairs of contexts]
+    masks: Words  # [pairs, prob_bits, 2]: the bits of the contexts' codes, each as a word of 64
+    entries: Integers  # [entries, 2]: place of a bit, and first context of a CDE that is compared for it
+
+
+# What chains have after their last sample: cycles, states, and results of `result_words` rows and one that counts the
+# samples with an unused code.
+_Ran = tuple[Integers, list[int], npt.NDArray[Any]]
+
+
 class Chains:
     """Chains of one model: machines that differ only in `chain` and `chains`.
 
@@ -69,14 +73,10 @@ class Chains:
 
     def __init__(self, machines: Sequence[BM2Machine]) -> None:
         self._machines = tuple(machines)
-        self._parameters = machines[0].parameters
+        self._parameters = first = machines[0].parameters
         for machine in machines:
-            parameters = replace(
-                machine.parameters, chain=self._parameters.chain, chains=self._parameters.chains
-            )
-            if parameters != self._parameters or not all(
-                map(np.array_equal, machine.tables, machines[0].tables)
-            ):
+            parameters = replace(machine.parameters, chain=first.chain, chains=first.chains)
+            if parameters != first or not all(map(np.array_equal, machine.tables, machines[0].tables)):
                 raise ParameterError(
                     "The machines of the chains differ; all must have the same model and parameters."
                 )
@@ -93,7 +93,7 @@ class Chains:
             raise StartError(f"There are {len(starts)} starts for {len(self._machines)} chains.")
         for start in starts:
             check_bm2_start(self._parameters, start)
-        results = self._run_sliced(starts)
+        results = self._run_together(starts)
         if results is None:
             self._kernels = self._kernels or [make_bm2_kernel(machine) for machine in self._machines]
             for kernel, start in zip(self._kernels, starts, strict=True):
@@ -104,299 +104,204 @@ class Chains:
             ]
         return tuple(results)
 
-    def _run_sliced(self, starts: Sequence[BM2Start]) -> list[ChainResult] | None:
-        """Run the chains sliced; None if they do not suit that, or if one of them may have timed out."""
-        parameters, first = self._parameters, starts[0]
+    def _run_together(self, starts: Sequence[BM2Start]) -> list[ChainResult] | None:
+        """Run the chains sliced or in step; None if they do not suit that, or if one may not draw all samples."""
+        parameters, first, count = self._parameters, starts[0], len(starts)
         if (
-            len(starts) < SLICED_MIN
+            count < IN_STEP
             or any(replace(start, state=first.state, bank=first.bank) != first for start in starts)
             or not first.samples
-            or first.ops_timeout < 4 * CYCLES
+            or first.ops_timeout < CHUNK
             or first.sequencer is not Sequencer.LINEAR
             or parameters.sample_every is SampleEvery.MOVE
             or parameters.rng.lfsr_bits is None
             or parameters.rng_reset is RngReset.FREE
-            or parameters.steps_per_clock > STEPS_MAX
             or parameters.stream
         ):
             return None
-        circuit = _circuit(self._machines[0], first.known, {start.state for start in starts})
-        if circuit is None:
-            return None
-        numbers = [
-            generator_numbers(machine.parameters, start.bank)
-            for machine, start in zip(self._machines, starts, strict=True)
-        ]
-        seeds = LFSR(parameters.rng).seeds(np.stack(numbers))
-        results: list[ChainResult] = []
-        for at in range(0, len(starts), SLICE):
-            states = [start.state for start in starts[at : at + SLICE]]
-            part = _run_slice(parameters, first, circuit, states, seeds[at : at + SLICE])
+        lfsr = LFSR(parameters.rng)
+        banks = [start.bank for start in starts]
+        numbers = map(generator_numbers, (machine.parameters for machine in self._machines), banks)
+        seeds = lfsr.seeds(np.stack(list(numbers)))
+        circuit = self._circuit(starts)
+        moves = fast.moves_of(parameters, first.known, first.sequencer)
+        parts: list[_Ran] = []
+        size = SLICE if circuit else IN_STEP
+        for at in range(0, count, size):
+            # the last chain fills the rest of the last part
+            lanes = [min(at + lane, count - 1) for lane in range(size)]
+            given = moves, first, [starts[lane].state for lane in lanes], seeds[lanes]
+            part = self._run_slice(circuit, *given) if circuit else self._run_in_step(*given)
             if part is None:
                 return None
-            results += part
-        return results
-
-
-class _Circuit(NamedTuple):
-    """The operations of a cycle of sliced chains. A place is that of a bit in `bits`."""
-
-    bits: list[
-        int
-    ]  # the state bits that have a vector: the unknown ones, then those in which the starts differ
-    unknown: int  # number of the unknown ones
-    cdes: Integers  # [groups of four contexts]
-    masks: Words  # [groups, prob_bits, 4]: the bits of the contexts' codes, each as a word of 64
-    # [entries, 3 + n]: place of an unknown bit, first context of a CDE that is compared for it, and number and places
-    # of the bits whose values are the contexts
-    entries: Integers
-    # [unused codes and events, 1 + 2 * n]: number of bits, and their places and values
-    conditions: Integers
-    # the events that have a counter, as mask and value of state bits, and its number; counter 0 counts all samples
-    events: dict[tuple[int, int], int]
-
-
-def _circuit(machine: BM2Machine, known: int, states: set[int]) -> _Circuit | None:
-    """Return the operations for a mask of known bits and these start states; None if there are too many."""
-    parameters = machine.parameters
-    state = min(states)
-    differing = 0
-    for other in states:
-        differing |= (other ^ state) & known
-    unknown = [bit for bit in range(parameters.state_bits) if not known >> bit & 1]
-    bits = unknown + [bit for bit in range(parameters.state_bits) if differing >> bit & 1]
-    codes: list[int] = []
-    cdes: list[int] = []
-    entries: list[list[int]] = []
-    for cde, table in enumerate(machine.tables):
-        local_bits = parameters.factor_bits(cde)
-        for place, bit in enumerate(unknown):
-            others = [other for other in local_bits if other != bit]
-            chosen = [other for other in others if other in bits] if bit in local_bits else []
-            if len(codes) + (1 << len(chosen)) > CONTEXTS_MAX:
-                return None
-            if bit in local_bits:
-                entries.append([place, len(codes), len(chosen), *map(bits.index, chosen)])
-                for context in range(1 << len(chosen)):
-                    address = local_bits.index(bit) << len(others)
-                    for i, other in enumerate(others):
-                        value = context >> chosen.index(other) if other in chosen else state >> other
-                        address |= (value & 1) << i
-                    codes.append(int(table[address]))
-            elif parameters.literal:
-                entries.append([place, len(codes), 0])
-                codes.append(1 << (parameters.prob_bits - 1))
-        codes += [0] * (-len(codes) % 4)
-        cdes += [cde] * (len(codes) // 4 - len(cdes))
-
-    unused = [
-        (mask, code << offset)
-        for mask, offset, cardinality in zip(
-            parameters.masks, parameters.offsets, parameters.cardinalities, strict=True
-        )
-        for code in range(cardinality, (mask >> offset) + 1)
-        if not mask & known
-    ]
-    counted = [
-        (0, 0),
-        *((mask, value) for mask, _, _ in _counted(parameters, known) for value in _values_of(mask)),
-    ]
-    events = {event: 1 + at for at, event in enumerate(dict.fromkeys(counted))}
-    if len(events) > COUNTERS_MAX:
-        return None
-    conditions = [
-        [
-            mask.bit_count(),
-            *(n for place, bit in enumerate(bits) if mask >> bit & 1 for n in (place, value >> bit & 1)),
+            parts.append(part)
+        cycles = np.concatenate([part[0] for part in parts])[:count]
+        results = np.concatenate([part[2] for part in parts], axis=1).T[:count]
+        if cycles.max() > first.max_cycles:
+            return None
+        made = (cycles % lfsr.period * parameters.steps_per_clock).astype(np.uint64)
+        generators = lfsr.jump(seeds, np.repeat(made[:, np.newaxis], parameters.cdes, axis=1))
+        return [
+            ChainResult(
+                reason=BM2StopReason.SAMPLES,
+                cycles=int(cycles[chain]),
+                samples=first.samples,
+                unused=int(results[chain, -1]),
+                timed_out_bit=-1,
+                state=parts[chain // size][1][chain % size],
+                results=results[chain, :-1].astype(np.uint32),
+                rng_state=generators[chain],
+            )
+            for chain in range(count)
         ]
-        for mask, value in (*unused, *events)
-    ]
-    code_bits = (
-        np.array(codes, dtype=np.uint64).reshape(-1, 1, 4)
-        >> np.arange(parameters.prob_bits, dtype=np.uint64)[:, np.newaxis]
-    )
-    return _Circuit(
-        bits=bits,
-        unknown=len(unknown),
-        cdes=np.array(cdes, dtype=np.int64),
-        masks=-(code_bits & np.uint64(1)),
-        entries=_rows(sorted(entries)),
-        conditions=_rows(conditions),
-        events=events,
-    )
+
+    def _circuit(self, starts: Sequence[BM2Start]) -> _Circuit | None:
+        """Return the operations for these starts; None if the chains cannot be sliced."""
+        parameters, known, state = self._parameters, starts[0].known, starts[0].state
+        unknown = [bit for bit in range(parameters.state_bits) if not known >> bit & 1]
+        if (
+            len(starts) < SLICED_MIN
+            or len(unknown) > UNKNOWN_MAX
+            or parameters.literal
+            or any((start.state ^ state) & known for start in starts)
+        ):
+            return None
+        codes: list[int] = []
+        cdes: list[int] = []
+        entries: list[tuple[int, int]] = []
+        for cde, table in enumerate(self._machines[0].tables):
+            bits = parameters.factor_bits(cde)
+            for bit in filter(bits.__contains__, unknown):
+                others, near = ([other for other in each if other != bit] for each in (unknown, bits))
+                entries.append((unknown.index(bit), len(codes)))
+                for context in range(1 << len(others)):
+                    values = state & known | _spread(context, others)
+                    local = sum((values >> other & 1) << i for i, other in enumerate(near))
+                    codes.append(int(table[bits.index(bit) << len(near) | local]))
+            codes += [0] * (-len(codes) % 2)
+            cdes += [cde] * (len(codes) // 2 - len(cdes))
+        planes = np.arange(parameters.prob_bits, dtype=np.uint64)[:, np.newaxis]
+        masks = -(np.array(codes, dtype=np.uint64).reshape(-1, 1, 2) >> planes & np.uint64(1))
+        return _Circuit(np.array(unknown), np.array(cdes), masks, np.array(sorted(entries)))
+
+    def _run_slice(
+        self, circuit: _Circuit, moves: Moves, start: BM2Start, states: list[int], seeds: Words
+    ) -> _Ran | None:
+        """Run 512 chains; None if one may not draw all samples."""
+        parameters, unknown = self._parameters, circuit.unknown.tolist()
+        lfsr, steps = LFSR(parameters.rng), parameters.steps_per_clock
+        events = 1 << len(unknown)
+        # counters have their lowest bit first
+        depth = max(start.samples.bit_length(), start.burn_in.bit_length(), LOW_PLANES + 2)
+        numbers = aligned((parameters.cdes, lfsr.bits + CYCLES * steps, 8), np.uint64)
+        # the bits that each generator shifted in before the first cycle, the last one last
+        shifts = np.arange(lfsr.bits, dtype=np.uint64)[::-1, np.newaxis]
+        numbers[:, : lfsr.bits] = _vectors(seeds.T[:, np.newaxis] >> shifts & np.uint64(1))
+        values, pointed, counts, room = (
+            aligned((count, 8), np.uint64)
+            for count in (len(unknown), len(unknown), events * depth, 2 * len(circuit.cdes) + 2 * events)
+        )
+        values[:] = _vectors(np.array([[state >> bit & 1 for state in states] for bit in unknown]))
+        pointed[0] = ~np.uint64(0)
+        sweeps = start.burn_in or start.samples
+        counts[[plane for plane in range(depth) if -sweeps >> plane & 1]] = ~np.uint64(0)
+        ends = np.zeros(SLICE, dtype=np.int64)
+        exponents = np.array(POLYNOMIALS[parameters.rng])
+        vectors = numbers.reshape(-1, 8), values, pointed, counts, room
+        window = start.ops_timeout // (2 * CYCLES) * CYCLES - CYCLES
+        limits = start.burn_in, start.samples, start.max_cycles, window, steps
+        if not run_sliced(circuit, exponents, vectors, ends, limits):
+            return None
+
+        counted = _bits_of(counts).reshape(-1, depth, SLICE) << np.arange(depth)[:, np.newaxis]
+        drawn = counted.sum(axis=1)[1:]
+        results = np.zeros((parameters.result_words + 1, SLICE), dtype=np.int64)
+        known = states[0] & start.known
+        for value, samples in enumerate([start.samples - drawn.sum(axis=0), *drawn]):
+            codes = unpack(parameters, known | _spread(value, unknown))
+            words = [first + codes[variable] for variable, first, _ in moves.counted.tolist()]
+            if parameters.joint_words:
+                joint = 0
+                for variable in parameters.searched:
+                    joint = joint << parameters.bits[variable] | codes[variable]
+                words.append(parameters.histogram_words + joint)
+            unused = any(codes[variable] >= size for variable, _, size in moves.counted.tolist())
+            results[-1 if unused else words] += samples
+        ended = _bits_of(values).T.tolist()
+        return ends, [known | sum(map(int.__lshift__, own, unknown)) for own in ended], results
+
+    @cached_property
+    def _wiring(self) -> Wiring:
+        return fast.wiring_of(self._machines[0])
+
+    def _run_in_step(self, moves: Moves, start: BM2Start, states: list[int], seeds: Words) -> _Ran | None:
+        """Run `IN_STEP` chains; None if one may not draw all samples."""
+        parameters, cdes, row = self._parameters, self._parameters.cdes, fast.row_size(self._parameters)
+        numbers = aligned((IN_STEP, cdes, row), np.uint16)
+        values, addresses, results, clock = (
+            aligned((count, IN_STEP), np.uint64)
+            for count in (len(parameters.bits), cdes + 1, parameters.result_words + 1, 3)
+        )
+        clock[0] = np.arange(IN_STEP) * cdes * row
+        clock[1] = clock[0] + np.uint64(row - CHUNK)
+        firsts = clock[0].copy()
+        for lane, state in enumerate(states):
+            fast.load_state(parameters, state, values[:, lane], addresses[:, lane])
+            fast.fill(self._wiring, numbers[lane], seeds[lane], parameters.ones_code)
+        vectors = values, addresses, results, clock, aligned((3, LANES), np.uint64)
+        limits = start.burn_in, start.samples, start.max_cycles, start.ops_timeout
+        if not run_in_step(self._wiring, moves, numbers.reshape(-1), vectors, limits):
+            return None
+        cycles = (clock[2] + clock[0] - firsts).astype(np.int64)
+        return cycles, [pack(parameters, own) for own in values.T.tolist()], results
 
 
-def _counted(parameters: BM2Parameters, known: int) -> list[tuple[int, int, tuple[int, ...]]]:
-    """Return what is counted: unknown bits, the first word for their values, and their variables and known ones."""
-    first_words = accumulate((1 << bits for bits in parameters.bits), initial=0)
-    counted: list[tuple[int, int, tuple[int, ...]]] = [
-        (mask, word, (variable,))
-        for variable, (mask, word) in enumerate(zip(parameters.masks, first_words, strict=False))
-        if mask & ~known
-    ]
-    if parameters.joint_words:
-        searched = sum(parameters.masks[variable] for variable in parameters.searched)
-        counted.append((searched & ~known, parameters.histogram_words, parameters.searched))
-    return counted
-
-
-def _values_of(mask: int) -> list[int]:
-    """Return all values of the bits in a mask but 0, which the other samples have."""
-    values = [mask]
-    while values[-1]:
-        values.append((values[-1] - 1) & mask)
-    return values[:-1]
-
-
-def _rows(rows: list[list[int]]) -> Integers:
-    """Return rows of different lengths as one array."""
-    array = np.zeros((len(rows), max(map(len, rows))), dtype=np.int64)
-    for at, row in enumerate(rows):
-        array[at, : len(row)] = row
-    return array
+def _spread(value: int, bits: Sequence[int]) -> int:
+    """Return the state whose bits have those of a value."""
+    return sum((value >> i & 1) << bit for i, bit in enumerate(bits))
 
 
 def _vectors(bits: npt.NDArray[Any]) -> Words:
     """Return the vectors of the bits [..., chains]: uint64[..., 8]."""
-    padded = np.zeros((*bits.shape[:-1], SLICE), dtype=np.bool_)
-    padded[..., : bits.shape[-1]] = bits
-    return np.packbits(padded, axis=-1, bitorder="little").view(np.uint64)
+    return np.packbits(bits.astype(np.bool_), axis=-1, bitorder="little").view(np.uint64)
 
 
-def _bits_of(vectors: Words, count: int) -> Integers:
-    """Return the bits of the first chains of vectors: int64[..., count]."""
-    return np.unpackbits(vectors.view(np.uint8), axis=-1, bitorder="little")[..., :count].astype(np.int64)
-
-
-def _run_slice(
-    parameters: BM2Parameters, start: BM2Start, circuit: _Circuit, states: list[int], seeds: Words
-) -> list[ChainResult] | None:
-    """Run up to 512 chains; None if one of them may have timed out."""
-    count, lfsr, steps = len(states), LFSR(parameters.rng), parameters.steps_per_clock
-    # counters have their lowest bit first
-    depth = max(start.samples.bit_length(), start.burn_in.bit_length(), LOW_PLANES + 2)
-    numbers = aligned((parameters.cdes, lfsr.bits + CYCLES * steps, 8), np.uint64)
-    values = aligned((len(circuit.bits), 8), np.uint64)
-    pointed = aligned((circuit.unknown, 8), np.uint64)
-    running = aligned((3, 8), np.uint64)
-    left = aligned((depth, 8), np.uint64)
-    counts = aligned((1 + len(circuit.events), depth, 8), np.uint64)
-    room = aligned((4 * len(circuit.cdes) + len(counts), 8), np.uint64)
-    ends = np.full(SLICE, start.max_cycles, dtype=np.int64)
-    # the bits that each generator shifted in before the first cycle, the last one last
-    shifts = np.arange(lfsr.bits, dtype=np.uint64)[::-1, np.newaxis]
-    numbers[:, : lfsr.bits] = _vectors((seeds.T[:, np.newaxis] >> shifts) & np.uint64(1))
-    values[:] = _vectors(np.array([[state >> bit & 1 for state in states] for bit in circuit.bits]))
-    pointed[0] = running[0] = _vectors(np.ones(count))
-    running[1] = 0 if start.burn_in else running[0]
-    sweeps = start.burn_in or start.samples
-    left[[plane for plane in range(depth) if sweeps >> plane & 1]] = ~np.uint64(0)
-    if not run_sliced(
-        np.array(POLYNOMIALS[parameters.rng], dtype=np.int64),
-        steps,
-        circuit.masks,
-        circuit.cdes,
-        circuit.entries,
-        circuit.conditions,
-        numbers,
-        values,
-        pointed,
-        running,
-        left,
-        counts,
-        room,
-        ends,
-        start.samples,
-        start.max_cycles,
-        start.ops_timeout // 2 - CYCLES,
-    ):
-        return None
-
-    drawn = (_bits_of(counts, count) << np.arange(depth)[:, np.newaxis]).sum(axis=1)
-    results = np.zeros((count, parameters.result_words), dtype=np.uint32)
-    evidence = [state & start.known for state in states]
-    for known in set(evidence):
-        same = np.flatnonzero([each == known for each in evidence])
-        for mask, first, variables in _counted(parameters, start.known):
-            rest = drawn[circuit.events[0, 0], same]
-            for value in (*_values_of(mask), 0):
-                samples = drawn[circuit.events[mask, value], same] if value else rest
-                rest = rest - samples
-                codes = unpack(parameters, known | value)
-                word = 0
-                for variable in variables:
-                    word = word << parameters.bits[variable] | codes[variable]
-                results[same, first + word] = samples
-    going = _bits_of(running[0], count)
-    ended = _bits_of(values[: circuit.unknown], count).T.tolist()
-    cycles = ends[:count]
-    made = (cycles % lfsr.period * steps).astype(np.uint64)
-    generators = lfsr.jump(seeds, np.repeat(made[:, np.newaxis], parameters.cdes, axis=1))
-    return [
-        ChainResult(
-            reason=BM2StopReason.MAX_CYCLES if going[chain] else BM2StopReason.SAMPLES,
-            cycles=int(cycles[chain]),
-            samples=int(drawn[0, chain]),
-            unused=int(drawn[0, chain] - drawn[circuit.events[0, 0], chain]),
-            timed_out_bit=-1,
-            state=known | sum(value << bit for bit, value in zip(circuit.bits, ended[chain], strict=False)),
-            results=results[chain],
-            rng_state=generators[chain],
-        )
-        for chain, known in enumerate(evidence)
-    ]
+def _bits_of(vectors: Words) -> Integers:
+    """Return the bits of vectors: int64[..., chains]."""
+    return np.unpackbits(vectors.view(np.uint8), axis=-1, bitorder="little").astype(np.int64)
 
 
 # Everything below is compiled, as in `machines.bm2_fast`.
 
 _0: Final = np.uint64(0)
 _1: Final = np.uint64(1)
-_63: Final = np.uint64(63)
-
-
-@in_llvm(types.boolean, VECTOR)
-def _some(builder: Any, vector: Any) -> Any:
-    """Return whether a vector has a 1."""
-    whole = builder.bitcast(vector, ir.IntType(SLICE))
-    return builder.icmp_unsigned("!=", whole, ir.Constant(ir.IntType(SLICE), 0))
+_ALL: Final = np.uint64(2**CHUNK - 1)
 
 
 @jit
 def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
+    circuit: _Circuit,
     exponents: Integers,
-    steps: int,
-    masks: Words,
-    cdes: Integers,
-    entries: Integers,
-    conditions: Integers,
-    numbers: Words,
-    values: Words,
-    pointed: Words,
-    running: Words,
-    left: Words,
-    counts: Words,
-    room: Words,
+    vectors: tuple[Words, ...],
     ends: Integers,
-    samples: int,
-    max_cycles: int,
-    window: int,
+    limits: tuple[int, ...],
 ) -> bool:
-    """Run sliced chains to their ends, and set `ends`; return False if one wrote no bit for `window` cycles.
+    """Run sliced chains to their ends, and set `ends`; return False if one may reach a limit before.
 
-    The vectors of `running` are the chains that have not stopped, those whose burn-in has ended, and room for one.
-    `left` counts the sweeps up to the end of the burn-in or of the chain. `room` is for the contexts' bits, and for
-    carries of the counters in `counts`.
+    `counts` has the sweeps, which overflow at the end of the burn-in or of the chain, and the samples of each state but
+    0; `room` is for the contexts' bits or the events of a sample, and for carries.
     """
+    numbers, values, pointed, counts, room = vectors
+    burn_in, samples, max_cycles, window, steps = limits
+    cdes, masks, entries = circuit.cdes, circuit.masks, circuit.entries
     zero = splat(_0)
-    going, counting, moved = load(running, 0), load(running, 1), zero
-    unknown, depth, rows = pointed.shape[0], left.shape[0], numbers.shape[1]
-    carries, width = room.shape[0] - counts.shape[0], masks.shape[1]
-    unused = conditions.shape[0] - counts.shape[0] + 1
-    bits = exponents[0]
-    cycle = 0
-    unwatched = 0
-    while cycle < max_cycles and _some(going):
-        for first in range(bits, bits + numbers.shape[0] * rows, rows):
+    going, counting, moved = ~zero, zero if burn_in else ~zero, zero
+    bits, unknown, counters, cycle = exponents[0], pointed.shape[0], 1 << pointed.shape[0], 0
+    rows, depth, carries = bits + CYCLES * steps, counts.shape[0] // counters, room.shape[0] - counters
+    while some(going):
+        if cycle >= max_cycles:
+            return False
+        for first in range(bits, bits + numbers.shape[0], rows):
             last, older = load(numbers, first - 1), load(numbers, first - 2)
             for at in range(first, first + CYCLES * steps):
                 made = load(numbers, at - bits) ^ load(numbers, at - exponents[1])
@@ -407,41 +312,34 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
                 older = last
                 last = made
         # Only if a chain has fewer than 16 sweeps left, the end of its sweeps is looked for in each cycle.
-        high = zero
+        near = going
         for plane in range(LOW_PLANES + 1, depth):
-            high = high | load(left, plane)
-        careful = _some(going & ~high)
-        borrows = zero
-        for counter in range(counts.shape[0]):
+            near = near & load(counts, plane)
+        careful = some(near)
+        for counter in range(counters):
             store(room, carries + counter, zero)
-        cycles = min(CYCLES, max_cycles - cycle)
-        for now in range(cycles):
+        for now in range(CYCLES):
             # the bits of all contexts: number < code, from the low bit up, as the majority of what the lower bits
             # say, the inverted number and the code
-            for group in range(cdes.shape[0]):
-                low_bit = cdes[group] * rows + bits + now * steps - 1
-                less0, less1, less2, less3 = zero, zero, zero, zero
-                for i in range(width):
+            for pair in range(cdes.shape[0]):
+                low_bit = cdes[pair] * rows + bits + now * steps - 1
+                less0, less1 = zero, zero
+                for i in range(masks.shape[1]):
                     zeros = ~load(numbers, low_bit - i)
-                    code0, code1 = splat(masks[group, i, 0]), splat(masks[group, i, 1])
-                    code2, code3 = splat(masks[group, i, 2]), splat(masks[group, i, 3])
+                    code0, code1 = splat(masks[pair, i, 0]), splat(masks[pair, i, 1])
                     less0 = (less0 & zeros) | (code0 & (less0 | zeros))
                     less1 = (less1 & zeros) | (code1 & (less1 | zeros))
-                    less2 = (less2 & zeros) | (code2 & (less2 | zeros))
-                    less3 = (less3 & zeros) | (code3 & (less3 | zeros))
-                store(room, 4 * group, less0)
-                store(room, 4 * group + 1, less1)
-                store(room, 4 * group + 2, less2)
-                store(room, 4 * group + 3, less3)
+                store(room, 2 * pair, less0)
+                store(room, 2 * pair + 1, less1)
             entry = 0
             before = zero
             for bit in range(unknown):
                 all_ones, some_ones = ~zero, zero
                 while entry < entries.shape[0] and entries[entry, 0] == bit:
-                    context, chosen = entries[entry, 1], entries[entry, 2]
-                    for i in range(chosen):
-                        chosen_bit = load(values, entries[entry, 3 + i])
-                        for pair in range(1 << (chosen - 1 - i)):
+                    context = entries[entry, 1]
+                    for i in range(unknown - 1):
+                        chosen_bit = load(values, i + (i >= bit))
+                        for pair in range(1 << (unknown - 2 - i)):
                             if_0, if_1 = load(room, context + 2 * pair), load(room, context + 2 * pair + 1)
                             store(room, context + pair, (if_0 & ~chosen_bit) | (if_1 & chosen_bit))
                     made = load(room, context)
@@ -455,69 +353,167 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
                 before = written
                 moved = moved | written
             store(pointed, 0, load(pointed, 0) | before)
-            # `before` is now the chains that have ended a sweep; a sample with an unused code has no other events
-            sampled = before & counting
-            for step in range(unused + counts.shape[0]):
-                event = sampled
-                if step:
-                    condition = step - 1
-                    for i in range(1, 1 + 2 * conditions[condition, 0], 2):
-                        value_bit = load(values, conditions[condition, i])
-                        event = event & (value_bit if conditions[condition, i + 1] else ~value_bit)
-                if 0 < step <= unused:
-                    sampled = sampled & ~event
-                    continue
-                counter = max(step - unused, 0)
-                for plane in range(counter * depth, counter * depth + LOW_PLANES):
+            # `before` is now the chains that have ended a sweep; each unknown bit splits the events in two
+            store(room, 0, before & counting)
+            for bit in range(unknown):
+                value_bit = load(values, bit)
+                for event in range(1 << bit):
+                    whole = load(room, event)
+                    store(room, event + (1 << bit), whole & value_bit)
+                    store(room, event, whole & ~value_bit)
+            store(room, 0, before)
+            carry = zero
+            for counter in range(counters - 1, -1, -1):
+                carry = load(room, counter)
+                planes = LOW_PLANES if counter or not careful else depth
+                for plane in range(counter * depth, counter * depth + planes):
                     digit = load(counts, plane)
-                    store(counts, plane, digit ^ event)
-                    event = event & digit
-                store(room, carries + counter, load(room, carries + counter) | event)
-            borrow = before
-            for plane in range(depth if careful else LOW_PLANES):
-                digit = load(left, plane)
-                store(left, plane, digit ^ borrow)
-                borrow = borrow & ~digit
-            if not careful:
-                borrows = borrows | borrow
-                continue
-            high = zero
-            for plane in range(depth):
-                high = high | load(left, plane)
-            through = before & ~high
-            if _some(through):
-                going = going & ~(through & counting)
-                store(running, 2, through & counting)
-                begun = through & ~counting
+                    store(counts, plane, digit ^ carry)
+                    carry = carry & digit
+                if planes == LOW_PLANES:
+                    store(room, carries + counter, load(room, carries + counter) | carry)
+            if careful and some(carry):
+                going = going & ~(carry & counting)
+                store(room, 0, carry & counting)
+                begun = carry & ~counting
                 counting = counting | begun
                 for plane in range(depth):
-                    if (samples >> plane) & 1:
-                        store(left, plane, load(left, plane) | begun)
+                    if (-samples >> plane) & 1:
+                        store(counts, plane, load(counts, plane) | begun)
                 for lane in range(ends.shape[0]):
-                    if (running[2, lane >> 6] >> (np.uint64(lane) & _63)) & _1:
+                    if (room[0, lane >> 6] >> (np.uint64(lane) & np.uint64(63))) & _1:
                         ends[lane] = cycle + now + 1
-        for counter in range(counts.shape[0]):
+        for counter in range(counters):
             carry = load(room, carries + counter)
             plane = counter * depth + LOW_PLANES
-            while plane < (counter + 1) * depth and _some(carry):
+            while plane < (counter + 1) * depth and some(carry):
                 digit = load(counts, plane)
                 store(counts, plane, digit ^ carry)
                 carry = carry & digit
                 plane += 1
-        plane = LOW_PLANES
-        while plane < depth and _some(borrows):
-            digit = load(left, plane)
-            store(left, plane, digit ^ borrows)
-            borrows = borrows & ~digit
-            plane += 1
-        cycle += cycles
-        for first in range(0, numbers.shape[0] * rows, rows):
+        cycle += CYCLES
+        for first in range(0, numbers.shape[0], rows):
             for at in range(first, first + bits):
                 store(numbers, at, load(numbers, at + CYCLES * steps))
-        unwatched += cycles
-        if unwatched >= window:
-            if _some(going & ~moved):
+        if cycle % window == 0:
+            if some(going & ~moved):
                 return False
-            moved, unwatched = zero, 0
-    store(running, 0, going)
+            moved = zero
+    return True
+
+
+@fast.in_llvm(VECTOR, None, types.int64, None, types.int64, None, types.int64, None, types.int64)
+def _less_in_lanes(
+    builder: Any, numbers: Any, row: Any, places: Any, lane: Any, codes: Any, base: Any, own: Any, first: Any
+) -> Any:
+    """Compare the chunks at the places of 8 chains with their codes, as `less_in_chunk` does."""
+    masks = ir.Constant(ir.VectorType(lane.type, LANES), ir.Undefined)
+    numbers, codes = builder.gep(numbers, [row]), builder.gep(codes, [base])
+    for i in range(LANES):
+        word = ir.Constant(lane.type, i)
+        place = builder.load(builder.gep(places, [builder.add(lane, word)]))
+        code = builder.load(builder.gep(codes, [builder.load(builder.gep(own, [builder.add(first, word)]))]))
+        masks = builder.insert_element(masks, fast.compared(builder, numbers, place, code), word)
+    return masks
+
+
+@jit
+def run_in_step(  # noqa: PLR0915 - vectors are not passed to functions
+    wiring: Wiring,
+    moves: Moves,
+    numbers: npt.NDArray[np.uint16],
+    vectors: tuple[Words, ...],
+    limits: tuple[int, ...],
+) -> bool:
+    """Run chains in step until their samples are drawn; return False if one may reach a limit before.
+
+    The rows of `clock` are the place in `numbers` of each chain's next cycle, the end of its block there, and the
+    number of the block's first cycle.
+    """
+    values, addresses, results, clock, room = vectors
+    burn_in, samples, max_cycles, ops_timeout = limits
+    zero, one = splat(_0), splat(_1)
+    rows, block = addresses.shape[0] - 1, np.int64(clock[1, 0] - clock[0, 0])
+    bits, entries, codes = wiring.bits, wiring.entries.view(np.int64), wiring.codes
+    counted, searched = moves.counted.view(np.int64), wiring.searched.view(np.int64)
+    for sweep in range(burn_in + samples):
+        for move in range(moves.bits.shape[0]):
+            bit = moves.bits[move]
+            variable, shift = np.int64(bits[bit, fast.VARIABLE]) * PARTS, splat(bits[bit, fast.SHIFT])
+            first_entry, last_entry = bits[bit, fast.FIRST_ENTRY], bits[bit, fast.LAST_ENTRY]
+            for part in range(PARTS):
+                all_ones, some_ones = ~zero, zero
+                for entry in range(first_entry, last_entry):
+                    row, base = entries[entry, fast.ROW], entries[entry, fast.BASE]
+                    address = (entries[entry, fast.ADDRESS] * PARTS + part) * LANES
+                    less = _less_in_lanes(numbers, row, clock, part * LANES, codes, base, addresses, address)
+                    all_ones = all_ones & less
+                    some_ones = some_ones | less
+                nth = fast.first_ones(~(all_ones ^ some_ones) | splat(_ALL + _1))
+                before, value = load(clock, part), load(values, variable + part)
+                after = before + nth + one
+                made = (all_ones >> nth) & one
+                late = below(load(clock, PARTS + part), after) | below(splat(np.uint64(CHUNK - 1)), nth)
+                store(clock, part, after)
+                if some(late):
+                    store(room, 0, late)
+                    store(room, 1, before)
+                    store(room, 2, made)
+                    for lane in range(LANES):
+                        chain = part * LANES + lane
+                        at: Any = np.int64(room[1, lane])
+                        end, taken = np.int64(clock[1, chain]), 0
+                        while room[0, lane]:
+                            ones, any_ones = _ALL, _0
+                            for entry in range(first_entry, last_entry):
+                                own = addresses[entries[entry, fast.ADDRESS], chain]
+                                code = codes[entries[entry, fast.BASE] + np.int64(own)]
+                                mask = fast.less_in_chunk(numbers, entries[entry, fast.ROW] + at, code)
+                                ones &= mask
+                                any_ones |= mask
+                            cycles = min(end - at, CHUNK)
+                            agree = (ones | ~any_ones) & (_ALL >> np.uint64(CHUNK - cycles))
+                            if agree:
+                                cycles = np.int64(fast.first_one(agree)) + 1
+                                room[0, lane] = _0
+                                room[2, lane] = (ones >> np.uint64(cycles - 1)) & _1
+                            at += cycles
+                            taken += cycles
+                            if taken > ops_timeout or np.int64(clock[2, chain]) > max_cycles:
+                                return False
+                            if at == end and not agree:
+                                fast.refill(wiring.exponents, numbers, int(end - block) // CHUNK, rows)
+                                clock[2, chain] += np.uint64(block)
+                                at -= block
+                            clock[0, chain] = np.uint64(at)
+                    made = load(room, 2)
+                flip = made ^ ((value >> shift) & one)
+                store(values, variable + part, value ^ (flip << shift))
+                for entry in range(first_entry, last_entry):
+                    place, local = entries[entry, fast.ADDRESS] * PARTS + part, entries[entry, fast.LOCAL]
+                    store(addresses, place, load(addresses, place) ^ (flip << splat(np.uint64(local))))
+        if sweep < burn_in:
+            continue
+        for part in range(PARTS):
+            good = one
+            for i in range(counted.shape[0]):
+                value = load(values, counted[i, fast.VARIABLE] * PARTS + part)
+                good = good & below(value, splat(np.uint64(counted[i, fast.CARDINALITY])))
+            place = (results.shape[0] - 1) * PARTS + part
+            store(results, place, load(results, place) + (good ^ one))
+            for i in range(counted.shape[0]):
+                value = load(values, counted[i, fast.VARIABLE] * PARTS + part)
+                for code in range(counted[i, fast.CARDINALITY]):
+                    place = (counted[i, fast.FIRST_WORD] + code) * PARTS + part
+                    is_code = below(value ^ splat(np.uint64(code)), good)
+                    store(results, place, load(results, place) + (is_code & one))
+            if wiring.joint_word:
+                joint = zero
+                for i in range(searched.shape[0]):
+                    own_code = load(values, searched[i, 0] * PARTS + part)
+                    joint = (joint << splat(np.uint64(searched[i, 1]))) | own_code
+                store(room, 0, joint + splat(wiring.joint_word))
+                store(room, 1, good)
+                for lane in range(LANES):
+                    results[room[0, lane], part * LANES + lane] += room[1, lane]
     return True

@@ -12,7 +12,7 @@ For the same reason it is the XOR of those in the cycles t - 32 * e, which makes
 import math
 import operator
 from collections.abc import Callable
-from functools import wraps
+from functools import lru_cache, partial, wraps
 from itertools import accumulate
 from typing import Any, Final, NamedTuple
 
@@ -35,9 +35,6 @@ CHUNK: Final = 32
 STREAM_ROOM: Final = 4096
 """Number of samples for which a stream's buffer has room at first; it grows when it must."""
 
-KEPT_MOVES: Final = 64
-"""Maximum number of sets of known variables whose moves are kept."""
-
 Integers = npt.NDArray[np.int64]
 extending: Any = untyped_extending
 
@@ -49,7 +46,7 @@ AT, ORIGIN, END, BEGAN, PENDING, PLACE, BURN_IN, SAMPLES, UNUSED, STREAMED, ORDE
 OPS_TIMEOUT, SAMPLES_DUE, LIMIT, PAUSE_AT, STREAM, RANDOM, EVERY_MOVE = range(7)
 # Columns of `Wiring.bits`, `Wiring.entries` and `Moves.counted`.
 VARIABLE, SHIFT, FIRST_ENTRY, LAST_ENTRY = range(4)
-ROW, ADDRESS, BASE, BELOW, ABOVE, LOCAL = range(6)
+ROW, ADDRESS, BASE, LOCAL = range(4)
 FIRST_WORD, CARDINALITY = 1, 2
 
 # Reasons to stop: those of a machine, and that the stream's buffer must grow.
@@ -61,11 +58,10 @@ FULL, ROOM = int(BM2StopReason.FULL), 7
 class Wiring(NamedTuple):
     """A machine's tables and wiring."""
 
-    codes: npt.NDArray[np.uint16]  # the tables of all CDEs, then the code 2**(prob_bits - 1)
+    codes: npt.NDArray[np.uint16]  # of each entry, by all local bits; first twice the code 2**(prob_bits - 1)
     bits: Words  # [state bits, 4]: its variable, its place in the variable's code, and its entries
-    # [entries, 6]: a CDE that is compared for a bit: its first number, its place in `Chain.addresses` (a CDE that is
-    # not concerned has an unused one), its first code, masks of the local bits below and above the pointed one, and
-    # the pointed local bit
+    # [entries, 4]: a CDE that is compared for a bit: its first number, its place in `Chain.addresses` (a CDE that is
+    # not concerned has an unused one), its first code, and the pointed local bit
     entries: Words
     exponents: Integers  # of the generators' polynomial
     clock: Words  # [1, bytes, 256]: a clock of the generators
@@ -109,8 +105,7 @@ class FastBM2(BM2Kernel):
             )
         self._jumps = jump_tables(parameters.rng, parameters.steps_per_clock).copy()
         self._wiring = wiring_of(machine)
-        # computed once, by known bits and order
-        self._kept_moves: dict[tuple[int, Sequencer], Moves] = {}
+        self._moves_of = lru_cache(64)(partial(moves_of, parameters))  # by known bits and order
         self._settings = np.zeros(7, dtype=np.int64)
         self._chain = Chain(
             control=np.zeros(13, dtype=np.int64),
@@ -152,12 +147,7 @@ class FastBM2(BM2Kernel):
         load_state(parameters, start.state, chain.values, chain.addresses)
         fill(self._wiring, chain.numbers, self._states, parameters.ones_code)
 
-        wanted = start.known, start.sequencer
-        if wanted not in self._kept_moves:
-            if len(self._kept_moves) == KEPT_MOVES:
-                self._kept_moves.clear()
-            self._kept_moves[wanted] = moves_of(parameters, *wanted)
-        moves = self._moves = self._kept_moves[wanted]
+        moves = self._moves = self._moves_of(start.known, start.sequencer)
         random = start.sequencer is Sequencer.RANDOM
         move = int(control[ORDER]) * (len(moves.first) - 1) >> 16 if random else 0
         pending = moves.bits[slice(*moves.first[move : move + 2].tolist())]
@@ -225,8 +215,6 @@ def load_state(parameters: BM2Parameters, state: int, values: Words, addresses: 
 def wiring_of(machine: BM2Machine) -> Wiring:
     """Return the wiring of a machine with LFSRs; it does not depend on its seeds."""
     parameters = machine.parameters
-    tables = [*machine.tables, np.array([1 << (parameters.prob_bits - 1)], dtype=np.uint16)]
-    bases = list(accumulate(map(len, tables), initial=0))
     # the CDEs whose factor has a bit, and the bit's place in that factor
     concerned: list[list[tuple[int, int]]] = [[] for _ in range(parameters.state_bits)]
     for cde in range(parameters.cdes):
@@ -234,21 +222,24 @@ def wiring_of(machine: BM2Machine) -> Wiring:
             concerned[bit].append((cde, j))
     exponents = POLYNOMIALS[parameters.rng]
     row = row_size(parameters)
+    codes = [np.full(2, 1 << (parameters.prob_bits - 1), dtype=np.uint16)]
+    base = len(codes[0])
     bits: list[tuple[int, ...]] = []
     entries: list[tuple[int, ...]] = []
     for variable, (width, offset) in enumerate(zip(parameters.bits, parameters.offsets, strict=True)):
         for shift in range(width):
             first = len(entries)
             for cde, j in concerned[offset + shift]:
-                half = len(tables[cde]) // len(parameters.factor_bits(cde))
-                below = (1 << j) - 1
-                entries.append((cde * row, cde, bases[cde] + j * half, below, half - 1 - below, j))
+                table = machine.tables[cde].reshape(len(parameters.factor_bits(cde)), -1, 1, 1 << j)[j]
+                codes.append(np.repeat(table, 2, axis=1).ravel())  # the pointed bit does not matter
+                entries.append((cde * row, cde, base, j))
+                base += len(codes[-1])
             if parameters.literal:
                 others = set(range(parameters.cdes)) - {cde for cde, _ in concerned[offset + shift]}
-                entries += [(cde * row, parameters.cdes, bases[-2], 0, 0, 0) for cde in sorted(others)]
+                entries += [(cde * row, parameters.cdes, 0, 0) for cde in sorted(others)]
             bits.append((variable, shift, first, len(entries)))
     return Wiring(
-        codes=np.concatenate(tables),
+        codes=np.concatenate(codes),
         bits=np.array(bits, dtype=np.uint64),
         entries=np.array(entries, dtype=np.uint64),
         exponents=np.array(exponents, dtype=np.int64),
@@ -302,7 +293,7 @@ _NUMBERS: Final = ir.VectorType(ir.IntType(16), CHUNK)
 
 
 class _VectorType(types.Type):
-    """512 bits of an array that is `aligned`, as numba's type of a local variable; it has `&`, `|`, `^` and `~`."""
+    """512 bits of an array that is `aligned`, as numba's type of a local variable; it has `&`, `|`, `^`, `~`, `+`, `<<`, `>>`."""
 
 
 VECTOR: Final = _VectorType("Vector")
@@ -328,6 +319,9 @@ _define(operator.and_, "and_", 2)
 _define(operator.or_, "or_", 2)
 _define(operator.xor, "xor", 2)
 _define(operator.invert, "not_", 1)
+_define(operator.add, "add", 2)
+_define(operator.lshift, "shl", 2)
+_define(operator.rshift, "lshr", 2)
 
 
 def in_llvm(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -379,8 +373,7 @@ def splat(builder: Any, word: Any) -> Any:
     return _repeated(builder, word, _VECTOR)
 
 
-@in_llvm(types.uint64, None, types.int64, types.uint16)
-def less_in_chunk(builder: Any, numbers: Any, place: Any, code: Any) -> Any:
+def compared(builder: Any, numbers: Any, place: Any, code: Any) -> Any:
     """Compare the numbers of a chunk with a code: bit i is 1 if number `place` + i is less."""
     chunk = builder.load(builder.bitcast(builder.gep(numbers, [place]), _NUMBERS.as_pointer()))
     chunk.align = 2
@@ -388,10 +381,35 @@ def less_in_chunk(builder: Any, numbers: Any, place: Any, code: Any) -> Any:
     return builder.zext(builder.bitcast(less, ir.IntType(CHUNK)), _BITS)
 
 
+less_in_chunk: Final = in_llvm(types.uint64, None, types.int64, types.uint16)(compared)
+
+
 @in_llvm(types.uint64, types.uint64)
 def first_one(builder: Any, word: Any) -> Any:
     """Return the place of the lowest 1 of a word that is not 0."""
     return builder.cttz(word, ir.Constant(ir.IntType(1), 1))
+
+
+@in_llvm(VECTOR, VECTOR, VECTOR)
+def below(builder: Any, left: Any, right: Any) -> Any:
+    """Return all ones in each word of one vector that is less than that of another, else 0."""
+    return builder.sext(builder.icmp_unsigned("<", left, right), _VECTOR)
+
+
+@in_llvm(VECTOR, VECTOR)
+def first_ones(builder: Any, vector: Any) -> Any:
+    """Return the place of the lowest 1 of each word, none of which is 0."""
+    flag = ir.IntType(1)
+    kind = ir.FunctionType(_VECTOR, [_VECTOR, flag])
+    count = builder.module.declare_intrinsic("llvm.cttz.v8i64", (), kind)
+    return builder.call(count, [vector, ir.Constant(flag, 1)])
+
+
+@in_llvm(types.boolean, VECTOR)
+def some(builder: Any, vector: Any) -> Any:
+    """Return whether a vector has a 1."""
+    whole = builder.bitcast(vector, ir.IntType(512))
+    return builder.icmp_unsigned("!=", whole, ir.Constant(ir.IntType(512), 0))
 
 
 @jit
@@ -462,9 +480,7 @@ def run_chain(  # noqa: PLR0915 - a call of a function takes longer than a move
             while True:
                 all_ones, some_ones = _ALL, _0
                 for entry in range(first_entry, last_entry):
-                    address = addresses[entries[entry, ADDRESS]]
-                    others = (address & entries[entry, BELOW]) | ((address >> _1) & entries[entry, ABOVE])
-                    code = codes[entries[entry, BASE] + others]
+                    code = codes[entries[entry, BASE] + addresses[entries[entry, ADDRESS]]]
                     less = less_in_chunk(numbers, np.int64(entries[entry, ROW]) + start, code)
                     all_ones &= less
                     some_ones |= less

@@ -49,8 +49,8 @@ def run_both(machines, starts):
 
 @pytest.mark.parametrize("examples", [60, pytest.param(1000, marks=pytest.mark.thorough)])
 def test_equals_single_chains(examples):
-    """Small networks are sliced, unless a chain may have timed out."""
-    sliced = []
+    """Small networks are sliced, larger ones go in step, unless a chain may have reached a limit."""
+    ran = []
 
     def compare(run, count, lengths, seed):
         random = np.random.default_rng(seed)
@@ -83,17 +83,19 @@ def test_equals_single_chains(examples):
         st.integers(1, 4000),
         st.sampled_from([32, 70, 2**20]),
     )
-    search = given(runs(LFSRS, variables=4), st.sampled_from([2, 9]), lengths, st.integers(0, 2**32))(compare)
-    ran = bm2_chains.run_sliced
+    search = given(runs(LFSRS, variables=4), st.sampled_from([16, 25]), lengths, st.integers(0, 2**32))(
+        compare
+    )
+    sliced, in_step = bm2_chains.run_sliced, bm2_chains.run_in_step
     with mock.patch.multiple(
         bm2_chains,
         SLICED_MIN=2,
-        CONTEXTS_MAX=1000,
-        COUNTERS_MAX=1000,
-        run_sliced=lambda *given: sliced.append(ran(*given)) or sliced[-1],
+        UNKNOWN_MAX=6,
+        run_sliced=lambda *given: ran.append(("sliced", sliced(*given))) or ran[-1][1],
+        run_in_step=lambda *given: ran.append(("in step", in_step(*given))) or ran[-1][1],
     ):
         settings(max_examples=examples, suppress_health_check=list(HealthCheck))(search)()
-    assert True in sliced
+    assert set(ran) == {(kernel, drawn) for kernel in ("sliced", "in step") for drawn in (True, False)}
 
 
 def test_chains_fill_several_vectors_and_know_different_things():
@@ -107,19 +109,24 @@ def test_chains_fill_several_vectors_and_know_different_things():
     assert len({tuple(result.rng_state.tolist()) for result in results}) == 600
 
 
-def test_a_chain_of_one_bit_can_sample_in_every_cycle():
+@pytest.mark.parametrize("count", [32, 64])
+def test_a_chain_of_one_bit_can_sample_in_every_cycle(count):
     """Its one CDE agrees with itself, so a sweep takes a cycle, and every cycle of a block can be the last."""
-    machines = boards(network(cardinalities=(2,), factors=((0,),)), 32)
+    machines = boards(network(cardinalities=(2,), factors=((0,),)), count)
     for samples in range(1, 36):
         for burn_in in (0, 8, 17):
-            results = Chains(machines).run([start_of(samples=samples, burn_in=burn_in, max_cycles=100)] * 32)
+            results = Chains(machines).run(
+                [start_of(samples=samples, burn_in=burn_in, max_cycles=100)] * count
+            )
             assert {(each.cycles, each.samples) for each in results} == {(samples + burn_in, samples)}
 
 
-def test_one_chain_times_out_by_one_cycle():
-    machines = boards(contradiction(), 32)
-    moves = [each.cycles for each in run_both(machines, [start_of(samples=1, ops_timeout=2**22)] * 32)]
-    results = run_both(machines, [start_of(samples=1, ops_timeout=max(moves) - 1)] * 32)
+@pytest.mark.parametrize("count", [32, 64])
+def test_one_chain_times_out_by_one_cycle(count):
+    """In step, and sliced."""
+    machines = boards(contradiction(), count)
+    moves = [each.cycles for each in run_both(machines, [start_of(samples=1, ops_timeout=2**22)] * count)]
+    results = run_both(machines, [start_of(samples=1, ops_timeout=max(moves) - 1)] * count)
     assert max(moves) > 2**16
     assert [each.reason for each in results].count(BM2StopReason.OPS_TIMEOUT) == 1
 
