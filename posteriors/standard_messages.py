@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
 import numpy as np
 
 from bridge.stamps import header, stamp
+from posteriors.posterior import REPLICA
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,55 +42,42 @@ class Level(IntEnum):
     STALE = 3
 
 
-class PlaneAxis(NamedTuple):
-    """A coordinate of a plane: the centre of the first cell and the distance of neighbouring centres."""
-
-    first: float
-    step: float
-    size: int
-
-
 class Plane(NamedTuple):
-    """The plane of two searched variables."""
+    """The plane of two searched variables, in metres if they are lengths."""
 
-    x: PlaneAxis
-    y: PlaneAxis
+    x: Dimension
+    y: Dimension
     x_is_last: bool
     """True if x is the last, fastest dimension of the posterior."""
 
     @classmethod
-    def of(cls, dimensions: Sequence[Dimension]) -> Self:
-        """Return the plane of a deployment's searched variables.
+    def of(cls, dimensions: Sequence[Dimension], *, square: bool = False) -> Self:
+        """Return the plane of the dimensions of a result, with `square` cells, or a ValueError that says why not.
 
-        x and y are the variables of these names; with other names, the last one is x. Lengths become metres.
-
-        Raises:
-            ValueError: They span no plane; the sentence says why.
+        x and y are the variables of these names; with other names, the last one is x.
         """
-        if len(dimensions) != 2:
-            raise ValueError(f"there are {len(dimensions)} searched variables, not two")
+        if len(dimensions) != 2 or dimensions[0].label == REPLICA:
+            raise ValueError(f"a posterior over {', '.join(each.label for each in dimensions)} is no plane")
         if named := [each.label for each in dimensions if each.states]:
             raise ValueError(f"the values of {named[0]} are names")
-        slow, fast = dimensions
+        slow, fast = (
+            each.replace(offset=each.offset * metres, step=each.step * metres)
+            for each in dimensions
+            for metres in (_METRES.get(each.unit, 1.0),)
+        )
         x_is_last = (slow.label.lower(), fast.label.lower()) != ("x", "y")
         x, y = (fast, slow) if x_is_last else (slow, fast)
-        return cls(_axis(x), _axis(y), x_is_last)
-
-    @property
-    def has_square_cells(self) -> bool:
-        """True if both steps are equal, as in every OccupancyGrid."""
-        return math.isclose(abs(self.x.step), abs(self.y.step), rel_tol=1e-6)
+        if square and not math.isclose(abs(x.step), abs(y.step), rel_tol=1e-6):
+            raise ValueError(
+                f"its cells would not be square: {abs(x.step):g} along x, {abs(y.step):g} along y"
+            )
+        return cls(x, y, x_is_last)
 
     def cells(self, posterior: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return a posterior as float64[y, x]."""
         if self.x_is_last:
             return posterior.reshape(self.y.size, self.x.size)
         return posterior.reshape(self.x.size, self.y.size).T
-
-
-def _axis(dimension: Dimension) -> PlaneAxis:
-    metres = _METRES.get(dimension.unit, 1.0)
-    return PlaneAxis(dimension.offset * metres, dimension.step * metres, dimension.size)
 
 
 def has_coordinates(dimensions: Sequence[Dimension]) -> bool:
@@ -131,10 +119,7 @@ def grid_message(
     cells = plane.cells(posterior)[:: -1 if plane.y.step < 0 else 1, :: -1 if plane.x.step < 0 else 1]
     data = np.rint(cells * (MOST_OCCUPIED / posterior.max())).astype(np.int8)
     resolution = abs(plane.x.step)
-    x, y = (
-        min(axis.first, axis.first + (axis.size - 1) * axis.step) - resolution / 2
-        for axis in (plane.x, plane.y)
-    )
+    x, y = (min(axis.value(0), axis.value(axis.size - 1)) - resolution / 2 for axis in (plane.x, plane.y))
     return {
         "header": header(stamp_ns, MAP_FRAME, ros_version),
         "info": {
@@ -155,7 +140,7 @@ def pose_message(
     cells = plane.cells(posterior)
     across, down = cells.sum(axis=0), cells.sum(axis=1)
     total = across.sum()
-    xs, ys = (axis.first + axis.step * np.arange(axis.size) for axis in (plane.x, plane.y))
+    xs, ys = (axis.offset + axis.step * np.arange(axis.size) for axis in (plane.x, plane.y))
     x, y = float(across @ xs / total), float(down @ ys / total)
     xs, ys = xs - x, ys - y
     covariance = np.zeros((6, 6))
@@ -198,12 +183,7 @@ def decision_statuses(
 ) -> list[dict[str, Any]]:
     """Return a status with the most probable value, for each replica.
 
-    Args:
-        posterior: float64[replicas * lines], or None without one.
-        deployment: The names, values and units of the searched variables.
-        why: The reason why the decision is not valid; empty if it is.
-        number: Number of the frame.
-        age_ms: Milliseconds since the receipt of the reading.
+    `why` is the reason why the decision is not valid, empty if it is; `age_ms` the time since the reading's receipt.
     """
     replicas = deployment.machine.replicas
     rows = [None] * replicas if posterior is None else posterior.reshape(replicas, -1)
@@ -215,8 +195,8 @@ def decision_statuses(
         message = reason
         if row is not None and decided:
             best = _best(row, deployment.searched)
-            values = best | _certainty(row)
-            message = ", ".join(f"{label.removeprefix('value.')} {value}" for label, value in best.items())
+            values = {f"value.{label}": value for label, value in best.items()} | _certainty(row)
+            message = ", ".join(f"{label} {value}" for label, value in best.items())
         values |= {
             "valid": "false" if reason else "true",
             "why": reason,
@@ -228,11 +208,11 @@ def decision_statuses(
     return statuses
 
 
-def _best(row: NDArray[np.float64], dimensions: Sequence[Dimension]) -> dict[str, object]:
+def _best(row: NDArray[np.float64], dimensions: Sequence[Dimension]) -> dict[str, str]:
     """Return the most probable value of each variable: the name of a state, or a number with its unit."""
     indices = np.unravel_index(int(row.argmax()), [each.size for each in dimensions])
     return {
-        f"value.{each.label}": each.states[index]
+        each.label: each.states[index]
         if each.states
         else f"{each.value(int(index)):.9g} {each.unit}".rstrip()
         for each, index in zip(dimensions, indices, strict=True)

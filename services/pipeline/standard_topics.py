@@ -9,7 +9,6 @@ A result never waits for them: only the newest frame is kept, and a fault costs 
 import asyncio
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, Literal, NoReturn
 
@@ -52,16 +51,6 @@ _Make = Callable[[], dict[str, Any] | None]
 """Function that makes a message, or nothing."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Frame:
-    """A published frame."""
-
-    publish: Publish
-    inference: Inference
-    tick: int
-    """Monotonic time of its publication, in ns."""
-
-
 class StandardTopics:
     """The topics for robot tools on one server.
 
@@ -80,8 +69,9 @@ class StandardTopics:
         self._publications: dict[str, Publication] = {}
         # Of a deployment whose grid or pose is published.
         self._plane: Plane | None = None
-        # The last frame, and whether it still has to be sent; `_timer` then calls `_send`.
-        self._last: _Frame | None = None
+        # The last frame with the monotonic time (ns) of its publication, and whether it still has to be sent; `_timer`
+        # then calls `_send`.
+        self._last: tuple[Publish, Inference, int] | None = None
         self._waiting = False
         self._timer: asyncio.Handle | None = None
         # When frames were sent last (monotonic, s).
@@ -102,15 +92,15 @@ class StandardTopics:
 
     def _chosen(self) -> Iterator[str]:
         """Yield the keys of the topics that are on; log why one that is switched on stays off."""
-        deployment, searched = self._deployment, self._deployment.searched
-        is_map = has_coordinates(searched) and deployment.machine.replicas == 1
-        for key, wanted in dict(deployment.topics).items():
+        dimensions = self._deployment.result_dimensions
+        is_map = has_coordinates(dimensions)
+        for key, wanted in dict(self._deployment.topics).items():
             of_plane = key in {"posterior", "pose"}
             if wanted is False or (wanted is None and of_plane and not is_map):
                 continue
             if of_plane:
                 try:
-                    self._plane = _plane(deployment, square=key == "posterior")
+                    self._plane = Plane.of(dimensions, square=key == "posterior")
                 except ValueError as why:
                     self._log.info(f"{_TYPES[key][0]} is not published: {why}")
                     continue
@@ -118,7 +108,7 @@ class StandardTopics:
 
     def offer(self, publish: Publish, inference: Inference) -> None:
         """Send the topics of a frame later, unless a newer one takes its place."""
-        self._last, self._waiting = _Frame(publish, inference, time.monotonic_ns()), True
+        self._last, self._waiting = (publish, inference, time.monotonic_ns()), True
         if self._timer is None and self._publications:
             loop = asyncio.get_running_loop()
             wait = self._sent_at + INTERVAL - time.monotonic()
@@ -134,20 +124,19 @@ class StandardTopics:
         self._publish("diagnostics", self._health)
 
     def _send(self) -> None:
-        self._timer, frame = None, self._last
-        if not self._waiting or frame is None or self._ros is None or self._ros.state is not State.CONNECTED:
+        self._timer, last = None, self._last
+        if not self._waiting or last is None or self._ros is None or self._ros.state is not State.CONNECTED:
             return
         if any(each.must_wait for each in self._publications.values()):
             self._timer = asyncio.get_running_loop().call_later(INTERVAL, self._send)
             return
         self._waiting, self._sent_at = False, time.monotonic()
         with self._ros.together():
-            for key, make in self._messages(frame).items():
+            for key, make in self._messages(last[0], last[1]).items():
                 self._publish(key, make)
 
-    def _messages(self, frame: _Frame) -> Mapping[str, _Make]:
+    def _messages(self, publish: Publish, inference: Inference) -> Mapping[str, _Make]:
         """Return the functions that make the messages of a frame."""
-        publish, inference = frame.publish, frame.inference
         make: dict[str, _Make] = {
             "counts": partial(counts_message, inference.boards),
             "decision": partial(self._decision, publish, inference),
@@ -207,7 +196,7 @@ class StandardTopics:
 
     def _boards(self) -> Iterator[dict[str, Any]]:
         """Yield the status of each board: its part of the last frame, and what pcie-app says of it."""
-        frame, deployment = self._last, self._deployment
+        deployment = self._deployment
         processes = self._stack.processes if self._stack else []
         known = {each.index: each for process in processes for each in process.boards}
         reasons = deployment.machine.kind.reasons
@@ -215,13 +204,12 @@ class StandardTopics:
         for at, board in enumerate(deployment.boards):
             level, message = Level.STALE, "no frame yet"
             values: dict[str, object] = {"image": board.image_hash}
-            if frame is not None:
-                result, number = frame.inference.boards[at], frame.publish.result.number
-                level, message = Level.OK, reasons[result.reason]
-                values |= {"frame": number, "cycles": result.cycles, "reason": message}
-                if not _is_sound(frame.inference):
-                    level = Level.WARN
-                if time.monotonic_ns() - frame.tick > silence_s * 1e9:
+            if self._last is not None:
+                publish, inference, tick = self._last
+                result = inference.boards[at]
+                level, message = Level.OK if _is_sound(inference) else Level.WARN, reasons[result.reason]
+                values |= {"frame": publish.result.number, "cycles": result.cycles, "reason": message}
+                if time.monotonic_ns() - tick > silence_s * 1e9:
                     level, message = Level.STALE, f"no frame for {silence_s:g} s"
             if there := known.get(at):
                 values |= {"endpoint": there.endpoint, "state": there.state, "restarts": there.restarts}
@@ -244,30 +232,14 @@ class StandardTopics:
             yield status(process.name, level, process.why, process.name, values)
 
 
-def _plane(deployment: Deployment, *, square: bool) -> Plane:
-    """Return the plane of the searched variables, or raise a ValueError that says why there is none."""
-    if deployment.machine.replicas > 1:
-        raise ValueError("the deployment has replicas")
-    plane = Plane.of(deployment.searched)
-    if square and not plane.has_square_cells:
-        steps = f"{abs(plane.x.step):g} along x and {abs(plane.y.step):g} along y"
-        raise ValueError(f"its cells would not be square ({steps})")
-    return plane
-
-
 def _is_sound(inference: Inference) -> bool:
     """Return whether there is a posterior, and no board ended early."""
     return inference.posterior is not None and "ended_early" not in inference.details
 
 
 def _numbers(process: ProcessStatus) -> dict[str, object]:
-    values: dict[str, object] = {
-        "pid": process.pid,
-        "version": process.version,
-        "uptime_s": f"{process.uptime_s:.0f}",
-        "cpu_percent": process.cpu_percent,
-        "memory_bytes": process.memory_bytes,
-    }
+    names = ("pid", "version", "uptime_s", "cpu_percent", "memory_bytes")
+    values = {name: getattr(process, name) for name in names}
     if (frames := process.frames) is not None:
         values |= {"completed": frames.completed, "per_second": frames.rate}
         values |= {f"lost: {reason}": count for reason, count in frames.lost.items()}

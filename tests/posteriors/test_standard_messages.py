@@ -133,15 +133,19 @@ def test_coordinates_are_lengths_or_numbers_that_are_no_indices(dimensions, ther
     assert has_coordinates(dimensions) == there
 
 
-@pytest.mark.parametrize("dimensions", [(X,), (Y, X, X), (Y, X.replace(states=("a", "b", "c")))])
+@pytest.mark.parametrize(
+    "dimensions",
+    [(X,), (Y, X, X), (Dimension(label="replica", size=2), X), (Y, X.replace(states=("a", "b", "c")))],
+)
 def test_what_is_no_plane_is_refused(dimensions):
-    with pytest.raises(ValueError, match=r"searched variables|names"):
+    with pytest.raises(ValueError, match=r"no plane|names"):
         Plane.of(dimensions)
 
 
 def test_cells_that_are_not_square():
-    assert Plane.of([Y, X]).has_square_cells
-    assert not Plane.of([Y, X.replace(step=0.6)]).has_square_cells
+    assert Plane.of([Y, X.replace(step=-50, unit="cm")], square=True).x.step == -0.5
+    with pytest.raises(ValueError, match="not be square: 0.6 along x, 0.5 along y"):
+        Plane.of([Y, X.replace(step=0.6)], square=True)
 
 
 def test_counts_have_a_row_for_each_board():
