@@ -7,6 +7,7 @@ A result never waits for them: only the newest frame is kept, and a fault costs 
 """
 
 import asyncio
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -74,8 +75,8 @@ class StandardTopics:
         self._last: tuple[Publish, Inference, int] | None = None
         self._waiting = False
         self._timer: asyncio.Handle | None = None
-        # When frames were sent last (monotonic, s).
-        self._sent_at = 0.0
+        # When frames were sent last (monotonic, s); the clock of a machine that has just booted is near 0.
+        self._sent_at = -math.inf
         # The last status of the run's processes, if there is a run directory, and the levels published last.
         self._stack: StackStatus | None = None
         self._levels: list[int] = []
