@@ -1,7 +1,7 @@
 """Many chains of a BM2 at a time, each with the same results as a kernel of its own, bit for bit.
 
 Chains of a small network are sliced: bit i of a vector belongs to chain i, and a cycle is a list of logical
-operations on vectors. Each CDE makes a bit in every context (values of the other unknown bits), and a chain takes that
+operations on vectors. Each CDE makes a bit in every context (values of the other bits of its factor), and a chain takes that
 of its own state; a bit is written in the chains that point at it. Chains of a large network go in step: they make the
 same move, each in cycles of its own, and 8 of them share what finds the first agreement. Others run one by one.
 """
@@ -28,7 +28,7 @@ from machines.rng import LFSR, POLYNOMIALS, Words, generator_numbers
 
 SLICE: Final = 512  # chains in a vector
 SLICED_MIN: Final = 64  # chains to be sliced; fewer are faster in step
-UNKNOWN_MAX: Final = 4  # unknown bits of sliced chains, of which each state but one has a counter
+UNKNOWN_MAX: Final = 5  # unknown bits of sliced chains, of which each state but one has a counter
 CYCLES: Final = 8  # cycles of sliced chains whose random bits are made together
 LOW_PLANES: Final = 3  # a counter's lowest bits; they overflow at most once in `CYCLES` cycles
 LANES: Final = 8  # chains in step that share a vector, a word each
@@ -56,11 +56,12 @@ class _Circuit(NamedTuple):
     unknown: Integers  # the unknown bits; a place is one in this array
     cdes: Integers  # [pairs of contexts]
     masks: Words  # [pairs, prob_bits, 2]: the bits of the contexts' codes, each as a word of 64
-    entries: Integers  # [entries, 2]: place of a bit, and first context of a CDE that is compared for it
+    entries: (
+        Integers  # [entries, 3 + n]: a bit's place, a CDE's first context, number and places of context bits
+    )
 
 
-# What chains have after their last sample: cycles, states, and results of `result_words` rows and one that counts the
-# samples with an unused code.
+# Cycles, states and results of some chains; the results' last row counts the samples with an unused code.
 _Ran = tuple[Integers, list[int], npt.NDArray[Any]]
 
 
@@ -168,14 +169,16 @@ class Chains:
             return None
         codes: list[int] = []
         cdes: list[int] = []
-        entries: list[tuple[int, int]] = []
+        entries: list[list[int]] = []
         for cde, table in enumerate(self._machines[0].tables):
             bits = parameters.factor_bits(cde)
             for bit in filter(bits.__contains__, unknown):
-                others, near = ([other for other in each if other != bit] for each in (unknown, bits))
-                entries.append((unknown.index(bit), len(codes)))
-                for context in range(1 << len(others)):
-                    values = state & known | _spread(context, others)
+                near = [other for other in bits if other != bit]
+                chosen = [place for place, other in enumerate(unknown) if other in near]
+                row = [unknown.index(bit), len(codes), len(chosen), *chosen, *unknown]
+                entries.append(row[: 3 + len(unknown)])
+                for context in range(1 << len(chosen)):
+                    values = state & known | _spread(context, [unknown[place] for place in chosen])
                     local = sum((values >> other & 1) << i for i, other in enumerate(near))
                     codes.append(int(table[bits.index(bit) << len(near) | local]))
             codes += [0] * (-len(codes) % 2)
@@ -206,11 +209,10 @@ class Chains:
         sweeps = start.burn_in or start.samples
         counts[[plane for plane in range(depth) if -sweeps >> plane & 1]] = ~np.uint64(0)
         ends = np.zeros(SLICE, dtype=np.int64)
-        exponents = np.array(POLYNOMIALS[parameters.rng])
         vectors = numbers.reshape(-1, 8), values, pointed, counts, room
         window = start.ops_timeout // (2 * CYCLES) * CYCLES - CYCLES
         limits = start.burn_in, start.samples, start.max_cycles, window, steps
-        if not run_sliced(circuit, exponents, vectors, ends, limits):
+        if not run_sliced(circuit, np.array(POLYNOMIALS[parameters.rng]), vectors, ends, limits):
             return None
 
         counted = _bits_of(counts).reshape(-1, depth, SLICE) << np.arange(depth)[:, np.newaxis]
@@ -319,8 +321,7 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
         for counter in range(counters):
             store(room, carries + counter, zero)
         for now in range(CYCLES):
-            # the bits of all contexts: number < code, from the low bit up, as the majority of what the lower bits
-            # say, the inverted number and the code
+            # number < code for all contexts, from the low bit up: the majority of less so far, ~number and code
             for pair in range(cdes.shape[0]):
                 low_bit = cdes[pair] * rows + bits + now * steps - 1
                 less0, less1 = zero, zero
@@ -336,10 +337,10 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
             for bit in range(unknown):
                 all_ones, some_ones = ~zero, zero
                 while entry < entries.shape[0] and entries[entry, 0] == bit:
-                    context = entries[entry, 1]
-                    for i in range(unknown - 1):
-                        chosen_bit = load(values, i + (i >= bit))
-                        for pair in range(1 << (unknown - 2 - i)):
+                    context, chosen = entries[entry, 1], entries[entry, 2]
+                    for i in range(chosen):
+                        chosen_bit = load(values, entries[entry, 3 + i])
+                        for pair in range(1 << (chosen - 1 - i)):
                             if_0, if_1 = load(room, context + 2 * pair), load(room, context + 2 * pair + 1)
                             store(room, context + pair, (if_0 & ~chosen_bit) | (if_1 & chosen_bit))
                     made = load(room, context)
