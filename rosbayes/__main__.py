@@ -12,6 +12,7 @@ _COMMANDS: Final = {
     "toolchain": ("toolchain.commands.main", "From a model to a deployment."),
     "master": ("services.commands.master", "Move readings to the boards and posteriors back."),
     "listen": ("services.commands.listen", "Print, draw or save the posteriors of a running stack."),
+    "dashboard": ("services.commands.dashboard", "Show posteriors in a browser."),
     "status": ("services.commands.status", "Show the whole stack in one screen."),
     "hub": ("services.commands.hub", "Serve rosbridge without ROS."),
     "discover": ("services.commands.discover", "List the rosbridge servers on this network."),

@@ -80,7 +80,7 @@ def hub(
     """Serve rosbridge without ROS."""
     check_metrics(settings.metrics, insecure=insecure)
     # read before anything listens: a wrong file must not open a hub without its protection
-    access = _access_policy(tls_cert, tls_key, token_file, origin or [])
+    access = access_policy(tls_cert, tls_key, token_file, origin or [])
     if not is_loopback(host) and not insecure and (access.tls is None or not access.tokens):
         # TLS without tokens lets everybody in, and tokens without TLS can be read on the way
         missing = " and ".join(
@@ -108,7 +108,7 @@ def hub(
     )
 
 
-def _access_policy(
+def access_policy(
     certificate: Path | None, key: Path | None, tokens: Path | None, origins: list[str]
 ) -> AccessPolicy:
     """Return the access policy according to the flags."""

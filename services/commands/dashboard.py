@@ -1,0 +1,159 @@
+"""The command `dashboard`: the page in the browser."""
+
+import asyncio
+import contextlib
+import os
+import socket
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from bridge.client.websocket import check_uri
+from bridge.hub.access import AccessPolicy, is_loopback
+from bridge.names import check_name
+from posteriors.posterior import RESULTS_TOPIC
+from services.commands import flags as options
+from services.commands.hub import access_policy
+from services.errors import SettingsError
+from services.settings import Settings
+from services.sockets.reporting import serve_status
+from services.sockets.serving import deployment_for
+from services.sockets.status import ProcessStatus
+from terminal.command_line import CommandLine
+from terminal.one_line import shown
+from terminal.output import say
+from terminal.run_directory import default_run_directory, status_directory
+from terminal.signals import run_async, until_one_ends
+from toolchain.deployment import Deployment
+
+DEFAULT_URI: Final = "ws://127.0.0.1:9090"
+TRUTH_TOPIC: Final = "/boat/true_pose"
+
+app = CommandLine(
+    help="Show the posteriors of a running stack in a browser.\n\n"
+    "`dashboard --uri ws://robot:9090`, then open http://127.0.0.1:8080\n\n"
+    "With `-d build/boat`, axes have units; without it, those of the master on this machine are used. "
+    "On a non-loopback address it requires TLS and tokens, as `hub` does."
+)
+
+
+@app.command(help=app.info.help)
+@options.with_settings("deployment", "uri", "ca", "ros_version", "run_directory", "log_format")
+def dashboard(
+    settings: Settings,
+    topic: Annotated[
+        str | None,
+        typer.Option(
+            help="Topic of the posteriors.", show_default="the deployment's, or /BMresults", metavar="TOPIC"
+        ),
+    ] = None,
+    truth: Annotated[
+        str, typer.Option(help="Topic of the true pose (PoseStamped).", metavar="TOPIC")
+    ] = TRUTH_TOPIC,
+    host: Annotated[str, typer.Option(help="Address to listen on.", metavar="ADDRESS")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 8080,
+    tls_cert: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Certificate of the page (PEM), to serve https://.")
+    ] = None,
+    tls_key: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Private key of the certificate (PEM).")
+    ] = None,
+    token_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Accepted tokens, one per line.")
+    ] = None,
+    origin: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ORIGIN",
+            help="Address under which browsers know the page, if it is not that of this machine, such as https://robot.example; repeat for more.",
+        ),
+    ] = None,
+    insecure: options.Insecure = False,
+) -> int:
+    """Show the posteriors of a running stack in a browser."""
+    if find_spec("nicegui") is None:
+        raise SettingsError(
+            "the dashboard needs NiceGUI, which is not installed: pip install 'rosbayes[dashboard]'"
+        )
+    # read before anything listens, as in the hub
+    policy = access_policy(tls_cert, tls_key, token_file, origin or [])
+    if not is_loopback(host) and not insecure and (policy.tls is None or not policy.tokens):
+        raise SettingsError(
+            f"--host {shown(host)} lets everybody on that network see the posteriors and move the boat; "
+            "give --tls-cert, --tls-key and --token-file, or --insecure if that is intended"
+        )
+    deployment = deployment_for(settings) if settings.deployment is not None else None
+    output = deployment.outputs[0] if deployment is not None else None
+    uri = settings.uri or (deployment.output_uri(output) if deployment and output else DEFAULT_URI)
+    check_uri(uri)
+    results = topic or (output.topic if output is not None else RESULTS_TOPIC)
+    for name in (results, truth):
+        check_name(name)
+    with _listening(host, port) as listener:
+        return run_async(
+            _serve(settings, deployment, listener, policy, host=host, uri=uri, topic=results, truth=truth)
+        )
+
+
+@contextlib.contextmanager
+def _listening(host: str, port: int) -> Iterator[socket.socket]:
+    """Listen on an address within the context, or raise a SettingsError."""
+    # before the web framework is imported, which takes a second
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, kind, protocol)
+    except OSError as error:
+        raise SettingsError(
+            f"the dashboard cannot listen on {shown(host)}: that is not an address or name of this machine ({error.strerror})"
+        ) from None
+    with listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind(address)
+            listener.listen()
+        except OSError as error:
+            raise SettingsError(
+                f"the dashboard cannot listen on {shown(host)} port {port} ({os.strerror(error.errno or 0)}): "
+                "end the process that listens there, or choose another --port"
+            ) from None
+        yield listener
+
+
+async def _serve(
+    settings: Settings,
+    deployment: Deployment | None,
+    listener: socket.socket,
+    policy: AccessPolicy,
+    *,
+    host: str,
+    uri: str,
+    topic: str,
+    truth: str,
+) -> int:
+    """Serve the page until cancelled."""
+    from services.dashboard.feed import Feed
+    from services.dashboard.robot import Robot
+    from services.dashboard.server import PageServer
+
+    feed = Feed()
+    robot = Robot(feed, settings, deployment, uri=uri, topic=topic, truth=truth)
+    server = PageServer(feed, robot, listener, policy, loopback=is_loopback(host))
+    scheme, address = "https" if policy.tls else "http", f"[{host}]" if ":" in host else host
+    where = f"{scheme}://{address}:{listener.getsockname()[1]}"
+
+    def status() -> ProcessStatus:
+        return ProcessStatus(ready=server.ready.is_set(), why=f"{where}, {robot.state}")
+
+    async def say_where() -> None:
+        await server.ready.wait()
+        say(f"dashboard: open {where} in a browser")
+        await asyncio.Event().wait()
+
+    directory = status_directory(settings.run_directory, "dashboard")
+    stack = settings.run_directory or default_run_directory()
+    async with serve_status(directory, "dashboard", status):
+        await until_one_ends(server.run(), robot.follow(), robot.watch_stack(stack), say_where())
+    return 0

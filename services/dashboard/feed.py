@@ -1,0 +1,220 @@
+"""What the page shows: the last frames, the times of their stages, rate and losses.
+
+    frame outcomes ──▶ Feed ──▶ frames (the last 1000), stage times (a mean a second), rate, losses by reason
+
+It has no clock and no connection: the time of each frame comes with it.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from posteriors.frame_report import FrameReport, StageTimes
+from posteriors.pairing import FrameOutcome
+from posteriors.posterior import REPLICA, Posterior
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+KEPT_FRAMES: Final = 1000
+KEPT_BYTES: Final = 128 << 20
+"""Maximum size of all kept posteriors; of fine grids, fewer than `KEPT_FRAMES` are kept."""
+STAGE_SECONDS: Final = 300
+RATE_SECONDS: Final = 5
+STAGES: Final = tuple(each.name for each in fields(StageTimes) if each.name != "boards_compute")
+"""The stages that follow each other; `boards_compute` is a part of `compute`."""
+OTHER: Final = "other reasons"
+MISSING: Final = "missing"
+"""Key in `/bm/frame` of the variables without a reading."""
+READING: Final = "reading."
+"""Prefix of the keys of readings in `/bm/frame`."""
+_MAX_REASONS: Final = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A reading of a frame, as `/bm/frame` reports it; empty texts are not known."""
+
+    name: str
+    value: str = ""
+    address: str = ""
+    age_ms: str = ""
+    missing: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Frame:
+    """A frame as it is kept, equal only to itself; `values` is None if it has no posterior."""
+
+    at: int
+    """Place in the sequence of all frames that arrived, from 1."""
+    heard_ns: int
+    values: "NDArray[np.float32] | None" = None
+    labels: tuple[str, ...] = ()
+    report: FrameReport | None = None
+    readings: tuple[Reading, ...] = ()
+    statistics: Mapping[str, str] = field(default_factory=dict)
+    """Of a BM2's samples, by their keys in `/bm/frame`."""
+    truth: tuple[float, float] | None = None
+    """The true x and y when the frame arrived."""
+
+    @property
+    def searched(self) -> tuple[str, ...]:
+        """The labels of the searched variables, without that of replicas."""
+        return tuple(label for label in self.labels if label != REPLICA)
+
+    @property
+    def standard_error(self) -> float | None:
+        """The sampling error of a BM2's probabilities; None if unknown, or not sampled."""
+        try:
+            return float(self.statistics["standard_error"])
+        except (KeyError, ValueError):
+            return None
+
+    def marginal(self, labels: tuple[str, ...]) -> "NDArray[np.float64]":
+        """Return the marginal of one or two labels, in that order; it sums to 1, also over replicas."""
+        assert self.values is not None  # noqa: S101 - a caller's mistake
+        places = [self.labels.index(label) for label in labels]
+        others = tuple(at for at in range(len(self.labels)) if at not in places)
+        summed = self.values.sum(axis=others, dtype=np.float64)
+        if places != sorted(places):
+            summed = summed.T
+        return np.asarray(summed / summed.sum())
+
+
+@dataclass(slots=True)
+class _Second:
+    """The frames of one second: their number, and the sum and the number of the times of each stage."""
+
+    start: int
+    frames: int = 0
+    sums: list[float] = field(default_factory=lambda: [0.0] * len(STAGES))
+    counts: list[int] = field(default_factory=lambda: [0] * len(STAGES))
+
+
+class Feed:
+    """The frames of the page, the newest last.
+
+    Attributes:
+        frames: The last frames, at most `KEPT_FRAMES`.
+        truth: The newest true x and y; None if there is none.
+        watchers: Called after each change; they only note it, because the feed is in the middle of a frame.
+        lost: Number of frames without a posterior by reason, at most `_MAX_REASONS` of them.
+    """
+
+    def __init__(self) -> None:
+        self.frames: deque[Frame] = deque(maxlen=KEPT_FRAMES)
+        self.truth: tuple[float, float] | None = None
+        self.watchers: set[Callable[[], None]] = set()
+        self.lost: Counter[str] = Counter()
+        # Frames so far: the number of the newest one.
+        self._count = 0
+        # Bytes of the posteriors in `frames`.
+        self._bytes = 0
+        # One for each second with frames, the newest last; those older than `STAGE_SECONDS` are removed.
+        self._seconds: deque[_Second] = deque()
+
+    @property
+    def newest(self) -> Frame | None:
+        """The newest frame; None before the first one."""
+        return self.frames[-1] if self.frames else None
+
+    def frame(self, at: int) -> Frame | None:
+        """Return the frame at a place, or the nearest one that is kept; None before the first frame."""
+        if not self.frames:
+            return None
+        return self.frames[min(max(at - self.frames[0].at, 0), len(self.frames) - 1)]
+
+    def add(self, outcome: FrameOutcome, now_s: float) -> Frame:
+        """Add a frame at a time of a monotonic clock in seconds, and tell the watchers."""
+        report = outcome.report if isinstance(outcome, Posterior) else outcome
+        details = report.details if report else outcome.details
+        values = None
+        if isinstance(outcome, Posterior):
+            values = np.array(outcome.probabilities, np.float32).reshape(outcome.sizes)
+        else:
+            self.add_loss(outcome.outcome or "no reason given")
+        self._count += 1
+        frame = Frame(
+            at=self._count,
+            heard_ns=outcome.heard_ns,
+            values=values,
+            labels=outcome.labels if isinstance(outcome, Posterior) else (),
+            report=report,
+            readings=read_readings(details),
+            statistics={
+                key: value for key, value in details.items() if key != MISSING and not key.startswith(READING)
+            },
+            truth=self.truth,
+        )
+        self._keep(frame)
+        self._time(report, now_s)
+        self.changed()
+        return frame
+
+    def add_loss(self, reason: str) -> None:
+        """Count a frame that has no posterior; rare reasons are counted together if there are too many."""
+        known = reason in self.lost or len(self.lost) < _MAX_REASONS
+        self.lost[reason if known else OTHER] += 1
+
+    def changed(self) -> None:
+        """Tell the watchers that something is new."""
+        for watcher in tuple(self.watchers):
+            watcher()
+
+    def rate(self, now_s: float) -> float:
+        """Return frames per second over the last `RATE_SECONDS` whole seconds."""
+        last = int(now_s)
+        recent = [each for each in self._seconds if last - RATE_SECONDS <= each.start < last]
+        # from the first frame on, as in the other processes' rates
+        first = self._seconds[0].start if self._seconds else last
+        return sum(each.frames for each in recent) / max(min(RATE_SECONDS, last - first), 1)
+
+    def stage_times(self, now_s: float) -> list[tuple[int, list[float]]]:
+        """Return the mean microseconds of each stage, a row a second with its age in seconds, the oldest first."""
+        rows = []
+        for second in self._seconds:
+            means = [total / max(count, 1) for total, count in zip(second.sums, second.counts, strict=True)]
+            if (age := int(now_s) - second.start) <= STAGE_SECONDS and any(second.counts):
+                rows.append((age, [round(mean, 1) for mean in means]))
+        return rows
+
+    def _keep(self, frame: Frame) -> None:
+        if len(self.frames) == KEPT_FRAMES:
+            self._forget()
+        self.frames.append(frame)
+        self._bytes += frame.values.nbytes if frame.values is not None else 0
+        while self._bytes > KEPT_BYTES and len(self.frames) > 1:
+            self._forget()
+
+    def _forget(self) -> None:
+        values = self.frames.popleft().values
+        self._bytes -= values.nbytes if values is not None else 0
+
+    def _time(self, report: FrameReport | None, now_s: float) -> None:
+        if not self._seconds or self._seconds[-1].start != int(now_s):
+            self._seconds.append(_Second(int(now_s)))
+            while self._seconds[0].start < int(now_s) - STAGE_SECONDS:
+                self._seconds.popleft()
+        second = self._seconds[-1]
+        second.frames += 1
+        if report is None:
+            return
+        for at, stage in enumerate(STAGES):
+            if (time := getattr(report.stages, stage)) is not None:
+                second.sums[at] += time
+                second.counts[at] += 1
+
+
+def read_readings(details: Mapping[str, str]) -> tuple[Reading, ...]:
+    """Return the readings in the further values of a `/bm/frame`, those that are missing last."""
+    found = []
+    for key, text in details.items():
+        if key.startswith(READING):
+            value, address, age, *_ = [*text.split(";"), "", "", ""]
+            found.append(Reading(key.removeprefix(READING), value, address, age))
+    missing = [Reading(name, missing=True) for name in details.get(MISSING, "").split(",") if name]
+    return (*found, *missing)

@@ -1,0 +1,266 @@
+"""The page, its socket and its files, as a web application.
+
+/          the page: layout, buttons and choices
+/live      WebSocket: what moves, as messages of `View`; poses and switches come back
+/frames.*  the kept frames as files
+"""
+
+import asyncio
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
+from nicegui import ui
+from nicegui.element import Element
+
+from services.dashboard.feed import STAGES, Feed
+from services.dashboard.robot import Robot
+from services.dashboard.saving import archive, same_shape, table
+from services.dashboard.view import View, choices, packed
+from services.output.axes import printable
+
+_STATS_EVERY: Final = 0.5
+_IN_FLIGHT: Final = 2
+"""Messages on the way to a browser: more would only be older when it gets to them."""
+_HERE: Final = Path(__file__).parent
+_MAX_INBOUND: Final = 4096
+
+
+class Live(Element, component="live.js"):
+    """The moving part of the page, which `live.js` draws."""
+
+    def __init__(self, view: str) -> None:
+        super().__init__()
+        self._props["view"] = view
+
+
+class Wish(msgspec.Struct, frozen=True):
+    """What a browser asks for: a place for the boat, or a switch of the world."""
+
+    pose: tuple[float, float] | None = None
+    switch: str = ""
+    on: bool = False
+
+
+class Dashboard:
+    """The page for any number of browsers."""
+
+    def __init__(self, feed: Feed, robot: Robot) -> None:
+        self._feed = feed
+        self._robot = robot
+        # The choices of each browser, by its number with the framework, which is also in the address of its socket.
+        self._views: dict[str, View] = {}
+        # The last statistics and when they were made (monotonic, s), because all browsers get the same ones.
+        self._stats: tuple[float, bytes] = (0.0, b"")
+
+    def application(self) -> FastAPI:
+        """Return the web application; the framework is set up once in a process."""
+        application = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+        application.add_api_websocket_route("/live", self._live)
+        application.add_api_route("/frames.npz", self._npz)
+        application.add_api_route("/frames.csv", self._csv)
+        ui.page("/", title="rosbayes")(self._page)
+        ui.run_with(
+            application,
+            title="rosbayes",
+            dark=None,
+            tailwind=False,
+            binding_refresh_interval=None,
+            show_welcome_message=False,
+        )
+        return application
+
+    # The page
+
+    def _page(self) -> None:
+        client = ui.context.client
+        view = self._views[client.id] = View(self._feed)
+        client.on_delete(partial(self._views.pop, client.id, None))
+        ui.add_css(_HERE / "live.css")
+        with ui.row().classes("items-center"):
+            ui.label("rosbayes").classes("text-h6").props('role="heading" aria-level="1"')
+            live: Live
+
+            def pressed(act: Callable[[], None]) -> None:
+                act()
+                paused = view.at is not None
+                pause.props(
+                    f'icon={"play_arrow" if paused else "pause"} aria-label="{"Continue" if paused else "Pause"}"'
+                )
+
+            _button(
+                "", "skip_previous", "step-back", "One frame back", lambda: pressed(lambda: view.step(-1))
+            )
+            pause = _button(
+                "", "pause", "pause", "Pause", lambda: pressed(lambda: view.pause(view.at is None))
+            )
+            _button(
+                "", "skip_next", "step-forward", "One frame forward", lambda: pressed(lambda: view.step(1))
+            )
+            _button(
+                "PNG", "", "save-png", "Save the picture", lambda: live.run_method("savePng", "posterior.png")
+            )
+            for kind in ("npz", "csv"):
+                url = f"/frames.{kind}?view={client.id}"
+                _button(
+                    kind.upper(),
+                    "",
+                    f"save-{kind}",
+                    f"Save the frames as {kind.upper()}",
+                    partial(ui.download.from_url, url),
+                )
+            marginals = ui.select(
+                {}, label="marginal", on_change=lambda event: view.choose(event.value or ())
+            )
+            marginals.props('dense options-dense data-testid=marginals aria-label="Marginal"').style(
+                "min-width: 9rem"
+            )
+            dark = ui.dark_mode(value=None)
+            _button("", "contrast", "dark", "Light or dark", lambda: dark.set_value(not dark.value))
+        live = Live(client.id)
+
+        def offer() -> None:
+            """Offer the marginals of the newest posterior; an update is sent only if they are new."""
+            frame = self._feed.newest
+            labels = frame.searched if frame is not None else ()
+            options = {each: " by ".join(map(printable, each)) for each in choices(labels)}
+            marginals.set_visibility(len(labels) > 1)
+            if labels and options != marginals.options:
+                marginals.set_options(options, value=view.labels(frame) if frame is not None else None)
+
+        ui.timer(1.0, offer)
+
+    # The socket
+
+    async def _live(self, socket: WebSocket, view: str = "") -> None:
+        await socket.accept()
+        room = asyncio.Semaphore(_IN_FLIGHT)
+        changed = asyncio.Event()
+        changed.set()
+        self._feed.watchers.add(changed.set)
+        writing = asyncio.create_task(
+            self._write(socket, self._views.get(view) or View(self._feed), room, changed)
+        )
+        asking: set[asyncio.Task[None]] = set()
+        try:
+            while True:
+                text = await socket.receive_text()
+                if text == ".":
+                    room.release()
+                elif (wish := _wish(text)) is not None:
+                    # a service may take seconds, in which the page goes on
+                    task = asyncio.create_task(self._grant(socket, wish))
+                    asking.add(task)
+                    task.add_done_callback(asking.discard)
+        except (WebSocketDisconnect, KeyError):  # closed, or bytes instead of text
+            pass
+        finally:
+            self._feed.watchers.discard(changed.set)
+            for task in (writing, *asking):
+                task.cancel()
+            await asyncio.gather(writing, *asking, return_exceptions=True)
+
+    async def _write(
+        self, socket: WebSocket, view: View, room: asyncio.Semaphore, changed: asyncio.Event
+    ) -> None:
+        loop = asyncio.get_running_loop()
+        sent: object = None
+        next_stats = 0.0
+        while True:
+            try:
+                async with asyncio.timeout_at(next_stats):
+                    await changed.wait()
+            except TimeoutError:
+                pass
+            changed.clear()
+            if loop.time() >= next_stats:
+                next_stats = loop.time() + _STATS_EVERY
+                await room.acquire()
+                await socket.send_bytes(self._statistics())
+            frame = view.frame
+            if frame is None:
+                continue
+            await room.acquire()
+            # after the wait for room, since then newer ones may have come
+            frame = view.frame
+            assert frame is not None  # noqa: S101 - frames are not forgotten without newer ones
+            axes = self._robot.axes_for(frame.labels)
+            now = (frame, view.at, view.labels(frame), axes)
+            message = view.message(axes) if now != sent else None
+            if message is None:
+                room.release()
+                continue
+            sent = now
+            await socket.send_bytes(message)
+
+    def _statistics(self) -> bytes:
+        now = time.monotonic()
+        if now - self._stats[0] >= _STATS_EVERY / 2:
+            robot = self._robot
+            head: dict[str, Any] = {
+                "kind": "stats",
+                "state": robot.state,
+                "connected": robot.connected,
+                "rate": self._feed.rate(now),
+                "lost": {**self._feed.lost, **robot.lost},
+                "why": robot.why,
+                "boards": robot.boards,
+                "landmarks": robot.landmarks,
+                "truth": self._feed.truth,
+                "switches": robot.switches,
+                "can_set_pose": robot.can_set_pose,
+                "samples": robot.samples,
+                "stage_names": STAGES,
+                "stages": self._feed.stage_times(now),
+            }
+            self._stats = (now, packed(head))
+        return self._stats[1]
+
+    async def _grant(self, socket: WebSocket, wish: Wish) -> None:
+        if wish.pose is not None:
+            self._robot.set_pose(*wish.pose)
+        elif wish.switch:
+            await socket.send_bytes(
+                packed({"kind": "notice", "text": await self._robot.switch(wish.switch, wish.on)})
+            )
+
+    # Files
+
+    async def _npz(self, view: str = "") -> Response:
+        return await self._file(view, "application/zip", "posteriors.npz")
+
+    async def _csv(self, view: str = "") -> Response:
+        return await self._file(view, "text/csv; charset=utf-8", "posteriors.csv")
+
+    async def _file(self, view: str, media_type: str, name: str) -> Response:
+        shown = self._views.get(view) or View(self._feed)
+        frames = same_shape(tuple(self._feed.frames), shown.frame)
+        if not frames:
+            return Response("there is no posterior yet\n", status_code=404, media_type="text/plain")
+        axes = self._robot.axes_for(frames[0].labels)
+        make = partial(archive, frames, axes) if name.endswith(".npz") else partial(table, frames)
+        # in a thread, because it takes longer than the time between two frames
+        content = await asyncio.to_thread(make)
+        return Response(
+            content, media_type=media_type, headers={"Content-Disposition": f'attachment; filename="{name}"'}
+        )
+
+
+def _wish(text: str) -> Wish | None:
+    """Return what a browser asks for; None if it cannot be understood."""
+    if len(text) > _MAX_INBOUND:
+        return None
+    try:
+        return msgspec.json.decode(text, type=Wish)
+    except msgspec.MsgspecError:
+        return None
+
+
+def _button(text: str, icon: str, test: str, purpose: str, act: Callable[[], object]) -> ui.button:
+    button = ui.button(text, icon=icon or None, on_click=act)
+    button.props(f'flat dense data-testid={test} aria-label="{purpose}"').tooltip(purpose)
+    return button

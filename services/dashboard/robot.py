@@ -1,0 +1,294 @@
+"""The robot and the stack as the page sees them: topics, services, and the status sockets of this machine.
+
+It connects again for ever, because the page is there before the robot, and after it.
+"""
+
+import asyncio
+import base64
+import math
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from bridge.client import Publication, Ros, connect
+from bridge.discovery import announced_uri
+from bridge.errors import BridgeError, DisconnectedError, NotRosbridgeError, SlowPeerError, UnreachableError
+from bridge.stamps import header
+from posteriors.errors import BadResultError
+from posteriors.listening import posteriors
+from posteriors.posterior import MAX_RESULT, SAMPLES_TOPIC, SAMPLES_TYPE
+from services.dashboard.feed import Feed
+from services.output.axes import Axis, deployment_axes
+from services.settings import Settings
+from services.sockets.status import ask_stack
+from terminal.connection import report_connection
+from terminal.output import say, warn
+from toolchain.deployment import Deployment, load_deployment
+from toolchain.errors import ToolchainError
+
+TRUTH_TOPIC: Final = "/boat/true_pose"
+POSE_TYPE: Final = "geometry_msgs/PoseStamped"
+SET_POSE_TOPIC: Final = "/boat/set_pose"
+LANDMARKS_TOPIC: Final = "/boat/beacons"
+LANDMARKS_TYPE: Final = "visualization_msgs/MarkerArray"
+SWITCH_TYPE: Final = "std_srvs/SetBool"
+_WORLD: Final = "/boat/"
+_SWITCHES: Final = frozenset({"sail", "noise", "works", "plugged"})
+"""Last parts of the names of the services that are switches of the world."""
+_RETRY: Final = 1.0
+_ASK_EVERY: Final = 2.0
+_STATUS_EVERY: Final = 1.0
+_SAMPLES_EVERY_MS: Final = 500
+_SAMPLES: Final = 8
+"""Number of samples that are shown."""
+_MAX_LANDMARKS: Final = 100
+_QUEUE_SIZE: Final = 64
+
+
+class Robot:
+    """Everything that the page reads and asks over rosbridge and status sockets.
+
+    Attributes:
+        state: State of the connection in words.
+        connected: Whether it is there.
+        landmarks: x, y and name of each landmark.
+        switches: The services that switch the world, by name, with the value last set here; they start on.
+        can_set_pose: Whether somebody listens to the topic that moves the boat.
+        lost: Lost frames by reason, as the processes of the stack count them.
+        boards: Endpoint, state and image of each board.
+        why: Sentences about processes that are not ready.
+        samples: The last states that a BM2 streamed, a line each; empty if it streams none.
+    """
+
+    def __init__(
+        self,
+        feed: Feed,
+        settings: Settings,
+        deployment: Deployment | None,
+        *,
+        uri: str,
+        topic: str,
+        truth: str,
+    ) -> None:
+        self._feed = feed
+        self._settings = settings
+        self._uri = uri
+        self._topic = topic
+        self._truth = truth
+        # Of the flag, or that of the master on this machine, which the status names.
+        self._deployment = deployment
+        self._folder = ""
+        self.axes: tuple[Axis, ...] = tuple(deployment_axes(deployment)) if deployment else ()
+        self.state = f"connecting to {uri}"
+        self.connected = False
+        self.landmarks: list[tuple[float, float, str]] = []
+        self.switches: dict[str, bool] = {}
+        self.can_set_pose = False
+        self.lost: dict[str, int] = {}
+        self.boards: list[tuple[str, str, str]] = []
+        self.why: list[str] = []
+        self.samples = ""
+        # The open connection, and its publication of poses; None while there is none.
+        self._ros: Ros | None = None
+        self._poses: Publication | None = None
+
+    # Following
+
+    async def follow(self) -> None:
+        """Follow the topics until cancelled; a server that is not there is tried again every second.
+
+        Raises:
+            UsageError: The URI or a topic cannot be used.
+        """
+        report = report_connection(self._uri)
+
+        def on_state(state: str, reason: str) -> None:
+            self._set_state(state, reason)
+            report(state, reason)
+
+        said = ""
+        while True:
+            try:
+                async with connect(
+                    await announced_uri(self._uri),
+                    connect_timeout=self._settings.connect_timeout,
+                    ca_file=self._settings.ca,
+                    ros_version=self._settings.ros_version,
+                    on_state=on_state,
+                    max_size=MAX_RESULT,
+                ) as ros:
+                    self._ros, said = ros, ""
+                    await self._follow(ros)
+            except (UnreachableError, NotRosbridgeError) as error:
+                self._set_state("waiting", str(error))
+                if not said:
+                    say(f"dashboard: waiting for rosbridge at {self._uri} ({error})")
+                said = "said"
+                await asyncio.sleep(_RETRY)
+            finally:
+                self._ros = self._poses = None
+
+    async def _follow(self, ros: Ros) -> None:
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._follow_frames(ros))
+            tasks.create_task(self._follow_truth(ros))
+            tasks.create_task(self._follow_landmarks(ros))
+            tasks.create_task(self._follow_samples(ros))
+            tasks.create_task(self._ask_about_world(ros))
+
+    def _set_state(self, state: str, reason: str) -> None:
+        self.connected = state == "connected"
+        self.state = f"{state}: {self._uri}" + (f" ({reason})" if reason and not self.connected else "")
+        self._feed.changed()
+
+    async def _follow_frames(self, ros: Ros) -> None:
+        name = self._deployment.name if self._deployment else None
+        async with posteriors(ros, topic=self._topic, deployment=name, queue_size=_QUEUE_SIZE) as frames:
+            counted = 0
+            while True:
+                try:
+                    self._feed.add(await frames.next_frame(None), time.monotonic())
+                except BadResultError as error:
+                    self._feed.add_loss("unreadable message")
+                    warn(str(error))
+                # those that were announced and never arrived, and those that came too fast for this process
+                gone = frames.announced_only + frames.lost
+                for _ in range(gone - counted):
+                    self._feed.add_loss("not received by the page")
+                counted = gone
+
+    async def _follow_truth(self, ros: Ros) -> None:
+        async for message in ros.subscribe(self._truth, POSE_TYPE, queue_size=1):
+            if (point := _point(message.msg.get("pose"))) is not None:
+                self._feed.truth = point[:2]
+
+    async def _follow_landmarks(self, ros: Ros) -> None:
+        async for message in ros.subscribe(LANDMARKS_TOPIC, LANDMARKS_TYPE, queue_size=1):
+            self.landmarks = read_landmarks(message.msg)
+
+    async def _follow_samples(self, ros: Ros) -> None:
+        # two messages a second are more than eyes follow
+        subscription = ros.subscribe(
+            SAMPLES_TOPIC, SAMPLES_TYPE, throttle_rate=_SAMPLES_EVERY_MS, queue_length=1, queue_size=1
+        )
+        async for message in subscription:
+            self.samples = read_samples(message.msg)
+
+    async def _ask_about_world(self, ros: Ros) -> None:
+        """Ask which services and topics of the world exist, again and again, because a simulator may come later."""
+        while True:
+            if (names := await ros.services()) is not None:
+                found = sorted(each for each in names if _is_switch(each))
+                self.switches = {name: self.switches.get(name, True) for name in found}
+            if (topics := await ros.topics()) is not None:
+                self.can_set_pose = SET_POSE_TOPIC in topics
+            if self.can_set_pose and self._poses is None:
+                self._poses = await ros.advertise(SET_POSE_TOPIC, POSE_TYPE, queue_size=1)
+            await asyncio.sleep(_ASK_EVERY)
+
+    # The stack
+
+    async def watch_stack(self, directory: Path) -> None:
+        """Read the status sockets of this machine until cancelled."""
+        while True:
+            status = await ask_stack(directory)
+            self.why = status.why
+            lost: dict[str, int] = {}
+            folder = ""
+            for process in status.processes:
+                if process.name == "pcie-app":
+                    self.boards = [(each.endpoint, each.state, each.image) for each in process.boards]
+                if process.name == "master":
+                    folder = process.folder
+                # each process loses other frames
+                for reason, count in process.frames.lost.items() if process.frames else ():
+                    lost[reason] = lost.get(reason, 0) + count
+            self.lost = lost
+            if folder and folder != self._folder and self._settings.deployment is None:
+                self._folder = folder
+                await self._learn_axes(Path(folder))
+            await asyncio.sleep(_STATUS_EVERY)
+
+    async def _learn_axes(self, folder: Path) -> None:
+        """Take the units from the folder of the master on this machine; without them there are numbers of cells."""
+        try:
+            deployment = await asyncio.to_thread(load_deployment, folder, images=False)
+        except (ToolchainError, OSError) as error:
+            warn(f"dashboard: no units, because the master's deployment cannot be read: {error}")
+            return
+        self.axes = tuple(deployment_axes(deployment))
+        self._feed.changed()
+
+    def axes_for(self, labels: tuple[str, ...]) -> tuple[Axis, ...]:
+        """Return the axes with units for a posterior of these labels; none if it is another deployment's."""
+        return self.axes if tuple(axis.label for axis in self.axes) == labels else ()
+
+    # Asking
+
+    def set_pose(self, x: float, y: float) -> None:
+        """Put the boat somewhere; without a connection, or if nobody listens, nothing happens."""
+        ros, poses = self._ros, self._poses
+        if ros is None or poses is None or not self.can_set_pose or not math.isfinite(x + y):
+            return
+        pose = {
+            "position": {"x": x, "y": y, "z": 0.0},
+            "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+        }
+        # while the server is away or slow, poses are dropped: the next one replaces them
+        with suppress(DisconnectedError, SlowPeerError):
+            poses.publish_nowait(
+                {"header": header(time.time_ns(), "map", ros.ros_version or 1), "pose": pose}
+            )
+
+    async def switch(self, name: str, on: bool) -> str:
+        """Call a switch of the world; return what went wrong, empty if nothing did."""
+        if self._ros is None or name not in self.switches:
+            return "this switch is not there now"
+        try:
+            await self._ros.call(name, {"data": on})
+        except BridgeError as error:
+            return str(error)
+        self.switches[name] = on
+        self._feed.changed()
+        return ""
+
+
+def _is_switch(name: str) -> bool:
+    return name.startswith(_WORLD) and name.rpartition("/")[2] in _SWITCHES
+
+
+def _point(pose: Any) -> tuple[float, float] | None:
+    position = pose.get("position") if isinstance(pose, Mapping) else None
+    if not isinstance(position, Mapping):
+        return None
+    values = [position.get(name) for name in ("x", "y")]
+    if not all(isinstance(each, int | float) and math.isfinite(each) for each in values):
+        return None
+    return float(values[0]), float(values[1])  # type: ignore[arg-type]  # checked above
+
+
+def read_landmarks(message: Mapping[str, Any]) -> list[tuple[float, float, str]]:
+    """Return x, y and name of each marker that has a place."""
+    markers = message.get("markers")
+    found = [
+        (*point, str(marker.get("text") or marker.get("id") or ""))
+        for marker in (markers if isinstance(markers, list) else ())
+        if isinstance(marker, Mapping) and (point := _point(marker.get("pose"))) is not None
+    ]
+    return found[:_MAX_LANDMARKS]
+
+
+def read_samples(message: Mapping[str, Any]) -> str:
+    """Return the last states of a `/bm/samples` message, a line each, as the hexadecimal words of the board."""
+    try:
+        size = int(message["layout"]["dim"][1]["size"])
+        data = message["data"]
+        octets = base64.b64decode(data) if isinstance(data, str) else bytes(data)
+        words = np.frombuffer(octets, "<u4").reshape(-1, size // 4)[-_SAMPLES:]
+    except (KeyError, IndexError, TypeError, ValueError, ZeroDivisionError):
+        return ""  # another program publishes there
+    return "\n".join(" ".join(f"{word:08x}" for word in state[::-1]) for state in words)

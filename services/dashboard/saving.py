@@ -1,0 +1,86 @@
+"""The kept frames as files: a NumPy archive, and a table with a column a cell."""
+
+import csv
+import io
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from services.dashboard.feed import Frame
+from services.output.axes import Axis
+
+_NOT_KNOWN = -1
+
+
+def same_shape(frames: Sequence[Frame], shown: Frame | None) -> list[Frame]:
+    """Return the frames whose posteriors have the variables of the one that is shown, or of the newest one."""
+    with_posterior = [each for each in frames if each.values is not None]
+    if shown is None or shown.values is None:
+        shown = with_posterior[-1] if with_posterior else None
+    if shown is None or shown.values is None:
+        return []
+    form = (shown.labels, shown.values.shape)
+    return [
+        each
+        for each in with_posterior
+        if each.values is not None and (each.labels, each.values.shape) == form
+    ]
+
+
+def archive(frames: Sequence[Frame], axes: Sequence[Axis]) -> bytes:
+    """Return an archive for `numpy.load`, with the names that `listen --save` uses; frames must not be empty."""
+    reports = [each.report for each in frames]
+    arrays = {
+        "probabilities": np.array([each.values for each in frames]),
+        "frame": np.array([_known(each.number if each else None) for each in reports]),
+        "stamp_ns": np.array([_known(each.stamp_ns if each else None) for each in reports]),
+        "cycles": np.array([_known(each.cycles if each else None) for each in reports]),
+        "heard_ns": np.array([each.heard_ns for each in frames]),
+        "labels": np.array(frames[0].labels),
+    }
+    for at, axis in enumerate(axes):
+        arrays[f"axis{at}"] = np.array([axis.value(index) for index in range(axis.size)])
+    file = io.BytesIO()
+    np.savez(file, **arrays)  # type: ignore[arg-type]  # the stub takes the names for its own flag
+    return file.getvalue()
+
+
+def table(frames: Sequence[Frame]) -> bytes:
+    """Return a table as CSV: a row a frame, with its most probable cell; frames must not be empty."""
+    labels, first = frames[0].labels, frames[0].values
+    sizes = first.shape if first is not None else ()
+    file = io.StringIO(newline="")
+    rows = csv.writer(file, lineterminator="\n")
+    cells = product(*(range(size) for size in sizes))
+    rows.writerow(
+        [
+            *("frame", "stamp_ns", "heard_ns", "cycles", *map(_harmless, labels), "probability"),
+            *(
+                _harmless(" ".join(f"{label}={at}" for label, at in zip(labels, cell, strict=True)))
+                for cell in cells
+            ),
+        ]
+    )
+    for frame in frames:
+        report, values = frame.report, frame.values
+        if values is None:
+            continue
+        best = np.unravel_index(int(values.argmax()), values.shape)
+        rows.writerow(
+            [
+                *((report.number, report.stamp_ns) if report else (None, None)),
+                *(frame.heard_ns, report.cycles if report else None, *map(int, best), float(values.max())),
+                *map(float, values.ravel()),
+            ]
+        )
+    return file.getvalue().encode()
+
+
+def _known(number: int | None) -> int:
+    return _NOT_KNOWN if number is None else number
+
+
+def _harmless(name: str) -> str:
+    # a spreadsheet would compute a name that begins like a formula
+    return f"'{name}" if name.startswith(("=", "+", "-", "@", "\t", "\r")) else name

@@ -1,0 +1,75 @@
+"""The web server of the page, in the event loop and with the signals of this process."""
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+import tempfile
+from collections.abc import Iterator
+from typing import Final, cast
+
+# the framework would look for stored settings below the current folder; the page stores nothing
+os.environ.setdefault("NICEGUI_STORAGE_PATH", os.path.join(tempfile.gettempdir(), "rosbayes-dashboard-none"))  # noqa: PTH118
+
+import uvicorn
+
+from bridge.hub.access import AccessPolicy
+from services.dashboard.doors import App, Doors
+from services.dashboard.feed import Feed
+from services.dashboard.page import Dashboard
+from services.dashboard.robot import Robot
+
+_SHUTDOWN_S: Final = 1
+_MESSAGE_BYTES: Final = 1 << 20
+_LOOK_EVERY: Final = 0.05
+
+
+class _Server(uvicorn.Server):
+    """A server that leaves signals to the process."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+class PageServer:
+    """The server of the page on a listening socket.
+
+    Attributes:
+        ready: Set once the page can be opened.
+    """
+
+    def __init__(
+        self, feed: Feed, robot: Robot, listener: socket.socket, policy: AccessPolicy, *, loopback: bool
+    ) -> None:
+        self.ready = asyncio.Event()
+        self._listener = listener
+        application = cast("App", Dashboard(feed, robot).application())
+        config = uvicorn.Config(
+            Doors(application, policy, loopback=loopback),
+            log_config=None,
+            log_level=logging.WARNING,
+            access_log=False,
+            lifespan="on",
+            proxy_headers=False,
+            server_header=False,
+            ws="websockets-sansio",
+            ws_max_size=_MESSAGE_BYTES,
+            ws_per_message_deflate=False,  # it would take longer than the loopback's bytes
+            timeout_graceful_shutdown=_SHUTDOWN_S,
+            ssl_context_factory=(lambda *_: policy.tls) if policy.tls is not None else None,  # type: ignore[arg-type]
+        )
+        self._server = _Server(config)
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        serving = asyncio.create_task(self._server.serve([self._listener]))
+        try:
+            while not self._server.started and not serving.done():
+                await asyncio.sleep(_LOOK_EVERY)
+            self.ready.set()
+            await asyncio.shield(serving)
+        finally:
+            self._server.should_exit = True
+            await asyncio.gather(serving, return_exceptions=True)

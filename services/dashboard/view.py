@@ -1,0 +1,169 @@
+"""What one browser looks at: the newest frame or an earlier one, and its marginals, as messages for the page.
+
+A message is binary: the length of its head (4 bytes, little-endian), the head (JSON), and the picture: a byte a
+cell of a heat map, relative to the highest cell, or a little-endian float32 a bar.
+"""
+
+import struct
+import time
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import orjson
+
+from services.dashboard.feed import Feed, Frame
+from services.output.axes import Axis
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_LENGTH: Final = struct.Struct("<I")
+_MAX_CHOICES: Final = 200
+_ACROSS: Final = "x"
+"""Label of the variable that is always drawn from left to right, as on a map."""
+
+
+class View:
+    """The choices of one browser.
+
+    Attributes:
+        at: Place of the frame that is shown; None for the newest one.
+        chosen: The one or two labels whose marginal is shown; empty for the default.
+    """
+
+    def __init__(self, feed: Feed) -> None:
+        self._feed = feed
+        self.at: int | None = None
+        self.chosen: tuple[str, ...] = ()
+
+    @property
+    def frame(self) -> Frame | None:
+        """The frame that is shown; None before the first one."""
+        return self._feed.newest if self.at is None else self._feed.frame(self.at)
+
+    def pause(self, paused: bool) -> None:
+        """Stay at the frame that is shown, or return to the newest."""
+        frame = self.frame
+        self.at = frame.at if paused and frame is not None else None
+        self._feed.changed()
+
+    def step(self, frames: int) -> None:
+        """Pause, and go by this many frames, as far as they are kept."""
+        if (frame := self.frame) is not None:
+            found = self._feed.frame(frame.at + frames)
+            self.at = found.at if found is not None else None
+        self._feed.changed()
+
+    def choose(self, labels: tuple[str, ...]) -> None:
+        """Show another marginal."""
+        self.chosen = labels
+        self._feed.changed()
+
+    def labels(self, frame: Frame) -> tuple[str, ...]:
+        """Return the labels that are shown of a frame, the vertical one first."""
+        if self.chosen and set(self.chosen) <= set(frame.labels):
+            return self.chosen
+        return default_labels(frame)
+
+    def message(self, axes: Sequence[Axis]) -> bytes | None:
+        """Return the message for the frame that is shown; None before the first one."""
+        frame = self.frame
+        if frame is None:
+            return None
+        head, picture = _encoded(frame, self.labels(frame), tuple(axes))
+        kept = self._feed.frames
+        now_ns = time.time_ns()
+        head = head | {
+            "paused": self.at is not None,
+            "first": kept[0].at,
+            "last": kept[-1].at,
+            "sent_ms": now_ns / 1e6,
+            "age_ms": max(now_ns - frame.heard_ns, 0) / 1e6,
+        }
+        return packed(head, picture)
+
+
+def packed(head: dict[str, Any], picture: bytes = b"") -> bytes:
+    """Return a message."""
+    # NaN would be no JSON; orjson writes null
+    text = orjson.dumps(head, option=orjson.OPT_SERIALIZE_NUMPY)
+    return b"".join((_LENGTH.pack(len(text)), text, picture))
+
+
+def default_labels(frame: Frame) -> tuple[str, ...]:
+    """Return the first two searched variables, or the only one; `x` is the second, which goes across."""
+    first = frame.searched[:2]
+    return first[::-1] if first[:1] == (_ACROSS,) and len(first) == 2 else first
+
+
+def choices(labels: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Return the marginals that can be chosen: those of pairs, then those of single variables."""
+    pairs: list[tuple[str, ...]] = [
+        pair[::-1] if pair[0] == _ACROSS else pair for pair in combinations(labels, 2)
+    ]
+    return [*pairs, *((label,) for label in labels)][:_MAX_CHOICES]
+
+
+# Several browsers show the same frame, so that it is encoded once. Frames are compared by identity.
+@lru_cache(maxsize=4)
+def _encoded(frame: Frame, labels: tuple[str, ...], axes: tuple[Axis, ...]) -> tuple[dict[str, Any], bytes]:
+    report = frame.report
+    head: dict[str, Any] = {
+        "kind": "frame",
+        "at": frame.at,
+        "heard_ms": frame.heard_ns / 1e6,
+        "number": report.number if report else None,
+        "outcome": report.outcome if report else "posterior without a report",
+        "cycles": report.cycles if report else None,
+        "boards": [[each.name, each.stopped, each.cycles] for each in report.boards] if report else [],
+        "readings": [
+            [each.name, each.value, each.address, each.age_ms, each.missing] for each in frame.readings
+        ],
+        "statistics": frame.statistics,
+        "truth": frame.truth,
+        "plot": None,
+    }
+    if frame.values is None or not labels:
+        return head, b""
+    marginal = frame.marginal(labels)
+    shown = [_axis(label, size, axes) for label, size in zip(labels, marginal.shape, strict=True)]
+    peak = float(marginal.max())
+    head["plot"] = plot = {"axes": shown, "max": peak, "error": frame.standard_error}
+    if marginal.ndim == 1:
+        return head, marginal.astype("<f4").tobytes()
+    # names have no mean
+    if not any(axis["states"] for axis in shown):
+        plot |= moments(marginal)
+    return head, np.rint(marginal * (255 / peak)).astype(np.uint8).tobytes()
+
+
+def moments(marginal: "NDArray[np.float64]") -> dict[str, list[float]]:
+    """Return mean (row, column) and covariance (rows, both, columns) of a marginal of two variables, in cells."""
+    rows, columns = np.arange(marginal.shape[0]), np.arange(marginal.shape[1])
+    by_row, by_column = marginal.sum(axis=1), marginal.sum(axis=0)
+    row, column = float(by_row @ rows), float(by_column @ columns)
+    return {
+        "mean": [row, column],
+        "covariance": [
+            float(by_row @ (rows - row) ** 2),
+            float((rows - row) @ marginal @ (columns - column)),
+            float(by_column @ (columns - column) ** 2),
+        ],
+    }
+
+
+def _axis(label: str, size: int, axes: tuple[Axis, ...]) -> dict[str, Any]:
+    """Return an axis for the page; without a deployment, its values are the numbers of cells."""
+    known = next((axis.dimension for axis in axes if axis.label == label and axis.dimension), None)
+    return {
+        "label": label,
+        "size": size,
+        "known": known is not None,
+        "unit": known.unit if known else "",
+        "offset": known.offset if known else 0.0,
+        "step": known.step if known else 1.0,
+        "states": list(known.states) if known else [],
+    }
