@@ -27,22 +27,7 @@ RATE_SECONDS: Final = 5
 STAGES: Final = tuple(each.name for each in fields(StageTimes) if each.name != "boards_compute")
 """The stages that follow each other; `boards_compute` is a part of `compute`."""
 OTHER: Final = "other reasons"
-MISSING: Final = "missing"
-"""Key in `/bm/frame` of the variables without a reading."""
-READING: Final = "reading."
-"""Prefix of the keys of readings in `/bm/frame`."""
 _MAX_REASONS: Final = 20
-
-
-@dataclass(frozen=True, slots=True)
-class Reading:
-    """A reading of a frame, as `/bm/frame` reports it; empty texts are not known."""
-
-    name: str
-    value: str = ""
-    address: str = ""
-    age_ms: str = ""
-    missing: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,7 +40,6 @@ class Frame:
     values: "NDArray[np.float32] | None" = None
     labels: tuple[str, ...] = ()
     report: FrameReport | None = None
-    readings: tuple[Reading, ...] = ()
     statistics: Mapping[str, str] = field(default_factory=dict)
     """Of a BM2's samples, by their keys in `/bm/frame`."""
     truth: tuple[float, float] | None = None
@@ -144,10 +128,7 @@ class Feed:
             values=values,
             labels=outcome.labels if isinstance(outcome, Posterior) else (),
             report=report,
-            readings=read_readings(details),
-            statistics={
-                key: value for key, value in details.items() if key != MISSING and not key.startswith(READING)
-            },
+            statistics=details,
             truth=self.truth,
         )
         self._keep(frame)
@@ -207,14 +188,3 @@ class Feed:
             if (time := getattr(report.stages, stage)) is not None:
                 second.sums[at] += time
                 second.counts[at] += 1
-
-
-def read_readings(details: Mapping[str, str]) -> tuple[Reading, ...]:
-    """Return the readings in the further values of a `/bm/frame`, those that are missing last."""
-    found = []
-    for key, text in details.items():
-        if key.startswith(READING):
-            value, address, age, *_ = [*text.split(";"), "", "", ""]
-            found.append(Reading(key.removeprefix(READING), value, address, age))
-    missing = [Reading(name, missing=True) for name in details.get(MISSING, "").split(",") if name]
-    return (*found, *missing)

@@ -59,16 +59,18 @@ export default {
           <table data-testid="readings"><thead><tr><th>variable</th><th>value</th><th>address</th><th>age</th></tr></thead><tbody ref="readings"></tbody></table>
           <h2>Boards</h2>
           <table data-testid="boards"><thead><tr><th>board</th><th>stopped</th><th>cycles</th><th>state</th><th>image</th></tr></thead><tbody ref="boards"></tbody></table>
-          <table ref="statisticsTable" data-testid="statistics"><tbody ref="statistics"></tbody></table>
+          <table data-testid="statistics"><tbody ref="statistics"></tbody></table>
         </section>
         <section class="bm-wide">
           <h2>Stages, the last five minutes</h2>
           <canvas ref="stages" data-testid="stage-times" class="bm-stages" role="img" aria-label="Times of the stages"></canvas>
           <ul ref="stageNames" class="bm-stage-names"></ul>
-          <h2>Losses</h2>
+          <h2>Frames lost</h2>
           <table data-testid="losses"><thead><tr><th>reason</th><th>frames</th></tr></thead><tbody ref="losses"></tbody></table>
-          <h2>Samples</h2>
-          <pre ref="samples" data-testid="samples"></pre>
+          <div ref="samplesPart" hidden>
+            <h2>Samples</h2>
+            <pre ref="samples" data-testid="samples"></pre>
+          </div>
         </section>
       </div>
     </div>`,
@@ -151,7 +153,7 @@ export default {
       }
       if (!live.dirty) return;
       live.dirty = false;
-      if (live.head) this.drawPosterior();
+      this.drawPosterior();
       if (live.fresh) {
         live.fresh = false;
         this.$refs.posterior.dataset.at = live.head.at;
@@ -184,9 +186,8 @@ export default {
       const { head, stats } = this.live, refs = this.$refs;
       setText(refs.outcome, head.outcome);
       setText(refs.cycles, head.cycles == null ? "" : `${head.cycles} cycles`);
-      fill(refs.readings, head.readings.map(([name, text, address, ms, missing]) =>
-        missing ? [name, "missing", "", ""] : [name, text, address, ms && `${ms} ms`]),
-        (at) => head.readings[at][4] ? "bm-missing" : "");
+      const rows = head.readings.map(([name, text, address, ms]) => [name, typeof text === "number" ? number(text, 9) : text, address, age(ms)]);
+      fill(refs.readings, [...rows, ...head.missing.map((name) => [name, "missing", "", ""])], (at) => at < rows.length ? "" : "bm-missing");
       const known = stats?.boards ?? [];
       const boards = head.boards.length ? head.boards : known.map(([endpoint]) => [endpoint, "", null]);
       fill(refs.boards, boards.map((board, at) => [...board, known[at]?.[1] ?? "", (known[at]?.[2] ?? "").slice(0, 12)]));
@@ -221,11 +222,13 @@ export default {
       const stats = this.live.stats, refs = this.$refs;
       this.showConnection();
       setText(refs.rate, `${number(stats.rate, 3)} results/s`);
-      fill(refs.losses, Object.entries(stats.lost).map(([reason, count]) => [reason, count]));
+      const lost = Object.entries(stats.lost);
+      fill(refs.losses, lost.length ? lost : [["none", 0]]);
       if (stats.why.length) setText(refs.notice, stats.why.join("; "));
       else if (this.live.hadWhy) setText(refs.notice, "");
       this.live.hadWhy = stats.why.length > 0;
       setText(refs.samples, stats.samples);
+      refs.samplesPart.hidden = !stats.samples;
       refs.posterior.classList.toggle("bm-draggable", this.canDrag());
       this.showSwitches(stats.switches);
       this.drawStages(stats.stages, stats.stage_names);
@@ -241,13 +244,17 @@ export default {
           box.setAttribute("role", "switch");
           box.dataset.name = name;
           box.dataset.testid = `switch-${short.replaceAll("/", "-")}`;
-          box.onchange = () => this.tell({ switch: name, on: box.checked });
+          box.onchange = () => {
+            box.changedAt = performance.now();
+            this.tell({ switch: name, on: box.checked });
+          };
           label.append(box, ` ${short.replaceAll("/", " ")}`);
           return label;
         }));
       }
       for (const box of world.querySelectorAll("input")) {
-        if (document.activeElement !== box || box.checked === switches[box.dataset.name]) box.checked = switches[box.dataset.name];
+        // not while the service is asked
+        if (performance.now() - (box.changedAt ?? -2000) > 1500) box.checked = switches[box.dataset.name];
         box.disabled = !this.live.stats.connected;
       }
     },
@@ -306,9 +313,9 @@ export default {
       context.fillStyle = context.strokeStyle = style.color;
       context.font = "12px sans-serif";
       this.live.box = null;
-      if (!head.plot) {
+      if (!head?.plot) {
         context.textAlign = "center";
-        context.fillText(`no posterior: ${head.outcome}`, width / 2, height / 2, width - 20);
+        context.fillText(head ? `no posterior: ${head.outcome}` : "waiting for the first posterior", width / 2, height / 2, width - 20);
         return;
       }
       if (head.plot.axes.length === 1) this.drawBars(context, width, height, head.plot, new Float32Array(picture));

@@ -119,9 +119,8 @@ def _encoded(frame: Frame, labels: tuple[str, ...], axes: tuple[Axis, ...]) -> t
         "outcome": report.outcome if report else "posterior without a report",
         "cycles": report.cycles if report else None,
         "boards": [[each.name, each.stopped, each.cycles] for each in report.boards] if report else [],
-        "readings": [
-            [each.name, each.value, each.address, each.age_ms, each.missing] for each in frame.readings
-        ],
+        "readings": [[name, *each] for name, each in report.readings.items()] if report else [],
+        "missing": report.missing if report else (),
         "statistics": frame.statistics,
         "truth": frame.truth,
         "plot": None,
