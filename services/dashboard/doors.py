@@ -80,7 +80,9 @@ class Doors:
         if len(origins) > 1 or not set(origins) <= ours:
             return HTTPStatus.FORBIDDEN
         presented = Headers(headers)
-        if found := token or _cookie(headers):
+        found = token or _cookie(headers)
+        # others are no tokens, and no headers
+        if found and found.isascii() and found.isprintable():
             presented.pop("Authorization", None)
             presented["Authorization"] = f"Bearer {found}"
         # the host was checked above, by stricter rules where others can reach the server

@@ -8,8 +8,8 @@
 const VIRIDIS = [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37]];
 const COLOURS = new Uint8ClampedArray(256 * 4);
 for (let i = 0; i < 256; i++) {
-  const place = (i / 255) * (VIRIDIS.length - 1), low = Math.min(Math.floor(place), VIRIDIS.length - 2);
-  for (let c = 0; c < 3; c++) COLOURS[4 * i + c] = VIRIDIS[low][c] + (place - low) * (VIRIDIS[low + 1][c] - VIRIDIS[low][c]);
+  const share = (i / 255) * (VIRIDIS.length - 1), low = Math.min(Math.floor(share), VIRIDIS.length - 2);
+  for (let c = 0; c < 3; c++) COLOURS[4 * i + c] = VIRIDIS[low][c] + (share - low) * (VIRIDIS[low + 1][c] - VIRIDIS[low][c]);
   COLOURS[4 * i + 3] = 255;
 }
 // Okabe and Ito's colours, which colour-blind eyes can tell apart
@@ -21,6 +21,8 @@ const number = (value, digits = 4) => Number(Number(value).toPrecision(digits)).
 const centre = (axis, index) => axis.offset + index * axis.step;
 const value = (axis, index) => axis.states.length ? axis.states[Math.round(index)] ?? "" : number(centre(axis, index));
 const title = (axis) => axis.label + (axis.unit ? ` (${axis.unit})` : axis.known ? "" : " (cell)");
+// the index at a share of an axis; numbers of cells and names are whole
+const place = (axis, share) => axis.known && !axis.states.length ? share * (axis.size - 1) : Math.round(share * (axis.size - 1));
 const age = (ms) => ms < 1000 ? `${Math.round(ms)} ms` : ms < 60e3 ? `${(ms / 1000).toFixed(1)} s` : `${Math.floor(ms / 60e3)} min`;
 const setText = (element, text) => { if (element.textContent !== text) element.textContent = text; };
 
@@ -325,7 +327,7 @@ export default {
       const [down, across] = head.plot.axes, left = 62, bottom = 40, top = 8, right = 12;
       // cells are squares where both axes have the same unit
       let w = width - left - right, h = height - top - bottom;
-      if (down.known && down.unit === across.unit && !down.states.length && !across.states.length) {
+      if (down.known === across.known && down.unit === across.unit && !down.states.length && !across.states.length) {
         const ratio = Math.abs((across.size * across.step) / (down.size * down.step));
         if (w / h > ratio) w = h * ratio; else h = w / ratio;
       }
@@ -357,13 +359,13 @@ export default {
       context.textAlign = "center";
       const count = Math.max(2, Math.min(5, Math.floor(w / 70)));
       for (let at = 0; at < count; at++) {
-        const index = across.states.length ? Math.round(at / (count - 1) * (across.size - 1)) : at / (count - 1) * (across.size - 1);
+        const index = place(across, at / (count - 1));
         context.fillText(value(across, index), left + (index + 0.5) / across.size * w, top + h + 15, w / count);
       }
       context.fillText(acrossTitle, left + w / 2, top + h + 33, w);
       context.textAlign = "right";
       for (let at = 0; at < 5; at++) {
-        const index = down.states.length ? Math.round(at / 4 * (down.size - 1)) : at / 4 * (down.size - 1);
+        const index = place(down, at / 4);
         context.fillText(value(down, index), left - 5, top + h - (index + 0.5) / down.size * h + 4, 40);
       }
       context.save();

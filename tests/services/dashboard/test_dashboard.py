@@ -1,0 +1,202 @@
+"""The command and its page: what it refuses, and one process between a hub and a browser that is a plain WebSocket.
+
+test's robot  -->  hub (a process)  -->  dashboard (a process)  -->  pages and /live, read here
+"""
+
+import asyncio
+import contextlib
+import http.client
+import json
+import signal
+import socket
+import struct
+
+import pytest
+import websockets
+
+from bridge.client import connect
+from services.commands.dashboard import app
+from services.dashboard.robot import read_landmarks, read_samples
+from tests.casestudies.pretend_stack import certain, frame_message
+from tests.command_runner import invoke
+from tests.integration.conftest import stage as stage  # noqa: PLC0414  # a fixture
+from tests.patience import PROCESS_PATIENCE
+from tests.posteriors.messages import posterior_message
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--uri", "http://robot:9090"], "ws://"),
+        (["--host", "192.0.2.1"], "--insecure"),
+        (["--host", "192.0.2.1", "--token-file", "{token}"], "--tls-cert"),
+        (["--tls-cert", "nowhere.pem"], "--tls-key"),
+        (["--origin", "robot.example"], "--origin"),
+        (["--truth", "no topic"], "no topic"),
+        (["--port", "{taken}"], "--port"),
+        (["-d", "nowhere"], "nowhere"),
+    ],
+)
+def test_what_the_command_refuses(tmp_path, arguments, named):
+    token = tmp_path / "token"
+    token.write_text("a-token-of-sixteen-characters\n")
+    token.chmod(0o600)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        ended = invoke(app, [each.format(token=token, taken=port) for each in arguments])
+    assert (ended.exit_code, ended.stderr.count("\n")) == (2, 1)
+    assert named in ended.stderr
+
+
+def test_without_the_extra_it_says_how_to_install_it(monkeypatch):
+    monkeypatch.setattr("services.commands.dashboard.find_spec", lambda _name: None)
+    ended = invoke(app, [])
+    assert ended.exit_code == 2
+    assert "rosbayes[dashboard]" in ended.stderr
+
+
+def test_landmarks_of_a_message_or_none():
+    pose = {"position": {"x": 1, "y": 2.5, "z": 0}}
+    markers = [{"pose": pose, "text": "<b>"}, {"pose": pose, "id": 3}, {"pose": {"position": {"x": "1"}}}, 7]
+    assert read_landmarks({"markers": markers}) == [(1.0, 2.5, "<b>"), (1.0, 2.5, "3")]
+    for strange in ({}, {"markers": 3}, {"markers": [{"pose": 1}]}):
+        assert read_landmarks(strange) == []
+
+
+def test_samples_of_a_message_or_none():
+    layout = {"dim": [{"size": 2}, {"size": 8}]}
+    data = list(struct.pack("<4I", 1, 2, 3, 0xABC))
+    assert read_samples({"layout": layout, "data": data}) == "00000002 00000001\n00000abc 00000003"
+    for strange in ({}, {"layout": layout, "data": [1]}, {"layout": {"dim": []}, "data": data}):
+        assert not read_samples(strange)
+
+
+def fetch(port, path, **headers):
+    """The status of an answer, and its text."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PROCESS_PATIENCE)
+    with contextlib.closing(connection):
+        connection.request("GET", path, headers=headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode()
+
+
+async def refused(url, **more):
+    with pytest.raises(websockets.exceptions.InvalidStatus) as caught:
+        async with websockets.connect(url, **more):
+            pass
+    return caught.value.response.status_code
+
+
+class Browser:
+    """A plain WebSocket in a browser's place."""
+
+    def __init__(self, socket):
+        self._socket = socket
+
+    async def next(self, kind, wanted):
+        """The next message of a kind that is as wanted."""
+        async with asyncio.timeout(PROCESS_PATIENCE):
+            while True:
+                message = await self._socket.recv()
+                await self._socket.send(".")
+                (length,) = struct.unpack_from("<I", message)
+                head = json.loads(message[4 : 4 + length])
+                if head["kind"] == kind and wanted(head):
+                    return head
+
+    async def say(self, text):
+        await self._socket.send(text)
+
+    async def ask(self, **wish):
+        await self.say(json.dumps(wish))
+
+
+async def publish(ros, results, reports, numbers):
+    stamp = {"secs": 5, "nsecs": 0}
+    for number in numbers:
+        await reports.publish(frame_message(stamp, number, published=True))
+        await results.publish(posterior_message(certain(33), 32, 32))
+    await ros.topics()  # the server has read them
+
+
+async def check_doors(port):
+    """Pages and both sockets are for this server's pages alone, and the page names no other server."""
+    status, text = await asyncio.to_thread(fetch, port, "/")
+    assert status == 200
+    assert "://" not in text.replace("http://www.w3.org/", "")
+    engine = "/_nicegui_ws/socket.io/?EIO=4&transport="
+    for path in ("/", f"{engine}polling", "/frames.csv"):
+        assert (await asyncio.to_thread(fetch, port, path, Origin="http://evil.example"))[0] == 403
+        assert (await asyncio.to_thread(fetch, port, path, Host="evil.example"))[0] == 403
+    for path in ("/live", f"{engine}websocket"):
+        url = f"ws://127.0.0.1:{port}{path}"
+        assert await refused(url, origin="http://evil.example") == 403
+        assert await refused(url, additional_headers={"Host": "evil.example"}) == 403
+    assert (await asyncio.to_thread(fetch, port, "/frames.csv"))[0] == 404, "there is nothing to save yet"
+
+
+async def use_the_robot(ros, browser, port):
+    """Results, a pose, a switch and a file."""
+    results = await ros.advertise("/BMresults", "std_msgs/Float64MultiArray")
+    reports = await ros.advertise("/bm/frame", "diagnostic_msgs/DiagnosticArray")
+    asked = []
+
+    async def switched(request):
+        asked.append(request["data"])
+        return {"success": True, "message": ""}
+
+    poses = ros.subscribe("/boat/set_pose", "geometry_msgs/PoseStamped")
+    await ros.advertise_service("/boat/noise", "std_srvs/SetBool", switched)
+    await publish(ros, results, reports, range(1, 4))
+    head = await browser.next("frame", lambda head: head["number"] == 3)
+    assert head["plot"]["axes"][0]["label"] == "y"
+    assert head["plot"]["mean"] == [1, 1]
+
+    await browser.next("stats", lambda head: head["can_set_pose"] and head["switches"])
+    await browser.ask(pose=[1.5, -2])
+    pose = (await poses.next(PROCESS_PATIENCE)).msg["pose"]
+    assert pose["position"] == {"x": 1.5, "y": -2.0, "z": 0.0}
+    await browser.ask(switch="/boat/noise", on=False)
+    await browser.next("stats", lambda head: head["switches"] == {"/boat/noise": False})
+    assert asked == [False]
+    await browser.ask(switch="/rosapi/topics", on=True)
+    await browser.next("notice", lambda head: head["text"])
+    await browser.say("[" * 1000)
+
+    status, text = await asyncio.to_thread(fetch, port, "/frames.csv")
+    assert (status, text.count("\n")) == (200, 4)
+
+
+@pytest.mark.process
+async def test_a_page_from_the_first_result_to_the_last(stage):
+    hub, uri = await stage.hub()
+    port = stage.place()
+    environment = {"BM_RUN_DIRECTORY": str(stage.runs)}
+    dashboard = stage.start("dashboard", "--port", str(port), "--uri", uri, environment=environment)
+    await dashboard.says(rf"open http://127\.0\.0\.1:{port}")
+    await check_doors(port)
+    async with websockets.connect(
+        f"ws://127.0.0.1:{port}/live", origin=f"http://127.0.0.1:{port}"
+    ) as socket_:
+        browser = Browser(socket_)
+        await browser.next("stats", lambda head: head["connected"])
+        async with connect(uri, check_types=False) as ros:
+            await use_the_robot(ros, browser, port)
+
+        # a server that goes and returns
+        hub.send(signal.SIGTERM)
+        await hub.end()
+        await browser.next("stats", lambda head: not head["connected"])
+        await stage.hub(int(uri.rpartition(":")[2]))
+        await browser.next("stats", lambda head: head["connected"])
+        async with connect(uri, check_types=False) as ros:
+            results = await ros.advertise("/BMresults", "std_msgs/Float64MultiArray")
+            reports = await ros.advertise("/bm/frame", "diagnostic_msgs/DiagnosticArray")
+            await publish(ros, results, reports, [9])
+            await browser.next("frame", lambda head: head["number"] == 9)
+
+        dashboard.send(signal.SIGTERM)
+        assert await dashboard.end() == 143
+    assert "Traceback" not in dashboard.err
