@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import math
+import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -20,6 +21,8 @@ LIMIT = 180.0 * FACTOR
 """Time limit of the demo, in seconds."""
 PORT = "9090"
 """Port of the hub in a demo that runs until Ctrl-C."""
+FIRST_RESULT = r"^ *[0-9]+ "
+"""A viewer's line for a frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,11 +80,11 @@ async def demo(arguments: argparse.Namespace) -> int:
     array = arguments.uri is not None  # a real server accepts only installed message types
     case = sprinkler(rates, arguments.count) if arguments.sprinkler else boat(rates, array=array)
     screen = Screen()
+    # the page shows what the viewer prints, whose lines would hide the page's address
+    shown = {"master"} if arguments.dashboard else {case.viewer, "master"}
     processes = {
-        name: Process(
-            name, out / f"{name}.log", show=screen.show if name in {case.viewer, "master"} else None
-        )
-        for name in ("hub", case.viewer, "master", *case.publishers)
+        name: Process(name, out / f"{name}.log", show=screen.show if name in shown else None)
+        for name in ("hub", case.viewer, "master", *case.publishers, "dashboard")
     }
     hub, viewer, master, *_ = processes.values()
     saying = asyncio.create_task(screen.say_what_it_waits_for())
@@ -110,14 +113,36 @@ async def demo(arguments: argparse.Namespace) -> int:
         await master.start("master", "--loop", *count, "-d", str(deployment), "--uri", uri)
         for name, options in case.publishers.items():
             await processes[name].start(name, "--uri", uri, *options)
+        if arguments.dashboard:
+            # after the first posterior, which does not wait for the installation
+            await viewer.line(FIRST_RESULT)
+            screen.show("installing the page in the browser, if that was not done before ...")
+            await install_dashboard(out / "installation.log")
+            await processes["dashboard"].start("dashboard", "--uri", uri, "-d", str(deployment))
+            address = await processes["dashboard"].line(r"http://\S+")
+            screen.show(f"open {address[0]} in a browser; on the page, drag the boat")
         await master.succeed()
         screen.waits_for = "drawing the pictures"
         await viewer.succeed()
         screen.show(f"done in {time.monotonic() - started:.1f} s; pictures are in {out}")
+        screen.show("to watch it live in a browser, and to drag the boat: scripts/demo --dashboard")
     finally:
         saying.cancel()
         await asyncio.gather(*(process.end() for process in reversed(processes.values())))
     return 0
+
+
+async def install_dashboard(log: Path) -> None:
+    """Install the packages of the page into this environment, unless they are there.
+
+    Raises:
+        StackError: pip cannot install them.
+    """
+    installing = Process("installation", log)
+    await installing.start(
+        "/bin/bash", "-c", f". {shlex.quote(str(ROOT / 'scripts' / 'environment'))} dashboard"
+    )
+    await installing.succeed()
 
 
 def main() -> int:
@@ -135,6 +160,11 @@ def main() -> int:
         action="store_true",
         help=f"run until Ctrl-C, with the hub on port {PORT}, so that `listen` and others can connect",
     )
+    parser.add_argument(
+        "--dashboard",
+        action="store_true",
+        help="run until Ctrl-C, as --stay, with a page in the browser on port 8080",
+    )
     parser.add_argument("--rate", type=float, default=10.0, help="readings per second")
     parser.add_argument("--seed", type=int, shown="a new one each time", help="seed of what is simulated")
     parser.add_argument(
@@ -143,6 +173,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if arguments.count < 1:
         parser.error("--count must be 1 or more")
+    arguments.stay |= arguments.dashboard
     arguments.out = arguments.out.resolve()
     return run_script(lambda: demo(arguments), math.inf if arguments.stay else LIMIT)
 

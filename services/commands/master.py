@@ -46,6 +46,9 @@ def master(
     insecure: options.Insecure = False,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per result.")] = False,
     plot: Annotated[bool, typer.Option("--plot", help="Draw the newest posterior in the terminal.")] = False,
+    dashboard: Annotated[
+        bool, typer.Option("--dashboard", help="Start the page in the browser too (see `dashboard`).")
+    ] = False,
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print the resulting settings and exit.")
     ] = False,
@@ -77,10 +80,14 @@ def master(
         raise SettingsError("choose one of --once and --loop")
     if once and count is not None:
         raise SettingsError("--count requires --loop; --once computes one frame")
+    if once and dashboard:
+        raise SettingsError("--dashboard requires --loop; --once ends with the first frame")
     check_metrics(settings.metrics, insecure=insecure)
     # loaded before processes start, so that a damaged folder is reported at once
     loaded = deployment_for(settings)
-    return run_async(run_master(settings, loaded, once=once, count=count, json=json, plot=plot))
+    return run_async(
+        run_master(settings, loaded, once=once, count=count, json=json, plot=plot, dashboard=dashboard)
+    )
 
 
 def _check(settings: Settings) -> None:

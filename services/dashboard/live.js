@@ -349,11 +349,12 @@ export default {
       context.clip();
       const plot = head.plot;
       if (plot.mean) this.drawMean(context, box, plot.mean, plot.covariance);
+      context.restore();
+      // landmarks and shores are on the edge, or beyond it
       const stats = this.live.stats;
-      for (const [x, y, name] of stats?.landmarks ?? []) this.drawLandmark(context, this.pixel(x, y), name);
+      for (const [x, y, name] of stats?.landmarks ?? []) this.drawLandmark(context, this.pixel(x, y), name, width, height);
       const truth = this.live.drag ?? head.truth ?? stats?.truth;
       if (truth) this.drawTruth(context, this.pixel(...truth));
-      context.restore();
     },
     drawTicks(context, { left, top, w, h, down, across }, downTitle, acrossTitle) {
       context.textAlign = "center";
@@ -394,9 +395,10 @@ export default {
         context.stroke();
       }
     },
-    drawLandmark(context, place, name) {
+    drawLandmark(context, place, name, width, height) {
       if (!place) return;
       const [x, y] = place;
+      if (x < 0 || x > width || y < 0 || y > height) return;
       context.beginPath();
       context.moveTo(x, y - 7);
       context.lineTo(x + 7, y + 6);

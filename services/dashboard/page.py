@@ -79,7 +79,8 @@ class Dashboard:
     def _page(self) -> None:
         client = ui.context.client
         view = self._views[client.id] = View(self._feed)
-        client.on_delete(partial(self._views.pop, client.id, None))
+        # a function of ours, because the framework looks at its parameters
+        client.on_delete(lambda: self._views.pop(client.id, None))
         ui.add_css(_HERE / "live.css")
         with ui.row().classes("items-center"):
             ui.label("rosbayes").classes("text-h6").props('role="heading" aria-level="1"')

@@ -6,6 +6,7 @@ from pcie_shim.endpoint import Endpoint
 from services.child import RESTARTS, own_command
 from services.settings import Settings
 from services.sockets.reporting import shifted
+from toolchain.deployment import Deployment
 
 METRICS_PORTS = {"subscriber": 1, "publisher": 2, "pcie-app": 3, "board": 4}
 """Ports of the processes' metrics, counted from the master's; board N has the N-th after that of board 0."""
@@ -27,6 +28,21 @@ def boards_command(boards: int, directory: Path, settings: Settings, *, once: bo
         *("--directory", str(directory), "--restarts", restarts),
         *_metrics(settings, "board"),
     ]
+
+
+def dashboard_command(settings: Settings, deployment: Deployment, directory: Path | None) -> list[str]:
+    """Return the command of the page in the browser for the results of a run, with the folder of its sockets."""
+    command = [*own_command("dashboard"), "--deployment", str(deployment.directory)]
+    values = {
+        "uri": settings.uri,
+        "ca": settings.ca,
+        "ros-version": settings.ros_version,
+        "run-directory": directory,
+    }
+    for name, value in values.items():
+        if value:
+            command += [f"--{name}", str(value)]
+    return command
 
 
 _SETTINGS = {

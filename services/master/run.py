@@ -9,7 +9,9 @@ from collections.abc import Coroutine, Iterable
 from pathlib import Path
 from typing import Any
 
-from services.errors import NoDataError
+from services.child import Child, end_all
+from services.errors import NoDataError, StackError
+from services.master.command_lines import dashboard_command
 from services.master.flow import FrameFlow
 from services.master.peers import ROLE, Peer, Peers
 from services.output.axes import deployment_axes
@@ -49,6 +51,7 @@ class Master:
         count: int | None,
         json: bool,
         plot: bool = False,
+        dashboard: bool = False,
     ) -> None:
         self._settings = settings
         self._once = once
@@ -64,6 +67,9 @@ class Master:
         self._flow = FrameFlow(
             settings, deployment, self._peers, self._log, once=once, count=self._count, show=self._show
         )
+        # The page in the browser, which only reads: its failure never ends the run. Made in `run`, if it is wanted.
+        self._dashboard = dashboard
+        self._page: Child | None = None
         # Work beside the frames, until the end of the run.
         self._tasks: list[asyncio.Task[None]] = []
 
@@ -94,6 +100,9 @@ class Master:
             if not self._once and sys.stderr.isatty() and not shown:
                 self._begin_task(self._show_progress())
             self._begin_task(self._expect_data())
+            if self._dashboard:
+                self._page = Child("dashboard", dashboard_command(settings, self._deployment, run_directory))
+                self._begin_task(self._keep_page(self._page))
             with drawing() if self._plot else contextlib.nullcontext() as show:
                 if show is not None:
                     self._begin_task(self._keep_drawing(show))
@@ -108,6 +117,8 @@ class Master:
             await peers.leave()
             # before the children end, because the private folder that contains the socket goes with them
             await sockets.aclose()
+            if self._page is not None:
+                await end_all([self._page], settings.stop_timeout)
             await peers.end()
             # a run that ended before a reading could arrive needs no summary
             if not self._once and self._peers.begun.is_set():
@@ -124,6 +135,15 @@ class Master:
                 if time.monotonic() >= deadline:
                     raise
             await asyncio.sleep(_LOCK_EVERY)
+
+    async def _keep_page(self, page: Child) -> None:
+        try:
+            await page.start()
+            await page.wait()
+            failure = page.failure()
+        except StackError as error:
+            failure = error
+        self._log.warning(f"{failure}; the run goes on without the page")
 
     def _begin_task(self, work: Coroutine[Any, Any, None]) -> None:
         self._tasks.append(asyncio.ensure_future(work))
@@ -249,7 +269,15 @@ class ChildrenWatch:
 
 
 async def run_master(
-    settings: Settings, deployment: Deployment, *, once: bool, count: int | None, json: bool, plot: bool
+    settings: Settings,
+    deployment: Deployment,
+    *,
+    once: bool,
+    count: int | None,
+    json: bool,
+    plot: bool,
+    dashboard: bool = False,
 ) -> int:
     """Create a master inside the event loop, to which its futures belong, and run it to its end (see `Master.run`)."""
-    return await Master(settings, deployment, once=once, count=count, json=json, plot=plot).run()
+    master = Master(settings, deployment, once=once, count=count, json=json, plot=plot, dashboard=dashboard)
+    return await master.run()

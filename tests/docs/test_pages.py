@@ -172,7 +172,18 @@ def test_every_error_and_operation_of_a_board_is_described():
         assert f"| {getattr(framing, name)} {name} |" in page
 
 
-COMMANDS = ("master", "subscriber", "publisher", "pcie_app", "board", "loader", "hub", "listen", "status")
+COMMANDS = (
+    "master",
+    "subscriber",
+    "publisher",
+    "pcie_app",
+    "board",
+    "loader",
+    "hub",
+    "listen",
+    "dashboard",
+    "status",
+)
 OTHERS = {"hub": {"ros_version", "message_bytes"}, "board": {"boards"}}
 """Flags of a command that are not settings, but have the name of one."""
 

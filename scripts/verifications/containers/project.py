@@ -20,7 +20,7 @@ STOP_GRACE: Final = 60 * FACTOR
 """Seconds that a service has to end after SIGTERM; then the engine kills it (exit code 137)."""
 PROBED: Final = (
     *("master", "subscriber", "publisher", "pcie-app", "boards"),
-    *("hub", "boat-simulator", "boat-normaliser", "boat-viewer"),
+    *("hub", "boat-simulator", "boat-normaliser", "boat-viewer", "dashboard"),
 )
 PROBE: Final = {
     "interval": f"{15 * FACTOR:g}s",
@@ -74,7 +74,7 @@ def fetch_wheels() -> None:
     Raises:
         DownloadError: pip cannot download them.
     """
-    folder, lock = home() / "wheels", ROOT / "requirements.lock"
+    folder, lock = home() / "wheels", ROOT / "requirements-dashboard.lock"
     made = folder / ".made"
     stamp = hashlib.sha256(lock.read_bytes()).hexdigest()
     if made.exists() and made.read_text() == stamp:

@@ -27,7 +27,7 @@ CORE: Final = ("master", "subscriber", "publisher", "pcie-app")
 BOARDS: Final = ("board0", "board1", "board2", "board3")
 """Names of the processes in the container `boards` with the boat's deployment."""
 BOAT: Final = ("hub", "boat-simulator", "boat-normaliser", "boat-viewer")
-SERVICES: Final = (*CORE, "boards", *BOAT, "viewer")
+SERVICES: Final = (*CORE, "boards", *BOAT, "viewer", "dashboard")
 CHECK: Final = "check"
 """The container that ends before all others start."""
 

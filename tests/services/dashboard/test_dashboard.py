@@ -16,7 +16,10 @@ import websockets
 
 from bridge.client import connect
 from services.commands.dashboard import app
+from services.commands.master import app as master
 from services.dashboard.robot import read_landmarks, read_samples
+from services.master.command_lines import dashboard_command
+from services.settings import Settings
 from tests.casestudies.pretend_stack import certain, frame_message
 from tests.command_runner import invoke
 from tests.integration.conftest import stage as stage  # noqa: PLC0414  # a fixture
@@ -200,3 +203,15 @@ async def test_a_page_from_the_first_result_to_the_last(stage):
         dashboard.send(signal.SIGTERM)
         assert await dashboard.end() == 143
     assert "Traceback" not in dashboard.err
+
+
+def test_a_master_starts_it_for_its_own_results(boat, tmp_path):
+    settings = Settings(uri="ws://robot:9090", ca=tmp_path / "ca.pem")
+    command = dashboard_command(settings, boat, tmp_path)
+    flags = dict(zip(command[1::2], command[2::2], strict=True))
+    assert flags["--deployment"] == str(boat.directory)
+    assert (flags["--uri"], flags["--run-directory"]) == ("ws://robot:9090", str(tmp_path))
+    assert flags["--ca"] == str(tmp_path / "ca.pem")
+    ended = invoke(master, ["--once", "--dashboard", "-d", boat.directory])
+    assert ended.exit_code == 2
+    assert "--loop" in ended.stderr
