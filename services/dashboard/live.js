@@ -314,6 +314,7 @@ export default {
       context.clearRect(0, 0, width, height);
       context.fillStyle = context.strokeStyle = style.color;
       context.font = "12px sans-serif";
+      context.lineWidth = 1;
       this.live.box = null;
       if (!head?.plot) {
         context.textAlign = "center";
@@ -409,12 +410,13 @@ export default {
       context.lineWidth = 1.5;
       context.fill();
       context.stroke();
-      context.textAlign = "center";
+      context.textAlign = x < width / 2 ? "left" : "right";  // inwards, where no axis is
+      const to = x < width / 2 ? x + 10 : x - 10;
       context.strokeStyle = "#000";
       context.lineWidth = 3;
-      context.strokeText(name, x, y - 11, 120);
+      context.strokeText(name, to, y - 4, 120);
       context.fillStyle = "#fff";
-      context.fillText(name, x, y - 11, 120);
+      context.fillText(name, to, y - 4, 120);
     },
     drawTruth(context, place) {
       if (!place) return;
@@ -432,7 +434,7 @@ export default {
     },
     drawBars(context, width, height, { axes: [axis], max, error }, bars) {
       const left = 48, bottom = 40, top = 12, w = width - left - 8, h = height - top - bottom;
-      const high = Math.min(1, max + (error ?? 0)) || 1, step = w / axis.size, y = (p) => top + h * (1 - Math.min(p / high, 1));
+      const high = bars.length > 10 ? Math.min(1, max + (error ?? 0)) || 1 : 1, step = w / axis.size, y = (p) => top + h * (1 - Math.min(p / high, 1));
       const colour = context.fillStyle;
       bars.forEach((p, at) => {
         const x = left + at * step, gap = step > 6 ? step * 0.1 : 0;

@@ -189,7 +189,7 @@ class Dashboard:
             # after the wait for room, since then newer ones may have come
             frame = view.frame
             assert frame is not None  # noqa: S101 - frames are not forgotten without newer ones
-            axes = self._robot.axes_for(frame.labels)
+            axes = self._robot.axes_for(frame)
             now = (frame, view.at, view.labels(frame), axes)
             message = view.message(axes) if now != sent else None
             if message is None:
@@ -242,7 +242,7 @@ class Dashboard:
         frames = same_shape(tuple(self._feed.frames), shown.frame)
         if not frames:
             return Response("there is no posterior yet\n", status_code=404, media_type="text/plain")
-        axes = self._robot.axes_for(frames[0].labels)
+        axes = self._robot.axes_for(frames[0])
         make = partial(archive, frames, axes) if name.endswith(".npz") else partial(table, frames)
         # in a thread, because it takes longer than the time between two frames
         content = await asyncio.to_thread(make)

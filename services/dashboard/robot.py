@@ -21,7 +21,7 @@ from bridge.stamps import header
 from posteriors.errors import BadResultError
 from posteriors.listening import posteriors
 from posteriors.posterior import MAX_RESULT, SAMPLES_TOPIC, SAMPLES_TYPE
-from services.dashboard.feed import Feed
+from services.dashboard.feed import Feed, Frame
 from services.output.axes import Axis, deployment_axes
 from services.settings import Settings
 from services.sockets.status import ask_stack
@@ -79,10 +79,12 @@ class Robot:
         self._uri = uri
         self._topic = topic
         self._truth = truth
-        # Of the flag, or that of the master on this machine, which the status names.
+        # The name of the flag's deployment: frames of others are ignored.
+        self._only = deployment.name if deployment else None
+        # Of the flag, or that of the master on this machine, whose status names its folder.
         self._deployment = deployment
         self._folder = ""
-        self.axes: tuple[Axis, ...] = tuple(deployment_axes(deployment)) if deployment else ()
+        self._axes: tuple[Axis, ...] = tuple(deployment_axes(deployment)) if deployment else ()
         self.state = f"connecting to {uri}"
         self.connected = False
         self.landmarks: list[tuple[float, float, str]] = []
@@ -146,7 +148,7 @@ class Robot:
         self._feed.changed()
 
     async def _follow_frames(self, ros: Ros) -> None:
-        name = self._deployment.name if self._deployment else None
+        name = self._only
         async with posteriors(ros, topic=self._topic, deployment=name, queue_size=_QUEUE_SIZE) as frames:
             counted = 0
             while True:
@@ -220,12 +222,18 @@ class Robot:
         except (ToolchainError, OSError) as error:
             warn(f"dashboard: no units, because the master's deployment cannot be read: {error}")
             return
-        self.axes = tuple(deployment_axes(deployment))
+        self._deployment, self._axes = deployment, tuple(deployment_axes(deployment))
         self._feed.changed()
 
-    def axes_for(self, labels: tuple[str, ...]) -> tuple[Axis, ...]:
-        """Return the axes with units for a posterior of these labels; none if it is another deployment's."""
-        return self.axes if tuple(axis.label for axis in self.axes) == labels else ()
+    def axes_for(self, frame: Frame) -> tuple[Axis, ...]:
+        """Return the axes of a frame's posterior; none if it is another deployment's, whose units would mislead."""
+        deployment, values = self._deployment, frame.values
+        if deployment is None or values is None:
+            return ()
+        if frame.report is not None and frame.report.deployment != deployment.name:
+            return ()
+        ours = [(axis.label, axis.size) for axis in self._axes]
+        return self._axes if ours == list(zip(frame.labels, values.shape, strict=True)) else ()
 
     # Asking
 
