@@ -6,7 +6,6 @@ import os
 import socket
 from collections.abc import Iterator
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Annotated, Final
 
 import typer
@@ -55,15 +54,9 @@ def dashboard(
     ] = TRUTH_TOPIC,
     host: Annotated[str, typer.Option(help="Address to listen on.", metavar="ADDRESS")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 8080,
-    tls_cert: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Certificate of the page (PEM), to serve https://.")
-    ] = None,
-    tls_key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Private key of the certificate (PEM).")
-    ] = None,
-    token_file: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Accepted tokens, one per line.")
-    ] = None,
+    tls_cert: options.TlsCert = None,
+    tls_key: options.TlsKey = None,
+    token_file: options.TokenFile = None,
     origin: Annotated[
         list[str] | None,
         typer.Option(
@@ -79,12 +72,13 @@ def dashboard(
             "the dashboard needs NiceGUI, which is not installed: pip install 'rosbayes[dashboard]'"
         )
     # read before anything listens, as in the hub
-    policy = access_policy(tls_cert, tls_key, token_file, origin or [])
-    if not is_loopback(host) and not insecure and (policy.tls is None or not policy.tokens):
-        raise SettingsError(
-            f"--host {shown(host)} lets everybody on that network see the posteriors and move the boat; "
-            "give --tls-cert, --tls-key and --token-file, or --insecure if that is intended"
-        )
+    policy = access_policy(
+        host,
+        (tls_cert, tls_key, token_file),
+        origin or [],
+        insecure=insecure,
+        danger="lets everybody on that network see the posteriors and move the boat",
+    )
     deployment = deployment_for(settings) if settings.deployment is not None else None
     output = deployment.outputs[0] if deployment is not None else None
     uri = settings.uri or (deployment.output_uri(output) if deployment and output else DEFAULT_URI)

@@ -1,6 +1,7 @@
 """Flags of the commands: those of settings, made from `Settings`, and others that several commands share."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
 import typer
@@ -30,6 +31,15 @@ Listen: TypeAlias = Annotated[
         help="Endpoint at which to wait for a master (a board: for pcie-app or a loader).",
         metavar="unix:PATH|tcp://HOST:PORT",
     ),
+]
+TlsCert: TypeAlias = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Certificate (PEM), to serve wss:// and https://.")
+]
+TlsKey: TypeAlias = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Private key of the certificate (PEM).")
+]
+TokenFile: TypeAlias = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Accepted client tokens, one per line.")
 ]
 Insecure: TypeAlias = Annotated[
     bool, typer.Option("--insecure", help="Permit an unprotected address that other machines can reach.")

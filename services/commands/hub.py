@@ -40,15 +40,9 @@ def hub(
     ros_version: Annotated[
         Literal["1", "2"], typer.Option(help="Emulated ROS version: spelling of types, answers of rosapi.")
     ] = "1",
-    tls_cert: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Certificate of the hub (PEM), to serve wss://.")
-    ] = None,
-    tls_key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Private key of the certificate (PEM).")
-    ] = None,
-    token_file: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Accepted client tokens, one per line.")
-    ] = None,
+    tls_cert: options.TlsCert = None,
+    tls_key: options.TlsKey = None,
+    token_file: options.TokenFile = None,
     origin: Annotated[
         list[str] | None,
         typer.Option(
@@ -80,17 +74,13 @@ def hub(
     """Serve rosbridge without ROS."""
     check_metrics(settings.metrics, insecure=insecure)
     # read before anything listens: a wrong file must not open a hub without its protection
-    access = access_policy(tls_cert, tls_key, token_file, origin or [])
-    if not is_loopback(host) and not insecure and (access.tls is None or not access.tokens):
-        # TLS without tokens lets everybody in, and tokens without TLS can be read on the way
-        missing = " and ".join(
-            flags
-            for flags, there in (("--tls-cert and --tls-key", access.tls), ("--token-file", access.tokens))
-            if not there
-        )
-        raise SettingsError(
-            f"--host {shown(host)} lets everybody on that network publish to your robot; give {missing}, or --insecure if that is intended"
-        )
+    access = access_policy(
+        host,
+        (tls_cert, tls_key, token_file),
+        origin or [],
+        insecure=insecure,
+        danger="lets everybody on that network publish to your robot",
+    )
 
     return run_async(
         _serve(
@@ -109,9 +99,15 @@ def hub(
 
 
 def access_policy(
-    certificate: Path | None, key: Path | None, tokens: Path | None, origins: list[str]
+    host: str,
+    files: tuple[Path | None, Path | None, Path | None],
+    origins: list[str],
+    *,
+    insecure: bool,
+    danger: str,
 ) -> AccessPolicy:
-    """Return the access policy according to the flags."""
+    """Return the access policy according to the flags: certificate, key and tokens, which a host on the network needs."""
+    certificate, key, tokens = files
     if (certificate is None) != (key is None):
         raise SettingsError(
             "TLS needs both the certificate and its key: give --tls-cert FILE and --tls-key FILE"
@@ -122,11 +118,22 @@ def access_policy(
             raise SettingsError(
                 f"--origin {shown(page)} is not a web page's origin: expected for example https://robot.example:8000"
             )
-    return AccessPolicy(
+    policy = AccessPolicy(
         tls=tls_context(certificate, key) if certificate is not None and key is not None else None,
         tokens=read_tokens(tokens) if tokens is not None else (),
         origins=tuple(origins),
     )
+    if not is_loopback(host) and not insecure and (policy.tls is None or not policy.tokens):
+        # TLS without tokens lets everybody in, and tokens without TLS can be read on the way
+        missing = " and ".join(
+            flags
+            for flags, there in (("--tls-cert and --tls-key", policy.tls), ("--token-file", policy.tokens))
+            if not there
+        )
+        raise SettingsError(
+            f"--host {shown(host)} {danger}; give {missing}, or --insecure if that is intended"
+        )
+    return policy
 
 
 async def _serve(
