@@ -78,6 +78,7 @@ export default {
     </div>`,
 
   mounted() {
+    document.documentElement.lang = "en";  // for screen readers; the framework names none
     this.live = { head: null, picture: null, heardAt: 0, stats: null, drag: null, image: document.createElement("canvas"), dirty: true };
     const canvas = this.$refs.posterior;
     canvas.addEventListener("pointerdown", (event) => this.pick(event));
@@ -379,6 +380,7 @@ export default {
     },
     drawMean(context, { left, top, w, h, down, across }, [row, column], [rr, rc, cc]) {
       const x = left + (column + 0.5) / across.size * w, y = top + h - (row + 0.5) / down.size * h;
+      Object.assign(this.$refs.posterior.dataset, { meanX: x.toFixed(1), meanY: y.toFixed(1) });  // where tests find it
       // in pixels, with y downwards
       const sx = w / across.size, sy = h / down.size, a = cc * sx * sx, b = -rc * sx * sy, c = rr * sy * sy;
       const middle = (a + c) / 2, spread = Math.hypot((a - c) / 2, b), angle = Math.atan2(2 * b, a - c) / 2;

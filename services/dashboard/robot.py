@@ -37,6 +37,7 @@ LANDMARKS_TOPIC: Final = "/boat/beacons"
 LANDMARKS_TYPE: Final = "visualization_msgs/MarkerArray"
 SWITCH_TYPE: Final = "std_srvs/SetBool"
 _WORLD: Final = "/boat/"
+_SAIL: Final = "/boat/sail"
 _SWITCHES: Final = frozenset({"sail", "noise", "works", "plugged"})
 """Last parts of the names of the services that are switches of the world."""
 _RETRY: Final = 1.0
@@ -246,6 +247,8 @@ class Robot:
             "position": {"x": x, "y": y, "z": 0.0},
             "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
         }
+        if _SAIL in self.switches:  # a boat that is put somewhere lies still
+            self.switches[_SAIL] = False
         # while the server is away or slow, poses are dropped: the next one replaces them
         with suppress(DisconnectedError, SlowPeerError):
             poses.publish_nowait(

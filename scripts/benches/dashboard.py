@@ -1,0 +1,250 @@
+"""The dashboard: how many of 50 posteriors a second are shown and how late, its cost, and how fast a dragged boat is found.
+
+display  this process -- 50 posteriors a second, 64 x 64 --> hub --> dashboard --> Chromium, one window and two
+drag     mouse in Chromium --> dashboard --> hub --> boat-simulator --> ... --> master --> hub --> dashboard --> Chromium
+cycle    two stacks, one of them with a dashboard and a plain WebSocket reader, as Chromium takes a core of its own
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import os
+import random
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import fields
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from websockets.asyncio.client import connect as connect_plainly
+
+from bridge.client import Ros, connect
+from posteriors import BoardReport, FrameReport, StageTimes
+from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, VariableReading, write_frame_report
+from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
+from scripts.benches.cycle import cpu_us, message, quantile, readings
+from scripts.benches.load import mib_of
+from scripts.running.browser import Browser, Stand, Visit, browser
+from scripts.running.flags import ScriptParser
+from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, run_script
+
+HZ: Final = 50
+SIDE: Final = 64
+WARM_UP: Final = 3.0
+"""Seconds of results before a measurement."""
+DRAGS: Final = 20
+SAMPLES: Final = 10
+"""Number of intervals in the measurement of memory."""
+TURN: Final = 50
+"""Number of cycles in a turn, after which the other stack is measured."""
+PARTS: Final = ("cycle", "drag", "display")
+
+Rows = list[tuple[str, str, str]]
+"""What was measured, the figure, and the aim."""
+
+
+async def publish(ros: Ros, sent: dict[int, float]) -> None:
+    """Publish results as a stack would until cancelled, and keep when each was sent, in Unix ms, by frame number."""
+    axis, posteriors = np.arange(SIDE), []
+    for turn in np.linspace(0, 2 * np.pi, HZ, endpoint=False):
+        x, y = SIDE / 2 + SIDE / 3 * np.cos(turn), SIDE / 2 + SIDE / 3 * np.sin(turn)
+        values = np.exp(-((axis - x) ** 2 + (axis[:, None] - y) ** 2) / 40).ravel()
+        posteriors.append((values / values.sum()).tolist())
+    reports = await ros.advertise(FRAME_TOPIC, FRAME_TYPE)
+    results = await ros.advertise(RESULTS_TOPIC, RESULTS_TYPE)
+    dim = [{"label": name, "size": SIDE, "stride": SIDE ** (2 - at)} for at, name in enumerate("yx")]
+    boards = [
+        BoardReport(name=f"board {at}", stopped="overflow", cycles=9, counts_total=9) for at in range(4)
+    ]
+    values = {f"D{at}": VariableReading(12.0, 12, 3.0) for at in range(6)}
+    stages = StageTimes(**{each.name: 100.0 for each in fields(StageTimes)})
+    began = time.perf_counter()
+    while True:
+        number, now = len(sent) + 1, time.time_ns()
+        report = FrameReport(
+            stamp_ns=now, received_ns=now, sent_ns=now, number=number, outcome="posterior", cycles=1000,
+            counts_total=255, stages=stages, boards=tuple(boards), readings=values,
+        )  # fmt: skip
+        sent[number] = now / 1e6
+        with ros.together():
+            await reports.publish(write_frame_report(report, 1))
+            await results.publish({"layout": {"dim": dim, "data_offset": 0}, "data": posteriors[number % HZ]})
+        await asyncio.sleep(max(0.0, began + number / HZ - time.perf_counter()))
+
+
+async def display(stand: Stand, chromium: Browser, arguments: argparse.Namespace) -> Rows:
+    """Measure one window and two, then the memory of process and browser."""
+    sent: dict[int, float] = {}
+    async with connect(stand.uri, check_types=False) as ros:
+        publishing = asyncio.create_task(publish(ros, sent))
+        visits: list[Visit] = []
+        rows: Rows = []
+        for name, shown_aim, age_aim, cpu_aim in (
+            ("one window", "at least 45", "50 ms", ""), ("two windows", "", "", "40 %"),
+        ):  # fmt: skip
+            visits.append(await chromium.open(stand.url))
+            await asyncio.sleep(WARM_UP)
+            begin, used, began = len(sent), cpu_us([stand.pid("dashboard")]), time.perf_counter()
+            await asyncio.sleep(arguments.seconds)
+            share = (cpu_us([stand.pid("dashboard")]) - used) / 1e6 / (time.perf_counter() - began)
+            end = len(sent)
+            await visits[0].frame_above(end)
+            paints = {each["number"]: each["at"] for each in await visits[0].page.evaluate("window.paints")}
+            ages = [at - sent[number] for number, at in paints.items() if begin < number <= end]
+            late = f"{statistics.median(ages):.0f} ms, {quantile(ages, 0.95):.0f} ms"
+            rows += [
+                (f"shown of {HZ} a second, {name}", f"{HZ * len(ages) / (end - begin):.1f}", shown_aim),
+                (f"age when painted, {name}: median, 95 %", late, age_aim),
+                (f"CPU of the dashboard, {name}", f"{share:.0%} of a core", cpu_aim),
+            ]
+        await visits[1].close()
+        rows += await memory(visits[0], stand.pid("dashboard"), arguments.minutes)
+        publishing.cancel()
+    return rows
+
+
+async def memory(visit: Visit, pid: int, minutes: float) -> Rows:
+    """Measure memory over some minutes of results, and compare the end with the middle."""
+    session = await visit.page.context.new_cdp_session(visit.page)
+    taken: dict[str, list[float]] = {}
+    for sample in range(SAMPLES + 1):
+        await asyncio.sleep(60 * minutes / SAMPLES if sample else 0)
+        await session.send("HeapProfiler.collectGarbage")
+        heap, counters = [
+            await session.send(name) for name in ("Runtime.getHeapUsage", "Memory.getDOMCounters")
+        ]
+        figures = {"MiB of the dashboard": mib_of(pid), "MiB of the browser's heap": heap["usedSize"] / 2**20}
+        for name, figure in {**figures, "nodes in the browser": counters["nodes"]}.items():
+            taken.setdefault(name, []).append(figure)
+        print(
+            f"minute {sample * minutes / SAMPLES:g}:",
+            *(f"{name} {each[-1]:,.1f};" for name, each in taken.items()),
+            file=sys.stderr,
+        )
+    half = SAMPLES // 2
+    return [
+        (f"{name}, after {minutes:g} minutes / half of them", f"{each[-1]:,.1f} / {each[half]:,.1f} = {each[-1] / each[half]:.2f}", "1")
+        for name, each in taken.items()
+    ]  # fmt: skip
+
+
+async def drags(stand: Stand, chromium: Browser, chance: random.Random) -> Rows:
+    """Measure the time from the drop until a posterior is painted at the boat, by the browser's clock."""
+    visit = await chromium.open(stand.url)
+    times = []
+    for number in range(DRAGS):
+        goal = (0.75 if number % 2 else 0.35, chance.uniform(0.2, 0.7))  # far from the previous one
+        dropped = await visit.drag(goal, steps=1)
+        times.append(await visit.mean_near(goal) - dropped)
+    return [("drop of the boat to its posterior: median, longest", f"{statistics.median(times):.0f} ms, {max(times):.0f} ms", "200 ms")]  # fmt: skip
+
+
+async def read(url: str) -> None:
+    """Read what a page would until cancelled."""
+    async with connect_plainly(f"{url.replace('http', 'ws', 1)}/live", max_size=None) as socket:
+        async for _ in socket:
+            await socket.send(".")  # the page's acknowledgement
+
+
+async def cycles(plain: Stand, beside: Stand, frames: int, seed: int) -> Rows:
+    """Compare the cycle times of two stacks, of which one has a dashboard with a reader, in turns."""
+    some, times = readings(seed, frames + TURN), {plain: [0.0], beside: [0.0]}
+    async with connect(plain.uri) as one, connect(beside.uri) as other:
+        reading = asyncio.create_task(read(beside.url))
+        sides = [
+            (
+                times[stand],
+                ros.subscribe(RESULTS_TOPIC, RESULTS_TYPE),
+                await ros.advertise(BOAT_TOPIC, BOAT_TYPE),
+            )
+            for stand, ros in ((plain, one), (beside, other))
+        ]
+        for at in range(0, len(some), TURN):
+            for taken, results, publication in sides:
+                if at == TURN:
+                    taken.clear()  # the first turn was the warm-up
+                for each in some[at : at + TURN]:
+                    started = time.perf_counter()
+                    await publication.publish(message(each))
+                    await results.next(timeout=30)
+                    taken.append(1e6 * (time.perf_counter() - started))
+                    await asyncio.sleep(max(0.0, started + 1 / HZ - time.perf_counter()))
+        reading.cancel()
+    with_it, without = statistics.median(times[beside]), statistics.median(times[plain])
+    figures = f"{with_it:,.0f} / {without:,.0f} = {with_it / without:.3f}"
+    return [(f"cycle at {HZ} a second, with the dashboard / without, us", figures, "at most 1.05")]
+
+
+async def bench(arguments: argparse.Namespace) -> int:
+    """Measure part after part, and print the table."""
+    seed = arguments.seed if arguments.seed is not None else random.randrange(2**32)
+    rows: Rows = []
+    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
+        source, boat, plain, beside = (
+            Stand(Path(folder) / name) for name in ("source", "boat", "plain", "beside")
+        )
+        async with contextlib.AsyncExitStack() as stack:
+            for stand in (source, boat, plain, beside):
+                stack.push_async_callback(stand.end)
+            if "cycle" in arguments.only:
+                for stand in (plain, beside):
+                    await stand.start_hub()
+                    await stand.start_master()
+                await beside.start_dashboard()
+                rows += await cycles(plain, beside, arguments.frames, seed)
+                await asyncio.gather(plain.end(), beside.end())
+            chromium = await stack.enter_async_context(browser())
+            if "drag" in arguments.only:
+                await boat.start_hub()
+                await boat.start_master()
+                await boat.start_boat(10.0)
+                await boat.start_dashboard()
+                rows += await drags(boat, chromium, random.Random(seed))
+                await boat.end()
+            if "display" in arguments.only:
+                await source.start_hub()
+                await source.start_dashboard()
+                rows += await display(source, chromium, arguments)
+    table = Table(
+        title=f"dashboard; display: {HZ} posteriors a second of {SIDE} x {SIDE}, otherwise the boat's 32 x 32"
+    )
+    for column in ("", "measured", "aim"):
+        table.add_column(column, justify="right" if column else "left")
+    for row in rows:
+        table.add_row(*row)
+    Console(width=None if sys.stdout.isatty() else 120).print(table)
+    print(f"{len(os.sched_getaffinity(0))} cores, shared by all processes and the browser; seed {seed}")
+    return 0
+
+
+def main() -> int:
+    """Parse the flags and measure."""
+    parser = ScriptParser(
+        prog="scripts/bench dashboard",
+        description="Measure what the dashboard shows, how late, and what it costs the stack.",
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=20.0, help="duration of each measurement of the display"
+    )
+    parser.add_argument("--minutes", type=float, default=2.0, help="duration of the measurement of memory")
+    parser.add_argument(
+        "--frames", type=int, default=500, help="number of cycles with and without the dashboard"
+    )
+    parser.add_argument("--seed", type=int, shown="a new one each time", help="seed of the boat's positions")
+    parser.add_argument(
+        "--only", choices=PARTS, action="append", shown="all", help="one part; repeat for more"
+    )
+    arguments = parser.parse_args()
+    arguments.only = arguments.only or PARTS
+    return run_script(lambda: bench(arguments), 1200 + 60 * arguments.minutes)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
