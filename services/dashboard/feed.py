@@ -118,7 +118,9 @@ class Feed:
         details = report.details if report else outcome.details
         values = None
         if isinstance(outcome, Posterior):
-            values = np.array(outcome.probabilities, np.float32).reshape(outcome.sizes)
+            # before they become float32, whose range is smaller
+            scale = outcome.replicas / outcome.values.sum()
+            values = (outcome.values * scale).astype(np.float32)
         else:
             self.add_loss(outcome.outcome or "no reason given")
         self._count += 1

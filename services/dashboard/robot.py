@@ -7,7 +7,7 @@ import asyncio
 import base64
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +16,7 @@ import numpy as np
 
 from bridge.client import Publication, Ros, connect
 from bridge.discovery import announced_uri
-from bridge.errors import BridgeError, DisconnectedError, NotRosbridgeError, SlowPeerError, UnreachableError
+from bridge.errors import BridgeError, NotRosbridgeError, UnreachableError
 from bridge.stamps import header
 from posteriors.errors import BadResultError
 from posteriors.listening import posteriors
@@ -136,12 +136,30 @@ class Robot:
                 self._ros = self._poses = None
 
     async def _follow(self, ros: Ros) -> None:
-        async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._follow_frames(ros))
-            tasks.create_task(self._follow_truth(ros))
-            tasks.create_task(self._follow_landmarks(ros))
-            tasks.create_task(self._follow_samples(ros))
-            tasks.create_task(self._ask_about_world(ros))
+        def take_truth(message: dict[str, Any]) -> None:
+            self._feed.truth = _point(message.get("pose")) or self._feed.truth
+
+        def take_landmarks(message: dict[str, Any]) -> None:
+            self.landmarks = read_landmarks(message)
+
+        def take_samples(message: dict[str, Any]) -> None:
+            self.samples = read_samples(message)
+
+        async def follow(topic: str, kind: str, take: Callable[[dict[str, Any]], None], **flow: int) -> None:
+            async for message in ros.subscribe(topic, kind, queue_size=1, **flow):  # type: ignore[arg-type]
+                take(message.msg)
+
+        # two messages of samples a second are more than eyes follow
+        slow = {"throttle_rate": _SAMPLES_EVERY_MS, "queue_length": 1}
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._follow_frames(ros))
+                tasks.create_task(self._ask_about_world(ros))
+                tasks.create_task(follow(self._truth, POSE_TYPE, take_truth))
+                tasks.create_task(follow(LANDMARKS_TOPIC, LANDMARKS_TYPE, take_landmarks))
+                tasks.create_task(follow(SAMPLES_TOPIC, SAMPLES_TYPE, take_samples, **slow))
+        except ExceptionGroup as failed:  # such as a topic that has two types
+            raise failed.exceptions[0] from None
 
     def _set_state(self, state: str, reason: str) -> None:
         self.connected = state == "connected"
@@ -149,8 +167,9 @@ class Robot:
         self._feed.changed()
 
     async def _follow_frames(self, ros: Ros) -> None:
-        name = self._only
-        async with posteriors(ros, topic=self._topic, deployment=name, queue_size=_QUEUE_SIZE) as frames:
+        async with posteriors(
+            ros, topic=self._topic, deployment=self._only, queue_size=_QUEUE_SIZE
+        ) as frames:
             counted = 0
             while True:
                 try:
@@ -163,23 +182,6 @@ class Robot:
                 for _ in range(gone - counted):
                     self._feed.add_loss("not received by the page")
                 counted = gone
-
-    async def _follow_truth(self, ros: Ros) -> None:
-        async for message in ros.subscribe(self._truth, POSE_TYPE, queue_size=1):
-            if (point := _point(message.msg.get("pose"))) is not None:
-                self._feed.truth = point[:2]
-
-    async def _follow_landmarks(self, ros: Ros) -> None:
-        async for message in ros.subscribe(LANDMARKS_TOPIC, LANDMARKS_TYPE, queue_size=1):
-            self.landmarks = read_landmarks(message.msg)
-
-    async def _follow_samples(self, ros: Ros) -> None:
-        # two messages a second are more than eyes follow
-        subscription = ros.subscribe(
-            SAMPLES_TOPIC, SAMPLES_TYPE, throttle_rate=_SAMPLES_EVERY_MS, queue_length=1, queue_size=1
-        )
-        async for message in subscription:
-            self.samples = read_samples(message.msg)
 
     async def _ask_about_world(self, ros: Ros) -> None:
         """Ask which services and topics of the world exist, again and again, because a simulator may come later."""
@@ -249,11 +251,10 @@ class Robot:
         }
         if _SAIL in self.switches:  # a boat that is put somewhere lies still
             self.switches[_SAIL] = False
+        head = header(time.time_ns(), "map", ros.ros_version or 1)
         # while the server is away or slow, poses are dropped: the next one replaces them
-        with suppress(DisconnectedError, SlowPeerError):
-            poses.publish_nowait(
-                {"header": header(time.time_ns(), "map", ros.ros_version or 1), "pose": pose}
-            )
+        with suppress(BridgeError):
+            poses.publish_nowait({"header": head, "pose": pose})
 
     async def switch(self, name: str, on: bool) -> str:
         """Call a switch of the world; return what went wrong, empty if nothing did."""
@@ -276,10 +277,11 @@ def _point(pose: Any) -> tuple[float, float] | None:
     position = pose.get("position") if isinstance(pose, Mapping) else None
     if not isinstance(position, Mapping):
         return None
-    values = [position.get(name) for name in ("x", "y")]
-    if not all(isinstance(each, int | float) and math.isfinite(each) for each in values):
+    try:
+        x, y = float(position["x"]), float(position["y"])
+    except (KeyError, TypeError, ValueError, OverflowError):
         return None
-    return float(values[0]), float(values[1])  # type: ignore[arg-type]  # checked above
+    return (x, y) if math.isfinite(x) and math.isfinite(y) else None
 
 
 def read_landmarks(message: Mapping[str, Any]) -> list[tuple[float, float, str]]:

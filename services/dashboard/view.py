@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 _LENGTH: Final = struct.Struct("<I")
 _MAX_CHOICES: Final = 200
+_LARGEST: Final = 1 << 53
 _ACROSS: Final = "x"
 """Label of the variable that is always drawn from left to right, as on a map."""
 
@@ -115,11 +116,17 @@ def _encoded(frame: Frame, labels: tuple[str, ...], axes: tuple[Axis, ...]) -> t
         "kind": "frame",
         "at": frame.at,
         "heard_ms": frame.heard_ns / 1e6,
-        "number": report.number if report else None,
+        "number": _shown(report.number) if report else None,
         "outcome": report.outcome if report else "posterior without a report",
-        "cycles": report.cycles if report else None,
-        "boards": [[each.name, each.stopped, each.cycles] for each in report.boards] if report else [],
-        "readings": [[name, *each] for name, each in report.readings.items()] if report else [],
+        "cycles": _shown(report.cycles) if report else None,
+        "boards": [[each.name, each.stopped, _shown(each.cycles)] for each in report.boards]
+        if report
+        else [],
+        "readings": [
+            [name, each.value, _shown(each.address), each.age_ms] for name, each in report.readings.items()
+        ]
+        if report
+        else [],
         "missing": report.missing if report else (),
         "statistics": frame.statistics,
         "truth": frame.truth,
@@ -137,6 +144,11 @@ def _encoded(frame: Frame, labels: tuple[str, ...], axes: tuple[Axis, ...]) -> t
     if not any(axis["states"] for axis in shown):
         plot |= moments(marginal)
     return head, np.rint(marginal * (255 / peak)).astype(np.uint8).tobytes()
+
+
+def _shown(number: int | None) -> int | str | None:
+    # anybody can publish larger numbers than JSON's readers know
+    return number if number is None or abs(number) < _LARGEST else f"{number:.3g}"
 
 
 def moments(marginal: "NDArray[np.float64]") -> dict[str, list[float]]:

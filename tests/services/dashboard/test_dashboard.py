@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import http.client
 import json
+import math
 import signal
 import socket
 import struct
@@ -62,7 +63,13 @@ def test_without_the_extra_it_says_how_to_install_it(monkeypatch):
 
 def test_landmarks_of_a_message_or_none():
     pose = {"position": {"x": 1, "y": 2.5, "z": 0}}
-    markers = [{"pose": pose, "text": "<b>"}, {"pose": pose, "id": 3}, {"pose": {"position": {"x": "1"}}}, 7]
+    markers = [
+        {"pose": pose, "text": "<b>"},
+        {"pose": pose, "id": 3},
+        {"pose": {"position": {"x": "1"}}},
+        {"pose": {"position": {"x": 10**400, "y": math.nan}}},
+        7,
+    ]
     assert read_landmarks({"markers": markers}) == [(1.0, 2.5, "<b>"), (1.0, 2.5, "3")]
     for strange in ({}, {"markers": 3}, {"markers": [{"pose": 1}]}):
         assert read_landmarks(strange) == []

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -150,3 +151,16 @@ def test_a_spreadsheet_computes_no_name():
     frame = Feed().add(posterior(1, [0.5, 0.5], ("=1+1",)), 0.0)
     assert b"\n=" not in table([frame])
     assert b",=" not in table([frame])
+
+
+def test_numbers_beyond_every_range():
+    """Anybody can publish them, and the page must go on."""
+    huge = 10**30
+    reading = {"D1": VariableReading(1e300, huge, 0.5)}
+    one = posterior(huge, np.full((2, 2), 1e-300), cycles=huge, readings=reading)
+    head, picture = shown(replace(one, heard_ns=1))
+    assert (head["number"], head["cycles"]) == ("1e+30", "1e+30")
+    assert head["plot"]["max"] == 0.25
+    assert list(picture) == [255] * 4
+    largest = replace(posterior(1, np.full((2, 2), 1e307)), heard_ns=1)
+    assert shown(largest)[0]["plot"]["mean"] == [0.5, 0.5]
