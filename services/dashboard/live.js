@@ -26,6 +26,18 @@ const place = (axis, share) => axis.known && !axis.states.length ? share * (axis
 const age = (ms) => ms < 1000 ? `${Math.round(ms)} ms` : ms < 60e3 ? `${(ms / 1000).toFixed(1)} s` : `${Math.floor(ms / 60e3)} min`;
 const setText = (element, text) => { if (element.textContent !== text) element.textContent = text; };
 
+// Write on a canvas; begin a path along points; fill and outline the path, or only outline it without a filling.
+const write = (context, align, text, x, y, width) => Object.assign(context, { textAlign: align }).fillText(text, x, y, width);
+function path(context, ...points) {
+  context.beginPath();
+  points.forEach(([x, y], at) => at ? context.lineTo(x, y) : context.moveTo(x, y));
+}
+function paint(context, lineWidth, strokeStyle, fillStyle) {
+  Object.assign(context, { lineWidth, strokeStyle });
+  if (fillStyle) Object.assign(context, { fillStyle }).fill();
+  context.stroke();
+}
+
 // Show rows of texts in the body of a table; rows and cells that are there already are used again.
 function fill(body, rows, mark) {
   while (body.rows.length > rows.length) body.deleteRow(-1);
@@ -263,7 +275,6 @@ export default {
     },
     drawStages(rows, names) {
       const [context, width, height] = this.prepare(this.$refs.stages), left = 48, bottom = 18;
-      const colour = getComputedStyle(this.$el).color;
       const totals = rows.map(([, times]) => times.reduce((sum, time) => sum + time, 0)), top = Math.max(...totals, 1);
       const x = (second) => left + (width - left) * (1 - second / 300), y = (time) => (height - bottom) * (1 - time / top) + 4 * time / top;
       context.clearRect(0, 0, width, height);
@@ -276,15 +287,11 @@ export default {
           sum += time;
         });
       });
-      context.fillStyle = colour;
-      context.font = "12px sans-serif";
-      context.textAlign = "right";
-      context.fillText(`${number(top / 1000, 2)} ms`, left - 4, 14);
-      context.fillText("0", left - 4, height - bottom);
-      context.textAlign = "left";
-      context.fillText("5 min ago", left, height - 4);
-      context.textAlign = "right";
-      context.fillText("now", width - 2, height - 4);
+      Object.assign(context, { fillStyle: getComputedStyle(this.$el).color, font: "12px sans-serif" });
+      write(context, "right", `${number(top / 1000, 2)} ms`, left - 4, 14);
+      write(context, "right", "0", left - 4, height - bottom);
+      write(context, "left", "5 min ago", left, height - 4);
+      write(context, "right", "now", width - 2, height - 4);
       const last = rows.at(-1)?.[1] ?? [], list = this.$refs.stageNames;
       if (list.children.length !== names.length) {
         list.replaceChildren(...names.map((_, at) => {
@@ -311,18 +318,12 @@ export default {
     },
     drawPosterior() {
       const { head, picture } = this.live, canvas = this.$refs.posterior, [context, width, height] = this.prepare(canvas);
-      const style = getComputedStyle(this.$el);
+      const { color } = getComputedStyle(this.$el);
       context.clearRect(0, 0, width, height);
-      context.fillStyle = context.strokeStyle = style.color;
-      context.font = "12px sans-serif";
-      context.lineWidth = 1;
+      Object.assign(context, { fillStyle: color, strokeStyle: color, font: "12px sans-serif", lineWidth: 1 });
       this.live.box = null;
-      if (!head?.plot) {
-        context.textAlign = "center";
-        context.fillText(head ? `no posterior: ${head.outcome}` : "waiting for the first posterior", width / 2, height / 2, width - 20);
-        return;
-      }
-      if (head.plot.axes.length === 1) this.drawBars(context, width, height, head.plot, new Float32Array(picture));
+      if (!head?.plot) write(context, "center", head ? `no posterior: ${head.outcome}` : "waiting for the first posterior", width / 2, height / 2, width - 20);
+      else if (head.plot.axes.length === 1) this.drawBars(context, width, height, head.plot, new Float32Array(picture));
       else this.drawGrid(context, width, height, head, new Uint8Array(picture));
     },
     drawGrid(context, width, height, head, cells) {
@@ -344,7 +345,7 @@ export default {
       context.imageSmoothingEnabled = false;
       context.drawImage(image, left, top, w, h);
       context.strokeRect(left, top, w, h);
-      this.drawTicks(context, box, title(down), title(across));
+      this.drawTicks(context, box);
       context.save();
       context.beginPath();
       context.rect(left, top, w, h);
@@ -358,24 +359,21 @@ export default {
       const truth = this.live.drag ?? head.truth ?? stats?.truth;
       if (truth) this.drawTruth(context, this.pixel(...truth));
     },
-    drawTicks(context, { left, top, w, h, down, across }, downTitle, acrossTitle) {
-      context.textAlign = "center";
+    drawTicks(context, { left, top, w, h, down, across }) {
       const count = Math.max(2, Math.min(5, Math.floor(w / 70)));
       for (let at = 0; at < count; at++) {
         const index = place(across, at / (count - 1));
-        context.fillText(value(across, index), left + (index + 0.5) / across.size * w, top + h + 15, w / count);
+        write(context, "center", value(across, index), left + (index + 0.5) / across.size * w, top + h + 15, w / count);
       }
-      context.fillText(acrossTitle, left + w / 2, top + h + 33, w);
-      context.textAlign = "right";
+      write(context, "center", title(across), left + w / 2, top + h + 33, w);
       for (let at = 0; at < 5; at++) {
         const index = place(down, at / 4);
-        context.fillText(value(down, index), left - 5, top + h - (index + 0.5) / down.size * h + 4, 40);
+        write(context, "right", value(down, index), left - 5, top + h - (index + 0.5) / down.size * h + 4, 40);
       }
       context.save();
       context.translate(13, top + h / 2);
       context.rotate(-Math.PI / 2);
-      context.textAlign = "center";
-      context.fillText(downTitle, 0, 0, h);
+      write(context, "center", title(down), 0, 0, h);
       context.restore();
     },
     drawMean(context, { left, top, w, h, down, across }, [row, column], [rr, rc, cc]) {
@@ -385,39 +383,21 @@ export default {
       const sx = w / across.size, sy = h / down.size, a = cc * sx * sx, b = -rc * sx * sy, c = rr * sy * sy;
       const middle = (a + c) / 2, spread = Math.hypot((a - c) / 2, b), angle = Math.atan2(2 * b, a - c) / 2;
       for (const [line, style] of [[4, "#000"], [2, "#fff"]]) {
-        context.strokeStyle = style;
-        context.lineWidth = line;
         context.beginPath();
         context.ellipse(x, y, 2 * Math.sqrt(Math.max(middle + spread, 0)), 2 * Math.sqrt(Math.max(middle - spread, 0)), angle, 0, 2 * Math.PI);
-        context.stroke();
-        context.beginPath();
-        context.moveTo(x - 6, y);
-        context.lineTo(x + 6, y);
-        context.moveTo(x, y - 6);
-        context.lineTo(x, y + 6);
-        context.stroke();
+        paint(context, line, style);
+        path(context, [x - 6, y], [x + 6, y], [x, y], [x, y - 6], [x, y + 6]);
+        paint(context, line, style);
       }
     },
     drawLandmark(context, place, name, width, height) {
       if (!place) return;
       const [x, y] = place;
       if (x < 0 || x > width || y < 0 || y > height) return;
-      context.beginPath();
-      context.moveTo(x, y - 7);
-      context.lineTo(x + 7, y + 6);
-      context.lineTo(x - 7, y + 6);
-      context.closePath();
-      context.fillStyle = "#e69f00";
-      context.strokeStyle = "#000";
-      context.lineWidth = 1.5;
-      context.fill();
-      context.stroke();
-      context.textAlign = x < width / 2 ? "left" : "right";  // inwards, where no axis is
-      const to = x < width / 2 ? x + 10 : x - 10;
-      context.strokeStyle = "#000";
-      context.lineWidth = 3;
-      context.strokeText(name, to, y - 4, 120);
-      context.fillStyle = "#fff";
+      path(context, [x, y - 7], [x + 7, y + 6], [x - 7, y + 6], [x, y - 7]);
+      paint(context, 1.5, "#000", "#e69f00");
+      const [align, to] = x < width / 2 ? ["left", x + 10] : ["right", x - 10];  // inwards, where no axis is
+      Object.assign(context, { textAlign: align, lineWidth: 3, fillStyle: "#fff" }).strokeText(name, to, y - 4, 120);
       context.fillText(name, to, y - 4, 120);
     },
     drawTruth(context, place) {
@@ -425,14 +405,8 @@ export default {
       const [x, y] = place;
       context.beginPath();
       context.arc(x, y, this.live.drag ? 11 : 8, 0, 2 * Math.PI);
-      context.fillStyle = "#d55e00";
-      context.strokeStyle = "#fff";
-      context.lineWidth = 2.5;
-      context.fill();
-      context.stroke();
-      const canvas = this.$refs.posterior;  // where tests and pointers find the boat
-      canvas.dataset.boatX = x.toFixed(1);
-      canvas.dataset.boatY = y.toFixed(1);
+      paint(context, 2.5, "#fff", "#d55e00");
+      Object.assign(this.$refs.posterior.dataset, { boatX: x.toFixed(1), boatY: y.toFixed(1) });
     },
     drawBars(context, width, height, { axes: [axis], max, error }, bars) {
       const left = 48, bottom = 40, top = 12, w = width - left - 8, h = height - top - bottom;
@@ -443,23 +417,15 @@ export default {
         context.fillStyle = "#0072b2";
         context.fillRect(x + gap, y(p), Math.max(step - 2 * gap, 1), top + h - y(p));
         if (error == null) return;
-        context.strokeStyle = "#d55e00";
-        context.lineWidth = 2;
-        context.beginPath();
-        context.moveTo(x + step / 2, y(Math.max(p - error, 0)));
-        context.lineTo(x + step / 2, y(p + error));
-        context.stroke();
+        path(context, [x + step / 2, y(Math.max(p - error, 0))], [x + step / 2, y(p + error)]);
+        paint(context, 2, "#d55e00");
       });
-      context.fillStyle = context.strokeStyle = colour;
-      context.lineWidth = 1;
-      context.strokeRect(left, top, w, h);
-      context.textAlign = "right";
-      context.fillText(number(high, 3), left - 4, top + 8);
-      context.fillText("0", left - 4, top + h);
-      context.textAlign = "center";
+      Object.assign(context, { fillStyle: colour, strokeStyle: colour, lineWidth: 1 }).strokeRect(left, top, w, h);
+      write(context, "right", number(high, 3), left - 4, top + 8);
+      write(context, "right", "0", left - 4, top + h);
       const every = Math.ceil(axis.size / Math.max(1, Math.floor(w / 60)));
-      for (let at = 0; at < axis.size; at += every) context.fillText(value(axis, at), left + (at + 0.5) * step, top + h + 15, every * step);
-      context.fillText(title(axis), left + w / 2, top + h + 33, w);
+      for (let at = 0; at < axis.size; at += every) write(context, "center", value(axis, at), left + (at + 0.5) * step, top + h + 15, every * step);
+      write(context, "center", title(axis), left + w / 2, top + h + 33, w);
     },
 
     // --- the boat ---
