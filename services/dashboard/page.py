@@ -8,9 +8,10 @@
 import asyncio
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import msgspec
 from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
@@ -22,6 +23,7 @@ from services.dashboard.robot import Robot
 from services.dashboard.saving import archive, same_shape, table
 from services.dashboard.view import View, choices, packed
 from services.output.axes import printable
+from terminal.signals import until_one_ends
 
 _STATS_EVERY: Final = 0.5
 _IN_FLIGHT: Final = 2
@@ -61,8 +63,7 @@ class Dashboard:
         """Return the web application; the framework is set up once in a process."""
         application = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
         application.add_api_websocket_route("/live", self._live)
-        application.add_api_route("/frames.npz", self._npz)
-        application.add_api_route("/frames.csv", self._csv)
+        application.add_api_route("/frames.{kind}", self._file)
         ui.page("/", title="rosbayes")(self._page)
         ui.run_with(
             application,
@@ -86,42 +87,29 @@ class Dashboard:
             ui.label("rosbayes").classes("text-h6").props('role="heading" aria-level="1"')
             live: Live
 
-            def pressed(act: Callable[[], None]) -> None:
-                act()
-                paused = view.at is not None
-                pause.props(
-                    f'icon={"play_arrow" if paused else "pause"} aria-label="{"Continue" if paused else "Pause"}"'
-                )
+            def pressed(act: Callable[[Any], None], how: Any) -> None:
+                act(how)
+                icon, purpose = ("play_arrow", "Continue") if view.at is not None else ("pause", "Pause")
+                pause.props(f'icon={icon} aria-label="{purpose}"')
 
-            _button(
-                "", "skip_previous", "step-back", "One frame back", lambda: pressed(lambda: view.step(-1))
-            )
-            pause = _button(
-                "", "pause", "pause", "Pause", lambda: pressed(lambda: view.pause(view.at is None))
-            )
-            _button(
-                "", "skip_next", "step-forward", "One frame forward", lambda: pressed(lambda: view.step(1))
-            )
-            _button(
-                "PNG", "", "save-png", "Save the picture", lambda: live.run_method("savePng", "posterior.png")
-            )
+            def save_picture() -> None:
+                live.run_method("savePng", "posterior.png")
+
+            _button("One frame back", "step-back", lambda: pressed(view.step, -1), icon="skip_previous")
+            pause = _button("Pause", "pause", lambda: pressed(view.pause, view.at is None), icon="pause")
+            _button("One frame forward", "step-forward", lambda: pressed(view.step, 1), icon="skip_next")
+            _button("Save the picture", "save-png", save_picture, text="PNG")
             for kind in ("npz", "csv"):
-                url = f"/frames.{kind}?view={client.id}"
-                _button(
-                    kind.upper(),
-                    "",
-                    f"save-{kind}",
-                    f"Save the frames as {kind.upper()}",
-                    partial(ui.download.from_url, url),
-                )
+                save = partial(ui.download.from_url, f"/frames.{kind}?view={client.id}")
+                _button(f"Save the frames as {kind.upper()}", f"save-{kind}", save, text=kind.upper())
             marginals = ui.select(
                 {}, label="marginal", on_change=lambda event: view.choose(event.value or ())
             )
             marginals.props('dense options-dense data-testid=marginals aria-label="Marginal"').style(
-                "min-width: 9rem"
+                "width: 9rem"
             )
             dark = ui.dark_mode(value=None)
-            _button("", "contrast", "dark", "Light or dark", lambda: dark.set_value(not dark.value))
+            _button("Light or dark", "dark", lambda: dark.set_value(not dark.value), icon="contrast")
         live = Live(client.id)
 
         def offer() -> None:
@@ -139,13 +127,18 @@ class Dashboard:
 
     async def _live(self, socket: WebSocket, view: str = "") -> None:
         await socket.accept()
-        room = asyncio.Semaphore(_IN_FLIGHT)
-        changed = asyncio.Event()
+        room, changed = asyncio.Semaphore(_IN_FLIGHT), asyncio.Event()
         changed.set()
         self._feed.watchers.add(changed.set)
-        writing = asyncio.create_task(
-            self._write(socket, self._views.get(view) or View(self._feed), room, changed)
-        )
+        writing = self._write(socket, self._views.get(view) or View(self._feed), room, changed)
+        try:
+            # closed, bytes instead of text, or closed during a message
+            with suppress(WebSocketDisconnect, KeyError, RuntimeError):
+                await until_one_ends(writing, self._read(socket, room))
+        finally:
+            self._feed.watchers.discard(changed.set)
+
+    async def _read(self, socket: WebSocket, room: asyncio.Semaphore) -> None:
         asking: set[asyncio.Task[None]] = set()
         try:
             while True:
@@ -157,13 +150,9 @@ class Dashboard:
                     task = asyncio.create_task(self._grant(socket, wish))
                     asking.add(task)
                     task.add_done_callback(asking.discard)
-        except (WebSocketDisconnect, KeyError):  # closed, or bytes instead of text
-            pass
         finally:
-            self._feed.watchers.discard(changed.set)
-            for task in (writing, *asking):
+            for task in asking:
                 task.cancel()
-            await asyncio.gather(writing, *asking, return_exceptions=True)
 
     async def _write(
         self, socket: WebSocket, view: View, room: asyncio.Semaphore, changed: asyncio.Event
@@ -172,11 +161,9 @@ class Dashboard:
         sent: object = None
         next_stats = 0.0
         while True:
-            try:
+            with suppress(TimeoutError):
                 async with asyncio.timeout_at(next_stats):
                     await changed.wait()
-            except TimeoutError:
-                pass
             changed.clear()
             if loop.time() >= next_stats:
                 next_stats = loop.time() + _STATS_EVERY
@@ -231,24 +218,20 @@ class Dashboard:
 
     # Files
 
-    async def _npz(self, view: str = "") -> Response:
-        return await self._file(view, "application/zip", "posteriors.npz")
-
-    async def _csv(self, view: str = "") -> Response:
-        return await self._file(view, "text/csv; charset=utf-8", "posteriors.csv")
-
-    async def _file(self, view: str, media_type: str, name: str) -> Response:
+    async def _file(self, kind: Literal["npz", "csv"], view: str = "") -> Response:
         shown = self._views.get(view) or View(self._feed)
         frames = same_shape(tuple(self._feed.frames), shown.frame)
         if not frames:
             return Response("there is no posterior yet\n", status_code=404, media_type="text/plain")
-        axes = self._robot.axes_for(frames[0])
-        make = partial(archive, frames, axes) if name.endswith(".npz") else partial(table, frames)
+        make = (
+            partial(archive, frames, self._robot.axes_for(frames[0]))
+            if kind == "npz"
+            else partial(table, frames)
+        )
         # in a thread, because it takes longer than the time between two frames
         content = await asyncio.to_thread(make)
-        return Response(
-            content, media_type=media_type, headers={"Content-Disposition": f'attachment; filename="{name}"'}
-        )
+        headers = {"Content-Disposition": f'attachment; filename="posteriors.{kind}"'}
+        return Response(content, media_type="application/octet-stream", headers=headers)
 
 
 def _wish(text: str) -> Wish | None:
@@ -261,7 +244,9 @@ def _wish(text: str) -> Wish | None:
         return None
 
 
-def _button(text: str, icon: str, test: str, purpose: str, act: Callable[[], object]) -> ui.button:
-    button = ui.button(text, icon=icon or None, on_click=act)
+def _button(
+    purpose: str, test: str, act: Callable[[], object], *, text: str = "", icon: str | None = None
+) -> ui.button:
+    button = ui.button(text, icon=icon, on_click=act)
     button.props(f'flat dense data-testid={test} aria-label="{purpose}"').tooltip(purpose)
     return button

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import orjson
 
+from posteriors.frame_report import FrameReport
 from services.dashboard.feed import Feed, Frame
 from services.output.axes import Axis
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _LENGTH: Final = struct.Struct("<I")
+_NO_REPORT: Final = FrameReport(stamp_ns=0, outcome="posterior without a report")
 _MAX_CHOICES: Final = 200
 _LARGEST: Final = 1 << 53
 _ACROSS: Final = "x"
@@ -111,23 +113,19 @@ def choices(labels: tuple[str, ...]) -> list[tuple[str, ...]]:
 # Several browsers show the same frame, so that it is encoded once. Frames are compared by identity.
 @lru_cache(maxsize=4)
 def _encoded(frame: Frame, labels: tuple[str, ...], axes: tuple[Axis, ...]) -> tuple[dict[str, Any], bytes]:
-    report = frame.report
+    report = frame.report or _NO_REPORT
     head: dict[str, Any] = {
         "kind": "frame",
         "at": frame.at,
         "heard_ms": frame.heard_ns / 1e6,
-        "number": _shown(report.number) if report else None,
-        "outcome": report.outcome if report else "posterior without a report",
-        "cycles": _shown(report.cycles) if report else None,
-        "boards": [[each.name, each.stopped, _shown(each.cycles)] for each in report.boards]
-        if report
-        else [],
+        "number": _shown(report.number),
+        "outcome": report.outcome,
+        "cycles": _shown(report.cycles),
+        "boards": [[each.name, each.stopped, _shown(each.cycles)] for each in report.boards],
         "readings": [
-            [name, each.value, _shown(each.address), each.age_ms] for name, each in report.readings.items()
-        ]
-        if report
-        else [],
-        "missing": report.missing if report else (),
+            [name, one.value, _shown(one.address), one.age_ms] for name, one in report.readings.items()
+        ],
+        "missing": report.missing,
         "statistics": frame.statistics,
         "truth": frame.truth,
         "plot": None,
