@@ -118,9 +118,9 @@ class Feed:
         details = report.details if report else outcome.details
         values = None
         if isinstance(outcome, Posterior):
-            # before they become float32, whose range is smaller
-            scale = outcome.replicas / outcome.values.sum()
-            values = (outcome.values * scale).astype(np.float32)
+            # before they become float32, whose range is smaller; by their maximum first, because a sum may be tiny
+            relative = outcome.values / outcome.values.max()
+            values = (relative * (outcome.replicas / relative.sum())).astype(np.float32)
         else:
             self.add_loss(outcome.outcome or "no reason given")
         self._count += 1

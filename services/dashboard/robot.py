@@ -16,7 +16,7 @@ import numpy as np
 
 from bridge.client import Publication, Ros, connect
 from bridge.discovery import announced_uri
-from bridge.errors import BridgeError, NotRosbridgeError, UnreachableError
+from bridge.errors import BridgeError, NotRosbridgeError, TopicLeftOutError, UnreachableError
 from bridge.stamps import header
 from posteriors.errors import BadResultError
 from posteriors.listening import posteriors
@@ -47,6 +47,9 @@ _SAMPLES_EVERY_MS: Final = 500
 _SAMPLES: Final = 8
 """Number of samples that are shown."""
 _MAX_LANDMARKS: Final = 100
+_MAX_NAME: Final = 100
+_MAX_WARNINGS: Final = 20
+"""Maximum number of unreadable messages that are reported, each with another reason: there may be thousands a second."""
 _QUEUE_SIZE: Final = 64
 
 
@@ -98,6 +101,8 @@ class Robot:
         # The open connection, and its publication of poses; None while there is none.
         self._ros: Ros | None = None
         self._poses: Publication | None = None
+        # The reasons for which messages were unreadable, as far as they were reported.
+        self._warned: set[str] = set()
 
     # Following
 
@@ -146,8 +151,10 @@ class Robot:
             self.samples = read_samples(message)
 
         async def follow(topic: str, kind: str, take: Callable[[dict[str, Any]], None], **flow: int) -> None:
-            async for message in ros.subscribe(topic, kind, queue_size=1, **flow):  # type: ignore[arg-type]
-                take(message.msg)
+            # the client has warned of a message that is too large; the page does without the topic
+            with suppress(TopicLeftOutError):
+                async for message in ros.subscribe(topic, kind, queue_size=1, **flow):  # type: ignore[arg-type]
+                    take(message.msg)
 
         # two messages of samples a second are more than eyes follow
         slow = {"throttle_rate": _SAMPLES_EVERY_MS, "queue_length": 1}
@@ -176,7 +183,9 @@ class Robot:
                     self._feed.add(await frames.next_frame(None), time.monotonic())
                 except BadResultError as error:
                     self._feed.add_loss("unreadable message")
-                    warn(str(error))
+                    if len(self._warned) < _MAX_WARNINGS and (why := str(error)) not in self._warned:
+                        self._warned.add(why)
+                        warn(why)
                 # those that were announced and never arrived, and those that came too fast for this process
                 gone = frames.announced_only + frames.lost
                 for _ in range(gone - counted):
@@ -288,7 +297,7 @@ def read_landmarks(message: Mapping[str, Any]) -> list[tuple[float, float, str]]
     """Return x, y and name of each marker that has a place."""
     markers = message.get("markers")
     found = [
-        (*point, str(marker.get("text") or marker.get("id") or ""))
+        (*point, str(marker.get("text") or marker.get("id") or "")[:_MAX_NAME])
         for marker in (markers if isinstance(markers, list) else ())
         if isinstance(marker, Mapping) and (point := _point(marker.get("pose"))) is not None
     ]
@@ -300,8 +309,8 @@ def read_samples(message: Mapping[str, Any]) -> str:
     try:
         size = int(message["layout"]["dim"][1]["size"])
         data = message["data"]
-        octets = base64.b64decode(data) if isinstance(data, str) else bytes(data)
+        octets = base64.b64decode(data) if isinstance(data, str) else bytes(list(data))  # not bytes(10**12)
         words = np.frombuffer(octets, "<u4").reshape(-1, size // 4)[-_SAMPLES:]
-    except (KeyError, IndexError, TypeError, ValueError, ZeroDivisionError):
+    except (ArithmeticError, LookupError, TypeError, ValueError):
         return ""  # another program publishes there
     return "\n".join(" ".join(f"{word:08x}" for word in state[::-1]) for state in words)

@@ -7,6 +7,7 @@ cell of a heat map, relative to the highest cell, or a little-endian float32 a b
 import struct
 import time
 from collections.abc import Sequence
+from decimal import Decimal
 from functools import lru_cache
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, Final
@@ -145,8 +146,8 @@ def _encoded(frame: Frame, labels: tuple[str, ...], axes: tuple[Axis, ...]) -> t
 
 
 def _shown(number: int | None) -> int | str | None:
-    # anybody can publish larger numbers than JSON's readers know
-    return number if number is None or abs(number) < _LARGEST else f"{number:.3g}"
+    # anybody can publish larger numbers than JSON's readers and floats know
+    return number if number is None or abs(number) < _LARGEST else f"{Decimal(number):.3g}"
 
 
 def moments(marginal: "NDArray[np.float64]") -> dict[str, list[float]]:

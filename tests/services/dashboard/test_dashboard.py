@@ -5,20 +5,26 @@ test's robot  -->  hub (a process)  -->  dashboard (a process)  -->  pages and /
 
 import asyncio
 import contextlib
+import fnmatch
 import http.client
 import json
 import math
 import signal
 import socket
 import struct
+import tomllib
+from pathlib import Path
 
 import pytest
 import websockets
 
 from bridge.client import connect
+from bridge.errors import DisconnectedError, TopicLeftOutError
+from posteriors.errors import BadResultError
 from services.commands.dashboard import app
 from services.commands.master import app as master
-from services.dashboard.robot import read_landmarks, read_samples
+from services.dashboard.feed import Feed
+from services.dashboard.robot import Robot, read_landmarks, read_samples
 from services.master.command_lines import dashboard_command
 from services.settings import Settings
 from tests.casestudies.pretend_stack import certain, frame_message
@@ -26,6 +32,9 @@ from tests.command_runner import invoke
 from tests.integration.conftest import stage as stage  # noqa: PLC0414  # a fixture
 from tests.patience import PROCESS_PATIENCE
 from tests.posteriors.messages import posterior_message
+
+PROJECT = Path(__file__).parents[3] / "pyproject.toml"
+FOLDER = PROJECT.parent / "services" / "dashboard"
 
 
 @pytest.mark.parametrize(
@@ -73,14 +82,71 @@ def test_landmarks_of_a_message_or_none():
     assert read_landmarks({"markers": markers}) == [(1.0, 2.5, "<b>"), (1.0, 2.5, "3")]
     for strange in ({}, {"markers": 3}, {"markers": [{"pose": 1}]}):
         assert read_landmarks(strange) == []
+    (landmark,) = read_landmarks({"markers": [{"pose": pose, "text": "x" * 1_000_000}]})
+    assert len(landmark[2]) == 100, "each page gets it twice a second"
 
 
 def test_samples_of_a_message_or_none():
     layout = {"dim": [{"size": 2}, {"size": 8}]}
     data = list(struct.pack("<4I", 1, 2, 3, 0xABC))
     assert read_samples({"layout": layout, "data": data}) == "00000002 00000001\n00000abc 00000003"
-    for strange in ({}, {"layout": layout, "data": [1]}, {"layout": {"dim": []}, "data": data}):
+    infinite = {"dim": [{"size": 2}, {"size": math.inf}]}
+    for strange in (
+        {},
+        {"layout": layout, "data": [1]},
+        {"layout": layout, "data": 16},
+        {"layout": {"dim": []}, "data": data},
+        {"layout": infinite, "data": data},
+    ):
         assert not read_samples(strange)
+
+
+async def nothing(*_arguments):
+    pass
+
+
+async def test_a_topic_with_too_large_messages_does_not_end_the_page(monkeypatch):
+    asked = []
+
+    class Server:
+        async def subscribe(self, topic, _kind, **_flow):
+            asked.append(topic)
+            raise TopicLeftOutError(f"{topic} is left out")
+            yield
+
+    robot = Robot(Feed(), Settings(), None, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
+    for other in ("_follow_frames", "_ask_about_world"):
+        monkeypatch.setattr(robot, other, nothing)
+    await robot._follow(Server())
+    assert set(asked) == {"/truth", "/boat/beacons", "/bm/samples"}
+
+
+async def test_each_reason_of_unreadable_messages_is_reported_once(monkeypatch, capsys):
+    errors = [BadResultError(f"it has {number % 30} values") for number in range(300)]
+
+    class Frames:
+        announced_only = lost = 0
+
+        async def next_frame(self, _timeout):
+            raise errors.pop() if errors else DisconnectedError("it is closed")
+
+    monkeypatch.setattr(
+        "services.dashboard.robot.posteriors", lambda *_, **__: contextlib.nullcontext(Frames())
+    )
+    feed = Feed()
+    robot = Robot(feed, Settings(), None, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
+    with pytest.raises(DisconnectedError):
+        await robot._follow_frames(None)
+    said = capsys.readouterr().err.splitlines()
+    assert (len(said), len(set(said))) == (20, 20)
+    assert feed.lost == {"unreadable message": 300}
+
+
+def test_every_file_of_the_page_is_in_the_package():
+    patterns = tomllib.loads(PROJECT.read_text())["tool"]["setuptools"]["package-data"]["services.dashboard"]
+    files = [each.name for each in FOLDER.iterdir() if each.is_file() and each.suffix != ".py"]
+    assert {each for each in files if not any(fnmatch.fnmatch(each, one) for one in patterns)} == set()
+    assert "live.js" in files
 
 
 def fetch(port, path, **headers):

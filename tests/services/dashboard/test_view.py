@@ -159,8 +159,10 @@ def test_numbers_beyond_every_range():
     reading = {"D1": VariableReading(1e300, huge, 0.5)}
     one = posterior(huge, np.full((2, 2), 1e-300), cycles=huge, readings=reading)
     head, picture = shown(replace(one, heard_ns=1))
-    assert (head["number"], head["cycles"]) == ("1e+30", "1e+30")
+    assert (head["number"], head["cycles"]) == ("1.00e+30", "1.00e+30")
     assert head["plot"]["max"] == 0.25
     assert list(picture) == [255] * 4
-    largest = replace(posterior(1, np.full((2, 2), 1e307)), heard_ns=1)
-    assert shown(largest)[0]["plot"]["mean"] == [0.5, 0.5]
+    for value in (1e307, 5e-324):
+        extreme = replace(posterior(1, np.full((2, 2), value), cycles=10**400), heard_ns=1)
+        head, picture = shown(extreme)
+        assert (head["plot"]["mean"], list(picture)) == ([0.5, 0.5], [255] * 4)
