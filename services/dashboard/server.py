@@ -5,12 +5,11 @@ import contextlib
 import logging
 import os
 import socket
-import tempfile
 from collections.abc import Iterator
 from typing import Final, cast
 
 # the framework would look for stored settings below the current folder; the page stores nothing
-os.environ.setdefault("NICEGUI_STORAGE_PATH", os.path.join(tempfile.gettempdir(), "rosbayes-dashboard-none"))  # noqa: PTH118
+os.environ.setdefault("NICEGUI_STORAGE_PATH", os.devnull)
 
 import uvicorn
 
