@@ -40,7 +40,7 @@ the posterior's own width.
 FOLLOW: Final = f"""
     window.paints = [];
     const now = () => performance.timeOrigin + performance.now();
-    document.addEventListener('pointerup', () => {{ window.dropped = now(); }}, true);
+    document.addEventListener('pointermove', ({{buttons}}) => {{ if (buttons) window.moved = now(); }}, true);
     const follow = canvas => new MutationObserver(() => {{
         const {{meanX, meanY}} = canvas.dataset;
         window.paints.push({{number: {NUMBER}, at: now(), x: Number(meanX), y: Number(meanY)}});
@@ -51,7 +51,7 @@ FOLLOW: Final = f"""
         if (canvas && canvas !== window.followed) follow(window.followed = canvas);
     }}).observe(document, {{childList: true, subtree: true}});
 """
-"""Script of each page: keeps the frames that were painted, with time and mean, and when the boat was dropped."""
+"""Script of each page: keeps the frames that were painted, with time and mean, and when the boat was last moved."""
 
 Place = tuple[float, float]
 Each = Callable[[Place], Awaitable[None]]
@@ -130,7 +130,7 @@ class Visit:
         return box["x"] + float(data[0]), box["y"] + float(data[1])
 
     async def drag(self, to: Place, steps: int = 5, each: Each | None = None) -> float:
-        """Move the boat with the mouse, and return when it was dropped, in milliseconds of the browser's clock.
+        """Move the boat with the mouse, and return when it reached its place, in milliseconds of the browser's clock.
 
         Args:
             to: Place as shares of the canvas's width and height.
@@ -148,14 +148,14 @@ class Visit:
             if each is not None:
                 await each(at)
         await mouse.up()
-        return float(await self.page.evaluate("window.dropped"))
+        return float(await self.page.evaluate("window.moved"))
 
     async def mean_near(self, to: Place) -> float:
-        """Wait until a posterior was painted after the drop with its mean near; return when, in the browser's clock."""
+        """Wait until a posterior was painted after that with its mean near; return when, in the browser's clock."""
         found = await self.until(
             """([x, y, near]) => {
                 const {clientWidth, clientHeight} = document.querySelector('[data-testid=posterior]');
-                return window.paints.find(paint => paint.at > window.dropped && near * clientWidth
+                return window.paints.find(paint => paint.at > window.moved && near * clientWidth
                     > Math.hypot(paint.x - x * clientWidth, paint.y - y * clientHeight))?.at;
             }""",
             [*to, NEAR],
