@@ -312,7 +312,7 @@ async def draw(scene: Scene) -> None:
     frames: list[Image.Image] = []
 
     async def take(pointer: Place) -> None:
-        await visit.frame_above(await visit.frame())
+        await visit.frame_above(await visit.frame() + 1)  # the first may be that of an earlier place
         picture = await visit.picture()
         arrow = [(pointer[0] + x, pointer[1] + y) for x, y in POINTER]  # browsers draw no pointer on pictures
         ImageDraw.Draw(picture).polygon(arrow, fill="white", outline="black")
