@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, Final, Literal, NoReturn
 
 from bridge.client import Publication, Ros, State
-from bridge.errors import DisconnectedError, SlowPeerError
+from bridge.errors import DisconnectedError, SlowPeerError, TypeConflictError
 from machines.kind import Inference
 from posteriors.frame_report import FRAME_TYPE
 from posteriors.standard_messages import (
@@ -88,7 +88,11 @@ class StandardTopics:
         self._ros, self._ros_version = ros, ros_version
         for key in self._chosen():
             topic, type_name = _TYPES[key]
-            self._publications[key] = await ros.advertise(topic, type_name, queue_size=1)
+            try:
+                self._publications[key] = await ros.advertise(topic, type_name, queue_size=1)
+            except TypeConflictError:
+                self._log.info(f"{topic} is not published for robot tools: the results have this topic")
+                continue
             self.advertised.append(AdvertisedTopic(ros, uri, topic, type_name, key))
 
     def _chosen(self) -> Iterator[str]:

@@ -179,6 +179,18 @@ async def test_cells_that_are_not_square_are_no_grid_but_a_pose(boat, capfd):
     assert "/bm/posterior is not published: its cells would not be square" in capfd.readouterr().err
 
 
+async def test_results_may_have_the_name_of_such_a_topic(boat, capfd):
+    outputs = [boat.outputs[0].replace(topic="/bm/posterior")]
+    async with FakeRosbridge() as fake:
+        async with topics_of(boat.model_copy(update={"outputs": outputs}), fake) as topics:
+            assert topics.publish_now(result(boat, 1)).outcome is Outcome.PUBLISHED
+            await fake.wait_for_op("publish", topic="/diagnostics")
+        (posterior,) = fake.ops("publish", topic="/bm/posterior")
+        assert len(posterior["msg"]["data"]) == 64
+        assert "/bm/pose" in published(fake)
+    assert "/bm/posterior is not published for robot tools" in capfd.readouterr().err
+
+
 async def test_the_health_is_that_of_boards_and_services(boat, monkeypatch, tmp_path):
     app = ProcessStatus(
         ready=False,
