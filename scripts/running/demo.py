@@ -120,6 +120,7 @@ async def demo(arguments: argparse.Namespace) -> int:
             await install_dashboard(out / "installation.log")
             await processes["dashboard"].start("dashboard", "--uri", uri, "-d", str(deployment))
             address = await processes["dashboard"].line(r"http://\S+")
+            saying.cancel()
             screen.show(f"open {address[0]} in a browser; on the page, drag the boat")
         await master.succeed()
         screen.waits_for = "drawing the pictures"
