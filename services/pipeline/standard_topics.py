@@ -182,13 +182,17 @@ class StandardTopics:
 
     async def keep_reporting(self) -> NoReturn:
         """Publish the health of boards and services once a second."""
-        directory = self._settings.run_directory
+        await self._ask_stack()
         while True:
-            if directory is not None and "diagnostics" in self._publications:
-                self._stack = await ask_stack(directory)
             if self._ros is not None and self._ros.state is State.CONNECTED:
                 self._publish("diagnostics", self._health)
-            await asyncio.sleep(_HEALTH_INTERVAL)
+            # a silent process takes a second, by which the next message must not be late
+            await asyncio.gather(asyncio.sleep(_HEALTH_INTERVAL), self._ask_stack())
+
+    async def _ask_stack(self) -> None:
+        directory = self._settings.run_directory
+        if directory is not None and "diagnostics" in self._publications:
+            self._stack = await ask_stack(directory)
 
     def _health(self) -> dict[str, Any]:
         boards = list(self._boards())

@@ -238,6 +238,26 @@ async def test_the_health_is_that_of_boards_and_services(boat, monkeypatch, tmp_
             assert (changed["level"], changed["message"]) == (0, boat.machine.kind.reasons[REASON])
 
 
+async def test_a_silent_process_does_not_delay_the_next_health(boat, monkeypatch, tmp_path):
+    asked = []
+
+    async def ask(directory):
+        asked.append(directory)
+        return StackStatus(directory="", ready=False, why=[], processes=[], silent=[])
+
+    monkeypatch.setattr(standard_topics, "ask_stack", ask)
+    monkeypatch.setattr(standard_topics, "_HEALTH_INTERVAL", 600.0)
+    async with FakeRosbridge() as fake:
+        topics = ResultTopics(Settings(uri=fake.uri, run_directory=tmp_path), boat)
+        async with topics.opened():
+            reporting = asyncio.create_task(topics.standard.keep_reporting())
+            # for the next message, while that one waits for its turn
+            await until(lambda: len(asked) == 2)
+            reporting.cancel()
+            await asyncio.wait([reporting])
+            assert len(fake.ops("publish", topic="/diagnostics")) <= 1
+
+
 async def test_replicas_have_decisions_and_no_grid(boat):
     machine = boat.machine.replace(replicas=2)
     deployment = boat.model_copy(update={"machine": machine})
