@@ -47,6 +47,7 @@ _SAMPLES_EVERY_MS: Final = 500
 _SAMPLES: Final = 8
 """Number of samples that are shown."""
 _MAX_LANDMARKS: Final = 100
+_MAX_SWITCHES: Final = 100
 _MAX_NAME: Final = 100
 _MAX_WARNINGS: Final = 20
 """Maximum number of unreadable messages that are reported, each with another reason: there may be thousands a second."""
@@ -196,7 +197,7 @@ class Robot:
         """Ask which services and topics of the world exist, again and again, because a simulator may come later."""
         while True:
             if (names := await ros.services()) is not None:
-                found = sorted(each for each in names if _is_switch(each))
+                found = sorted(each for each in names if _is_switch(each))[:_MAX_SWITCHES]
                 self.switches = {name: self.switches.get(name, True) for name in found}
             if (topics := await ros.topics()) is not None:
                 self.can_set_pose = SET_POSE_TOPIC in topics

@@ -165,6 +165,13 @@ async def refused(url, **more):
     return caught.value.response.status_code
 
 
+def wait_as_a_page_without_websocket(port):
+    engine = "/_nicegui_ws/socket.io/?EIO=4&transport=polling"
+    sid = json.loads(fetch(port, engine)[1].lstrip("0"))["sid"]
+    with contextlib.suppress(http.client.HTTPException, OSError):
+        fetch(port, f"{engine}&sid={sid}")
+
+
 class Browser:
     """A plain WebSocket in a browser's place."""
 
@@ -273,8 +280,13 @@ async def test_a_page_from_the_first_result_to_the_last(stage):
             await publish(ros, results, reports, [9])
             await browser.next("frame", lambda head: head["number"] == 9)
 
+        # a page without a WebSocket waits for its next events
+        polling = asyncio.create_task(asyncio.to_thread(wait_as_a_page_without_websocket, port))
+        for _ in range(2):  # it waits by then
+            await browser.next("stats", lambda head: head["connected"])
         dashboard.send(signal.SIGTERM)
         assert await dashboard.end() == 143
+        await polling
     assert "Traceback" not in dashboard.err
 
 
