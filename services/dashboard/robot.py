@@ -20,7 +20,7 @@ from bridge.errors import BridgeError, NotRosbridgeError, TopicLeftOutError, Unr
 from bridge.stamps import header
 from posteriors.errors import BadResultError
 from posteriors.listening import posteriors
-from posteriors.posterior import MAX_RESULT, SAMPLES_TOPIC, SAMPLES_TYPE
+from posteriors.posterior import MAX_RESULT, SAMPLES_TOPIC, SAMPLES_TYPE, Posterior
 from services.dashboard.feed import Feed, Frame
 from services.output.axes import Axis, deployment_axes
 from services.settings import Settings
@@ -175,13 +175,17 @@ class Robot:
         self._feed.changed()
 
     async def _follow_frames(self, ros: Ros) -> None:
-        async with posteriors(
-            ros, topic=self._topic, deployment=self._only, queue_size=_QUEUE_SIZE
-        ) as frames:
+        # all reports are read, because a posterior is known by its report
+        async with posteriors(ros, topic=self._topic, queue_size=_QUEUE_SIZE) as frames:
             counted = 0
             while True:
                 try:
-                    self._feed.add(await frames.next_frame(None), time.monotonic())
+                    frame = await frames.next_frame(None)
+                    report = frame.report if isinstance(frame, Posterior) else frame
+                    if report is not None and self._only not in {None, report.deployment}:
+                        self._feed.add_loss("of another deployment")
+                    else:
+                        self._feed.add(frame, time.monotonic())
                 except BadResultError as error:
                     self._feed.add_loss("unreadable message")
                     if len(self._warned) < _MAX_WARNINGS and (why := str(error)) not in self._warned:

@@ -32,6 +32,7 @@ from tests.command_runner import invoke
 from tests.integration.conftest import stage as stage  # noqa: PLC0414  # a fixture
 from tests.patience import PROCESS_PATIENCE
 from tests.posteriors.messages import posterior_message
+from tests.services.dashboard.frames import posterior, report
 
 PROJECT = Path(__file__).parents[3] / "pyproject.toml"
 FOLDER = PROJECT.parent / "services" / "dashboard"
@@ -140,6 +141,32 @@ async def test_each_reason_of_unreadable_messages_is_reported_once(monkeypatch, 
     said = capsys.readouterr().err.splitlines()
     assert (len(said), len(set(said))) == (20, 20)
     assert feed.lost == {"unreadable message": 300}
+
+
+async def test_frames_of_another_deployment_are_not_shown(monkeypatch, boat):
+    there = [
+        posterior(1, deployment="boat"),
+        posterior(2, deployment="garden"),
+        report(3, deployment="garden"),
+    ]
+
+    class Frames:
+        announced_only = lost = 0
+
+        async def next_frame(self, _timeout):
+            if not there:
+                raise DisconnectedError("it is closed")
+            return there.pop()
+
+    monkeypatch.setattr(
+        "services.dashboard.robot.posteriors", lambda *_, **__: contextlib.nullcontext(Frames())
+    )
+    feed = Feed()
+    robot = Robot(feed, Settings(), boat, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
+    with pytest.raises(DisconnectedError):
+        await robot._follow_frames(None)
+    assert [each.report.number for each in feed.frames] == [1]
+    assert feed.lost == {"of another deployment": 2}
 
 
 def test_every_file_of_the_page_is_in_the_package():
