@@ -109,6 +109,14 @@ class Visit:
         """Wait until a later frame is shown, and return its number."""
         return int(await self.until(f"number => {NUMBER} > number && {NUMBER}", number))
 
+    async def pause(self, *, state: bool = True, key: str = "") -> None:
+        """Pause or go on, by the mouse or by a key on the button, and wait until the page says so."""
+        await (self.page.keyboard.press(key) if key else self.part("pause").click())
+        await self.until(
+            "state => document.querySelector('[data-testid=age]').innerText.includes('paused') === state",
+            state,
+        )
+
     async def picture(self, name: str = "") -> Image.Image:
         """Return a picture of the page, or of the element with a test id."""
         from PIL import Image
