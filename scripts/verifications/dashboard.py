@@ -169,6 +169,8 @@ async def check_keyboard(scene: Scene) -> None:
             await visit.pause(key=key, state=False)
         else:
             await scene.put(*START)
+            await visit.frame_above(scene.newest)
+            await visit.boat()  # the page, too, has it there, and knows that it can be moved
             await keyboard.press(key)
             await scene.until(lambda: scene.boat[0] < START[0] - 5, "the arrow moved nothing")
 
