@@ -79,6 +79,10 @@ class Doors:
         ours = {f"http://{hosts[0]}", f"https://{hosts[0]}", *self._policy.origins}
         if len(origins) > 1 or not set(origins) <= ours:
             return HTTPStatus.FORBIDDEN
+        # another site's picture or frame sends no origin, and each page costs memory; a link may lead here
+        elsewhere = {"cross-site", "same-site"} & set(headers.get_all("Sec-Fetch-Site"))
+        if not origins and elsewhere and headers.get_all("Sec-Fetch-Dest") != ["document"]:
+            return HTTPStatus.FORBIDDEN
         presented = Headers(headers)
         found = token or _cookie(headers)
         # others are no tokens, and no headers

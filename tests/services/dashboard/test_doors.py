@@ -56,6 +56,21 @@ async def test_another_sites_page_gets_nothing(kind, host, origin, status):
     assert (await knock(kind, host=host, origin=origin))[0] == status
 
 
+@pytest.mark.parametrize(
+    ("site", "kind", "status"),
+    [
+        ("cross-site", "image", 403),
+        ("same-site", "iframe", 403),
+        ("cross-site", "document", 200),
+        ("same-origin", "script", 200),
+        ("none", "document", 200),
+    ],
+)
+async def test_another_sites_page_may_link_here_and_no_more(site, kind, status):
+    more = [(b"sec-fetch-site", site), (b"sec-fetch-dest", kind)]
+    assert (await knock(more=more))[0] == status
+
+
 async def test_two_hosts_or_origins_mean_another():
     for name, value in ((b"host", OURS), (b"origin", f"http://{OURS}")):
         assert (await knock(origin=f"http://{OURS}", more=[(name, value)]))[0] == 403
