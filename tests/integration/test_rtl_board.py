@@ -26,7 +26,10 @@ MODEL = """
 def facts(status):
     """Return the parts of a report that concern the machines, without times."""
     return {
-        pair["key"]: pair["value"] for pair in status["values"] if not pair["key"].endswith(("_ns", "_us"))
+        # a reading ends with its age
+        pair["key"]: pair["value"].rpartition(";")[0] if pair["key"].startswith("reading.") else pair["value"]
+        for pair in status["values"]
+        if not pair["key"].endswith(("_ns", "_us"))
     }
 
 
