@@ -43,7 +43,7 @@ _WRITE_BUFFER: Final = 64 * 1024
 _SEND_BUFFER: Final = 256 * 1024
 # One client's share of a turn: what is read from it (see `WebSocketTransport`), and the queued messages or fragments
 # that are written to it.
-_TURN_FRAMES: Final = 64
+_TURN_FRAMES: Final = 128
 _TURN_BYTES: Final = 64 * 1024
 _SLICE_BYTES: Final = 4 * 1024
 _TURN_MESSAGES: Final = 32
