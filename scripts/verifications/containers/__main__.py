@@ -102,9 +102,10 @@ def check_confined(stack: Stack) -> None:
         expect(host["ReadonlyRootfs"], f"{name} may write to its root")
         expect(host["Memory"] > 0 and host["PidsLimit"] > 0, f"{name} has no limits")
         ports = host["PortBindings"]
-        expect(not ports or name == "hub", f"{name} publishes {ports}")
-    published = stack.docker("port", stack.container("hub")).strip()
-    expect(published == "9090/tcp -> 127.0.0.1:9090", f"the hub is published at {published}")
+        expect(not ports or name in {"hub", "dashboard"}, f"{name} publishes {ports}")
+    for name, port in (("hub", 9090), ("dashboard", 8080)):
+        published = stack.docker("port", stack.container(name)).strip()
+        expect(published == f"{port}/tcp -> 127.0.0.1:{port}", f"{name} is published at {published}")
     out = "import socket\ntry: socket.create_connection(('172.17.0.1', 2375), 2)\nexcept OSError as e: print(e.errno)"
     for service in ("pcie-app", "subscriber", "boards", "boat-simulator"):
         inside = ("exec", stack.container(service))
@@ -210,7 +211,7 @@ def check_robot(stack: Stack) -> None:
         "BM_BOARDS": ",".join(f"tcp://host.docker.internal:{port}" for port in ports),
     }
     with robot(stack), containers(stack, boards), stack.cleared(**variables):
-        stack.up((*CORE, "viewer"))
+        stack.up((*CORE, "viewer", "dashboard"))
         stack.bits(3, f"ws://127.0.0.1:{ROBOT_PORT}", "host")
 
 
@@ -263,7 +264,10 @@ def check_own_model(stack: Stack) -> None:
     program = f"{stack.project}/models/mine/robot.py:/robot.py:ro"
     with stack.cleared(DEPLOYMENT=MINE):
         stack.compose("up", "--detach")
-        expect(set(stack.states()) == {*CORE, "boards", "hub", "viewer"}, f"it runs {[*stack.states()]}")
+        expect(
+            set(stack.states()) == {*CORE, "boards", "hub", "viewer", "dashboard"},
+            f"it runs {[*stack.states()]}",
+        )
         with containers(stack, {"my-robot": ["python", "/robot.py"]}, "--volume", program):
             runs(boards=1)
             drawn = stack.compose("exec", "--no-TTY", "viewer", "listen", "--plot", "--count", "1")
