@@ -280,7 +280,7 @@ def main() -> int:
     parser.add_argument(
         "--chain-sweeps",
         type=int,
-        default=20_000_000,
+        default=80_000_000,
         help="samples of all of many chains, fewer if they are long",
     )
     parser.add_argument("--seconds", type=float, default=3.0, help="limit of each run of pyAgrum's sampler")
