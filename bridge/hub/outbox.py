@@ -188,7 +188,7 @@ class Outbox:
         return None
 
     def accepts(self, lane: Lane, now: float) -> bool:
-        """Return whether `offer` would keep a message, which is then worth encoding; without a throttle it always does."""
+        """Return whether `offer` would keep a message, which is then worth encoding."""
         return not lane.throttle or bool(lane.queue_length) or (now >= lane.next_time and not lane.held)
 
     def release(self, now: float) -> None:

@@ -53,7 +53,7 @@ def normalise(raw: tuple[float | None, ...]) -> tuple[int | None, ...]:
 async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) -> None:
     """Normalise messages until cancelled; a BridgeError if no server answers at the URI.
 
-    A message with anything else than finite numbers is dropped, and each cause is reported once. A missing reading stays
+    A message with anything but finite numbers is dropped, and each cause is reported once. A missing reading stays
     missing.
     """
     from bridge.client import connect

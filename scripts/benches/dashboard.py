@@ -48,7 +48,7 @@ WARM_UP_TURNS: Final = 5
 PARTS: Final = ("cycle", "drag", "display")
 
 Rows = list[tuple[str, str, str]]
-"""What was measured, the figure, and the aim."""
+"""Rows of the table: quantity, figure and aim."""
 
 
 async def publish(ros: Ros, sent: dict[int, float]) -> None:
@@ -132,24 +132,28 @@ async def memory(visit: Visit, pid: int, minutes: float) -> Rows:
         )
     half = SAMPLES // 2
     return [
-        (f"{name}, after {minutes:g} minutes / half of them", f"{each[-1]:,.1f} / {each[half]:,.1f} = {each[-1] / each[half]:.2f}", "1")
+        (
+            f"{name}, after {minutes:g} minutes / half of them",
+            f"{each[-1]:,.1f} / {each[half]:,.1f} = {each[-1] / each[half]:.2f}",
+            "1",
+        )
         for name, each in taken.items()
-    ]  # fmt: skip
+    ]
 
 
 async def drags(stand: Stand, chromium: Browser, chance: random.Random) -> Rows:
     """Measure the time from the drop until a posterior is painted at the boat, by the browser's clock."""
     async with connect(stand.uri) as ros:
-        await ros.call(
-            "/boat/noise", {"data": False}, timeout=30
-        )  # else an unlucky reading adds that until the next one
+        # an unlucky reading would add the time until the next one
+        await ros.call("/boat/noise", {"data": False}, timeout=30)
     visit = await chromium.open(stand.url)
     times = []
     for number in range(DRAGS):
         goal = (0.5 if number % 2 else 0.25, chance.uniform(0.4, 0.7))  # far from the previous one
         dropped = await visit.drag(goal, steps=1)
         times.append(await visit.mean_near(goal) - dropped)
-    return [("drop of the boat to its posterior: median, longest", f"{statistics.median(times):.0f} ms, {max(times):.0f} ms", "200 ms")]  # fmt: skip
+    figures = f"{statistics.median(times):.0f} ms, {max(times):.0f} ms"
+    return [("drop of the boat to its posterior: median, longest", figures, "200 ms")]
 
 
 async def read(url: str) -> None:

@@ -61,7 +61,7 @@ def dashboard(
         list[str] | None,
         typer.Option(
             metavar="ORIGIN",
-            help="Address under which browsers know the page, if it is not that of this machine, such as https://robot.example; repeat for more.",
+            help="Further address of the page, such as https://robot.example for a proxy; repeat for more.",
         ),
     ] = None,
     insecure: options.Insecure = False,

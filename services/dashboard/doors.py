@@ -1,4 +1,4 @@
-"""Who may use the page: the hosts, origins and tokens of requests, for pages and sockets alike.
+"""Admission of requests by host, origin and token, for pages and sockets alike.
 
     request ──▶ host? ──▶ origin? ──▶ token? ──▶ page, socket
 

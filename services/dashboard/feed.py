@@ -1,4 +1,4 @@
-"""What the page shows: the last frames, the times of their stages, rate and losses.
+"""The state behind the page: the last frames, the times of their stages, rate and losses.
 
     frame outcomes ──▶ Feed ──▶ frames (the last 1000), stage times (a mean a second), rate, losses by reason
 
@@ -60,7 +60,8 @@ class Frame:
 
     def marginal(self, labels: tuple[str, ...]) -> "NDArray[np.float64]":
         """Return the marginal of one or two labels, in that order; it sums to 1, also over replicas."""
-        assert self.values is not None  # noqa: S101 - a caller's mistake
+        if self.values is None:
+            raise ValueError("a frame without a posterior has no marginal")
         places = [self.labels.index(label) for label in labels]
         others = tuple(at for at in range(len(self.labels)) if at not in places)
         summed = self.values.sum(axis=others, dtype=np.float64)

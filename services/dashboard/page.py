@@ -41,7 +41,7 @@ class Live(Element, component="live.js"):
 
 
 class Wish(msgspec.Struct, frozen=True):
-    """What a browser asks for: a place for the boat, or a switch of the world."""
+    """A request from a browser: a new place for the boat, or the setting of a switch."""
 
     pose: tuple[float, float] | None = None
     switch: str = ""
@@ -169,13 +169,14 @@ class Dashboard:
                 next_stats = loop.time() + _STATS_EVERY
                 await room.acquire()
                 await socket.send_bytes(self._statistics())
-            frame = view.frame
-            if frame is None:
+            if view.frame is None:
                 continue
             await room.acquire()
-            # after the wait for room, since then newer ones may have come
+            # looked up again, because newer ones may have come during the wait for room
             frame = view.frame
-            assert frame is not None  # noqa: S101 - frames are not forgotten without newer ones
+            if frame is None:
+                room.release()
+                continue
             axes = self._robot.axes_for(frame)
             now = (frame, view.at, view.labels(frame), axes)
             message = view.message(axes) if now != sent else None
@@ -235,7 +236,7 @@ class Dashboard:
 
 
 def _wish(text: str) -> Wish | None:
-    """Return what a browser asks for; None if it cannot be understood."""
+    """Return the request in a message from a browser; None if the message is not valid."""
     if len(text) > _MAX_INBOUND:
         return None
     try:

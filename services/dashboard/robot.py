@@ -151,21 +151,26 @@ class Robot:
         def take_samples(message: dict[str, Any]) -> None:
             self.samples = read_samples(message)
 
-        async def follow(topic: str, kind: str, take: Callable[[dict[str, Any]], None], **flow: int) -> None:
+        async def follow(
+            topic: str, kind: str, take: Callable[[dict[str, Any]], None], *, every_ms: int = 0
+        ) -> None:
             # the client has warned of a message that is too large; the page does without the topic
             with suppress(TopicLeftOutError):
-                async for message in ros.subscribe(topic, kind, queue_size=1, **flow):  # type: ignore[arg-type]
+                newest = ros.subscribe(
+                    topic, kind, queue_size=1, throttle_rate=every_ms, queue_length=1 if every_ms else 0
+                )
+                async for message in newest:
                     take(message.msg)
 
-        # two messages of samples a second are more than eyes follow
-        slow = {"throttle_rate": _SAMPLES_EVERY_MS, "queue_length": 1}
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(self._follow_frames(ros))
                 tasks.create_task(self._ask_about_world(ros))
                 tasks.create_task(follow(self._truth, POSE_TYPE, take_truth))
                 tasks.create_task(follow(LANDMARKS_TOPIC, LANDMARKS_TYPE, take_landmarks))
-                tasks.create_task(follow(SAMPLES_TOPIC, SAMPLES_TYPE, take_samples, **slow))
+                # more samples than that nobody can read
+                samples = follow(SAMPLES_TOPIC, SAMPLES_TYPE, take_samples, every_ms=_SAMPLES_EVERY_MS)
+                tasks.create_task(samples)
         except ExceptionGroup as failed:  # such as a topic that has two types
             raise failed.exceptions[0] from None
 

@@ -45,6 +45,7 @@ class PageServer:
         self.ready = asyncio.Event()
         self._listener = listener
         application = cast("App", Dashboard(feed, robot).application())
+        tls = policy.tls
         config = uvicorn.Config(
             Doors(application, policy, loopback=loopback),
             log_config=None,
@@ -57,7 +58,7 @@ class PageServer:
             ws_max_size=_MESSAGE_BYTES,
             ws_per_message_deflate=False,  # it would take longer than the loopback's bytes
             timeout_graceful_shutdown=_SHUTDOWN_S,
-            ssl_context_factory=(lambda *_: policy.tls) if policy.tls is not None else None,  # type: ignore[arg-type]
+            ssl_context_factory=(lambda *_: tls) if tls is not None else None,
         )
         self._server = _Server(config)
 

@@ -1,4 +1,4 @@
-"""What one browser looks at: the newest frame or an earlier one, and its marginals, as messages for the page.
+"""The view of one browser: the newest frame or an earlier one, and its marginals, as messages for the page.
 
 A message is binary: the length of its head (4 bytes, little-endian), the head (JSON), and the picture: a byte a
 cell of a heat map, relative to the highest cell, or a little-endian float32 a bar.

@@ -104,7 +104,7 @@ async def test_a_request_names_one_host(hosts):
 
 @pytest.mark.parametrize("origin", ["", "Origin: https://evil.example\r\n"])
 async def test_a_browser_is_told_where_the_page_is_and_nothing_else(origin):
-    """Whoever asks reads the same text, and is no client."""
+    """Every browser gets the same text, and does not become a client."""
     async with running_hub(access=AccessPolicy(tokens=(TOKEN,))) as port:
         raw = await RawClient.connect(port, handshake=False)
         request = f"GET /?token={TOKEN} HTTP/1.1\r\nHost: robot.example:{port}\r\n{origin}\r\n"

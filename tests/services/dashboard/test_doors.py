@@ -1,4 +1,4 @@
-"""Who may open pages and sockets: the same rules for both."""
+"""Admission to pages and sockets: the same rules for both."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What the page keeps: the last frames, five minutes of stage times, rate and losses; the clock is the test's."""
+"""The kept frames, five minutes of stage times, rate and losses, with the test's own clock."""
 
 import pytest
 

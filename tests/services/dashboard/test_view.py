@@ -1,4 +1,4 @@
-"""What one browser gets: pictures, marginals, pauses and steps, and files of the kept frames."""
+"""The messages for one browser: pictures, marginals, pausing and stepping, and files of the kept frames."""
 
 import csv
 import io
