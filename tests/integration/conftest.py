@@ -254,8 +254,11 @@ class Stage:
 class Robot:
     """A rosbridge client of plain websockets and json; publishes readings and collects results."""
 
-    def __init__(self, uri):
+    def __init__(self, uri, topics=()):
         self.uri = uri
+        self.topics = dict(topics)
+        """Other topics that it hears, and their types."""
+        self.heard = {topic: [] for topic in self.topics}
         self.results = []
         self.frames = []
         self.order = []
@@ -280,6 +283,7 @@ class Robot:
         for topic, type_ in (
             ("/BMresults", "std_msgs/Float64MultiArray"),
             ("/bm/frame", "diagnostic_msgs/DiagnosticArray"),
+            *self.topics.items(),
         ):
             await self._socket.send(json.dumps({"op": "subscribe", "topic": topic, "type": type_}))
         await self._socket.send(
@@ -307,7 +311,9 @@ class Robot:
         with contextlib.suppress(websockets.ConnectionClosed):
             async for text in socket:
                 message = json.loads(text)
-                if message.get("op") == "publish":
+                if message.get("topic") in self.heard:
+                    self.heard[message["topic"]].append(message["msg"])
+                elif message.get("op") == "publish":
                     self.order.append(message["topic"])
                     if message["topic"] == "/bm/frame":
                         self._report = message["msg"]

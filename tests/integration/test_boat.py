@@ -12,6 +12,7 @@ import pytest
 
 from casestudies.boat.model import model as boat_model
 from casestudies.boat.sensors import SENSOR_NAMES, map_grid
+from machines.posterior import joint_posterior
 from tests.casestudies.cells import line_at
 from tests.casestudies.figures import coverage, distances, means
 from tests.integration.conftest import (
@@ -25,6 +26,7 @@ from tests.integration.conftest import (
     until_rosapi,
     until_subscribed,
 )
+from tests.integration.roslibpy_listener import FOR_TOOLS
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
 from toolchain.models.model import exact_posterior
@@ -91,6 +93,29 @@ def values_of(report):
     return {pair["key"]: pair["value"] for pair in report["status"][0]["values"]}
 
 
+def assert_same_posterior(frame, result, grid, pose, decision, ros_version):
+    """The topics for robot tools have the posterior of a result, and the stamp of its report."""
+    posterior = np.array(result["data"])
+    for each in grid, pose, decision:
+        assert each["header"]["stamp"] == frame["header"]["stamp"]
+    assert ("secs" in grid["header"]["stamp"]) == (ros_version == "1")
+    assert grid["data"] == np.rint(98 * posterior / posterior.max()).tolist()
+    assert (grid["info"]["width"], grid["info"]["height"], grid["info"]["resolution"]) == (8, 8, 12.5)
+    assert grid["info"]["origin"]["position"] == {"x": -50, "y": -50, "z": 0}
+    centres = np.arange(-43.75, 50, 12.5)
+    for axis, along in (("x", 0), ("y", 1)):
+        shares = posterior.reshape(8, 8).sum(axis=along)
+        mean = shares @ centres
+        assert pose["pose"]["pose"]["position"][axis] == pytest.approx(mean)
+        assert pose["pose"]["covariance"][7 * along] == pytest.approx(shares @ (centres - mean) ** 2)
+    y, x = np.unravel_index(posterior.argmax(), (8, 8))
+    decided = values_of(decision)
+    assert (decided["value.y"], decided["value.x"]) == (f"{centres[y]:g}", f"{centres[x]:g}")
+    assert decided["valid"] == "true"
+    assert float(decided["probability"]) == pytest.approx(posterior.max(), 1e-5)
+    assert decided["number"] == values_of(frame)["number"]
+
+
 @pytest.mark.process
 @pytest.mark.parametrize("ros_version", ["1", "2"])
 async def test_roslibpy_as_the_robot(stage, boat, tmp_path, ros_version):
@@ -109,27 +134,55 @@ async def test_roslibpy_as_the_robot(stage, boat, tmp_path, ros_version):
     assert {name: report[f"reading.{name}"].rsplit(";", 1)[0] for name in READING} == {
         name: f"{value};{value}" for name, value in READING.items()
     }
-    # the same posterior on the topics for robot tools
-    posterior = np.array(result["data"])
-    grid, pose = messages["/bm/posterior"][0], messages["/bm/pose"][0]
-    assert grid["header"]["stamp"] == frame["header"]["stamp"]
-    assert ("secs" in grid["header"]["stamp"]) == (ros_version == "1")
-    assert grid["data"] == np.rint(98 * posterior / posterior.max()).tolist()
-    assert (grid["info"]["width"], grid["info"]["height"], grid["info"]["resolution"]) == (8, 8, 12.5)
-    assert grid["info"]["origin"]["position"] == {"x": -50, "y": -50, "z": 0}
-    centres = np.arange(-43.75, 50, 12.5)
-    assert pose["pose"]["pose"]["position"]["x"] == pytest.approx(
-        posterior.reshape(8, 8).sum(axis=0) @ centres
-    )
+    grid, pose, decision = (messages[topic][0] for topic in ("/bm/posterior", "/bm/pose", "/bm/decision"))
+    assert_same_posterior(frame, result, grid, pose, decision, ros_version)
     (counts,) = messages["/bm/counts"]
     assert (len(counts["data"]), counts["layout"]["dim"][0]["size"]) == (64, 4)
-    decision = values_of(messages["/bm/decision"][0])
-    assert (decision["valid"], float(decision["probability"])) == (
-        "true",
-        pytest.approx(posterior.max(), 1e-5),
-    )
     names = {each["name"] for each in messages["/diagnostics"][-1]["status"]}
     assert {"rosbayes: board 3", "rosbayes: publisher", "rosbayes: pcie-app"} <= names
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("ros_version", ["1", "2"])
+async def test_robot_tools_hear_what_separate_services_computed(stage, boat, ros_version):
+    """robot -> hub -> subscriber -> master -> pcie-app -> 4 boards; master -> publisher -> hub -> robot"""
+    _, uri = await stage.hub(ros_version=ros_version)
+    services = {"master", "subscriber", "pcie-app", "publisher"}
+    async with Robot(uri, FOR_TOOLS) as robot:
+        await robot.keep_publishing()
+        run = {"BM_RUN_DIRECTORY": str(stage.runs)}
+        stage.start("master", "--loop", "-d", str(boat), "--uri", uri, environment=run)
+
+        def by_stamp(topic):
+            return {stamp_of(each): each for each in robot.heard[topic]}
+
+        def same_frame():
+            """A result with its report, grid, pose, decision and counts."""
+            parts = [by_stamp(topic) for topic in ("/bm/posterior", "/bm/pose", "/bm/decision")]
+            for frame, result in robot.paired:
+                cycles = [int(values_of({"status": [each]})["cycles"]) for each in frame["status"][1:]]
+                for counts in robot.heard["/bm/counts"]:  # they have no stamp
+                    rows = np.array(counts["data"], np.uint32).reshape(4, 16)
+                    is_of_result = np.allclose(joint_posterior([*rows], cycles), result["data"], rtol=1e-12)
+                    if is_of_result and all(stamp_of(frame) in each for each in parts):
+                        return frame, result, *(each[stamp_of(frame)] for each in parts)
+            return None
+
+        def healthy():
+            """The statuses by name, once all are well."""
+            levels = [
+                {each["name"].removeprefix("rosbayes: "): each for each in health["status"]}
+                for health in robot.heard["/diagnostics"]
+                if not any(each["level"] for each in health["status"])
+            ]
+            return next((each for each in levels if services <= set(each)), None)
+
+        assert_same_posterior(*await until(same_frame), ros_version)
+        statuses = await until(healthy, lambda: f"{robot.heard['/diagnostics'][-1:]}")
+        assert set(statuses) == services | {f"board {at}" for at in range(4)}
+        pids = {name: values_of({"status": [statuses[name]]})["pid"] for name in services}
+        processes = stage.processes()
+        assert pids == {name: str(processes[name][0].pid) for name in services}
 
 
 def reading_of(values, name):
