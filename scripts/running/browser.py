@@ -242,10 +242,11 @@ class Stand:
         os.kill(self.pid(name), signal.SIGKILL)
         await self._processes[name].wait()
 
-    async def start_hub(self) -> None:
+    async def start_hub(self, ros_version: str = "1") -> None:
         """Start the hub on a free port, on which it will also start again."""
-        self.uri = await self.start("hub", r"ws://\S+", "hub", "--port", "0")
-        self._commands["hub"] = ("hub", "--port", str(urlsplit(self.uri).port))
+        command = ("hub", "--ros-version", ros_version, "--port")
+        self.uri = await self.start("hub", r"ws://\S+", *command, "0")
+        self._commands["hub"] = (*command, str(urlsplit(self.uri).port))
         self._where = ("--uri", self.uri, "--run-directory", str(self._folder / "run"))
 
     async def start_master(self) -> None:

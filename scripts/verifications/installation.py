@@ -18,7 +18,6 @@ from services.errors import SettingsError
 
 HERE: Final = Path(__file__).resolve().parent
 ROSLIBPY: Final = HERE / "conformance" / "roslibpy.lock"
-ROSLIB: Final = (HERE / "conformance" / "package.json", HERE / "conformance" / "package-lock.json")
 OLDEST_NODE: Final = 20
 LIMIT: Final = 600.0
 """Time limit of one installer, in seconds."""
@@ -109,8 +108,8 @@ def install_roslibpy() -> Path:
     return cached("roslibpy", (ROSLIBPY,), make)
 
 
-def install_roslib() -> Path:
-    """Return the path of roslib's module, after installing it once.
+def install_node_packages(name: str, folder: Path) -> Path:
+    """Return the `node_modules` of a folder's package-lock.json, after installing them once.
 
     Raises:
         SettingsError: Node is missing or too old.
@@ -119,28 +118,33 @@ def install_roslib() -> Path:
     version = subprocess.run([node, "-v"], capture_output=True, text=True, check=True).stdout if node else ""
     if npm is None or int(re.sub(r"\D*(\d*).*\n?", r"\1", version) or 0) < OLDEST_NODE:
         raise SettingsError(
-            f"roslib needs npm and Node {OLDEST_NODE} or later, and Node is {version.strip() or 'absent'}; "
+            f"{name} needs npm and Node {OLDEST_NODE} or later, and Node is {version.strip() or 'absent'}; "
             "install them (Debian: apt-get install nodejs npm)"
         )
+    locks = (folder / "package.json", folder / "package-lock.json")
 
     def make(folder: Path) -> None:
-        for lock in ROSLIB:
+        for lock in locks:
             shutil.copy(lock, folder)
         run(str(npm), "ci", "--ignore-scripts", "--no-audit", "--no-fund", cwd=folder)
 
-    return cached("roslib", ROSLIB, make) / "node_modules" / "roslib" / "dist" / "RosLib.js"
+    return cached(name, locks, make) / "node_modules"
 
 
 def install_programs(packages: Mapping[str, str]) -> None:
     """Install the Debian packages of missing programs.
 
     Args:
-        packages: The package of each program.
+        packages: The package of each program, or of each path.
 
     Raises:
         SettingsError: This is not Debian, the user may not install packages, or apt-get failed.
     """
-    absent = [program for program in packages if shutil.which(program) is None]
+
+    def absent_ones() -> list[str]:
+        return [each for each in packages if shutil.which(each) is None and not Path("/", each).exists()]
+
+    absent = absent_ones()
     if not absent:
         return
     names = sorted({packages[program] for program in absent})
@@ -150,5 +154,5 @@ def install_programs(packages: Mapping[str, str]) -> None:
     print(f"installing {' '.join(names)} (once) ...", flush=True)
     run("apt-get", "update", "-qq")
     run("apt-get", "install", "-qq", "-y", "--no-install-recommends", *names)
-    if any(shutil.which(program) is None for program in absent):
+    if absent_ones():
         raise SettingsError(wanted)

@@ -22,7 +22,7 @@ from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR
 from scripts.running.processes import Process, run_script
 from scripts.verifications.checks import Tally
-from scripts.verifications.installation import install_roslib, install_roslibpy
+from scripts.verifications.installation import install_node_packages, install_roslibpy
 
 NODE_SCRIPT: Final = Path(__file__).with_name("roslib.mjs")
 LIMIT: Final = 240 * FACTOR
@@ -97,7 +97,7 @@ async def roslibpy(ros_version: str, transport: str, folder: Path) -> str | None
 
 async def roslib(ros_version: str, folder: Path) -> str | None:
     """Run the checks of roslib.mjs, and return what failed, or None."""
-    module = install_roslib()
+    module = install_node_packages("roslib", NODE_SCRIPT.parent) / "roslib" / "dist" / "RosLib.js"
     async with hub_of(ros_version, folder) as port:
         uri = f"ws://127.0.0.1:{port}"
         return await failure_of("node", str(NODE_SCRIPT), str(module), uri, ros_version, folder=folder)

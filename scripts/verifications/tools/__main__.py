@@ -1,0 +1,243 @@
+"""Verification of the topics for robot tools with tools of others: Foxglove's readers and rviz (see scripts/verify).
+
+boat-simulator --> boat-normaliser --> hub <--> master with 4 boards
+                                        |--JSON, cbor-raw--> Foxglove's client and readers, on Node (foxglove.mjs)
+                                        `--cbor-raw--> this --> a node of ROS 1 (ros_node.py) --> rviz on Xvfb
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import math
+import os
+import socket
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from bridge.client import connect
+from bridge.codecs.serialised import MessageTypes
+from bridge.errors import BridgeError
+from bridge.stamps import header, header_stamp_ns
+from casestudies.boat.sensors import SET_POSE_TOPIC, TRUE_POSE_TYPE, true_pose
+from posteriors.standard_messages import Level
+from scripts.running.browser import PATIENCE, Place, Stand
+from scripts.running.flags import ScriptParser
+from scripts.running.patience import FACTOR, PRODUCT_LIMITS
+from scripts.running.processes import ROOT, run_script
+from scripts.verifications.checks import CheckError, Tally
+from scripts.verifications.installation import install_node_packages, install_programs
+from services.errors import StackError
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+HERE: Final = Path(__file__).parent
+PICTURES: Final = ROOT / "docs" / "pictures"
+LIMIT: Final = 900.0 * FACTOR
+"""Time limit of the verification, in seconds."""
+MODULES: Final = "/usr/lib/python3/dist-packages"
+PROGRAMS: Final = {
+    "rviz": "rviz",
+    "Xvfb": "xvfb",
+    "rosmaster": "python3-rosmaster",
+    f"{MODULES}/rospy": "python3-rospy",
+    f"{MODULES}/geometry_msgs": "python3-geometry-msgs",
+    f"{MODULES}/nav_msgs": "python3-nav-msgs",
+}
+PLACE: Final[Place] = (15.0, -12.0)
+"""Place in metres where the boat lies on the picture, so that the whole posterior is on the map."""
+NEAR: Final = 12.0
+"""Distance in metres from there to the posterior's mean up to which it has followed."""
+SCALE: Final = 4.0
+"""Pixels a metre in boat.rviz."""
+BACKGROUND: Final = (48, 48, 48)
+FEW: Final = 50
+"""Maximum number of pixels of this colour in a row or column of the rest of the window, such as of text."""
+
+
+class Scene(NamedTuple):
+    """The running stack, and what is to be done with it."""
+
+    stand: Stand
+    ros_version: str
+    folder: Path
+    pictures: bool
+
+
+async def grid_and_pose(stand: Stand) -> dict[str, tuple[str, bytes, dict[str, Any]]]:
+    """Return type, bytes and content of the grid and the pose of one frame, after putting the boat in its place."""
+    types = {"/bm/posterior": "nav_msgs/OccupancyGrid", "/bm/pose": "geometry_msgs/PoseWithCovarianceStamped"}
+    read = MessageTypes(1).read
+    async with asyncio.timeout(2 * PATIENCE), connect(stand.uri, check_types=False) as ros:
+        topics = {name: ros.subscribe(name, type_, compression="cbor-raw") for name, type_ in types.items()}
+        await topics["/bm/pose"].next(timeout=PATIENCE)  # the boat advertises its services first
+        await ros.call("/boat/noise", {"data": False})
+        await (await ros.advertise(SET_POSE_TOPIC, TRUE_POSE_TYPE)).publish(
+            true_pose(*PLACE, header(time.time_ns(), "map"))
+        )
+        found: dict[str, tuple[str, bytes, dict[str, Any]]] = {}
+        stamps = dict.fromkeys(types, 0)
+        while True:
+            behind = min(stamps, key=lambda name: stamps[name])
+            raw = (await topics[behind].next(timeout=PATIENCE)).raw
+            found[behind] = types[behind], raw, (message := read(raw, types[behind]))
+            stamps[behind] = header_stamp_ns(message) or 0
+            if len(set(stamps.values())) == 1:
+                mean = found["/bm/pose"][2]["pose"]["pose"]["position"]
+                if math.dist((mean["x"], mean["y"]), PLACE) < NEAR:
+                    return found
+
+
+async def rviz(scene: Scene) -> None:
+    """Check that rviz shows grid and pose."""
+    from PIL import ImageGrab
+
+    install_programs(PROGRAMS)
+    stand, folder = scene.stand, scene.folder
+    found = await grid_and_pose(stand)
+    messages = folder / "messages"
+    lines = (f"{name} {type_} {base64.b64encode(raw).decode()}\n" for name, (type_, raw, _) in found.items())
+    messages.write_text("".join(lines))
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    screen = ("Xvfb", "-displayfd", "1", "-screen", "0", "800x560x24", "-nolisten", "tcp")
+    display = ":" + await stand.start("Xvfb", r"^\d+$", *screen)
+    variables = {"DISPLAY": display, "ROS_MASTER_URI": f"http://127.0.0.1:{port}", "ROS_IP": "127.0.0.1"}
+    variables |= {"HOME": str(folder), "LIBGL_ALWAYS_SOFTWARE": "1"}
+    ros = ("env", *(f"{name}={value}" for name, value in variables.items()))
+    # it says nothing, and a node waits for it
+    await stand.start("rosmaster", "", *ros, "sh", "-c", f"echo; exec rosmaster --core -p {port}")
+    await stand.start("node", "published", *ros, "/usr/bin/python3", str(HERE / "ros_node.py"), str(messages))
+    await stand.start("rviz", "OGRE", *ros, "rviz", "-d", str(HERE / "boat.rviz"))
+    flaw: str | None = ""
+    try:
+        async with asyncio.timeout(PATIENCE):
+            while flaw is not None:
+                await asyncio.sleep(0.5)
+                picture = ImageGrab.grab(xdisplay=display)
+                flaw = flaw_of(picture, found["/bm/posterior"][2], found["/bm/pose"][2]["pose"])
+    except TimeoutError:
+        raise CheckError(f"rviz shows something else: {flaw}") from None
+    if scene.pictures:
+        picture.quantize().save(PICTURES / "rviz.png", optimize=True)
+
+
+def flaw_of(picture: Image.Image, grid: dict[str, Any], pose: dict[str, Any]) -> str | None:
+    """Return how the picture of rviz's window differs from grid and pose; None if it shows them."""
+    pixels = np.asarray(picture.convert("RGB"), int)
+    grey = (pixels == BACKGROUND).all(axis=2)
+    down, across = (np.flatnonzero(grey.sum(axis=axis) > FEW) for axis in (1, 0))
+    if not (down.size and across.size):
+        return "no background"
+    scene = pixels[down[0] : down[-1] + 1, across[0] : across[-1] + 1]
+    painted = (scene != BACKGROUND).any(axis=2)
+    cells = np.count_nonzero(grid["data"]) * (SCALE * grid["info"]["resolution"]) ** 2
+    if not 0.85 < painted.sum() / cells < 1.15:
+        return f"{painted.sum()} pixels are painted, and the grid has {cells:.0f}"
+    red, green, blue = np.moveaxis(scene, 2, 0)
+    if not ((red > 200) & (blue < 100)).any() or not ((blue > 200) & (red < 50)).any():
+        return "the colours of probable and of improbable cells are not both there"
+    rows, columns = np.nonzero(painted & (green > 8) & (green < 70))  # the grid has no green, axes have more
+    (xx, xy), (_, yy) = np.reshape(pose["covariance"], (6, 6))[:2, :2]
+    area = math.pi * math.sqrt(xx * yy - xy**2) * SCALE**2
+    if not 0.75 < len(rows) / area < 1.25:
+        return f"the ellipse has {len(rows)} pixels instead of {area:.0f}"
+    height, width = painted.shape
+    place = (columns.mean() - width / 2) / SCALE, (height / 2 - rows.mean()) / SCALE
+    wanted = pose["pose"]["position"]["x"], pose["pose"]["position"]["y"]
+    if math.dist(place, wanted) > 1.5:
+        return f"the ellipse is at {place[0]:.1f}, {place[1]:.1f} instead of {wanted[0]:.1f}, {wanted[1]:.1f}"
+    return None
+
+
+def draw(last: dict[str, Any]) -> None:
+    """Draw the decoded topics that rviz does not show."""
+    from matplotlib.figure import Figure
+
+    counts = last["/bm/counts"]
+    rows = np.reshape(counts["data"], (counts["layout"]["dim"][0]["size"], -1))
+    figure = Figure((8, 4), layout="constrained")
+    for board, axes in enumerate(figure.subplots(len(rows), sharex=True, sharey=True)):
+        axes.bar(range(rows.shape[1]), rows[board], width=1)
+        axes.set_ylabel(f"board {board}")
+    figure.supxlabel("count")
+    figure.savefig(PICTURES / "topic-counts.png")
+    lines = [f"{pair['key']:15}{pair['value']}" for pair in last["/bm/decision"]["status"][0]["values"]]
+    health = [
+        f"{each['name']:23}{Level(each['level']).name:8}{each['message']}"
+        for each in last["/diagnostics"]["status"]
+    ]
+    for name, text in (("decision", lines), ("diagnostics", health)):
+        figure = Figure()
+        figure.text(0, 0, "\n".join(text), family="monospace", linespacing=1.6)
+        figure.savefig(PICTURES / f"topic-{name}.png", bbox_inches="tight", pad_inches=0.1)
+
+
+async def foxglove(scene: Scene) -> None:
+    """Check that Foxglove's readers decode each topic, as its application would."""
+    modules, decoded = install_node_packages("foxglove", HERE), scene.folder / "decoded.json"
+    command = (
+        "node",
+        str(HERE / "foxglove.mjs"),
+        str(modules),
+        scene.stand.uri,
+        scene.ros_version,
+        str(decoded),
+    )
+    await scene.stand.start("foxglove", "messages of each", *command)
+    if scene.pictures and scene.ros_version == "1":
+        draw(json.loads(decoded.read_text()))
+
+
+CHECKS: Final = {"1": {"Foxglove's readers": foxglove, "rviz": rviz}, "2": {"Foxglove's readers": foxglove}}
+
+
+async def verify(only: str, *, pictures: bool) -> int:
+    """Run a stack for each version of ROS, and let the tools read its topics."""
+    os.environ |= {name: f"{limit:g}" for name, limit in PRODUCT_LIMITS.items()}
+    tally = Tally()
+    for version, checks in CHECKS.items():
+        chosen = {name: check for tool, check in checks.items() if only in (name := f"{tool}, ROS {version}")}
+        if not chosen:
+            continue
+        with tempfile.TemporaryDirectory(prefix="verify-rosbayes-") as made:
+            scene = Scene(Stand(Path(made) / "stand"), version, Path(made), pictures)
+            try:
+                await scene.stand.start_hub(version)
+                await scene.stand.start_master()
+                await scene.stand.start_boat(10.0)
+                for name, check in chosen.items():
+                    started, why = time.monotonic(), None
+                    try:
+                        await check(scene)
+                    except (CheckError, StackError, BridgeError, TimeoutError) as error:
+                        why = str(error) or type(error).__name__
+                    tally.report(name, started, why, scene.stand.tails() if why else "")
+            finally:
+                await scene.stand.end()
+            name = f"no process has shown a traceback, ROS {version}"
+            tally.report(name, time.monotonic(), scene.stand.traceback())
+    return tally.end()
+
+
+def main() -> int:
+    """Parse the flags and run the checks."""
+    parser = ScriptParser(prog="scripts/verify tools", description=__doc__.splitlines()[0])
+    parser.add_argument("--only", default="", help="checks with this in their names, such as rviz")
+    parser.add_argument(
+        "--pictures", action="store_true", help="also draw docs/pictures/rviz.png and topic-*"
+    )
+    arguments = parser.parse_args()
+    return run_script(lambda: verify(arguments.only, pictures=arguments.pictures), LIMIT)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
