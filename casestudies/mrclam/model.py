@@ -88,6 +88,7 @@ def model(
                 sigma=RANGE_SIGMA,
                 values=range_values,
                 step=range_step,
+                unit="m",
                 floor=floor,
                 on_missing="missing",
             )
@@ -99,6 +100,7 @@ def model(
                 sigma=BEARING_SIGMA,
                 values=bearing_values,
                 step=2 * np.pi / bearing_values,
+                unit="rad",
                 floor=floor,
                 on_missing="missing",
             )

@@ -161,7 +161,7 @@ def _model_hash(plan: MachinePlan | BM2Plan, codes: Sequence[NDArray[Any]]) -> s
     words: dict[str, Any] = {
         "name": model.name,
         "searched": [dimension.model_dump(mode="json") for dimension in model.searched],
-        "known": [variable.model_dump(mode="json") for variable in model.variables],
+        "known": [variable.model_dump(mode="json", exclude={"unit"}) for variable in model.variables],
         "prob_bits": parameters.prob_bits,
     }
     if isinstance(plan, BM2Plan):

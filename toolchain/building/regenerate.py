@@ -230,12 +230,13 @@ def _listed(values: Sequence[object]) -> str:
 def _with_places(new: Deployment, old: Deployment) -> Deployment:
     """Return the new deployment with the servers, topics, paths and endpoints of the old one."""
     before = {variable.name: variable for variable in old.variables}
-    kept = ("sources", "outputs", "queue", "tolerance_s", "prior", "directory")
+    kept = ("sources", "outputs", "topics", "queue", "tolerance_s", "prior", "directory")
     deployment = new.replace(
         **{key: getattr(old, key) for key in kept},
         variables=tuple(
-            variable.replace(source=before[variable.name].source, path=before[variable.name].path)
+            variable.replace(source=own.source, path=own.path, unit=variable.unit or own.unit)
             for variable in new.variables
+            for own in (before[variable.name],)
         ),
         boards=tuple(
             board.replace(endpoint=other.endpoint)

@@ -165,14 +165,15 @@ class Deployment(DeploymentFile):
 def deployment_hash(deployment: DeploymentFile) -> str:
     """Return the SHA-256 (hexadecimal) of the part of a deployment that follows from the model.
 
-    URIs, endpoints and the like are left out: a deployment remains valid for another robot, but not after an
-    edit that contradicts its tables.
+    URIs, endpoints, units of readings and the like are left out: a deployment remains valid for another robot, but
+    not after an edit that contradicts its tables.
     """
     content = deployment.model_dump(
         mode="json",
         exclude={
             "hash": True,
             "sources": {"__all__": {"uri", "compression", "topic_bytes"}},
+            "variables": {"__all__": {"unit"}},
             "boards": {"__all__": {"endpoint"}},
             "outputs": {"__all__": {"uri"}},
             "topics": True,
@@ -220,7 +221,7 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
     if computed != file.hash and not edited:
         raise DamagedDeploymentError(
             f"{path} is not as it was built: its hash is {computed[:16]}, "
-            f"but it names {file.hash[:16] or 'none'}; only URIs, endpoints, compression, topic_bytes and [topics] may be edited: "
+            f"but it names {file.hash[:16] or 'none'}; only URIs, endpoints, compression, topic_bytes, units of variables and [topics] may be edited: "
             "build it again with 'toolchain build', or keep the edit with 'toolchain regenerate deployment'"
         )
     deployment = Deployment(**dict(file), directory=directory)

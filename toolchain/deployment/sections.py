@@ -120,7 +120,7 @@ Choice = Annotated[Item, Field(strict=False)]
 Unit = Annotated[
     str, Field(max_length=NAME_MAX, exclude_if=lambda unit: not unit), AfterValidator(_printable)
 ]
-"""A unit such as m; an empty one is omitted from the file and from its hash."""
+"""A unit such as m; an empty one is omitted from the file."""
 # empty states are omitted from the file and from its hash
 States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda states: not states)]
 
@@ -210,6 +210,7 @@ class Variable(Section):
     bits: int = Field(ge=1, le=16)
     offset: float = 0.0
     step: Step = 1.0
+    unit: Unit = ""
     period: int | None = Field(default=None, ge=1)
     values: int = Field(ge=1)
     on_range: Literal["error", "clamp", "missing"] = "error"

@@ -27,6 +27,7 @@ def normal(
     values: int,
     offset: float = 0.0,
     step: float = 1.0,
+    unit: str = "",
     bits: int = 0,
     floor: float = 0.0,
     outliers: float = 0.0,
@@ -43,6 +44,7 @@ def normal(
         values: The number of bins (addresses).
         offset: The centre of the first bin.
         step: The width of a bin.
+        unit: The unit of the readings, such as m.
         bits: Address bits; 0 for the minimum.
         floor: Added to each bin for outliers, relative to the peak of the bin likelihood.
         outliers: Share of readings that do not depend on S, spread over all bins.
@@ -61,6 +63,7 @@ def normal(
         bits=bits,
         offset=offset,
         step=step,
+        unit=unit,
         on_range=on_range,
         on_missing=on_missing,
         path=path,
@@ -77,6 +80,7 @@ def wrapped_normal(
     values: int,
     offset: float = 0.0,
     step: float = 1.0,
+    unit: str = "",
     bits: int = 0,
     floor: float = 0.0,
     outliers: float = 0.0,
@@ -95,6 +99,7 @@ def wrapped_normal(
         bits=bits,
         offset=offset,
         step=step,
+        unit=unit,
         period=values,
         on_missing=on_missing,
         path=path,

@@ -194,6 +194,7 @@ class Symbol:
             "bits": self.bits,
             "offset": self.type.offset,
             "step": self.type.step,
+            "unit": self.type.unit,
             "period": self.period,
             "on_range": self.on_range,
             "on_missing": self.on_missing,

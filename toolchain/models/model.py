@@ -72,6 +72,8 @@ class TabulatedVariable:
     """The reading with address 0, in the unit of the variable."""
     step: float = 1.0
     """Difference between adjacent addresses, in the unit of the variable."""
+    unit: str = ""
+    """The unit of its readings, such as m; for people, who see it next to them."""
     period: int | None = None
     """The number of addresses after which the readings repeat (a turn of a bearing), or None."""
     on_range: Literal["error", "clamp", "missing"] = "error"

@@ -72,6 +72,14 @@ def test_options_arrive_in_the_deployment_and_in_the_images(tmp_path):
     assert np.array_equal(image.machine.tables[0], scaled.tables[0])
 
 
+def test_units_of_readings_change_no_image_and_no_hash():
+    plain = assemble(plan_machine(model(), OPTIONS)).deployment
+    known = tuple(replace(each, unit="m") for each in model().known)
+    with_units = assemble(plan_machine(replace(model(), known=known), OPTIONS)).deployment
+    assert {each.unit for each in with_units.variables} == {"m"}
+    assert (with_units.hash, with_units.boards) == (plain.hash, plain.boards)
+
+
 def test_seeds_that_no_memory_holds(tmp_path):
     options = replace(OPTIONS, rng_banks=65536, shared=False)
     with pytest.raises(BuildError, match="9633792 .* 57065, or --shared"):

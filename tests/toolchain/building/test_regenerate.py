@@ -74,7 +74,10 @@ def test_memories_from_the_model(case, built):
     regenerate("deployment", built, "--topic", "/elsewhere", "--path", "D1=data[7]")
     path = built / "deployment.toml"
     text = path.read_text().replace("ws://robot:9090", "ws://other:1")
-    path.write_text(text.replace('endpoint = ""', 'endpoint = "tcp://board:1"', 1))
+    text = text.replace('endpoint = ""', 'endpoint = "tcp://board:1"', 1).replace(
+        "values =", 'unit = "m"\nvalues =', 1
+    )
+    path.write_text(f"{text}\n[topics]\npose = false\n")
     result = regenerate("memories", built, "--model", case, "--set", "sigma=0.5")
     found = changes(result)
     assert found["boards/board0.bm"] == found["deployment.toml"] == found["report.txt"] == "changed"
@@ -85,6 +88,8 @@ def test_memories_from_the_model(case, built):
     assert deployment.sources[0].uri == "ws://other:1"
     assert [board.endpoint for board in deployment.boards] == ["tcp://board:1", ""]
     assert [variable.path for variable in deployment.variables] == ["data[7]", "data[1]"]
+    assert [variable.unit for variable in deployment.variables] == ["m", ""]
+    assert deployment.topics.pose is False
     assert [variable.bits for variable in deployment.variables] == [6, 4]
     once = build(case, "once", *OPTIONS, "--set", "sigma=0.5")
     same = contents(once)

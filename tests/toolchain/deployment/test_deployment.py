@@ -211,6 +211,19 @@ def test_topics_for_tools_are_not_part_of_the_hash(folder):
     assert "did you mean 'pose'?" in refused(folder)
 
 
+def test_units_of_readings_are_not_part_of_the_hash(folder):
+    before = load_deployment(folder, images=False)
+    edit(folder, 'name = "D1"\n', 'name = "D1"\nunit = "m"\n')
+    after = load_deployment(folder, images=False)
+    assert after.hash == before.hash
+    assert [each.unit for each in after.variables] == ["m", ""]
+    assert write_deployment(folder, after) == load_deployment(folder, images=False) == after
+    for wrong in ('"m\\u001b[2J"', f'"{"m" * 201}"', "3"):
+        edit(folder, 'unit = "m"', f"unit = {wrong}")
+        refused(folder, place=("variable", 0, "unit"))
+        edit(folder, f"unit = {wrong}", 'unit = "m"')
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [

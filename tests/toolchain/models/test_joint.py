@@ -235,8 +235,10 @@ def test_refused_joints_and_questions(make, sentence):
 
 def test_a_known_variable_has_the_rule_and_the_normal_of_its_symbol():
     x = Symbol("x", IntervalType(0, 8, 8))
-    distance = Symbol("D", IntegerType(0, 100), bits=7, on_range="clamp", on_missing="missing", path="d")
-    bearing = Symbol("B", IntegerType(0, 359, wraps=True), bits=9)
+    distance = Symbol(
+        "D", IntegerType(0, 100, unit="m"), bits=7, on_range="clamp", on_missing="missing", path="d"
+    )
+    bearing = Symbol("B", IntegerType(0, 359, wraps=True, unit="deg"), bits=9)
     factors = (
         uniform(x),
         conditional_normal(distance, [x], mean=lambda x: 10 * x, sigma=2.0),
@@ -246,12 +248,15 @@ def test_a_known_variable_has_the_rule_and_the_normal_of_its_symbol():
     searched = interval("x", 0, 8, cells=8)
     (centres,) = cell_centres(searched)
     expected = (
-        normal("D", mean=10 * centres, sigma=2.0, values=101, bits=7, on_missing="missing", path="d"),
-        wrapped_normal("B", mean=40 * centres, sigma=9.0, values=360, bits=9),
+        normal(
+            "D", mean=10 * centres, sigma=2.0, values=101, unit="m", bits=7, on_missing="missing", path="d"
+        ),
+        wrapped_normal("B", mean=40 * centres, sigma=9.0, values=360, unit="deg", bits=9),
     )
     assert asked.searched == (searched,)
     for ours, theirs in zip(asked.known, expected, strict=True):
         assert ours.as_variable() == theirs.as_variable()
+        assert ours.as_variable().unit
         assert ours.table == pytest.approx(theirs.table, abs=1e-15)
         assert ours.normal.mean == pytest.approx(theirs.normal.mean)
 
