@@ -417,6 +417,13 @@ def unpack(parameters: BM2Parameters, state: int) -> tuple[int, ...]:
     )
 
 
+def unpack_all(cardinalities: tuple[int, ...], states: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
+    """Return the code of every variable in packed states, uint32[states, words], as int64[states, variables]."""
+    bits = np.unpackbits(states.astype("<u4").view(np.uint8), axis=1, bitorder="little")
+    layout = zip(*_layout(cardinalities), strict=True)
+    return np.stack([bits[:, at : at + width] @ (1 << np.arange(width)) for width, at in layout], axis=1)
+
+
 # ---- start state ----------------------------------------------------------------------------------
 
 

@@ -8,12 +8,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from machines.bm2 import BM2Parameters, BM2StopReason
+from machines.bm2 import BM2Parameters, BM2StopReason, unpack_all
 
 BATCHES_MIN: Final = 20
 """Minimum number of batches from whose means the effective samples are computed."""
 
-_AGREE: Final = 1.1  # R-hat above which boards have not seen the same distribution (Gelman and Rubin 1992)
+AGREE: Final = 1.1
+"""R-hat above which boards have not seen the same distribution (Gelman and Rubin 1992)."""
 
 Floats = npt.NDArray[np.float64]
 
@@ -72,18 +73,11 @@ def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer])
 
 def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
     """Return the searched joint's values in a stream, uint32[samples, state_words]; -1 with a variable at an unused code."""
-    state = np.unpackbits(stream.astype("<u4").view(np.uint8), axis=1, bitorder="little")
+    codes = unpack_all(parameters.cardinalities, stream)
     values = np.zeros(len(stream), dtype=np.int64)
-    unused = np.zeros(len(stream), dtype=np.bool_)
-    codes = []
-    for offset, bits, cardinality in zip(
-        parameters.offsets, parameters.bits, parameters.cardinalities, strict=True
-    ):
-        codes.append(state[:, offset : offset + bits] @ (1 << np.arange(bits)))
-        unused |= codes[-1] >= cardinality
     for variable in parameters.searched:
-        values = values * parameters.cardinalities[variable] + codes[variable]
-    return np.where(unused, -1, values)
+        values = values * parameters.cardinalities[variable] + codes[:, variable]
+    return np.where((codes >= parameters.cardinalities).any(axis=1), -1, values)
 
 
 def estimate(chains: Sequence[Chain]) -> Estimate:
@@ -111,14 +105,19 @@ def estimate(chains: Sequence[Chain]) -> Estimate:
         halves = np.concatenate([_halves(chain) for chain in counted])
         if halves.sum(axis=1).min() >= 2:
             r_hat = float(split_r_hat(halves).max())
-    # Laplace's rule: a value that was never seen has an error, too
-    smooth = (effective * posterior + 1) / (effective + 2)
-    error = np.sqrt(smooth * (1 - smooth) / effective)
-    if r_hat > _AGREE:
+    error = standard_error(posterior, effective)
+    if r_hat > AGREE:
         # chains that have not mixed know no error of their own
         means = [chain.counts[-1] / chain.counts[-1].sum() for chain in counted]
         error = np.fmax(error, np.sqrt(np.var(means, axis=0, ddof=1) / len(means)))
     return Estimate(posterior, error, float(effective.min()), r_hat, left_out)
+
+
+def standard_error(probabilities: Floats, effective: Floats | float) -> Floats:
+    """Return the standard error of probabilities that are shares of this many independent samples."""
+    # Laplace's rule: a value that was never seen has an error, too
+    smooth = (effective * probabilities + 1) / (effective + 2)
+    return np.asarray(np.sqrt(smooth * (1 - smooth) / effective))
 
 
 def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:

@@ -1,8 +1,9 @@
 """`/BMresults`: posteriors as labelled arrays, and their conversion from and to messages."""
 
+import base64
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -203,6 +204,31 @@ def samples_layout(samples: int, sample_bytes: int) -> dict[str, Any]:
     words = "one little-endian word" if sample_bytes == 4 else f"{sample_bytes // 4} little-endian words"
     state = {"label": f"byte of {words}", "size": sample_bytes, "stride": sample_bytes}
     return {"dim": [rows, state], "data_offset": 0}
+
+
+def read_samples(
+    message: Mapping[str, Any], sizes: Sequence[int] = (), *, newest: int = 0
+) -> "NDArray[np.int64]":
+    """Return the values of the variables in the states of a message on `/bm/samples`, int64[samples, variables].
+
+    `sizes` are their numbers of values, in the order of the machine; a value that is not below is an unused code.
+    Without sizes, it is the words of the states, int64[samples, words]. `newest` is the number of samples, 0 for all.
+    A BadResultError if these are no such states.
+    """
+    import numpy as np
+
+    from machines.bm2 import unpack_all
+
+    try:
+        size, data = int(message["layout"]["dim"][1]["size"]), message["data"]
+        # a list, because bytes(10**12) would be a terabyte
+        octets = base64.b64decode(data) if isinstance(data, str) else bytes(list(data))
+        words = np.frombuffer(octets, "<u4").reshape(-1, size // 4)[-newest:]
+        return unpack_all(tuple(sizes), words) if sizes else words.astype(np.int64)
+    except (ArithmeticError, LookupError, TypeError, ValueError):
+        raise BadResultError(
+            f"a message on {SAMPLES_TOPIC} does not hold the states of this machine"
+        ) from None
 
 
 class _Dimension(Part):

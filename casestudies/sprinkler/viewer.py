@@ -1,13 +1,12 @@
 """Viewer of the sprinkler's samples: the estimates of P(R | G) from them, and their picture; it needs only topics."""
 
-import base64
 import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 import typer
@@ -20,7 +19,7 @@ from casestudies.sprinkler.model import exact_rain
 from casestudies.topics import Readiness, run_viewer, serve_readiness
 from posteriors.errors import NoResultError
 from posteriors.listening import posteriors
-from posteriors.posterior import SAMPLES_TOPIC, SAMPLES_TYPE, Posterior
+from posteriors.posterior import SAMPLES_TOPIC, SAMPLES_TYPE, Posterior, read_samples
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import check_writable, say, warn
@@ -31,6 +30,9 @@ PICTURE: Final = "sprinkler.png"
 HEADING: Final = "frame  grass  P(R = 1)   error   exact  effective samples"
 GRASS: Final = ("dry", "wet")
 """The states of G."""
+_SIZES: Final = (2, 2, 2)
+"""Numbers of values of the variables R, S, G of a sampled state."""
+_R, _G = 0, 2
 _COLOURS: Final = ("#aa7744", "#4477aa")
 _POINTS: Final = 200
 """Number of points of a curve."""
@@ -55,26 +57,19 @@ class Frame:
     """int64[points, 2]: the number of samples so far, and of those with R = 1; the last point is the whole frame."""
 
 
-def frame_of(posterior: Posterior, samples: NDArray[np.uint8]) -> Frame:
-    """Return a frame from its posterior and its samples, uint8[samples, bytes of a packed state]."""
-    rained = np.cumsum(samples[:, 0] & 1, dtype=np.int64)
+def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> Frame:
+    """Return a frame from its posterior and its samples, int64[samples, variables]."""
+    rained = np.cumsum(samples[:, _R])
     at = np.unique(np.geomspace(1, len(samples), _POINTS).astype(np.int64))
     details = posterior.report.details if posterior.report else {}
     return Frame(
         number=posterior.number or 0,
-        grass=int(samples[0, 0]) >> 2 & 1,
+        grass=int(samples[0, _G]),
         share=float(posterior.marginal("R")[1]),
         error=float(details.get("standard_error", 0.5)),
         effective=max(float(details.get("effective_samples", 1)), 1.0),
         curve=np.stack([at, rained[at - 1]], axis=1),
     )
-
-
-def read_samples(message: dict[str, Any]) -> NDArray[np.uint8]:
-    """Return the packed states of a message on `/bm/samples`, uint8[samples, bytes]."""
-    data = message["data"]
-    octets = base64.b64decode(data) if isinstance(data, str) else bytes(data)
-    return np.frombuffer(octets, np.uint8).reshape(-1, message["layout"]["dim"][1]["size"])
 
 
 def mean_and_error(frames: Sequence[Frame]) -> tuple[float, float]:
@@ -125,7 +120,7 @@ class Viewer:
         self.results = 0
         self._count = count
         self._seen: set[int] = set()
-        self._unclaimed: list[NDArray[np.uint8]] = []  # samples without their frame, in the order of arrival
+        self._unclaimed: list[NDArray[np.int64]] = []  # samples without their frame, in the order of arrival
 
     async def watch(self, uri: str, *, first_limit_s: float, limit_s: float) -> None:
         """Listen until all results have arrived, and print a line for each.
@@ -149,7 +144,7 @@ class Viewer:
                 self.add(posterior, await self._samples_of(posterior, samples, limit_s))
                 readiness.record()
 
-    def add(self, posterior: Posterior, samples: NDArray[np.uint8] | None) -> None:
+    def add(self, posterior: Posterior, samples: NDArray[np.int64] | None) -> None:
         """Add a result with its samples, None if they are lost, and print its line."""
         self.results += 1
         if samples is None:
@@ -172,12 +167,12 @@ class Viewer:
 
     async def _samples_of(
         self, posterior: Posterior, samples: Subscription, limit_s: float
-    ) -> NDArray[np.uint8] | None:
+    ) -> NDArray[np.int64] | None:
         """Return the samples whose share of R = 1 is that of a posterior, or None if they are lost."""
         share = posterior.marginal("R")[1]
         while True:
             for at, states in enumerate(self._unclaimed):
-                if abs(np.mean(states[:, 0] & 1) - share) < 1e-9:
+                if abs(np.mean(states[:, _R]) - share) < 1e-9:
                     del self._unclaimed[: at + 1]
                     return states
             if len(self._unclaimed) >= _WAITING:
@@ -186,7 +181,7 @@ class Viewer:
                 message = await samples.next(limit_s)
             except NoMessageError as error:
                 raise NoResultError(f"{error}: was the deployment built with --stream?") from None
-            self._unclaimed.append(read_samples(message.msg))
+            self._unclaimed.append(read_samples(message.msg, _SIZES))
 
     def finish(self, out: Path | None) -> None:
         """Print the estimates, and draw the picture."""

@@ -1,5 +1,9 @@
 """`/BMresults`: messages, and the posteriors that are read from them."""
 
+import base64
+import math
+import struct
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from posteriors import BadResultError, FrameReport, LabelError, Posterior, StageTimes
-from posteriors.posterior import read_posterior
+from posteriors.posterior import read_posterior, read_samples
 from tests.posteriors.messages import JSON, posterior_message
 
 
@@ -155,3 +159,37 @@ def test_one_replica_by_itself():
     for at in (1, 3, -1):
         with pytest.raises(LabelError):
             both.replica(at)
+
+
+LAYOUT = {"dim": [{"size": 2}, {"size": 8}]}
+
+
+@pytest.mark.parametrize("form", [list, bytes, lambda octets: base64.b64encode(octets).decode()])
+def test_samples_arrive_in_each_form_of_bytes(form):
+    message = {"layout": LAYOUT, "data": form(struct.pack("<4I", 1, 2, 3, 0xABC))}
+    assert read_samples(message).tolist() == [[1, 2], [3, 0xABC]]
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        {},
+        {"layout": LAYOUT, "data": [1]},
+        {"layout": LAYOUT, "data": 10**12},
+        {"layout": {"dim": []}, "data": [0] * 8},
+        {"layout": {"dim": [{"size": 2}, {"size": math.inf}]}, "data": [0] * 8},
+    ],
+)
+def test_messages_that_are_no_samples(message):
+    with pytest.raises(BadResultError, match="/bm/samples"):
+        read_samples(message)
+
+
+def test_the_values_in_a_state_follow_each_other_from_its_low_bit():
+    sizes = (2, 5, 1, 2**20, 2**12, 3)
+    values = [1, 4, 0, 2**20 - 2, 2**12 - 1, 3]  # the last one is an unused code
+    state = 1 | 4 << 1 | (2**20 - 2) << 4 | (2**12 - 1) << 24 | 3 << 36
+    message = {"layout": LAYOUT, "data": state.to_bytes(8, "little") + bytes(8)}
+    assert read_samples(message, sizes).tolist() == [values, [0] * 6]
+    with pytest.raises(BadResultError, match="this machine"):
+        read_samples(message, (*sizes, 2**30))

@@ -42,6 +42,7 @@ from toolchain.deployment import (
     BM2Section,
     BoardSection,
     Deployment,
+    Dimension,
     Output,
     Variable,
     write_deployment,
@@ -179,9 +180,13 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
     """Return the deployment of these images, with its hash; a BuildError if an option does not fit the machine."""
     model, options = plan.model, plan.options
     own: dict[str, Any]
+    hidden: tuple[Dimension, ...] = ()
     section: type[BM1Section | BM2Section]
     if isinstance(plan, BM2Plan):
         section, keys, own = BM2Section, BM2_KEYS, {"variables": plan.model.names}
+        asked = {*plan.model.known, *(each.label for each in model.searched)}
+        symbols = plan.model.symbols if plan.parameters.stream else ()  # only a stream shows hidden ones
+        hidden = tuple(each.dimension() for each in symbols if each.name not in asked)
     else:
         section, keys, own = BM1Section, MACHINE_KEYS, {"scale": options.scaling, "stop": options.stop}
     own |= {key: getattr(plan.parameters, key) for key in keys}
@@ -193,6 +198,7 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
             sources=options.all_sources,
             variables=_variables(plan),
             searched=model.searched,
+            hidden=hidden,
             machine=section(
                 lines=model.lines,
                 interface=size_text(layout.interface),
@@ -291,6 +297,8 @@ def _parameter_pairs(
                 [names[at] for at in parameters.searched],
             )
             pairs["searched variables"] = labels, asked
+            found_sizes = dict(zip(names, sizes, strict=True))
+            pairs |= {f"values of {e.label}": (e.size, found_sizes.get(e.label)) for e in deployment.hidden}
             read = sorted(names[at] for at in parameters.known)
             pairs["known variables"] = sorted(each.name for each in sensors), read
     same = {key: (getattr(machine, key), getattr(parameters, key)) for key in keys}

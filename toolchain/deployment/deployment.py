@@ -47,6 +47,7 @@ class DeploymentFile(Section):
     sources: Sequence[Source] = Field(validation_alias="source", min_length=1)
     variables: Sequence[Variable] = Field(default=(), validation_alias="variable")
     searched: Sequence[Dimension] = Field(min_length=1)
+    hidden: Sequence[Dimension] = Field(default=(), exclude_if=lambda hidden: not hidden)
     machine: MachineSection
     prior: WrittenPrior | None = Field(default=None, exclude_if=lambda prior: prior is None)
     boards: Sequence[BoardSection] = Field(validation_alias="board", min_length=1)
@@ -57,6 +58,7 @@ class DeploymentFile(Section):
     def _parts_agree(self) -> Self:
         names_differ("variable", [variable.name for variable in self.variables])
         names_differ("searched", [dimension.label for dimension in self.searched])
+        names_differ("hidden", [dimension.label for dimension in self.hidden])
         names_differ("output", [output.topic for output in self.outputs])
         for variable in self.variables:
             if variable.source >= len(self.sources):
@@ -132,6 +134,15 @@ class Deployment(DeploymentFile):
             else:
                 row = 2**variable.bits - 1 if address is None else address
         return tuple(sensors), row
+
+    @property
+    def state_dimensions(self) -> tuple[Dimension, ...]:
+        """The variables of a sampled state, in the order of their bits; none if one of them is not described here."""
+        keys = {"offset", "step", "unit", "states"}
+        known = (Dimension(label=v.name, size=v.values, **v.model_dump(include=keys)) for v in self.variables)
+        described = {each.label: each for each in (*known, *self.searched, *self.hidden)}
+        names = self.machine.variables
+        return tuple(described[name] for name in names) if described.keys() >= set(names) else ()
 
     @property
     def result_dimensions(self) -> tuple[Dimension, ...]:

@@ -3,7 +3,6 @@
 message ──▶ FrameAssembler ──▶ DeployedBoards ──▶ boards in threads ──▶ ResultTopics ──▶ FakeRosbridge
 """
 
-import base64
 import io
 import json
 from dataclasses import replace
@@ -18,7 +17,7 @@ from machines.kind import FrameInput
 from posteriors import posterior
 from posteriors.frame_report import read_frame_report
 from posteriors.pairing import Pairing
-from posteriors.posterior import read_posterior
+from posteriors.posterior import read_posterior, read_samples
 from services.boards.deployed import images_of
 from services.boards.frames import decode_boards, result_record
 from services.errors import InputLineError
@@ -108,9 +107,12 @@ async def test_posterior_details_and_samples_are_published(folder):
         assert {"samples", "effective_samples", "standard_error", "r_hat"} <= set(each.details)
         assert record(each, [Axis("Rain", 2)])["details"] == each.details
     assert [each["size"] for each in samples["layout"]["dim"]] == [2 * SAMPLES, 4]
-    states = np.frombuffer(base64.b64decode(samples["data"]), "<u4")
-    assert (states >> 2 == 1).all()
-    assert found.probabilities[1] == (states & 1).mean()
+    assert [each.label for each in deployment.state_dimensions] == ["Rain", "Sprinkler", "Grass"]
+    assert [each.states[-1] for each in deployment.state_dimensions] == ["yes", "yes", "white"]
+    values = read_samples(samples, [each.size for each in deployment.state_dimensions])
+    assert (values[:, 2] == 1).all()
+    assert found.probabilities[1] == values[:, 0].mean()
+    assert set(values[:, 1]) == {0, 1}
 
 
 async def test_without_a_stream_there_is_no_topic_of_samples(folder):

@@ -462,6 +462,23 @@ def test_names_of_the_variables_are_those_of_the_images(network, names, named):
         check_agreement(wrong, images)
 
 
+def test_a_machine_that_streams_its_states_names_all_variables_in_them(network):
+    question = ("--searched", "rain", "--known", "grass", "--machine", "bm2")
+    out = network.parent / "out"
+    done(build(network, *question))
+    plain = load_deployment(out)
+    assert (plain.hidden, plain.state_dimensions) == ((), ())
+    done(build(network, *question, "--stream", "16"))
+    deployment = load_deployment(out)
+    assert [each.label for each in deployment.hidden] == ["sprinkler"]
+    assert [each.label for each in deployment.state_dimensions] == list(deployment.machine.variables)
+    assert {(each.size, len(each.states)) for each in deployment.state_dimensions} == {(2, 2)}
+    (sprinkler,) = deployment.hidden
+    wrong = sprinkler.replace(size=3, states=("a", "b", "c"))
+    with pytest.raises(DeploymentError, match="values of sprinkler"):
+        check_agreement(deployment.replace(hidden=(wrong,)), read_images(deployment))
+
+
 def test_sources_give_a_path_to_each_variable(network):
     file = network.parent / "sources.toml"
     file.write_text(
