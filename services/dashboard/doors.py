@@ -104,7 +104,8 @@ class Doors:
             address = ipaddress.ip_address(name.removeprefix("[").removesuffix("]"))
         except ValueError:
             return not self._loopback and name in _own_names()
-        return address.is_loopback or not self._loopback
+        # a zone, as in [::1%evil.example], may be any text
+        return "%" not in name and (address.is_loopback or not self._loopback)
 
     async def _give_cookie(self, scope: Scope, send: Send, token: str) -> None:
         # so that the token does not stay in the address bar

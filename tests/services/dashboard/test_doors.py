@@ -49,6 +49,7 @@ async def knock(kind="http", *, host=OURS, origin=None, policy=None, loopback=Tr
         ("evil.example:8080", None, 403),
         ("evil.example:8080", "http://evil.example:8080", 403),
         ("192.168.1.5:8080", None, 403),
+        ("[::1%evil.example]", "http://[::1%evil.example]", 403),
         (None, None, 403),
     ],
 )
