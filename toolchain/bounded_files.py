@@ -198,6 +198,11 @@ class TomlFile:
             case "value_error":
                 subject = f"in [{key}]" if whole_table else f"{key}{section}".lstrip()
                 sentence = ": ".join(part for part in (subject, str(detail["ctx"]["error"])) if part)
+            case "model_type":
+                heading = f"[[{table}]]" if table else f"[{key}]"
+                sentence = f"{table or key} = {value} is not a table; begin it with a line {heading}"
+            case "tuple_type":
+                sentence = f"{key} = {value}{section}: expected a list"
             case _:
                 sentence = f"{key or place} = {value}{section}: expected {detail['msg'].removeprefix('Input should be ')}"
         return self.error(sentence, path=self.path, line=line, place=tuple(place))

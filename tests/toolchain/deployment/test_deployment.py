@@ -211,6 +211,18 @@ def test_topics_for_tools_are_not_part_of_the_hash(folder):
     assert "did you mean 'pose'?" in refused(folder)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "heading"),
+    [("topics", "3", "[topics]"), ("hidden", "[3]", "[[hidden]]"), ("hidden", "3", "a list")],
+)
+def test_what_should_be_a_table_is_named_in_our_words(folder, key, value, heading):
+    path = folder / "deployment.toml"
+    path.write_text(f"{key} = {value}\n{path.read_text()}")
+    sentence = refused(folder, line=1)
+    assert heading in sentence
+    assert not {"valid", "dictionary", "instance", "tuple"} & set(sentence.split())
+
+
 def test_units_of_readings_are_not_part_of_the_hash(folder):
     before = load_deployment(folder, images=False)
     edit(folder, 'name = "D1"\n', 'name = "D1"\nunit = "m"\n')
