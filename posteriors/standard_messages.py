@@ -127,7 +127,7 @@ def grid_message(
             "resolution": resolution,
             "width": plane.x.size,
             "height": plane.y.size,
-            "origin": _pose(x, y),
+            "origin": pose_at(x, y),
         },
         "data": data.ravel(),
     }
@@ -137,23 +137,34 @@ def pose_message(
     posterior: NDArray[np.float64], plane: Plane, stamp_ns: int, ros_version: RosVersion
 ) -> dict[str, Any]:
     """Return the mean and the covariance of a posterior as a geometry_msgs/PoseWithCovarianceStamped."""
-    cells = plane.cells(posterior)
-    across, down = cells.sum(axis=0), cells.sum(axis=1)
-    total = across.sum()
-    xs, ys = (axis.offset + axis.step * np.arange(axis.size) for axis in (plane.x, plane.y))
-    x, y = float(across @ xs / total), float(down @ ys / total)
-    xs, ys = xs - x, ys - y
+    (row, column), (rows, both, columns) = moments(plane.cells(posterior))
     covariance = np.zeros((6, 6))
-    covariance[0, 0], covariance[1, 1] = across @ xs**2 / total, down @ ys**2 / total
-    covariance[0, 1] = covariance[1, 0] = ys @ cells @ xs / total
+    covariance[0, 0], covariance[1, 1] = columns * plane.x.step**2, rows * plane.y.step**2
+    covariance[0, 1] = covariance[1, 0] = both * plane.x.step * plane.y.step
     covariance[5, 5] = _HEADING_VARIANCE
+    pose = pose_at(plane.x.value(column), plane.y.value(row))
     return {
         "header": header(stamp_ns, MAP_FRAME, ros_version),
-        "pose": {"pose": _pose(x, y), "covariance": covariance.ravel()},
+        "pose": {"pose": pose, "covariance": covariance.ravel()},
     }
 
 
-def _pose(x: float, y: float) -> dict[str, Any]:
+def moments(cells: NDArray[np.float64]) -> tuple[tuple[float, float], tuple[float, float, float]]:
+    """Return mean (row, column) and covariance (rows, both, columns) of a distribution over rows and columns."""
+    rows, columns = np.arange(cells.shape[0]), np.arange(cells.shape[1])
+    by_row, by_column = cells.sum(axis=1), cells.sum(axis=0)
+    total = by_row.sum()
+    row, column = float(by_row @ rows / total), float(by_column @ columns / total)
+    down, across = rows - row, columns - column
+    return (row, column), (
+        by_row @ down**2 / total,
+        down @ cells @ across / total,
+        by_column @ across**2 / total,
+    )
+
+
+def pose_at(x: float, y: float) -> dict[str, Any]:
+    """Return a geometry_msgs/Pose without rotation."""
     return {"position": {"x": x, "y": y, "z": 0.0}, "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}}
 
 

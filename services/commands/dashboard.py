@@ -1,10 +1,8 @@
 """The command `dashboard`: the page in the browser."""
 
 import asyncio
-import contextlib
 import os
 import socket
-from collections.abc import Iterator
 from importlib.util import find_spec
 from typing import Annotated, Final
 
@@ -92,28 +90,21 @@ def dashboard(
         )
 
 
-@contextlib.contextmanager
-def _listening(host: str, port: int) -> Iterator[socket.socket]:
-    """Listen on an address within the context, or raise a SettingsError."""
+def _listening(host: str, port: int) -> socket.socket:
+    """Return a socket that listens on an address, or raise a SettingsError."""
     # before the web framework is imported, which takes a second
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        listener = socket.socket(family, kind, protocol)
-    except OSError as error:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((host, port), family=family)
+    except socket.gaierror as error:
         raise SettingsError(
             f"the dashboard cannot listen on {shown(host)}: that is not an address or name of this machine ({error.strerror})"
         ) from None
-    with listener:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            listener.bind(address)
-            listener.listen()
-        except OSError as error:
-            raise SettingsError(
-                f"the dashboard cannot listen on {shown(host)} port {port} ({os.strerror(error.errno or 0)}): "
-                "end the process that listens there, or choose another --port"
-            ) from None
-        yield listener
+    except OSError as error:
+        raise SettingsError(
+            f"the dashboard cannot listen on {shown(host)} port {port} ({os.strerror(error.errno or 0)}): "
+            "end the process that listens there, or choose another --port"
+        ) from None
 
 
 async def _serve(

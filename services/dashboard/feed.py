@@ -5,6 +5,7 @@
 It has no clock and no connection: the time of each frame comes with it.
 """
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from machines.bm2_estimate import AGREE, standard_error
 from posteriors.frame_report import FrameReport, StageTimes
 from posteriors.pairing import FrameOutcome
 from posteriors.posterior import REPLICA, Posterior
@@ -51,12 +53,24 @@ class Frame:
         return tuple(label for label in self.labels if label != REPLICA)
 
     @property
-    def standard_error(self) -> float | None:
-        """The sampling error of a BM2's probabilities; None if unknown, or not sampled."""
+    def form(self) -> object:
+        """Labels and sizes, which are equal for posteriors of the same variables."""
+        return self.values is not None and (self.labels, self.values.shape)
+
+    def sampling_error(self, probabilities: "NDArray[np.float64]") -> "NDArray[np.float64] | None":
+        """Return the standard error of each of a BM2's probabilities; None if unknown, or not sampled."""
+        effective = self._statistic("effective_samples")
+        error = standard_error(probabilities, effective if 1 <= effective < math.inf else math.nan)
+        # boards that disagree know no error of their own; theirs is that of the worst value
+        if self._statistic("r_hat") > AGREE or np.isnan(error).any():
+            error = np.fmax(error, self._statistic("standard_error"))
+        return None if np.isnan(error).any() else error
+
+    def _statistic(self, key: str) -> float:
         try:
-            return float(self.statistics["standard_error"])
-        except (KeyError, ValueError):
-            return None
+            return float(self.statistics.get(key, math.nan))
+        except ValueError:
+            return math.nan
 
     def marginal(self, labels: tuple[str, ...]) -> "NDArray[np.float64]":
         """Return the marginal of one or two labels, in that order; it sums to 1, also over replicas."""

@@ -5,12 +5,12 @@
 // Everything from topics is set as text, never as markup. No state of Vue is used, since it would be slow and leak.
 
 // viridis at 9 places: even in brightness, also for colour-blind eyes
-const VIRIDIS = [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129], [92, 200, 99], [170, 220, 50], [253, 231, 37]];
+const VIRIDIS = [[68, 1, 84], [71, 44, 122], [59, 81, 139], [44, 113, 142], [33, 144, 141], [39, 173, 129],
+  [92, 200, 99], [170, 220, 50], [253, 231, 37]];
 const COLOURS = new Uint8ClampedArray(256 * 4);
 for (let i = 0; i < 256; i++) {
   const share = (i / 255) * (VIRIDIS.length - 1), low = Math.min(Math.floor(share), VIRIDIS.length - 2);
-  for (let c = 0; c < 3; c++) COLOURS[4 * i + c] = VIRIDIS[low][c] + (share - low) * (VIRIDIS[low + 1][c] - VIRIDIS[low][c]);
-  COLOURS[4 * i + 3] = 255;
+  COLOURS.set([...VIRIDIS[low].map((from, c) => from + (share - low) * (VIRIDIS[low + 1][c] - from)), 255], 4 * i);
 }
 // Okabe and Ito's colours, which colour-blind eyes can tell apart
 const STAGE_COLOURS = ["#0072b2", "#56b4e9", "#999999", "#009e73", "#e69f00", "#f0e442", "#cc79a7", "#d55e00"];
@@ -21,13 +21,18 @@ const number = (value, digits = 4) => Number(Number(value).toPrecision(digits)).
 const centre = (axis, index) => axis.offset + index * axis.step;
 const value = (axis, index) => axis.states.length ? axis.states[Math.round(index)] ?? "" : number(centre(axis, index));
 const title = (axis) => axis.label + (axis.unit ? ` (${axis.unit})` : axis.known ? "" : " (cell)");
+const hasValues = (axis) => axis.known && !axis.states.length;
 // the index at a share of an axis; numbers of cells and names are whole
-const place = (axis, share) => axis.known && !axis.states.length ? share * (axis.size - 1) : Math.round(share * (axis.size - 1));
-const age = (ms) => ms < 1000 ? `${Math.round(ms)} ms` : ms < 60e3 ? `${(ms / 1000).toFixed(1)} s` : `${Math.floor(ms / 60e3)} min`;
+const place = (axis, share) => (hasValues(axis) ? Number : Math.round)(share * (axis.size - 1));
+const minutes = (ms) => ms < 60e3 ? `${(ms / 1000).toFixed(1)} s` : `${Math.floor(ms / 60e3)} min`;
+const age = (ms) => ms < 1000 ? `${Math.round(ms)} ms` : minutes(ms);
 const setText = (element, text) => { if (element.textContent !== text) element.textContent = text; };
 
+function resize(canvas, width, height) {  // only if it is new, because it clears the canvas
+  if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
+}
 // Write on a canvas; begin a path along points; fill and outline the path, or only outline it without a filling.
-const write = (context, align, text, x, y, width) => Object.assign(context, { textAlign: align }).fillText(text, x, y, width);
+const write = (context, textAlign, text, ...where) => Object.assign(context, { textAlign }).fillText(text, ...where);
 function path(context, ...points) {
   context.beginPath();
   points.forEach(([x, y], at) => at ? context.lineTo(x, y) : context.moveTo(x, y));
@@ -49,6 +54,15 @@ function fill(body, rows, mark) {
   });
 }
 
+const table = (name, ...heads) => `<table data-testid="${name}"><thead><tr>
+  ${heads.map((head) => `<th>${head}</th>`).join("")}</tr></thead><tbody ref="${name}"></tbody></table>`;
+const swatch = (colour) => `<li hidden><span style="background: ${colour}"></span><span></span></li>`;
+const make = (tag, properties, ...parts) => {
+  const element = Object.assign(document.createElement(tag), properties);
+  element.append(...parts);
+  return element;
+};
+
 export default {
   props: { view: String },
   template: `
@@ -64,23 +78,25 @@ export default {
       <p ref="notice" class="bm-notice" role="alert"></p>
       <div class="bm-panels">
         <section>
-          <canvas ref="posterior" data-testid="posterior" class="bm-posterior" tabindex="0" role="img" aria-label="Posterior"></canvas>
+          <canvas ref="posterior" data-testid="posterior" class="bm-posterior" tabindex="0" role="img"
+            aria-label="Posterior"></canvas>
           <p ref="legend" class="bm-legend" data-testid="legend"></p>
           <div ref="world" class="bm-world"></div>
         </section>
         <section>
           <h2>Readings</h2>
-          <table data-testid="readings"><thead><tr><th>variable</th><th>value</th><th>address</th><th>age</th></tr></thead><tbody ref="readings"></tbody></table>
+          ${table("readings", "variable", "value", "address", "age")}
           <h2>Boards</h2>
-          <table data-testid="boards"><thead><tr><th>board</th><th>stopped</th><th>cycles</th><th>state</th><th>image</th></tr></thead><tbody ref="boards"></tbody></table>
-          <table data-testid="statistics"><tbody ref="statistics"></tbody></table>
+          ${table("boards", "board", "stopped", "cycles", "state", "image")}
+          ${table("statistics")}
         </section>
         <section class="bm-wide">
           <h2>Stages, the last five minutes</h2>
-          <canvas ref="stages" data-testid="stage-times" class="bm-stages" role="img" aria-label="Times of the stages"></canvas>
-          <ul ref="stageNames" class="bm-stage-names"></ul>
+          <canvas ref="stages" data-testid="stage-times" class="bm-stages" role="img"
+            aria-label="Times of the stages"></canvas>
+          <ul ref="stageNames" class="bm-stage-names">${STAGE_COLOURS.map(swatch).join("")}</ul>
           <h2>Frames lost</h2>
-          <table data-testid="losses"><thead><tr><th>reason</th><th>frames</th></tr></thead><tbody ref="losses"></tbody></table>
+          ${table("losses", "reason", "frames")}
           <div ref="samplesPart" hidden>
             <h2>Samples</h2>
             <pre ref="samples" data-testid="samples"></pre>
@@ -91,20 +107,13 @@ export default {
 
   mounted() {
     document.documentElement.lang = "en";  // for screen readers; the framework names none
-    this.live = { head: null, picture: null, heardAt: 0, stats: null, drag: null, image: document.createElement("canvas"), dirty: true };
-    const canvas = this.$refs.posterior;
-    canvas.addEventListener("pointerdown", (event) => this.pick(event));
-    canvas.addEventListener("pointermove", (event) => this.move(event));
-    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => this.drop(event));
-    canvas.addEventListener("keydown", (event) => this.key(event));
+    this.live = { head: null, picture: null, heardAt: 0, stats: null, drag: null, image: make("canvas"), dirty: true };
+    const { posterior, stages } = this.$refs, pointing = ["pointerdown", "pointermove", "pointerup", "pointercancel"];
+    for (const type of pointing) posterior.addEventListener(type, this.point);
+    posterior.addEventListener("keydown", this.key);
     this.resized = new ResizeObserver(() => { this.live.dirty = true; });
-    this.resized.observe(canvas);
-    this.resized.observe(this.$refs.stages);
-    const turn = () => {
-      this.turn();
-      this.animation = requestAnimationFrame(turn);
-    };
-    this.animation = requestAnimationFrame(turn);
+    for (const canvas of [posterior, stages]) this.resized.observe(canvas);
+    this.turn();
     this.connect();
   },
 
@@ -139,16 +148,9 @@ export default {
       const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
       const live = this.live;
       if (head.kind === "frame") {
-        live.head = head;
-        live.picture = buffer.slice(4 + length);
-        live.heardAt = performance.now();
-        live.fresh = true;
-      } else if (head.kind === "stats") {
-        live.stats = head;
-        live.statsFresh = true;
-      } else if (head.kind === "notice") {
-        setText(this.$refs.notice, head.text);
-      }
+        Object.assign(live, { head, picture: buffer.slice(4 + length), heardAt: performance.now(), fresh: true });
+      } else if (head.kind === "stats") Object.assign(live, { stats: head, statsFresh: true });
+      else if (head.kind === "notice") setText(this.$refs.notice, head.text);
       live.dirty = true;
     },
     tell(message) {
@@ -158,6 +160,7 @@ export default {
     // --- each animation frame ---
     turn() {
       const live = this.live, now = performance.now();
+      this.animation = requestAnimationFrame(this.turn);
       if (live.wanted) {  // at most one pose a frame
         this.tell({ pose: live.wanted });
         live.wanted = null;
@@ -201,26 +204,27 @@ export default {
       const { head, stats } = this.live, refs = this.$refs;
       setText(refs.outcome, head.outcome);
       setText(refs.cycles, head.cycles == null ? "" : `${head.cycles} cycles`);
-      const rows = head.readings.map(([name, text, address, ms]) => [name, typeof text === "number" ? number(text, 9) : text, address, age(ms)]);
-      fill(refs.readings, [...rows, ...head.missing.map((name) => [name, "missing", "", ""])], (at) => at < rows.length ? "" : "bm-missing");
+      const rows = head.readings.map(([name, found, address, ms, unit]) => {
+        const shown = typeof found === "number" ? `${number(found, 9)} ${unit}`.trimEnd() : found;
+        return [name, shown, address, age(ms)];
+      });
+      const missing = head.missing.map((name) => [name, "missing", "", ""]);
+      fill(refs.readings, [...rows, ...missing], (at) => at < rows.length ? "" : "bm-missing");
       const known = stats?.boards ?? [];
       const boards = head.boards.length ? head.boards : known.map(([endpoint]) => [endpoint, "", null]);
-      fill(refs.boards, boards.map((board, at) => [...board, known[at]?.[1] ?? "", (known[at]?.[2] ?? "").slice(0, 12)]));
+      fill(refs.boards, boards.map((board, at) => [...board, known[at]?.[1], known[at]?.[2].slice(0, 12)]));
       fill(refs.statistics, Object.entries(head.statistics).map(([key, text]) => [key.replaceAll("_", " "), text]));
       this.describe();
     },
     describe() {
       const { head, drag } = this.live, plot = head.plot;
-      if (!plot) {
-        setText(this.$refs.legend, `no posterior: ${head.outcome}`);
-        return;
-      }
-      const parts = [`darkest 0, brightest ${number(plot.max, 3)}`];
-      if (plot.axes.length === 1) parts[0] = `highest ${number(plot.max, 3)}`;
+      if (!plot) return setText(this.$refs.legend, `no posterior: ${head.outcome}`);
+      const parts = [`${plot.axes.length === 1 ? "highest" : "darkest 0, brightest"} ${number(plot.max, 3)}`];
       if (plot.error != null) parts.push(`sampling error ±${number(plot.error, 2)}`);
       if (plot.mean) {
         const [down, across] = plot.axes;
-        parts.push(`mean ${down.label} ${value(down, plot.mean[0])}, ${across.label} ${value(across, plot.mean[1])} (ellipse: 2 standard deviations)`);
+        const mean = `mean ${down.label} ${value(down, plot.mean[0])}, ${across.label} ${value(across, plot.mean[1])}`;
+        parts.push(`${mean} (ellipse: 2 standard deviations)`);
       }
       const truth = drag ?? head.truth;
       if (truth) parts.push(`truth x ${number(truth[0], 3)}, y ${number(truth[1], 3)}`);
@@ -228,7 +232,8 @@ export default {
       const label = `Posterior of ${plot.axes.map((axis) => axis.label).join(" and ")}: ${parts.join("; ")}`;
       if (Date.now() - (this.live.describedAt ?? 0) > 2000) {  // no torrent for screen readers
         this.live.describedAt = Date.now();
-        this.$refs.posterior.setAttribute("aria-label", label + (this.placed() && this.canDrag() ? ". Arrow keys move the boat" : ""));
+        const help = this.placed() && this.canDrag() ? ". Arrow keys move the boat" : "";
+        this.$refs.posterior.setAttribute("aria-label", label + help);
       }
     },
 
@@ -254,17 +259,14 @@ export default {
       if (world.dataset.names !== names.join()) {
         world.dataset.names = names.join();
         world.replaceChildren(...names.map((name) => {
-          const label = document.createElement("label"), box = document.createElement("input"), short = name.replace(/^\/boat\//, "");
-          box.type = "checkbox";
+          const box = make("input", { type: "checkbox" }), short = name.replace(/^\/boat\//, "");
           box.setAttribute("role", "switch");
-          box.dataset.name = name;
-          box.dataset.testid = `switch-${short.replaceAll("/", "-")}`;
+          Object.assign(box.dataset, { name, testid: `switch-${short.replaceAll("/", "-")}` });
           box.onchange = () => {
             box.changedAt = performance.now();
             this.tell({ switch: name, on: box.checked });
           };
-          label.append(box, ` ${short.replaceAll("/", " ")}`);
-          return label;
+          return make("label", {}, box, ` ${short.replaceAll("/", " ")}`);
         }));
       }
       for (const box of world.querySelectorAll("input")) {
@@ -276,9 +278,9 @@ export default {
     drawStages(rows, names) {
       const [context, width, height] = this.prepare(this.$refs.stages), left = 48, bottom = 18;
       const totals = rows.map(([, times]) => times.reduce((sum, time) => sum + time, 0)), top = Math.max(...totals, 1);
-      const x = (second) => left + (width - left) * (1 - second / 300), y = (time) => (height - bottom) * (1 - time / top) + 4 * time / top;
+      const x = (second) => left + (width - left) * (1 - second / 300), bar = Math.max((width - left) / 300, 1);
+      const y = (time) => (height - bottom) * (1 - time / top) + 4 * time / top;
       context.clearRect(0, 0, width, height);
-      const bar = Math.max((width - left) / 300, 1);
       rows.forEach(([second, times]) => {
         let sum = 0;
         times.forEach((time, at) => {
@@ -292,83 +294,79 @@ export default {
       write(context, "right", "0", left - 4, height - bottom);
       write(context, "left", "5 min ago", left, height - 4);
       write(context, "right", "now", width - 2, height - 4);
-      const last = rows.at(-1)?.[1] ?? [], list = this.$refs.stageNames;
-      if (list.children.length !== names.length) {
-        list.replaceChildren(...names.map((_, at) => {
-          const item = document.createElement("li"), swatch = document.createElement("span"), text = document.createElement("span");
-          swatch.style.background = STAGE_COLOURS[at % STAGE_COLOURS.length];
-          item.append(swatch, text);
-          return item;
-        }));
-      }
-      names.forEach((name, at) => setText(list.children[at].lastChild, ` ${name.replaceAll("_", " ")} ${last.length ? `${number(last[at], 3)} µs` : ""}`));
+      const last = rows.at(-1)?.[1];
+      [...this.$refs.stageNames.children].slice(0, names.length).forEach((item, at) => {
+        item.hidden = false;
+        setText(item.lastChild, ` ${names[at].replaceAll("_", " ")} ${last ? `${number(last[at], 3)} µs` : ""}`);
+      });
     },
 
     // --- the posterior ---
     // Fit a canvas to its element and to the screen's pixels; return its context and its size.
     prepare(canvas) {
-      const scale = devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
-      if (canvas.width !== Math.round(width * scale) || canvas.height !== Math.round(height * scale)) {
-        canvas.width = Math.round(width * scale);
-        canvas.height = Math.round(height * scale);
-      }
+      const scale = devicePixelRatio || 1, { clientWidth, clientHeight } = canvas;
+      resize(canvas, Math.round(clientWidth * scale), Math.round(clientHeight * scale));
       const context = canvas.getContext("2d");
       context.setTransform(scale, 0, 0, scale, 0, 0);
-      return [context, width, height];
+      return [context, clientWidth, clientHeight];
     },
     drawPosterior() {
-      const { head, picture } = this.live, canvas = this.$refs.posterior, [context, width, height] = this.prepare(canvas);
-      const { color } = getComputedStyle(this.$el);
+      const { head, picture } = this.live, [context, width, height] = this.prepare(this.$refs.posterior);
+      const { color } = getComputedStyle(this.$el), plot = head?.plot;
       context.clearRect(0, 0, width, height);
       Object.assign(context, { fillStyle: color, strokeStyle: color, font: "12px sans-serif", lineWidth: 1 });
       this.live.box = null;
-      if (!head?.plot) write(context, "center", head ? `no posterior: ${head.outcome}` : "waiting for the first posterior", width / 2, height / 2, width - 20);
-      else if (head.plot.axes.length === 1) this.drawBars(context, width, height, head.plot, new Float32Array(picture));
+      if (!plot) {
+        const why = head ? `no posterior: ${head.outcome}` : "waiting for the first posterior";
+        write(context, "center", why, width / 2, height / 2, width - 20);
+      } else if (plot.axes.length === 1) this.drawBars(context, width, height, plot, new Float32Array(picture));
       else this.drawGrid(context, width, height, head, new Uint8Array(picture));
     },
     drawGrid(context, width, height, head, cells) {
       const [down, across] = head.plot.axes, left = 62, bottom = 40, top = 8, right = 12;
       // cells are squares where both axes have the same unit
       let w = width - left - right, h = height - top - bottom;
-      if (down.known === across.known && down.unit === across.unit && !down.states.length && !across.states.length) {
+      if (down.known === across.known && down.unit === across.unit && !(down.states.length + across.states.length)) {
         const ratio = Math.abs((across.size * across.step) / (down.size * down.step));
         if (w / h > ratio) w = h * ratio; else h = w / ratio;
       }
-      const box = this.live.box = { left, top, w, h, down, across }, image = this.live.image;
-      if (image.width !== across.size || image.height !== down.size) [image.width, image.height] = [across.size, down.size];
-      const pixels = new ImageData(across.size, down.size), words = new Uint32Array(pixels.data.buffer), colours = new Uint32Array(COLOURS.buffer);
-      for (let row = 0; row < down.size; row++) {  // the first row is at the bottom, as on a map
-        const from = row * across.size, to = (down.size - 1 - row) * across.size;
-        for (let column = 0; column < across.size; column++) words[to + column] = colours[cells[from + column]];
+      const rows = down.size, columns = across.size, pixels = new ImageData(columns, rows), { image } = this.live;
+      const x = (column) => left + (column + 0.5) / columns * w, y = (row) => top + h - (row + 0.5) / rows * h;
+      const box = this.live.box = { left, top, w, h, down, across, x, y };
+      const words = new Uint32Array(pixels.data.buffer), colours = new Uint32Array(COLOURS.buffer);
+      for (let row = 0; row < rows; row++) {  // the first row is at the bottom, as on a map
+        const from = row * columns, to = (rows - 1 - row) * columns;
+        for (let column = 0; column < columns; column++) words[to + column] = colours[cells[from + column]];
       }
+      resize(image, columns, rows);
       image.getContext("2d").putImageData(pixels, 0, 0);
       context.imageSmoothingEnabled = false;
       context.drawImage(image, left, top, w, h);
       context.strokeRect(left, top, w, h);
       this.drawTicks(context, box);
+      const { plot } = head, { stats } = this.live;
       context.save();
       context.beginPath();
       context.rect(left, top, w, h);
       context.clip();
-      const plot = head.plot;
       if (plot.mean) this.drawMean(context, box, plot.mean, plot.covariance);
       context.restore();
-      // landmarks and shores are on the edge, or beyond it
-      const stats = this.live.stats;
-      for (const [x, y, name] of stats?.landmarks ?? []) this.drawLandmark(context, this.pixel(x, y), name, width, height);
+      for (const [x, y, name] of stats?.landmarks ?? []) {  // they are on the edge, or beyond it
+        this.drawLandmark(context, this.pixel(x, y), name, width, height);
+      }
       const truth = this.live.drag ?? head.truth ?? stats?.truth;
       if (truth) this.drawTruth(context, this.pixel(...truth));
     },
-    drawTicks(context, { left, top, w, h, down, across }) {
+    drawTicks(context, { left, top, w, h, down, across, x, y }) {
       const count = Math.max(2, Math.min(5, Math.floor(w / 70)));
       for (let at = 0; at < count; at++) {
         const index = place(across, at / (count - 1));
-        write(context, "center", value(across, index), left + (index + 0.5) / across.size * w, top + h + 15, w / count);
+        write(context, "center", value(across, index), x(index), top + h + 15, w / count);
       }
       write(context, "center", title(across), left + w / 2, top + h + 33, w);
       for (let at = 0; at < 5; at++) {
         const index = place(down, at / 4);
-        write(context, "right", value(down, index), left - 5, top + h - (index + 0.5) / down.size * h + 4, 40);
+        write(context, "right", value(down, index), left - 5, y(index) + 4, 40);
       }
       context.save();
       context.translate(13, top + h / 2);
@@ -376,15 +374,16 @@ export default {
       write(context, "center", title(down), 0, 0, h);
       context.restore();
     },
-    drawMean(context, { left, top, w, h, down, across }, [row, column], [rr, rc, cc]) {
-      const x = left + (column + 0.5) / across.size * w, y = top + h - (row + 0.5) / down.size * h;
+    drawMean(context, { w, h, down, across, ...box }, [row, column], [rr, rc, cc]) {
+      const x = box.x(column), y = box.y(row);
       Object.assign(this.$refs.posterior.dataset, { meanX: x.toFixed(1), meanY: y.toFixed(1) });  // where tests find it
       // in pixels, with y downwards
       const sx = w / across.size, sy = h / down.size, a = cc * sx * sx, b = -rc * sx * sy, c = rr * sy * sy;
       const middle = (a + c) / 2, spread = Math.hypot((a - c) / 2, b), angle = Math.atan2(2 * b, a - c) / 2;
+      const radii = [middle + spread, middle - spread].map((square) => 2 * Math.sqrt(Math.max(square, 0)));
       for (const [line, style] of [[4, "#000"], [2, "#fff"]]) {
         context.beginPath();
-        context.ellipse(x, y, 2 * Math.sqrt(Math.max(middle + spread, 0)), 2 * Math.sqrt(Math.max(middle - spread, 0)), angle, 0, 2 * Math.PI);
+        context.ellipse(x, y, ...radii, angle, 0, 2 * Math.PI);
         paint(context, line, style);
         path(context, [x - 6, y], [x + 6, y], [x, y], [x, y - 6], [x, y + 6]);
         paint(context, line, style);
@@ -408,37 +407,39 @@ export default {
       paint(context, 2.5, "#fff", "#d55e00");
       Object.assign(this.$refs.posterior.dataset, { boatX: x.toFixed(1), boatY: y.toFixed(1) });
     },
-    drawBars(context, width, height, { axes: [axis], max, error }, bars) {
+    drawBars(context, width, height, { axes: [axis], max, error }, numbers) {
       const left = 48, bottom = 40, top = 12, w = width - left - 8, h = height - top - bottom;
-      const high = bars.length > 10 ? Math.min(1, max + (error ?? 0)) || 1 : 1, step = w / axis.size, y = (p) => top + h * (1 - Math.min(p / high, 1));
-      const colour = context.fillStyle;
-      bars.forEach((p, at) => {
+      const high = axis.size > 10 ? Math.min(1, max + (error ?? 0)) || 1 : 1, step = w / axis.size;
+      const y = (p) => top + h * (1 - Math.min(p / high, 1)), colour = context.fillStyle;
+      const errors = numbers.subarray(axis.size);  // empty if they are not known
+      numbers.subarray(0, axis.size).forEach((p, at) => {
         const x = left + at * step, gap = step > 6 ? step * 0.1 : 0;
         context.fillStyle = "#0072b2";
         context.fillRect(x + gap, y(p), Math.max(step - 2 * gap, 1), top + h - y(p));
-        if (error == null) return;
-        path(context, [x + step / 2, y(Math.max(p - error, 0))], [x + step / 2, y(p + error)]);
+        if (!errors.length) return;
+        path(context, [x + step / 2, y(Math.max(p - errors[at], 0))], [x + step / 2, y(p + errors[at])]);
         paint(context, 2, "#d55e00");
       });
       Object.assign(context, { fillStyle: colour, strokeStyle: colour, lineWidth: 1 }).strokeRect(left, top, w, h);
       write(context, "right", number(high, 3), left - 4, top + 8);
       write(context, "right", "0", left - 4, top + h);
       const every = Math.ceil(axis.size / Math.max(1, Math.floor(w / 60)));
-      for (let at = 0; at < axis.size; at += every) write(context, "center", value(axis, at), left + (at + 0.5) * step, top + h + 15, every * step);
+      for (let at = 0; at < axis.size; at += every) {
+        write(context, "center", value(axis, at), left + (at + 0.5) * step, top + h + 15, every * step);
+      }
       write(context, "center", title(axis), left + w / 2, top + h + 33, w);
     },
 
     // --- the boat ---
     // Pixel of a place in the world, and the other way round; null if the axes are not x and y with values.
     placed() {
-      const box = this.live.box;
-      return box && box.down.known && box.across.known && box.down.label === "y" && box.across.label === "x" ? box : null;
+      const { box } = this.live, labels = box && `${box.down.label} ${box.across.label}`;
+      return labels === "y x" && box.down.known && box.across.known ? box : null;
     },
     pixel(x, y) {
       const box = this.placed();
-      if (!box) return null;
-      const column = (x - box.across.offset) / box.across.step, row = (y - box.down.offset) / box.down.step;
-      return [box.left + (column + 0.5) / box.across.size * box.w, box.top + box.h - (row + 0.5) / box.down.size * box.h];
+      const index = (axis, at) => (at - axis.offset) / axis.step;
+      return box && [box.x(index(box.across, x)), box.y(index(box.down, y))];
     },
     world(px, py) {
       const box = this.placed(), inside = (share) => Math.min(Math.max(share, 0), 1);
@@ -453,24 +454,21 @@ export default {
     boat() {
       return this.live.drag ?? this.live.head?.truth ?? this.live.stats?.truth;
     },
-    pick(event) {
-      const boat = this.boat();
-      if (!this.canDrag() || !this.placed() || !boat) return;
-      const [x, y] = this.pixel(...boat);
-      if (Math.hypot(event.offsetX - x, event.offsetY - y) > GRAB) return;
-      event.preventDefault();
-      this.$refs.posterior.focus();
-      this.$refs.posterior.setPointerCapture(event.pointerId);
-      this.live.pointer = event.pointerId;
-      this.put(event.offsetX, event.offsetY);
-    },
-    move(event) {
-      if (this.live.pointer === event.pointerId && this.placed()) this.put(event.offsetX, event.offsetY);
-    },
-    drop(event) {
-      if (this.live.pointer !== event.pointerId) return;
-      this.live.pointer = null;
-      this.letGo();
+    // Pick the boat up near it, move it, and drop it.
+    point(event) {
+      const { live } = this, { pointerId, offsetX, offsetY, target } = event;
+      if (event.type === "pointerdown") {
+        const boat = this.canDrag() && this.placed() && this.boat(), [x, y] = boat ? this.pixel(...boat) : [];
+        if (!boat || Math.hypot(offsetX - x, offsetY - y) > GRAB) return;
+        event.preventDefault();
+        target.focus();
+        target.setPointerCapture(pointerId);
+        live.pointer = pointerId;
+      } else if (live.pointer !== pointerId) return;
+      if (event.type === "pointerup" || event.type === "pointercancel") {
+        live.pointer = null;
+        this.letGo();
+      } else if (this.placed()) this.put(offsetX, offsetY);
     },
     put(px, py) {
       this.live.drag = this.live.wanted = this.world(px, py);
@@ -485,24 +483,19 @@ export default {
       }, 400);
     },
     key(event) {
-      const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key], boat = this.boat();
+      const by = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+      const boat = this.boat();
       if (!by || !boat || !this.canDrag() || !this.placed()) return;
       event.preventDefault();
       const { across, down } = this.placed(), cells = event.shiftKey ? 5 : 1;
-      const [px, py] = this.pixel(boat[0] + by[0] * cells * Math.abs(across.step), boat[1] + by[1] * cells * Math.abs(down.step));
-      this.put(px, py);
+      const moved = [across, down].map((axis, at) => boat[at] + by[at] * cells * Math.abs(axis.step));
+      this.put(...this.pixel(...moved));
       this.letGo();
     },
 
     // --- saving ---
     savePng(name) {
-      this.$refs.posterior.toBlob((blob) => {
-        const link = document.createElement("a");
-        link.href = URL.createObjectURL(blob);
-        link.download = name;
-        link.click();
-        setTimeout(() => URL.revokeObjectURL(link.href), 1000);
-      });
+      make("a", { href: this.$refs.posterior.toDataURL(), download: name }).click();
     },
   },
 };

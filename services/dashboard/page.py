@@ -26,10 +26,14 @@ from services.output.axes import printable
 from terminal.signals import until_one_ends
 
 _STATS_EVERY: Final = 0.5
+_OF_ROBOT: Final = ["state", "connected", "why", "boards", "landmarks", "switches", "can_set_pose", "samples"]
+"""Attributes of the robot that the page gets as they are."""
 _IN_FLIGHT: Final = 2
 """Messages on the way to a browser: more would only be older when it gets to them."""
 _HERE: Final = Path(__file__).parent
 _MAX_INBOUND: Final = 4096
+_MAX_ASKING: Final = 8
+"""Maximum number of services that are asked at once for a browser."""
 
 
 class Live(Element, component="live.js"):
@@ -145,11 +149,17 @@ class Dashboard:
                 text = await socket.receive_text()
                 if text == ".":
                     room.release()
-                elif (wish := _wish(text)) is not None:
+                elif (wish := _wish(text)) is None:
+                    continue
+                elif wish.pose is not None:
+                    self._robot.set_pose(*wish.pose)
+                elif len(asking) < _MAX_ASKING:
                     # a service may take seconds, in which the page goes on
-                    task = asyncio.create_task(self._grant(socket, wish))
+                    task = asyncio.create_task(self._switch(socket, wish))
                     asking.add(task)
                     task.add_done_callback(asking.discard)
+                else:
+                    await socket.send_bytes(_notice("the switches before this one have not answered yet"))
         finally:
             for task in asking:
                 task.cancel()
@@ -169,53 +179,33 @@ class Dashboard:
                 next_stats = loop.time() + _STATS_EVERY
                 await room.acquire()
                 await socket.send_bytes(self._statistics())
-            if view.frame is None:
-                continue
             await room.acquire()
-            # looked up again, because newer ones may have come during the wait for room
+            # looked up only now, because newer ones may have come during the wait for room
             frame = view.frame
-            if frame is None:
-                room.release()
-                continue
-            axes = self._robot.axes_for(frame)
-            now = (frame, view.at, view.labels(frame), axes)
-            message = view.message(axes) if now != sent else None
-            if message is None:
+            axes = self._robot.axes_for(frame) if frame is not None else ()
+            now = (frame, view.at, frame and view.labels(frame), axes)
+            if frame is None or now == sent:
                 room.release()
                 continue
             sent = now
-            await socket.send_bytes(message)
+            await socket.send_bytes(view.message(frame, axes, self._robot.units_for(frame)))
 
     def _statistics(self) -> bytes:
         now = time.monotonic()
         if now - self._stats[0] >= _STATS_EVERY / 2:
-            robot = self._robot
-            head: dict[str, Any] = {
+            head: dict[str, Any] = {name: getattr(self._robot, name) for name in _OF_ROBOT} | {
                 "kind": "stats",
-                "state": robot.state,
-                "connected": robot.connected,
                 "rate": self._feed.rate(now),
-                "lost": {**self._feed.lost, **robot.lost},
-                "why": robot.why,
-                "boards": robot.boards,
-                "landmarks": robot.landmarks,
+                "lost": {**self._feed.lost, **self._robot.lost},
                 "truth": self._feed.truth,
-                "switches": robot.switches,
-                "can_set_pose": robot.can_set_pose,
-                "samples": robot.samples,
                 "stage_names": STAGES,
                 "stages": self._feed.stage_times(now),
             }
             self._stats = (now, packed(head))
         return self._stats[1]
 
-    async def _grant(self, socket: WebSocket, wish: Wish) -> None:
-        if wish.pose is not None:
-            self._robot.set_pose(*wish.pose)
-        elif wish.switch:
-            await socket.send_bytes(
-                packed({"kind": "notice", "text": await self._robot.switch(wish.switch, wish.on)})
-            )
+    async def _switch(self, socket: WebSocket, wish: Wish) -> None:
+        await socket.send_bytes(_notice(await self._robot.switch(wish.switch, wish.on)))
 
     # Files
 
@@ -233,6 +223,10 @@ class Dashboard:
         content = await asyncio.to_thread(make)
         headers = {"Content-Disposition": f'attachment; filename="posteriors.{kind}"'}
         return Response(content, media_type="application/octet-stream", headers=headers)
+
+
+def _notice(text: str) -> bytes:
+    return packed({"kind": "notice", "text": text})
 
 
 def _wish(text: str) -> Wish | None:

@@ -4,7 +4,6 @@ It connects again for ever, because the page is there before the robot, and afte
 """
 
 import asyncio
-import base64
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -12,17 +11,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from bridge.client import Publication, Ros, connect
 from bridge.discovery import announced_uri
 from bridge.errors import BridgeError, NotRosbridgeError, TopicLeftOutError, UnreachableError
 from bridge.stamps import header
 from posteriors.errors import BadResultError
 from posteriors.listening import posteriors
-from posteriors.posterior import MAX_RESULT, SAMPLES_TOPIC, SAMPLES_TYPE, Posterior
+from posteriors.posterior import MAX_RESULT, SAMPLES_TOPIC, SAMPLES_TYPE, Posterior, read_samples
+from posteriors.standard_messages import pose_at
 from services.dashboard.feed import Feed, Frame
-from services.output.axes import Axis, deployment_axes
+from services.output.axes import Axis, deployment_axes, state_in_words
 from services.settings import Settings
 from services.sockets.status import ask_stack
 from terminal.connection import report_connection
@@ -30,7 +28,6 @@ from terminal.output import say, warn
 from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 
-TRUTH_TOPIC: Final = "/boat/true_pose"
 POSE_TYPE: Final = "geometry_msgs/PoseStamped"
 SET_POSE_TOPIC: Final = "/boat/set_pose"
 LANDMARKS_TOPIC: Final = "/boat/beacons"
@@ -46,6 +43,7 @@ _STATUS_EVERY: Final = 1.0
 _SAMPLES_EVERY_MS: Final = 500
 _SAMPLES: Final = 8
 """Number of samples that are shown."""
+_MAX_LINE: Final = 1000
 _MAX_LANDMARKS: Final = 100
 _MAX_SWITCHES: Final = 100
 _MAX_NAME: Final = 100
@@ -149,7 +147,7 @@ class Robot:
             self.landmarks = read_landmarks(message)
 
         def take_samples(message: dict[str, Any]) -> None:
-            self.samples = read_samples(message)
+            self.samples = self._samples_in_words(message)
 
         async def follow(
             topic: str, kind: str, take: Callable[[dict[str, Any]], None], *, every_ms: int = 0
@@ -249,13 +247,38 @@ class Robot:
 
     def axes_for(self, frame: Frame) -> tuple[Axis, ...]:
         """Return the axes of a frame's posterior; none if it is another deployment's, whose units would mislead."""
-        deployment, values = self._deployment, frame.values
-        if deployment is None or values is None:
-            return ()
-        if frame.report is not None and frame.report.deployment != deployment.name:
+        if self._deployment_of(frame) is None or frame.values is None:
             return ()
         ours = [(axis.label, axis.size) for axis in self._axes]
-        return self._axes if ours == list(zip(frame.labels, values.shape, strict=True)) else ()
+        return self._axes if ours == list(zip(frame.labels, frame.values.shape, strict=True)) else ()
+
+    def units_for(self, frame: Frame) -> dict[str, str]:
+        """Return the units of a frame's readings by the names of their variables, as far as they are known."""
+        deployment = self._deployment_of(frame)
+        return {each.name: each.unit for each in deployment.variables} if deployment is not None else {}
+
+    def _samples_in_words(self, message: Mapping[str, Any]) -> str:
+        """Return the last states of a message; of an unknown machine, as hexadecimal words."""
+        deployment = self._deployment_of(self._feed.newest)
+        dimensions = deployment.state_dimensions if deployment is not None else ()
+        try:
+            states = read_samples(message, [each.size for each in dimensions], newest=_SAMPLES).tolist()
+        except BadResultError:
+            return ""  # another program publishes there
+        lines = (
+            state_in_words(dimensions, state)
+            if dimensions
+            else " ".join(f"{word:08x}" for word in state[::-1])
+            for state in states
+        )
+        return "\n".join(line[:_MAX_LINE] for line in lines)
+
+    def _deployment_of(self, frame: Frame | None) -> Deployment | None:
+        report = frame.report if frame is not None else None
+        other = (
+            report is not None and self._deployment is not None and report.deployment != self._deployment.name
+        )
+        return None if other else self._deployment
 
     # Asking
 
@@ -264,16 +287,12 @@ class Robot:
         ros, poses = self._ros, self._poses
         if ros is None or poses is None or not self.can_set_pose or not math.isfinite(x + y):
             return
-        pose = {
-            "position": {"x": x, "y": y, "z": 0.0},
-            "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-        }
         if _SAIL in self.switches:  # a boat that is put somewhere lies still
             self.switches[_SAIL] = False
         head = header(time.time_ns(), "map", ros.ros_version or 1)
         # while the server is away or slow, poses are dropped: the next one replaces them
         with suppress(BridgeError):
-            poses.publish_nowait({"header": head, "pose": pose})
+            poses.publish_nowait({"header": head, "pose": pose_at(x, y)})
 
     async def switch(self, name: str, on: bool) -> str:
         """Call a switch of the world; return what went wrong, empty if nothing did."""
@@ -312,15 +331,3 @@ def read_landmarks(message: Mapping[str, Any]) -> list[tuple[float, float, str]]
         if isinstance(marker, Mapping) and (point := _point(marker.get("pose"))) is not None
     ]
     return found[:_MAX_LANDMARKS]
-
-
-def read_samples(message: Mapping[str, Any]) -> str:
-    """Return the last states of a `/bm/samples` message, a line each, as the hexadecimal words of the board."""
-    try:
-        size = int(message["layout"]["dim"][1]["size"])
-        data = message["data"]
-        octets = base64.b64decode(data) if isinstance(data, str) else bytes(list(data))  # not bytes(10**12)
-        words = np.frombuffer(octets, "<u4").reshape(-1, size // 4)[-_SAMPLES:]
-    except (ArithmeticError, LookupError, TypeError, ValueError):
-        return ""  # another program publishes there
-    return "\n".join(" ".join(f"{word:08x}" for word in state[::-1]) for state in words)

@@ -3,12 +3,12 @@
 import csv
 import io
 from collections.abc import Sequence
-from itertools import product
 
 import numpy as np
 
 from services.dashboard.feed import Frame
 from services.output.axes import Axis
+from services.output.posterior_file import cell_names
 
 _NOT_KNOWN = -1
 
@@ -18,14 +18,7 @@ def same_shape(frames: Sequence[Frame], shown: Frame | None) -> list[Frame]:
     with_posterior = [each for each in frames if each.values is not None]
     if shown is None or shown.values is None:
         shown = with_posterior[-1] if with_posterior else None
-    if shown is None or shown.values is None:
-        return []
-    form = (shown.labels, shown.values.shape)
-    return [
-        each
-        for each in with_posterior
-        if each.values is not None and (each.labels, each.values.shape) == form
-    ]
+    return [each for each in with_posterior if shown is not None and each.form == shown.form]
 
 
 def archive(frames: Sequence[Frame], axes: Sequence[Axis]) -> bytes:
@@ -49,19 +42,11 @@ def archive(frames: Sequence[Frame], axes: Sequence[Axis]) -> bytes:
 def table(frames: Sequence[Frame]) -> bytes:
     """Return a table as CSV: a row a frame, with its most probable cell; frames must not be empty."""
     labels, first = frames[0].labels, frames[0].values
-    sizes = first.shape if first is not None else ()
+    cells = cell_names(labels, first.shape) if first is not None else ()
     file = io.StringIO(newline="")
     rows = csv.writer(file, lineterminator="\n")
-    cells = product(*(range(size) for size in sizes))
-    rows.writerow(
-        [
-            *("frame", "stamp_ns", "heard_ns", "cycles", *map(_harmless, labels), "probability"),
-            *(
-                _harmless(" ".join(f"{label}={at}" for label, at in zip(labels, cell, strict=True)))
-                for cell in cells
-            ),
-        ]
-    )
+    names = ("frame", "stamp_ns", "heard_ns", "cycles", *labels, "probability", *cells)
+    rows.writerow(map(_harmless, names))
     for frame in frames:
         report, values = frame.report, frame.values
         if values is None:

@@ -1,26 +1,24 @@
 """The view of one browser: the newest frame or an earlier one, and its marginals, as messages for the page.
 
 A message is binary: the length of its head (4 bytes, little-endian), the head (JSON), and the picture: a byte a
-cell of a heat map, relative to the highest cell, or a little-endian float32 a bar.
+cell of a heat map, relative to the highest cell, or a little-endian float32 a bar and then, of a BM2, one a bar's error.
 """
 
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from functools import lru_cache
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import orjson
 
 from posteriors.frame_report import FrameReport
+from posteriors.standard_messages import moments
 from services.dashboard.feed import Feed, Frame
 from services.output.axes import Axis
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _LENGTH: Final = struct.Struct("<I")
 _NO_REPORT: Final = FrameReport(stamp_ns=0, outcome="posterior without a report")
@@ -72,15 +70,13 @@ class View:
             return self.chosen
         return default_labels(frame)
 
-    def message(self, axes: Sequence[Axis]) -> bytes | None:
-        """Return the message for the frame that is shown; None before the first one."""
-        frame = self.frame
-        if frame is None:
-            return None
+    def message(self, frame: Frame, axes: Sequence[Axis], units: Mapping[str, str]) -> bytes:
+        """Return the message for the frame that is shown, with the units of its readings."""
         head, picture = _encoded(frame, self.labels(frame), tuple(axes))
         kept = self._feed.frames
         now_ns = time.time_ns()
         head = head | {
+            "readings": [[*reading, units.get(reading[0], "")] for reading in head["readings"]],
             "paused": self.at is not None,
             "first": kept[0].at,
             "last": kept[-1].at,
@@ -136,33 +132,21 @@ def _encoded(frame: Frame, labels: tuple[str, ...], axes: tuple[Axis, ...]) -> t
     marginal = frame.marginal(labels)
     shown = [_axis(label, size, axes) for label, size in zip(labels, marginal.shape, strict=True)]
     peak = float(marginal.max())
-    head["plot"] = plot = {"axes": shown, "max": peak, "error": frame.standard_error}
+    errors = frame.sampling_error(marginal)
+    error = None if errors is None else float(errors.max())
+    head["plot"] = plot = {"axes": shown, "max": peak, "error": error}
     if marginal.ndim == 1:
-        return head, marginal.astype("<f4").tobytes()
+        bars = marginal if errors is None else np.concatenate([marginal, errors])
+        return head, bars.astype("<f4").tobytes()
     # names have no mean
     if not any(axis["states"] for axis in shown):
-        plot |= moments(marginal)
+        plot["mean"], plot["covariance"] = moments(marginal)
     return head, np.rint(marginal * (255 / peak)).astype(np.uint8).tobytes()
 
 
 def _shown(number: int | None) -> int | str | None:
     # anybody can publish larger numbers than JSON's readers and floats know
     return number if number is None or abs(number) < _LARGEST else f"{Decimal(number):.3g}"
-
-
-def moments(marginal: "NDArray[np.float64]") -> dict[str, list[float]]:
-    """Return mean (row, column) and covariance (rows, both, columns) of a marginal of two variables, in cells."""
-    rows, columns = np.arange(marginal.shape[0]), np.arange(marginal.shape[1])
-    by_row, by_column = marginal.sum(axis=1), marginal.sum(axis=0)
-    row, column = float(by_row @ rows), float(by_column @ columns)
-    return {
-        "mean": [row, column],
-        "covariance": [
-            float(by_row @ (rows - row) ** 2),
-            float((rows - row) @ marginal @ (columns - column)),
-            float(by_column @ (columns - column) ** 2),
-        ],
-    }
 
 
 def _axis(label: str, size: int, axes: tuple[Axis, ...]) -> dict[str, Any]:

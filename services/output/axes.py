@@ -71,6 +71,15 @@ def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
     return words if any(axis.dimension for axis in axes) else f"cell {words}"
 
 
+def state_in_words(dimensions: Sequence[Dimension], codes: Sequence[int]) -> str:
+    """Return a sampled state in words: `rain=yes  grass=wet`; a code may be unused."""
+    pairs = zip(dimensions, codes, strict=True)
+    return "  ".join(
+        f"{printable(each.label)}={Axis(each.label, each.size, each).shown(code) if code < each.size else f'code {code}'}"
+        for each, code in pairs
+    )
+
+
 def printable(text: str) -> str:
     """Return received text without control characters, and shortened."""
     # labels come over the wire: they must not fill the screen, nor control it

@@ -6,7 +6,7 @@ import io
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
@@ -96,6 +96,12 @@ def record(frame: FrameOutcome, axes: list[Axis]) -> dict[str, Any]:
     }
 
 
+def cell_names(labels: Sequence[str], sizes: Sequence[int]) -> list[str]:
+    """Return the names of all cells of a posterior, such as `y=1 x=2`, in the order of its probabilities."""
+    cells = product(*(range(size) for size in sizes))
+    return [" ".join(f"{label}={at}" for label, at in zip(labels, cell, strict=True)) for cell in cells]
+
+
 class _Lines(ResultFile):
     """A file to which whole lines are appended, so that an interruption never leaves an incomplete line."""
 
@@ -160,10 +166,7 @@ class _CsvLines(_Lines):
             *("frame", "stamp_ns", "cycles", "latency_us"),
             *(axis.label for axis in axes),
             "probability",
-            *(
-                " ".join(f"{axis.label}={at}" for axis, at in zip(axes, cell, strict=True))
-                for cell in product(*(range(axis.size) for axis in axes))
-            ),
+            *cell_names([axis.label for axis in axes], [axis.size for axis in axes]),
         ]
         if columns != self._columns:
             self._begin(columns)

@@ -14,9 +14,11 @@ import socket
 import struct
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import websockets
+from fastapi import WebSocketDisconnect
 
 from bridge.client import connect
 from bridge.errors import DisconnectedError, TopicLeftOutError
@@ -24,7 +26,8 @@ from posteriors.errors import BadResultError
 from services.commands.dashboard import app
 from services.commands.master import app as master
 from services.dashboard.feed import Feed
-from services.dashboard.robot import Robot, read_landmarks, read_samples
+from services.dashboard.page import Dashboard
+from services.dashboard.robot import Robot, read_landmarks
 from services.master.command_lines import dashboard_command
 from services.settings import Settings
 from tests.casestudies.pretend_stack import certain, frame_message
@@ -33,6 +36,8 @@ from tests.integration.conftest import stage as stage  # noqa: PLC0414  # a fixt
 from tests.patience import PROCESS_PATIENCE
 from tests.posteriors.messages import posterior_message
 from tests.services.dashboard.frames import posterior, report
+from tests.toolchain import builders
+from toolchain.deployment import BM2Section, BoardSection, Dimension
 
 PROJECT = Path(__file__).parents[3] / "pyproject.toml"
 FOLDER = PROJECT.parent / "services" / "dashboard"
@@ -87,19 +92,100 @@ def test_landmarks_of_a_message_or_none():
     assert len(landmark[2]) == 100, "each page gets it twice a second"
 
 
-def test_samples_of_a_message_or_none():
-    layout = {"dim": [{"size": 2}, {"size": 8}]}
-    data = list(struct.pack("<4I", 1, 2, 3, 0xABC))
-    assert read_samples({"layout": layout, "data": data}) == "00000002 00000001\n00000abc 00000003"
-    infinite = {"dim": [{"size": 2}, {"size": math.inf}]}
-    for strange in (
-        {},
-        {"layout": layout, "data": [1]},
-        {"layout": layout, "data": 16},
-        {"layout": {"dim": []}, "data": data},
-        {"layout": infinite, "data": data},
-    ):
-        assert not read_samples(strange)
+STATE = 1 | 3 << 2 | 1 << 4 | 52 << 6 | 10 << 13
+
+
+class SamplesServer:
+    """A server on which only samples are published."""
+
+    def __init__(self, *messages):
+        self._messages = messages
+
+    async def subscribe(self, topic, _kind, **_flow):
+        for message in self._messages if topic == "/bm/samples" else ():
+            yield SimpleNamespace(msg=message)
+
+
+def samples_message(*states, words=1):
+    data = b"".join(state.to_bytes(4 * words, "little") for state in states)
+    return {"layout": {"dim": [{"size": len(states)}, {"size": 4 * words}]}, "data": list(data)}
+
+
+@pytest.fixture
+def chain():
+    """A deployment whose samples are 22 bits of five variables."""
+    boards = (BoardSection(image="boards/board0.bm", image_hash="a" * 64, line_offset=0, lines=1),)
+    hidden = (Dimension(label="S", size=3, states=("no", "yes", "<b>")),)
+    machine = BM2Section(lines=12, stream=4, variables=("S", "y", "x", "D1", "B1"))
+    distance, bearing = builders.BOAT["variables"]
+    variables = (distance.replace(unit="m"), bearing)
+    return builders.boat(machine=machine, boards=boards, hidden=hidden, variables=variables)
+
+
+async def samples_shown(monkeypatch, deployment, *messages, of="boat"):
+    feed = Feed()
+    feed.add(report(1, deployment=of), 0.0)
+    robot = Robot(feed, Settings(), deployment, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
+    for other in ("_follow_frames", "_ask_about_world"):
+        monkeypatch.setattr(robot, other, nothing)
+    await robot._follow(SamplesServer(*messages))
+    return robot.samples
+
+
+async def test_sampled_states_are_shown_by_name(monkeypatch, chain):
+    words = "S=yes  y=3  x=1  D1=52 m  B1=10"
+    message = samples_message(*[0] * 10, STATE, STATE | 3)
+    shown = (await samples_shown(monkeypatch, chain, message)).split("\n")
+    assert (len(shown), shown[0]) == (8, "S=no  y=-3  x=0  D1=0 m  B1=0")
+    assert shown[-2:] == [words, words.replace("S=yes", "S=code 3")]
+
+
+async def test_states_of_other_machines_are_hexadecimal_words(monkeypatch, chain, boat):
+    message = samples_message(1 | 2 << 32, 3 | 0xABC << 32, words=2)
+    for deployment in (None, boat, chain.replace(hidden=())):
+        shown = await samples_shown(monkeypatch, deployment, message)
+        assert shown == "00000002 00000001\n00000abc 00000003"
+    assert await samples_shown(monkeypatch, chain, samples_message(STATE), of="garden") == f"{STATE:08x}"
+    assert not await samples_shown(monkeypatch, chain, message, {"layout": 3, "data": 10**12})
+    long = await samples_shown(monkeypatch, None, samples_message(1, words=10_000))
+    assert len(long) == 1000
+
+
+def test_units_are_those_of_the_deployment_of_a_frame(chain):
+    feed = Feed()
+    robot = Robot(feed, Settings(), chain, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
+    assert robot.units_for(feed.add(report(1, deployment="boat"), 0.0)) == {"D1": "m", "B1": ""}
+    assert robot.units_for(feed.add(report(1, deployment="garden"), 0.0)) == {}
+
+
+async def test_switches_that_do_not_answer_are_bounded_and_hold_up_nothing():
+    asked, poses, sent = [], [], []
+
+    async def switch(name, _on):
+        asked.append(name)
+        await asyncio.Event().wait()
+
+    class Socket:
+        def __init__(self):
+            self.texts = [json.dumps({"switch": f"/boat/{n}", "on": True}) for n in range(1000)]
+            self.texts += [json.dumps({"pose": [1, 2]}), "."]
+
+        async def receive_text(self):
+            await asyncio.sleep(0)
+            if not self.texts:
+                raise WebSocketDisconnect
+            return self.texts.pop(0)
+
+        async def send_bytes(self, message):
+            sent.append(message)
+
+    robot = SimpleNamespace(switch=switch, set_pose=lambda *pose: poses.append(pose))
+    room = asyncio.Semaphore(0)
+    with pytest.raises(WebSocketDisconnect):
+        await Dashboard(Feed(), robot)._read(Socket(), room)
+    assert (len(asked), poses, room.locked()) == (8, [(1.0, 2.0)], False)
+    assert len(sent) == 992
+    assert b"not answered" in sent[0]
 
 
 async def nothing(*_arguments):

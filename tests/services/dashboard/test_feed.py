@@ -1,5 +1,6 @@
 """The kept frames, five minutes of stage times, rate and losses, with the test's own clock."""
 
+import numpy as np
 import pytest
 
 from services.dashboard import feed as module
@@ -73,7 +74,23 @@ def test_watchers_learn_of_a_frame_with_its_truth():
     assert told == [(1.0, 2.0)]
 
 
-@pytest.mark.parametrize(("text", "error"), [("0.004", 0.004), ("?", None)])
-def test_a_sampling_error_is_a_number(text, error):
-    frame = Feed().add(posterior(1, details={"standard_error": text}), 0.0)
-    assert frame.standard_error == error
+AGREE, APART = {"r_hat": "1.0010"}, {"r_hat": "inf"}
+
+
+@pytest.mark.parametrize(
+    ("details", "errors"),
+    [
+        ({"effective_samples": "400", "standard_error": "0.025"}, [0.015, 0.025]),
+        ({"effective_samples": "400", "standard_error": "0.025"} | AGREE, [0.015, 0.025]),
+        ({"effective_samples": "400", "standard_error": "0.02"} | APART, [0.02, 0.025]),
+        ({"standard_error": "0.3"} | APART, [0.3, 0.3]),
+        ({"samples": "400"}, None),
+        ({"effective_samples": "?", "standard_error": "?"}, None),
+        ({"effective_samples": "-5"}, None),
+        ({"effective_samples": "inf"}, None),
+    ],
+)
+def test_each_probability_has_its_own_sampling_error(details, errors):
+    frame = Feed().add(posterior(1, details=details), 0.0)
+    found = frame.sampling_error(np.array([0.1, 0.5]))
+    assert found is errors is None or found == pytest.approx(errors, abs=5e-4)

@@ -25,13 +25,13 @@ def unpack(message):
     return json.loads(message[4 : 4 + length]), message[4 + length :]
 
 
-def shown(*outcomes, axes=(), chosen=()):
+def shown(*outcomes, axes=(), units=(), chosen=()):
     feed = Feed()
     for outcome in outcomes:
         feed.add(outcome, 0.0)
     view = View(feed)
     view.choose(chosen)
-    return unpack(view.message(axes))
+    return unpack(view.message(view.frame, axes, dict(units)))
 
 
 def test_a_heat_map_with_its_mean_and_covariance():
@@ -69,10 +69,23 @@ def test_axes_have_the_units_of_the_deployment():
     assert not shown(posterior(1))[0]["plot"]["axes"][0]["known"]
 
 
-def test_one_variable_is_bars_with_the_sampling_error():
-    head, picture = shown(posterior(1, [0.2, 0.8], ("rain",), details={"standard_error": "0.01"}))
-    assert np.frombuffer(picture, "<f4") == pytest.approx([0.2, 0.8])
-    assert head["plot"]["error"] == 0.01
+def test_one_variable_is_bars_each_with_its_sampling_error():
+    values = np.array([[0.1, 0.3], [0.1, 0.5]])
+    one = posterior(1, values, ("rain", "wind"), details={"effective_samples": "10000"})
+    head, picture = shown(one, chosen=("rain",))
+    assert np.frombuffer(picture, "<f4") == pytest.approx([0.4, 0.6, 0.0049, 0.0049], rel=0.01)
+    head, picture = shown(one, chosen=("wind",))
+    assert np.frombuffer(picture, "<f4") == pytest.approx([0.2, 0.8, 0.004, 0.004], rel=0.01)
+    assert head["plot"]["error"] == pytest.approx(0.004, rel=0.01)
+    assert shown(one)[0]["plot"]["error"] == pytest.approx(0.005, rel=0.01), "that of the worst cell"
+    head, picture = shown(posterior(1, [0.2, 0.8], ("rain",)))
+    assert (len(picture), head["plot"]["error"]) == (8, None)
+
+
+def test_readings_have_their_units():
+    readings = {"D1": VariableReading(1.5, 3, 0.5), "grass": VariableReading("wet", 1, 0.5)}
+    head, _ = shown(posterior(1, readings=readings), units={"D1": "m"})
+    assert head["readings"] == [["D1", 1.5, 3, 0.5, "m"], ["grass", "wet", 1, 0.5, ""]]
 
 
 def test_chosen_marginals_of_more_variables_and_replicas():
@@ -98,12 +111,12 @@ def test_pause_step_and_return_to_the_newest():
     view = View(feed)
     view.pause(True)
     view.step(-1)
-    assert (view.message(()), view.at) == (None, None)
+    assert (view.frame, view.at) == (None, None)
     for number in range(1, 6):
         feed.add(posterior(number), 0.0)
     view.step(-2)
     feed.add(posterior(6), 0.0)
-    head = unpack(view.message(()))[0]
+    head = unpack(view.message(view.frame, (), {}))[0]
     assert (head["number"], head["paused"], head["last"]) == (3, True, 6)
     view.step(1)
     assert view.frame.report.number == 4
@@ -122,9 +135,9 @@ def test_names_stay_what_they_are():
     one = posterior(
         1, labels=(HOSTILE, "x"), readings={HOSTILE: VariableReading(1.5, 3, 0.5)}, missing=(HOSTILE,)
     )
-    head, _ = shown(one)
+    head, _ = shown(one, units={HOSTILE: HOSTILE})
     assert head["plot"]["axes"][0]["label"] == HOSTILE
-    assert (head["readings"], head["missing"]) == ([[HOSTILE, 1.5, 3, 0.5]], [HOSTILE])
+    assert (head["readings"], head["missing"]) == ([[HOSTILE, 1.5, 3, 0.5, HOSTILE]], [HOSTILE])
 
 
 def test_the_kept_frames_as_files(boat):
