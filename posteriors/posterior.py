@@ -206,14 +206,14 @@ def samples_layout(samples: int, sample_bytes: int) -> dict[str, Any]:
     return {"dim": [rows, state], "data_offset": 0}
 
 
-def read_samples(
-    message: Mapping[str, Any], sizes: Sequence[int] = (), *, newest: int = 0
-) -> "NDArray[np.int64]":
+def read_samples(message: dict[str, Any], sizes: Sequence[int] = (), newest: int = 0) -> "NDArray[np.int64]":
     """Return the values of the variables in the states of a message on `/bm/samples`, int64[samples, variables].
 
-    `sizes` are their numbers of values, in the order of the machine; a value that is not below is an unused code.
-    Without sizes, it is the words of the states, int64[samples, words]. `newest` is the number of samples, 0 for all.
-    A BadResultError if these are no such states.
+    `sizes` are their numbers of values, in the order of the machine; a value beyond is an unused code. Without sizes,
+    return the words of the states, int64[samples, words]. `newest` limits the number of samples, unless it is 0.
+
+    Raises:
+        BadResultError: These are not such states.
     """
     import numpy as np
 

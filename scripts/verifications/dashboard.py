@@ -134,15 +134,15 @@ class Scene:
 
 
 async def check_live(scene: Scene) -> None:
-    """Check that frame numbers rise, the posterior is painted, and readings, boards and times are there."""
+    """Check that frame numbers rise, the posterior is painted, and readings with units, boards and times are there."""
     visit = scene.visit
     first = await visit.frame()
     await visit.until("first => window.paints.some(({number}) => number > first + 20)", first)
     for name in ("posterior", "stage-times"):
         colours = (await visit.picture(name)).getcolors(maxcolors=1 << 24)
         expect(len(colours or ()) > 10, f"{name} is painted with only the colours {colours}")
-    for name in SENSOR_NAMES:
-        await visit.text("readings", name)
+    for text in (*SENSOR_NAMES, " m\t", " deg\t"):
+        await visit.text("readings", text)
     await visit.text("boards", "overflow")
 
 

@@ -103,7 +103,8 @@ class Doors:
             # the name of a site is never an address
             address = ipaddress.ip_address(name.removeprefix("[").removesuffix("]"))
         except ValueError:
-            return not self._loopback and name in _own_names()
+            own = socket.gethostname().lower()
+            return not self._loopback and name in {own, f"{own}.local"}
         # a zone, as in [::1%evil.example], may be any text
         return "%" not in name and (address.is_loopback or not self._loopback)
 
@@ -114,11 +115,6 @@ class Doors:
         headers = [(b"location", b"/"), (b"set-cookie", cookie.encode()), (b"content-length", b"0")]
         await send({"type": "http.response.start", "status": HTTPStatus.SEE_OTHER, "headers": headers})
         await send({"type": "http.response.body", "body": b""})
-
-
-def _own_names() -> set[str]:
-    name = socket.gethostname().lower()
-    return {name, f"{name}.local"}
 
 
 def _cookie(headers: Headers) -> str:

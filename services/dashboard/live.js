@@ -169,6 +169,11 @@ export default {
         live.agedAt = now;
         this.showAge(now);
       }
+      // tables change no faster than eyes follow
+      if (live.untabled && (now - (live.tabledAt ?? -1000) > 100 || live.head.paused)) {
+        Object.assign(live, { untabled: false, tabledAt: now });
+        this.showTables();
+      }
       if (!live.dirty) return;
       live.dirty = false;
       this.drawPosterior();
@@ -176,11 +181,7 @@ export default {
         live.fresh = false;
         this.$refs.posterior.dataset.at = live.head.at;
         setText(this.$refs.number, live.head.number == null ? "?" : String(live.head.number));
-        // tables change no faster than eyes follow
-        if (now - (live.tabledAt ?? -1000) > 100 || live.head.paused) {
-          live.tabledAt = now;
-          this.showTables();
-        }
+        live.untabled = true;
       }
       if (live.statsFresh) {
         live.statsFresh = false;
@@ -390,9 +391,8 @@ export default {
       }
     },
     drawLandmark(context, place, name, width, height) {
-      if (!place) return;
-      const [x, y] = place;
-      if (x < 0 || x > width || y < 0 || y > height) return;
+      const [x, y] = place ?? [];
+      if (!(x >= 0 && x <= width && y >= 0 && y <= height)) return;
       path(context, [x, y - 7], [x + 7, y + 6], [x - 7, y + 6], [x, y - 7]);
       paint(context, 1.5, "#000", "#e69f00");
       const [align, to] = x < width / 2 ? ["left", x + 10] : ["right", x - 10];  // inwards, where no axis is

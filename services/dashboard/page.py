@@ -214,11 +214,8 @@ class Dashboard:
         frames = same_shape(tuple(self._feed.frames), shown.frame)
         if not frames:
             return Response("there is no posterior yet\n", status_code=404, media_type="text/plain")
-        make = (
-            partial(archive, frames, self._robot.axes_for(frames[0]))
-            if kind == "npz"
-            else partial(table, frames)
-        )
+        axes = self._robot.axes_for(frames[0])
+        make = partial(archive, frames, axes) if kind == "npz" else partial(table, frames)
         # in a thread, because it takes longer than the time between two frames
         content = await asyncio.to_thread(make)
         headers = {"Content-Disposition": f'attachment; filename="posteriors.{kind}"'}

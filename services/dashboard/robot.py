@@ -6,6 +6,7 @@ It connects again for ever, because the page is there before the robot, and afte
 import asyncio
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -146,9 +147,6 @@ class Robot:
         def take_landmarks(message: dict[str, Any]) -> None:
             self.landmarks = read_landmarks(message)
 
-        def take_samples(message: dict[str, Any]) -> None:
-            self.samples = self._samples_in_words(message)
-
         async def follow(
             topic: str, kind: str, take: Callable[[dict[str, Any]], None], *, every_ms: int = 0
         ) -> None:
@@ -167,7 +165,7 @@ class Robot:
                 tasks.create_task(follow(self._truth, POSE_TYPE, take_truth))
                 tasks.create_task(follow(LANDMARKS_TOPIC, LANDMARKS_TYPE, take_landmarks))
                 # more samples than that nobody can read
-                samples = follow(SAMPLES_TOPIC, SAMPLES_TYPE, take_samples, every_ms=_SAMPLES_EVERY_MS)
+                samples = follow(SAMPLES_TOPIC, SAMPLES_TYPE, self._take_samples, every_ms=_SAMPLES_EVERY_MS)
                 tasks.create_task(samples)
         except ExceptionGroup as failed:  # such as a topic that has two types
             raise failed.exceptions[0] from None
@@ -219,7 +217,7 @@ class Robot:
         while True:
             status = await ask_stack(directory)
             self.why = status.why
-            lost: dict[str, int] = {}
+            lost: Counter[str] = Counter()
             folder = ""
             for process in status.processes:
                 if process.name == "pcie-app":
@@ -227,8 +225,7 @@ class Robot:
                 if process.name == "master":
                     folder = process.folder
                 # each process loses other frames
-                for reason, count in process.frames.lost.items() if process.frames else ():
-                    lost[reason] = lost.get(reason, 0) + count
+                lost.update(process.frames.lost if process.frames else {})
             self.lost = lost
             if folder and folder != self._folder and self._settings.deployment is None:
                 self._folder = folder
@@ -257,28 +254,19 @@ class Robot:
         deployment = self._deployment_of(frame)
         return {each.name: each.unit for each in deployment.variables} if deployment is not None else {}
 
-    def _samples_in_words(self, message: Mapping[str, Any]) -> str:
-        """Return the last states of a message; of an unknown machine, as hexadecimal words."""
+    def _take_samples(self, message: dict[str, Any]) -> None:
+        """Keep the last states of a message in words; of an unknown machine, in hexadecimal."""
         deployment = self._deployment_of(self._feed.newest)
         dimensions = deployment.state_dimensions if deployment is not None else ()
-        try:
-            states = read_samples(message, [each.size for each in dimensions], newest=_SAMPLES).tolist()
-        except BadResultError:
-            return ""  # another program publishes there
-        lines = (
-            state_in_words(dimensions, state)
-            if dimensions
-            else " ".join(f"{word:08x}" for word in state[::-1])
-            for state in states
-        )
-        return "\n".join(line[:_MAX_LINE] for line in lines)
+        states: list[list[int]] = []
+        with suppress(BadResultError):  # another program publishes there
+            states = read_samples(message, [each.size for each in dimensions], _SAMPLES).tolist()
+        self.samples = "\n".join(state_in_words(dimensions, state)[:_MAX_LINE] for state in states)
 
     def _deployment_of(self, frame: Frame | None) -> Deployment | None:
-        report = frame.report if frame is not None else None
-        other = (
-            report is not None and self._deployment is not None and report.deployment != self._deployment.name
-        )
-        return None if other else self._deployment
+        deployment, report = self._deployment, frame.report if frame is not None else None
+        same = deployment is None or report is None or report.deployment == deployment.name
+        return deployment if same else None
 
     # Asking
 

@@ -133,8 +133,8 @@ def _encoded(frame: Frame, labels: tuple[str, ...], axes: tuple[Axis, ...]) -> t
     shown = [_axis(label, size, axes) for label, size in zip(labels, marginal.shape, strict=True)]
     peak = float(marginal.max())
     errors = frame.sampling_error(marginal)
-    error = None if errors is None else float(errors.max())
-    head["plot"] = plot = {"axes": shown, "max": peak, "error": error}
+    worst = None if errors is None else float(errors.max())
+    head["plot"] = plot = {"axes": shown, "max": peak, "error": worst}
     if marginal.ndim == 1:
         bars = marginal if errors is None else np.concatenate([marginal, errors])
         return head, bars.astype("<f4").tobytes()

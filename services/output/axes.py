@@ -72,12 +72,13 @@ def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
 
 
 def state_in_words(dimensions: Sequence[Dimension], codes: Sequence[int]) -> str:
-    """Return a sampled state in words: `rain=yes  grass=wet`; a code may be unused."""
-    pairs = zip(dimensions, codes, strict=True)
-    return "  ".join(
-        f"{printable(each.label)}={Axis(each.label, each.size, each).shown(code) if code < each.size else f'code {code}'}"
-        for each, code in pairs
-    )
+    """Return a sampled state in words, `rain=yes  grass=wet`; without dimensions, its words in hexadecimal."""
+    if not dimensions:
+        return " ".join(f"{word:08x}" for word in reversed(codes))
+    axes = [Axis(each.label, each.size, each) for each in dimensions]
+    pairs = zip(axes, codes, strict=True)
+    shown = ((axis, axis.shown(code) if code < axis.size else f"code {code}") for axis, code in pairs)
+    return "  ".join(f"{printable(axis.label)}={value}" for axis, value in shown)
 
 
 def printable(text: str) -> str:
