@@ -88,6 +88,14 @@ def cpu_us(pids: list[int]) -> float:
     return 1e6 * ticks / os.sysconf("SC_CLK_TCK")
 
 
+async def until_read(ros: Ros, topic: str) -> None:
+    """Wait until somebody subscribes to a topic: a reading that is published earlier has no result."""
+    while True:
+        if (await ros.call("/rosapi/subscribers", {"topic": topic}, timeout=30))["subscribers"]:
+            return
+        await asyncio.sleep(0.05)
+
+
 class Measured:
     """The echo or a stack: its topics for readings and answers, and the times of its cycles and their stages."""
 
@@ -152,6 +160,8 @@ async def measure(ros: Ros, masters: dict[str, Process], some: list[dict[str, in
     all_ = {FLOOR: Measured(await ros.advertise("/bench/reading", BOAT_TYPE), echoes, 0)}
     for name, topic in STACKS.items():
         all_[name] = Measured(await ros.advertise(topic, BOAT_TYPE), results, masters[name].pid)
+    for topic in ("/bench/reading", *STACKS.values()):
+        await until_read(ros, topic)
     for each in all_.values():
         await each.one_by_one(some[: max(20, len(some) // 10)])
         each.times.clear()  # that was the warm-up

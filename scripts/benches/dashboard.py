@@ -29,7 +29,7 @@ from bridge.client import Ros, connect
 from posteriors import BoardReport, FrameReport, StageTimes
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, VariableReading, write_frame_report
 from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
-from scripts.benches.cycle import cpu_us, message, quantile, readings
+from scripts.benches.cycle import cpu_us, message, quantile, readings, until_read
 from scripts.benches.load import mib_of
 from scripts.running.browser import Browser, Stand, Visit, browser
 from scripts.running.flags import ScriptParser
@@ -172,6 +172,8 @@ async def cycles(plain: Stand, beside: Stand, frames: int, seed: int) -> Rows:
             (await ros.advertise(BOAT_TOPIC, BOAT_TYPE), ros.subscribe(RESULTS_TOPIC, RESULTS_TYPE))
             for ros in (one, other)
         ]
+        for ros in (one, other):
+            await until_read(ros, BOAT_TOPIC)
         some = readings(seed, frames + WARM_UP_TURNS * TURN)
         for at in range(0, len(some), TURN):
             for taken, (publication, results) in zip(medians, sides, strict=True):

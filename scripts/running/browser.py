@@ -249,9 +249,11 @@ class Stand:
         self._commands["hub"] = (*command, str(urlsplit(self.uri).port))
         self._where = ("--uri", self.uri, "--run-directory", str(self._folder / "run"))
 
-    async def start_master(self) -> None:
-        """Build the boat's deployment, and start its master."""
+    async def start_master(self, extra: str = "") -> None:
+        """Build the boat's deployment, add lines to its deployment.toml, and start its master."""
         await build("boat", deployment := self._folder / "boat", self.uri, BOAT_TOPIC, BOAT_TYPE)
+        with (deployment / "deployment.toml").open("a") as file:
+            file.write(extra)
         flags = ("-d", str(deployment), "--loop", *self._where)
         await self.start("master", "pcie-app: 4 boards", "master", *flags)
 
