@@ -169,19 +169,18 @@ export default {
         live.agedAt = now;
         this.showAge(now);
       }
-      // tables change no faster than eyes follow
-      if (live.untabled && (now - (live.tabledAt ?? -1000) > 100 || live.head.paused)) {
-        Object.assign(live, { untabled: false, tabledAt: now });
-        this.showTables();
-      }
-      if (!live.dirty) return;
+      if (live.dirty) this.drawPosterior();
       live.dirty = false;
-      this.drawPosterior();
       if (live.fresh) {
         live.fresh = false;
         this.$refs.posterior.dataset.at = live.head.at;
         setText(this.$refs.number, live.head.number == null ? "?" : String(live.head.number));
         live.untabled = true;
+      }
+      // tables change no faster than eyes follow
+      if (live.untabled && (now - (live.tabledAt ?? -1000) > 80 || live.head.paused)) {
+        Object.assign(live, { untabled: false, tabledAt: now });
+        this.showTables();
       }
       if (live.statsFresh) {
         live.statsFresh = false;
