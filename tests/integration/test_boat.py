@@ -177,7 +177,10 @@ async def test_robot_tools_hear_what_separate_services_computed(stage, boat, ros
             ]
             return next((each for each in levels if services <= set(each)), None)
 
-        assert_same_posterior(*await until(same_frame), ros_version)
+        def so_far():
+            return f"{len(robot.paired)} results; the last on each topic: {[all_[-1:] for all_ in robot.heard.values()]}"
+
+        assert_same_posterior(*await until(same_frame, so_far), ros_version)
         statuses = await until(healthy, lambda: f"{robot.heard['/diagnostics'][-1:]}")
         assert set(statuses) == services | {f"board {at}" for at in range(4)}
         pids = {name: values_of({"status": [statuses[name]]})["pid"] for name in services}
