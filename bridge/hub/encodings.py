@@ -57,8 +57,9 @@ AROUND: Final = len(json_prefix("")) + 1
 class OutgoingMessage:
     """One published message, encoded on demand."""
 
-    data: bytes
-    """The message as JSON."""
+    json: bytes
+    """The message as JSON, from `_begin` on, and a brace: its own copy would only be used by a few encodings."""
+    _begin: int
     _parsed: dict[str, Any] | None
     """The parsed message, or None if it was not parsed yet."""
     _type: str
@@ -90,11 +91,11 @@ class OutgoingMessage:
 
     def _encode(self, compression: Encoding, name: str) -> bytes:
         if compression is _NONE:
-            return b"%b%b}" % (json_prefix(name), self.data)
+            return json_prefix(name) + self.json[self._begin :]
         if compression is _PNG:
             return as_png(self.payload(_NONE, name))
         if self._parsed is None:
-            self._parsed = orjson.loads(self.data)
+            self._parsed = orjson.loads(self.json[self._begin : -1])
         if compression is _CBOR_RAW:
             seconds, nanoseconds = divmod(self._time_ns, 10**9)
             serialised = self._definitions.serialise(self._type, self._parsed, self._max_size)

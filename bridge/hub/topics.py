@@ -241,14 +241,16 @@ class Topics:
                     dispatcher.mark_ready(client)
             else:
                 encoded = encoded or [
-                    self._message(topic, payload[len(prefix) : -1], message)
+                    self._message(topic, payload, len(prefix), message)
                     for payload, message in zip(payloads, parsed, strict=True)
                 ]
                 self._deliver_encoded(subscription, encoded, now)
 
-    def _message(self, topic: Topic, data: bytes, parsed: dict[str, Any] | None) -> OutgoingMessage:
+    def _message(
+        self, topic: Topic, json: bytes, begin: int, parsed: dict[str, Any] | None
+    ) -> OutgoingMessage:
         return OutgoingMessage(
-            data, parsed, topic.type, time.time_ns(), self._definitions, self._limits.message_bytes
+            json, begin, parsed, topic.type, time.time_ns(), self._definitions, self._limits.message_bytes
         )
 
     def _deliver_encoded(
@@ -259,7 +261,7 @@ class Topics:
         for message in messages:
             if lane.throttle and not outbox.accepts(lane, now):
                 continue
-            self._dispatcher.work += len(message.data) >> 6
+            self._dispatcher.work += len(message.json) >> 6
             try:
                 payload = message.payload(compression, name)
             except BridgeError as error:
@@ -305,7 +307,7 @@ class Topics:
         subscription.options[own_id] = options
         self._apply_options(subscription)
         if is_new and topic.latched is not None and qos.get("durability") != "volatile":
-            self._deliver_encoded(subscription, [self._message(topic, topic.latched, None)], now)
+            self._deliver_encoded(subscription, [self._message(topic, topic.latched + b"}", 0, None)], now)
 
     def unsubscribe(self, client: Client, operation: Operation, _now: float) -> None:
         """Perform `unsubscribe`."""

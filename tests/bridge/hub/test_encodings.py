@@ -140,7 +140,7 @@ def test_the_limit_of_a_message_is_exact(compression):
 
     def payload(max_size):
         data = json.dumps(message).encode()
-        return OutgoingMessage(data, message, "std_msgs/String", 0, definitions, max_size).payload(
+        return OutgoingMessage(data + b"}", 0, message, "std_msgs/String", 0, definitions, max_size).payload(
             compression, "/t"
         )
 
