@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
+import multiprocessing
 import os
 import random
 import statistics
@@ -23,7 +24,7 @@ from typing import Final
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from websockets.asyncio.client import connect as connect_plainly
+from websockets.sync.client import connect as connect_plainly
 
 from bridge.client import Ros, connect
 from posteriors import BoardReport, FrameReport, StageTimes
@@ -156,18 +157,20 @@ async def drags(stand: Stand, chromium: Browser, chance: random.Random) -> Rows:
     return [("drop of the boat to its posterior: median, longest", figures, "200 ms")]
 
 
-async def read(url: str) -> None:
-    """Read what a page would until cancelled."""
-    async with connect_plainly(f"{url.replace('http', 'ws', 1)}/live", max_size=None) as socket:
-        async for _ in socket:
-            await socket.send(".")  # the page's acknowledgement
+def read(url: str) -> None:
+    """Read what a page would until the server ends."""
+    with connect_plainly(f"{url.replace('http', 'ws', 1)}/live", max_size=None) as socket:
+        for _ in socket:
+            socket.send(".")  # the page's acknowledgement
 
 
 async def cycles(plain: Stand, beside: Stand, frames: int, seed: int) -> Rows:
     """Compare the cycle times of two stacks, of which one has a dashboard with a reader, in short turns."""
     medians: list[list[float]] = [[], []]
     async with connect(plain.uri) as one, connect(beside.uri) as other:
-        reading = asyncio.create_task(read(beside.url))
+        # a process of its own, as a browser is
+        reader = multiprocessing.get_context("spawn").Process(target=read, args=(beside.url,), daemon=True)
+        reader.start()
         sides = [
             (await ros.advertise(BOAT_TOPIC, BOAT_TYPE), ros.subscribe(RESULTS_TOPIC, RESULTS_TYPE))
             for ros in (one, other)
@@ -185,7 +188,7 @@ async def cycles(plain: Stand, beside: Stand, frames: int, seed: int) -> Rows:
                     times.append(1e6 * (time.perf_counter() - started))
                     await asyncio.sleep(max(0.0, started + 1 / HZ - time.perf_counter()))
                 taken.append(statistics.median(times))
-        reading.cancel()
+        reader.kill()
     without, with_it = (each[WARM_UP_TURNS:] for each in medians)
     # of neighbouring turns, because the load of the machine changes
     ratio = statistics.median(b / a for a, b in zip(without, with_it, strict=True))
@@ -211,6 +214,8 @@ async def bench(arguments: argparse.Namespace) -> int:
                 await beside.start_dashboard()
                 rows += await cycles(plain, beside, arguments.frames, seed)
                 await asyncio.gather(plain.end(), beside.end())
+            if set(arguments.only) <= {"cycle"}:
+                return show(rows, seed)
             chromium = await stack.enter_async_context(browser())
             if "drag" in arguments.only:
                 await boat.start_hub()
@@ -223,6 +228,11 @@ async def bench(arguments: argparse.Namespace) -> int:
                 await source.start_hub()
                 await source.start_dashboard()
                 rows += await display(source, chromium, arguments)
+    return show(rows, seed)
+
+
+def show(rows: Rows, seed: int) -> int:
+    """Print the table."""
     table = Table(
         title=f"dashboard; display: {HZ} posteriors a second of {SIDE} x {SIDE}, otherwise the boat's 32 x 32"
     )

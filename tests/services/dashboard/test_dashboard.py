@@ -9,6 +9,7 @@ import fnmatch
 import http.client
 import json
 import math
+import os
 import signal
 import socket
 import struct
@@ -372,6 +373,7 @@ async def test_a_page_from_the_first_result_to_the_last(stage):
     environment = {"BM_RUN_DIRECTORY": str(stage.runs)}
     dashboard = stage.start("dashboard", "--port", str(port), "--uri", uri, environment=environment)
     await dashboard.says(rf"open http://127\.0\.0\.1:{port}")
+    assert os.sched_getscheduler(dashboard.process.pid) == os.SCHED_BATCH  # it must not preempt the hub
     await check_doors(port)
     async with websockets.connect(
         f"ws://127.0.0.1:{port}/live", origin=f"http://127.0.0.1:{port}"
