@@ -130,12 +130,20 @@ class Topics:
                     break
                 client.last_published = advertisement
             topic = advertisement.topic
-            # What is left of the turn, in messages like the next one if all subscribers want another encoding.
-            each = _MESSAGE_WORK + (2 + (len(messages[first]) >> 6)) * len(topic.subscriptions)
-            end = first + 1 + (TURN_WORK - self._dispatcher.work) // each
+            batch = messages
+            if len(messages) > 1:
+                # What is left of the turn, in messages like the next one if all subscribers want another encoding.
+                each = _MESSAGE_WORK + (2 + (len(messages[first]) >> 6)) * len(topic.subscriptions)
+                batch = messages[first : first + 1 + (TURN_WORK - self._dispatcher.work) // each]
             # Otherwise the numbers of a message are freed before the next one is parsed, which is faster.
-            keep = any(each.compression is not _PLAIN for each in topic.subscriptions.values())
-            payloads, parsed = self._read_known(advertisement, messages[first:end], keep=keep)
+            keep = False
+            for (
+                subscription
+            ) in topic.subscriptions.values():  # `any` would take as long as parsing a small message
+                if subscription.compression is not _PLAIN:
+                    keep = True
+                    break
+            payloads, parsed = self._read_known(advertisement, batch, keep=keep)
             if not payloads:
                 break
             if topic.subscriptions or topic.latching:
