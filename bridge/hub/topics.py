@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
-import msgspec
 import orjson
 
 from bridge.codecs.json_codec import BRACE, envelope_of, is_deeper, topic_of
@@ -12,7 +11,6 @@ from bridge.errors import BridgeError
 from bridge.hub.definitions import MessageDefinitions
 from bridge.hub.dispatcher import Dispatcher, fragment_size_of
 from bridge.hub.encodings import AROUND, ENCODINGS, Encoding, OutgoingMessage, encoding_of, json_prefix
-from bridge.hub.filling import Filler
 from bridge.hub.graph import Advertisement, Client, Graph, SubscribeOptions, Topic, TopicSubscription
 from bridge.hub.limits import (
     HubLimits,
@@ -37,10 +35,6 @@ _MESSAGE_WORK: Final = 20
 TURN_WORK: Final = 10_000
 """Units of work, of about a microsecond each, after which a client's turn ends."""
 _PLAIN: Final = Encoding.NONE
-# Bytes of a message from which `_tail_of_large` may save time.
-_LARGE: Final = 4096
-# Reads only the names of a message's fields, and checks their values.
-_OUTLINE: Final = msgspec.json.Decoder(dict[str, msgspec.Raw])
 
 
 class Topics:
@@ -165,23 +159,18 @@ class Topics:
             if not data.startswith(envelope) or data[-1] != BRACE:
                 break
             message, payload = data[begin:-1], data
-            parsed: Any = None
             try:
-                # The condition before a call is the first one of the function, without the call.
-                tail = None if keep or len(message) < _LARGE else self._tail_of_large(message, filler)
-                if tail is None:
-                    parsed, tail = orjson.loads(message), b""
-                    if type(parsed) is not dict:
-                        break
-                    if filler is not None and len(parsed) != complete:
-                        tail = filler.fill(parsed, room)
-                if len(message) > shallow and is_deeper(message, depth):
+                parsed = orjson.loads(message)
+                # The second condition is the first one of `is_deeper`, without its call.
+                if type(parsed) is not dict or (len(message) > shallow and is_deeper(message, depth)):
                     break
-                # With white space between the last braces, the tail has no place.
-                if tail is None or (tail and data[-2] != BRACE):
-                    payload = b"%b%b}" % (envelope, orjson.dumps(parsed))
-                elif tail:
-                    payload = data[:-2] + tail
+                if filler is not None and len(parsed) != complete:
+                    tail = filler.fill(parsed, room)
+                    # With white space between the last braces, the tail has no place.
+                    if tail is None or (tail and data[-2] != BRACE):
+                        payload = b"%b%b}" % (envelope, orjson.dumps(parsed))
+                    elif tail:
+                        payload = data[:-2] + tail
             except (orjson.JSONDecodeError, RefusedOperationError):
                 break
             if len(payload) > longest:
@@ -190,28 +179,6 @@ class Topics:
             if keep:
                 messages_parsed.append(parsed)
         return payloads, messages_parsed
-
-    def _tail_of_large(self, message: bytes, filler: Filler | None) -> bytes | None:
-        """Check a large message, and return its tail (see `Filler.fill`), or None if it must be parsed.
-
-        Python objects for thousands of numbers would take longer than all other work on the message.
-        """
-        parts = () if filler is None else filler.parts
-        # msgspec does not check the encoding of text; a message of messages would be parsed twice; and a tail has no
-        # place after white space.
-        if not message.isascii() or message[-1] != BRACE or any(is_array for _name, _part, is_array in parts):
-            return None
-        try:
-            outline: dict[str, Any] = _OUTLINE.decode(message)
-        except (msgspec.MsgspecError, RecursionError):
-            return None
-        # An exponent may make a number infinite, which orjson detects.
-        if any(b"e" in bytes(value) or b"E" in bytes(value) for value in outline.values()):
-            return None
-        for name, _part, _is_array in parts:
-            if name in outline:
-                outline[name] = orjson.loads(outline[name])
-        return b"" if filler is None else filler.fill(outline, self._room)
 
     def distribute(self, topic: Topic, parsed: dict[str, Any], now: float) -> None:
         """Deliver a message to all subscribers of its topic."""

@@ -32,39 +32,6 @@ def test_a_complete_message_is_forwarded_as_it_was_received():
     assert subscriber.payloads()[1] == payload
 
 
-_RANGES = json.dumps([n / 7 for n in range(500)]).encode()
-
-
-@pytest.mark.parametrize(
-    "message",
-    [
-        b'{"header":{"seq":1,"stamp":{"secs":1,"nsecs":2},"frame_id":"a"},"ranges":%b}',
-        b'{"header":{"frame_id":"a"},"ranges":%b}',
-        b'{"ranges":%b,"range_max":1e999}',
-        b'{"ranges":%b} ',
-        b'{"ranges":%b,"more":"\xc3\xa9"}',
-    ],
-)
-def test_a_large_message_is_filled_as_a_small_one_is(message):
-    publisher, subscriber = publisher_and_subscriber("sensor_msgs/LaserScan", 1)
-    first, small, large = (
-        b'{"op":"publish","topic":"/t","msg":%b}' % said
-        for said in (b"{}", message % b"[0]", message % _RANGES)
-    )
-    _send(publisher, first, small, large, large)
-    _, expected, *received = subscriber.messages()
-    assert received == [expected | {"ranges": json.loads(_RANGES)}] * 2
-    assert len(expected) >= 10
-
-
-def test_a_large_message_with_invalid_text_is_refused():
-    publisher, subscriber = publisher_and_subscriber("sensor_msgs/LaserScan", 1)
-    large = b'{"op":"publish","topic":"/t","msg":{"ranges":%b,"more":"\xff"}}' % _RANGES
-    _send(publisher, b'{"op":"publish","topic":"/t","msg":{}}', large)
-    assert len(subscriber.messages()) == 1
-    assert publisher.client.refused == 1
-
-
 @pytest.mark.parametrize("ros_version", [1, 2])
 @pytest.mark.parametrize("header", [None, {}, {"frame_id": "map"}])
 def test_an_absent_stamp_of_a_header_is_the_time_of_receipt(ros_version, header):
