@@ -129,11 +129,10 @@ class Topics:
                 # What is left of the turn, in messages like the next one if all subscribers want another encoding.
                 each = _MESSAGE_WORK + (2 + (len(messages[first]) >> 6)) * len(topic.subscriptions)
                 batch = messages[first : first + 1 + (TURN_WORK - self._dispatcher.work) // each]
-            # Otherwise the numbers of a message are freed before the next one is parsed, which is faster.
+            # Otherwise the numbers of a message are freed before the next one is parsed, which is faster. A loop,
+            # because `any` takes as long as parsing a small message.
             keep = False
-            for (
-                subscription
-            ) in topic.subscriptions.values():  # `any` would take as long as parsing a small message
+            for subscription in topic.subscriptions.values():
                 if subscription.compression is not _PLAIN:
                     keep = True
                     break

@@ -134,8 +134,9 @@ def serve_board(
     if pin:
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {cores[index % len(cores)]})
-        # a board that wakes must not preempt the host, which has other boards to start
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        # a board that wakes must not preempt the host, which has other boards to start; some sandboxes refuse this
+        with suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     with closing(BoardServer(where, index, stop, board or EmulatedBoard())) as server:
         if on_ready is not None:
             on_ready(server.board)

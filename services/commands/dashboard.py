@@ -4,6 +4,7 @@ import asyncio
 import os
 import socket
 import sys
+from contextlib import suppress
 from importlib.util import find_spec
 from typing import Annotated, Final
 
@@ -122,8 +123,9 @@ async def _serve(
     """Serve the page until cancelled."""
     if sys.platform == "linux":
         # A posterior wakes this process in the middle of the hub's sending. It must not preempt the hub, which has
-        # other subscribers to serve.
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        # other subscribers to serve. Where the policy is refused, the page only costs the others more.
+        with suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     from services.dashboard.feed import Feed
     from services.dashboard.robot import Robot
     from services.dashboard.server import PageServer

@@ -63,7 +63,8 @@ class Frame:
         error = standard_error(probabilities, effective if 1 <= effective < math.inf else math.nan)
         # boards that disagree know no error of their own; theirs is that of the worst value
         if self._statistic("r_hat") > AGREE or np.isnan(error).any():
-            error = np.fmax(error, self._statistic("standard_error"))
+            worst = self._statistic("standard_error")
+            error = np.fmax(error, worst if 0 <= worst <= 1 else math.nan)
         return None if np.isnan(error).any() else error
 
     def _statistic(self, key: str) -> float:

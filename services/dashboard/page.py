@@ -232,7 +232,7 @@ def _wish(text: str) -> Wish | None:
         return None
     try:
         return msgspec.json.decode(text, type=Wish)
-    except msgspec.MsgspecError:
+    except (msgspec.MsgspecError, RecursionError):
         return None
 
 

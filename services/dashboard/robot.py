@@ -260,7 +260,9 @@ class Robot:
         dimensions = deployment.state_dimensions if deployment is not None else ()
         states: list[list[int]] = []
         with suppress(BadResultError):  # another program publishes there
-            states = read_samples(message, [each.size for each in dimensions], _SAMPLES).tolist()
+            found = read_samples(message, [each.size for each in dimensions], _SAMPLES)
+            # the words of an unknown state may be millions, and more than these are never shown
+            states = (found if dimensions else found[:, -_MAX_LINE:]).tolist()
         self.samples = "\n".join(state_in_words(dimensions, state)[:_MAX_LINE] for state in states)
 
     def _deployment_of(self, frame: Frame | None) -> Deployment | None:

@@ -361,6 +361,7 @@ async def use_the_robot(ros, browser, port):
     await browser.ask(switch="/rosapi/topics", on=True)
     await browser.next("notice", lambda head: head["text"])
     await browser.say("[" * 1000)
+    await browser.say('{"more":' + "[" * 2000)
 
     status, text = await asyncio.to_thread(fetch, port, "/frames.csv")
     assert (status, text.count("\n")) == (200, 4)

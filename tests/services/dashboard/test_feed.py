@@ -86,6 +86,8 @@ AGREE, APART = {"r_hat": "1.0010"}, {"r_hat": "inf"}
         ({"standard_error": "0.3"} | APART, [0.3, 0.3]),
         ({"samples": "400"}, None),
         ({"effective_samples": "?", "standard_error": "?"}, None),
+        ({"standard_error": "-9"}, None),
+        ({"standard_error": "1e308"}, None),
         ({"effective_samples": "-5"}, None),
         ({"effective_samples": "inf"}, None),
     ],
