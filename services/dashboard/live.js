@@ -98,7 +98,7 @@ export default {
           <h2>Frames lost</h2>
           ${table("losses", "reason", "frames")}
           <div ref="samplesPart" hidden>
-            <h2>Samples</h2>
+            <h2>Samples of the last frames</h2>
             <pre ref="samples" data-testid="samples"></pre>
           </div>
         </section>
@@ -189,10 +189,11 @@ export default {
     },
     showAge(now) {
       const { head, heardAt } = this.live;
-      const ms = head.age_ms + now - heardAt, old = ms > OLD_MS;
+      const ms = head.age_ms + now - heardAt, old = ms > OLD_MS && !head.paused;
       this.$refs.posterior.classList.toggle("bm-old", old);
       this.$refs.age.classList.toggle("bm-old-text", old);
-      const where = head.paused ? `paused, ${head.last - head.at} before the newest, ` : "";
+      const last = Math.max(head.last, this.live.stats?.last ?? 0);
+      const where = head.paused ? `paused, ${last - head.at} before the newest, ` : "";
       setText(this.$refs.age, `${where}${age(ms)} old`);
     },
     showConnection() {
@@ -218,7 +219,7 @@ export default {
     },
     describe() {
       const { head, drag } = this.live, plot = head.plot;
-      if (!plot) return setText(this.$refs.legend, `no posterior: ${head.outcome}`);
+      if (!plot) return setText(this.$refs.legend, head.outcome);
       const parts = [`${plot.axes.length === 1 ? "highest" : "darkest 0, brightest"} ${number(plot.max, 3)}`];
       if (plot.error != null) parts.push(`sampling error ±${number(plot.error, 2)}`);
       if (plot.mean) {
@@ -226,7 +227,7 @@ export default {
         const mean = `mean ${down.label} ${value(down, plot.mean[0])}, ${across.label} ${value(across, plot.mean[1])}`;
         parts.push(`${mean} (ellipse: 2 standard deviations)`);
       }
-      const truth = drag ?? head.truth;
+      const truth = this.placed() && (drag ?? head.truth);
       if (truth) parts.push(`truth x ${number(truth[0], 3)}, y ${number(truth[1], 3)}`);
       setText(this.$refs.legend, parts.join("; "));
       const label = `Posterior of ${plot.axes.map((axis) => axis.label).join(" and ")}: ${parts.join("; ")}`;
@@ -248,7 +249,7 @@ export default {
       else if (this.live.hadWhy) setText(refs.notice, "");
       this.live.hadWhy = stats.why.length > 0;
       setText(refs.samples, stats.samples);
-      refs.samplesPart.hidden = !stats.samples;
+      refs.samplesPart.hidden = !stats.samples || this.live.head?.paused;  // they are not those of one frame
       refs.posterior.classList.toggle("bm-draggable", this.canDrag());
       this.showSwitches(stats.switches);
       this.drawStages(stats.stages, stats.stage_names);
@@ -316,14 +317,20 @@ export default {
       context.clearRect(0, 0, width, height);
       Object.assign(context, { fillStyle: color, strokeStyle: color, font: "12px sans-serif", lineWidth: 1 });
       this.live.box = null;
-      if (!plot) {
-        const why = head ? `no posterior: ${head.outcome}` : "waiting for the first posterior";
-        write(context, "center", why, width / 2, height / 2, width - 20);
-      } else if (plot.axes.length === 1) this.drawBars(context, width, height, plot, new Float32Array(picture));
-      else this.drawGrid(context, width, height, head, new Uint8Array(picture));
+      if (plot) this.live.grid = plot.axes.length === 1 ? null : { axes: plot.axes };
+      if (plot?.axes.length === 1) {
+        return this.drawBars(context, width, height, plot, new Float32Array(picture));
+      }
+      // without a posterior, the last map stays, empty: boat and landmarks are still there
+      const shown = plot ?? this.live.grid;
+      if (shown) this.drawGrid(context, width, height, head, shown, plot && new Uint8Array(picture));
+      if (plot) return;
+      Object.assign(context, { fillStyle: color });
+      const why = head ? head.outcome : "waiting for the first posterior";
+      write(context, "center", why, width / 2, height / 2, width - 20);
     },
-    drawGrid(context, width, height, head, cells) {
-      const [down, across] = head.plot.axes, left = 62, bottom = 40, top = 8, right = 12;
+    drawGrid(context, width, height, head, plot, cells) {
+      const [down, across] = plot.axes, left = 62, bottom = 40, top = 8, right = 12;
       // cells are squares where both axes have the same unit
       let w = width - left - right, h = height - top - bottom;
       if (down.known === across.known && down.unit === across.unit && !(down.states.length + across.states.length)) {
@@ -334,7 +341,7 @@ export default {
       const x = (column) => left + (column + 0.5) / columns * w, y = (row) => top + h - (row + 0.5) / rows * h;
       const box = this.live.box = { left, top, w, h, down, across, x, y };
       const words = new Uint32Array(pixels.data.buffer), colours = new Uint32Array(COLOURS.buffer);
-      for (let row = 0; row < rows; row++) {  // the first row is at the bottom, as on a map
+      for (let row = 0; cells && row < rows; row++) {  // the first row is at the bottom, as on a map
         const from = row * columns, to = (rows - 1 - row) * columns;
         for (let column = 0; column < columns; column++) words[to + column] = colours[cells[from + column]];
       }
@@ -344,7 +351,7 @@ export default {
       context.drawImage(image, left, top, w, h);
       context.strokeRect(left, top, w, h);
       this.drawTicks(context, box);
-      const { plot } = head, { stats } = this.live;
+      const { stats } = this.live;
       context.save();
       context.beginPath();
       context.rect(left, top, w, h);

@@ -121,7 +121,8 @@ class Dashboard:
             frame = self._feed.newest
             labels = frame.searched if frame is not None else ()
             options = {each: " by ".join(map(printable, each)) for each in choices(labels)}
-            marginals.set_visibility(len(labels) > 1)
+            if labels:  # a frame without a posterior has none
+                marginals.set_visibility(len(labels) > 1)
             if labels and options != marginals.options:
                 marginals.set_options(options, value=view.labels(frame) if frame is not None else None)
 
@@ -188,7 +189,7 @@ class Dashboard:
                 room.release()
                 continue
             sent = now
-            await socket.send_bytes(view.message(frame, axes, self._robot.units_for(frame)))
+            await socket.send_bytes(view.message(frame, axes, self._robot.words_for(frame)))
 
     def _statistics(self) -> bytes:
         now = time.monotonic()
@@ -198,6 +199,7 @@ class Dashboard:
                 "rate": self._feed.rate(now),
                 "lost": {**self._feed.lost, **self._robot.lost},
                 "truth": self._feed.truth,
+                "last": self._feed.newest.at if self._feed.newest is not None else 0,
                 "stage_names": STAGES,
                 "stages": self._feed.stage_times(now),
             }

@@ -23,6 +23,7 @@ from posteriors.standard_messages import pose_at
 from services.dashboard.feed import Feed, Frame
 from services.output.axes import Axis, deployment_axes, state_in_words
 from services.settings import Settings
+from services.sockets.records import Outcome
 from services.sockets.status import ask_stack
 from terminal.connection import report_connection
 from terminal.output import say, warn
@@ -224,8 +225,10 @@ class Robot:
                     self.boards = [(each.endpoint, each.state, each.image) for each in process.boards]
                 if process.name == "master":
                     folder = process.folder
-                # each process loses other frames
-                lost.update(process.frames.lost if process.frames else {})
+                # the master also counts what the publisher loses
+                lost |= Counter(process.frames.lost if process.frames else {})
+            # these come as frames with their reason, which the feed counts
+            del lost[Outcome.NO_POSTERIOR]
             self.lost = lost
             if folder and folder != self._folder and self._settings.deployment is None:
                 self._folder = folder
@@ -249,10 +252,11 @@ class Robot:
         ours = [(axis.label, axis.size) for axis in self._axes]
         return self._axes if ours == list(zip(frame.labels, frame.values.shape, strict=True)) else ()
 
-    def units_for(self, frame: Frame) -> dict[str, str]:
-        """Return the units of a frame's readings by the names of their variables, as far as they are known."""
+    def words_for(self, frame: Frame) -> dict[str, tuple[str, tuple[str, ...]]]:
+        """Return the unit and the names of the values of a frame's variables by their names, as far as they are known."""
         deployment = self._deployment_of(frame)
-        return {each.name: each.unit for each in deployment.variables} if deployment is not None else {}
+        known = deployment.variables if deployment is not None else ()
+        return {each.name: (each.unit, each.states) for each in known}
 
     def _take_samples(self, message: dict[str, Any]) -> None:
         """Keep the last states of a message in words; of an unknown machine, in hexadecimal."""

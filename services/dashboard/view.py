@@ -70,13 +70,17 @@ class View:
             return self.chosen
         return default_labels(frame)
 
-    def message(self, frame: Frame, axes: Sequence[Axis], units: Mapping[str, str]) -> bytes:
-        """Return the message for the frame that is shown, with the units of its readings."""
+    def message(
+        self, frame: Frame, axes: Sequence[Axis], words: Mapping[str, tuple[str, tuple[str, ...]]]
+    ) -> bytes:
+        """Return the message for the frame that is shown; `words` are the units and the names of values of variables."""
         head, picture = _encoded(frame, self.labels(frame), tuple(axes))
         kept = self._feed.frames
         now_ns = time.time_ns()
         head = head | {
-            "readings": [[*reading, units.get(reading[0], "")] for reading in head["readings"]],
+            "readings": [
+                _in_words(reading, *words.get(reading[0], ("", ()))) for reading in head["readings"]
+            ],
             "paused": self.at is not None,
             "first": kept[0].at,
             "last": kept[-1].at,
@@ -84,6 +88,13 @@ class View:
             "age_ms": max(now_ns - frame.heard_ns, 0) / 1e6,
         }
         return packed(head, picture)
+
+
+def _in_words(reading: list[Any], unit: str, states: tuple[str, ...]) -> list[Any]:
+    name, value, address, age_ms = reading
+    if isinstance(address, int) and 0 <= address < len(states):
+        value = states[address]
+    return [name, value, address, age_ms, unit]
 
 
 def packed(head: dict[str, Any], picture: bytes = b"") -> bytes:

@@ -155,8 +155,8 @@ async def test_states_of_other_machines_are_hexadecimal_words(monkeypatch, chain
 def test_units_are_those_of_the_deployment_of_a_frame(chain):
     feed = Feed()
     robot = Robot(feed, Settings(), chain, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
-    assert robot.units_for(feed.add(report(1, deployment="boat"), 0.0)) == {"D1": "m", "B1": ""}
-    assert robot.units_for(feed.add(report(1, deployment="garden"), 0.0)) == {}
+    assert robot.words_for(feed.add(report(1, deployment="boat"), 0.0)) == {"D1": ("m", ()), "B1": ("", ())}
+    assert robot.words_for(feed.add(report(1, deployment="garden"), 0.0)) == {}
 
 
 async def test_switches_that_do_not_answer_are_bounded_and_hold_up_nothing():

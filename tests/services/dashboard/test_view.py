@@ -25,13 +25,13 @@ def unpack(message):
     return json.loads(message[4 : 4 + length]), message[4 + length :]
 
 
-def shown(*outcomes, axes=(), units=(), chosen=()):
+def shown(*outcomes, axes=(), words=(), chosen=()):
     feed = Feed()
     for outcome in outcomes:
         feed.add(outcome, 0.0)
     view = View(feed)
     view.choose(chosen)
-    return unpack(view.message(view.frame, axes, dict(units)))
+    return unpack(view.message(view.frame, axes, dict(words)))
 
 
 def test_a_heat_map_with_its_mean_and_covariance():
@@ -82,10 +82,13 @@ def test_one_variable_is_bars_each_with_its_sampling_error():
     assert (len(picture), head["plot"]["error"]) == (8, None)
 
 
-def test_readings_have_their_units():
-    readings = {"D1": VariableReading(1.5, 3, 0.5), "grass": VariableReading("wet", 1, 0.5)}
-    head, _ = shown(posterior(1, readings=readings), units={"D1": "m"})
-    assert head["readings"] == [["D1", 1.5, 3, 0.5, "m"], ["grass", "wet", 1, 0.5, ""]]
+def test_readings_have_units_and_names():
+    readings = {name: VariableReading(1.0, 1, 0.5) for name in ("D1", "grass", "other")}
+    words = {"D1": ("m", ()), "grass": ("", ("dry", "wet"))}
+    head, _ = shown(posterior(1, readings=readings), words=words)
+    assert head["readings"] == [
+        ["D1", 1.0, 1, 0.5, "m"], ["grass", "wet", 1, 0.5, ""], ["other", 1.0, 1, 0.5, ""],
+    ]  # fmt: skip
 
 
 def test_chosen_marginals_of_more_variables_and_replicas():
@@ -135,7 +138,7 @@ def test_names_stay_what_they_are():
     one = posterior(
         1, labels=(HOSTILE, "x"), readings={HOSTILE: VariableReading(1.5, 3, 0.5)}, missing=(HOSTILE,)
     )
-    head, _ = shown(one, units={HOSTILE: HOSTILE})
+    head, _ = shown(one, words={HOSTILE: (HOSTILE, ())})
     assert head["plot"]["axes"][0]["label"] == HOSTILE
     assert (head["readings"], head["missing"]) == ([[HOSTILE, 1.5, 3, 0.5, HOSTILE]], [HOSTILE])
 
