@@ -10,6 +10,8 @@ from terminal.command_line import CommandLine
 # each command line, and what it does in the list of `rosbayes --help`
 _COMMANDS: Final = {
     "toolchain": ("toolchain.commands.main", "From a model to a deployment."),
+    "query": ("toolchain.commands.main:query", "Print a posterior of a network, exact and of a machine."),
+    "show": ("toolchain.commands.main:show", "List the variables of a network."),
     "master": ("services.commands.master", "Move readings to the boards and posteriors back."),
     "listen": ("services.commands.listen", "Print, draw or save the posteriors of a running stack."),
     "dashboard": ("services.commands.dashboard", "Show posteriors in a browser."),
@@ -51,7 +53,8 @@ def rosbayes(
 ) -> None:
     """Bayesian machines for any ROS robot.
 
-    Each subcommand is also a command of its own: `rosbayes hub` and `hub` are the same.
+    Each subcommand is also a command of its own: `rosbayes hub` and `hub` are the same, and so are `rosbayes query` and
+    `toolchain query`.
     """
 
 

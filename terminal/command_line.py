@@ -40,10 +40,16 @@ class CommandLine(typer.Typer):
         return super().command(name, cls=cls or _Command, **settings)
 
     def add_later(self, name: str, module: str, *, purpose: str) -> None:
-        """Add the command line `app` of a module as a subcommand; it is imported when the subcommand is named."""
+        """Add the command line `app` of a module as a subcommand; it is imported when the subcommand is named.
+
+        `MODULE:NAME` is a command of a group.
+        """
+        module, _, part = module.partition(":")
 
         def load() -> Any:
-            command = get_command(import_module(module).app)
+            command: Any = get_command(import_module(module).app)
+            if part:
+                return command.commands[part]
             # the group has one completion for all
             command.params = [each for each in command.params if each.name not in _COMPLETION]
             return command

@@ -35,7 +35,9 @@ def run_apart(code, **environment):
 
 def test_its_subcommands_are_the_other_commands():
     group = get_command(app)
-    assert set(group.commands) == set(SCRIPTS)
+    assert set(group.commands) == set(SCRIPTS) | {"query", "show"}
+    for name in ("query", "show"):
+        assert group.resolve_command(None, [name])[1].name == name
     for name, place in SCRIPTS.items():
         loaded = group.resolve_command(None, [name])[1]
         assert loaded.callback.__module__ in {place, f"{place.rpartition('.')[0]}.main"}

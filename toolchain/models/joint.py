@@ -215,33 +215,48 @@ class Question:
             return self._refusal(active, observed)
         return None
 
+    def dependent(self) -> list[tuple[str, str]]:
+        """Return the pairs of known symbols that are not independent given the searched ones: no BM1 knows both."""
+        observed = [symbol.name for symbol in self.observed]
+        active = [without_idle(factor) for factor in self.joint.factors]
+        factors, pairs = self._pairs(active, observed)
+        return [(one, other) for _, one, other in pairs if self._between(factors, one, other)[0]]
+
+    def _pairs(
+        self, active: Sequence[Factor], observed: Sequence[str]
+    ) -> tuple[list[Factor], list[tuple[int, str, str]]]:
+        """Return the factors of all observed symbols, and the pairs that these join, with the lengths of their paths.
+
+        The factors of two symbols are among those of all, so no other pair is dependent, and the path of a pair is not
+        shorter than that among all.
+        """
+        factors, terms = self._factors(active, observed)
+        among_all = Links(terms, factors, {*(symbol.name for symbol in self.searched), *self.given})
+        return factors, [
+            (length, one, other)
+            for at, one in enumerate(observed)
+            for other, length in among_all.lengths(one, observed[at + 1 :]).items()
+        ]
+
+    def _between(self, active: Sequence[Factor], one: str, other: str) -> tuple[list[str], Links]:
+        """Return the shortest path between two observed symbols, empty if they are independent, and the links."""
+        factors, terms = self._factors(active, [one, other])
+        links = Links(terms, factors, {*(symbol.name for symbol in self.searched), *self.given})
+        return links.path(one, other), links
+
     def _refusal(self, active: Sequence[Factor], observed: Sequence[str]) -> NotFusionError:
         """Return an error with two dependent observed symbols, the path between them, and advice.
 
         If the observed symbols are not all independent, two of them are dependent, regardless of the others (a property
         of d-separation).
         """
-        cut = {symbol.name for symbol in self.searched} | set(self.given)
-        factors, terms = self._factors(active, observed)
-        among_all = Links(terms, factors, cut)
-        # The factors of two symbols are among those of all, so their path is not shorter than their path among all.
-        # Because there may be thousands of pairs, those with the shortest paths among all are tried first.
-        least = sorted(
-            (
-                (length, one, other)
-                for at, one in enumerate(observed)
-                for other, length in among_all.lengths(one, observed[at + 1 :]).items()
-            ),
-            key=itemgetter(0),
-        )
+        factors, pairs = self._pairs(active, observed)
         path: list[str] = []
         drawn = ""
-        for length, one, other in least:
+        for length, one, other in sorted(pairs, key=itemgetter(0)):  # because there may be thousands
             if path and len(path) <= length:
                 break
-            factors, terms = self._factors(active, [one, other])
-            links = Links(terms, factors, cut)
-            between = links.path(one, other)
+            between, links = self._between(factors, one, other)
             if between and (not path or len(between) < len(path)):
                 path, drawn = between, links.drawn(between)
         ends = f"{path[0]} or {path[-1]}"

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Iterator
+from copy import copy
 from pathlib import Path
 from typing import Final
 
@@ -374,8 +375,9 @@ _UAI_COMMENTS: Final = r"#[^\n]*|(?m:^c\b[^\n]*)"
 def read_uai(data: bytes, builder: NetworkBuilder) -> None:
     """Read a UAI file: a preamble (kind, sizes, variables of each factor), then the numbers of each factor.
 
-    The last variable of a factor varies fastest; in a BAYES file it is the child. (pyagrum 3.3.1 writes the
-    first parent fastest, contrary to the format.)
+    The last variable of a factor varies fastest; in a BAYES file it is the child. (pyagrum 3.3.1 writes the first parent
+    fastest, contrary to the format.) pgmpy, 0.1 to 1.1, writes the same scopes with the first variable fastest and the
+    child slowest; a file of which some table is a distribution only in that order is read in it.
     """
     text = Scanner(data, builder.path, comments=_UAI_COMMENTS)
     kind = text.word("BAYES or MARKOV")
@@ -389,6 +391,7 @@ def read_uai(data: bytes, builder: NetworkBuilder) -> None:
     for _ in range(factors):
         size = text.count("a factor's number of variables", MAX_PARENTS + 1)
         scopes.append(tuple(str(text.count("a variable", variables - 1)) for _ in range(size)))
+    tables: list[tuple[tuple[str, ...], NDArray[np.float64], Scanner]] = []
     for number, scope in enumerate(scopes):
         what = f"factor {number}"
         shape = builder.shape(scope, text)
@@ -397,23 +400,21 @@ def read_uai(data: bytes, builder: NetworkBuilder) -> None:
             raise text.error(f"{what} is to have {given} entries, but its variables make {math.prod(shape)}")
         values = text.next_numbers(given, what).reshape(shape)
         if kind == "BAYES" and scope:
-            _check_uai_order(scope[-1], values, text)
-            builder.distribution(scope[-1], scope[:-1], np.moveaxis(values, -1, 0), text)
+            tables.append((scope, values, copy(text)))  # at the line of its last number, for errors
         else:
             builder.potential(scope, values, text)
     if rest := text.next():
         raise text.error(f"expected the end of the file after the last factor, found {rest[:40]!r}")
+    reverses = any(_sums_to_1(_reversed(each), 0) and not _sums_to_1(each, -1) for _, each, _ in tables)
+    for scope, values, place in tables:
+        child_last = np.transpose(_reversed(values)) if reverses else values
+        builder.distribution(scope[-1], scope[:-1], np.moveaxis(child_last, -1, 0), place)
 
 
-def _check_uai_order(child: str, values: NDArray[np.float64], text: Scanner) -> None:
-    """Refuse a table that would be a distribution only if the child, the last in its scope, varied slowest."""
-    flat = values.ravel()
-    fastest, slowest = (
-        flat.reshape(-1, values.shape[-1]).sum(axis=1),
-        flat.reshape(values.shape[-1], -1).sum(axis=0),
-    )
-    if not np.allclose(fastest, 1, atol=ROUNDING) and np.allclose(slowest, 1, atol=ROUNDING):
-        raise text.error(
-            f"the table of {child} sums to 1 only if {child} varies slowest, as pgmpy writes UAI files; in the format it "
-            "varies fastest: save the network as BIF instead"
-        )
+def _reversed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the table in the order of pgmpy: its axes are those of the scope from the last to the first."""
+    return values.reshape(values.shape[::-1])
+
+
+def _sums_to_1(values: NDArray[np.float64], axis: int) -> bool:
+    return bool(np.allclose(values.sum(axis=axis), 1, rtol=0, atol=ROUNDING))

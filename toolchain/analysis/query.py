@@ -1,0 +1,290 @@
+"""Answers about a network: the exact posterior for known states, and what a machine says; and what there is to ask."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from machines.bm2_kind import BM2, kernels_of, run_batches
+from machines.kind import FrameInput
+from toolchain.analysis.chain import distance
+from toolchain.analysis.emulation import EmulatedBoards
+from toolchain.building.bm2_machine import chain_machines, plan_bm2
+from toolchain.building.choice import model_for
+from toolchain.building.machine import plan_machine, whole_machine
+from toolchain.building.options import BuildOptions, MachineChoice
+from toolchain.building.quantise import quantise
+from toolchain.errors import BuildError
+from toolchain.models.distribution import Distribution, Symbol
+from toolchain.models.joint import JointDistribution, Question
+from toolchain.models.network import NetworkModel
+
+MOST_CANDIDATES: Final = 100
+"""Maximum number of variables of which every pair is tested for independence."""
+_MOST_ROWS: Final = 40
+_MOST_STATES: Final = 8
+_BAR: Final = 24
+_EIGHTHS: Final = " ▏▎▍▌▋▊▉"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MachineAnswer:
+    """The posterior of a machine with the default options of a build, on one board, from the first bank of seeds."""
+
+    kind: str
+    why: str
+    """The reason for the kind, as a clause."""
+    cycles: int
+    stopped: str
+    """The reason why the board stopped."""
+    posterior: NDArray[np.float64] | None
+    """float64[lines]; None if there is none for these readings."""
+    total_variation: float
+    """Distance from the exact posterior; 1 without a posterior."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """The posterior of the searched variables together, the first one slowest."""
+
+    network: str
+    searched: tuple[Symbol, ...]
+    known: Mapping[str, str]
+    """The state of each known variable."""
+    exact: NDArray[np.float64]
+    machine: MachineAnswer | None
+
+    @property
+    def _lines(self) -> list[tuple[str, ...]]:
+        return list(product(*([each.shown(at) for at in range(each.size)] for each in self.searched)))
+
+    def as_json(self) -> str:
+        """Return the answer as one JSON object, with an object per line."""
+        names = [each.name for each in self.searched]
+        ours = self.machine.posterior if self.machine else None
+        rows: list[dict[str, Any]] = [
+            {"states": dict(zip(names, states, strict=True)), "exact": float(self.exact[line])}
+            | ({} if ours is None else {"machine": float(ours[line])})
+            for line, states in enumerate(self._lines)
+        ]
+        found = self.machine and {
+            "type": self.machine.kind,
+            "why": self.machine.why,
+            "cycles": self.machine.cycles,
+            "stopped": self.machine.stopped,
+            "has_posterior": ours is not None,
+            "total_variation": self.machine.total_variation,
+        }
+        content = {"network": self.network, "searched": names, "known": dict(self.known)}
+        return json.dumps(content | {"posterior": rows, "machine": found}) + "\n"
+
+    def report(self, *, blocks: bool = True) -> str:
+        """Return the answer as bars and a sentence; `blocks` permits characters beyond ASCII for bars."""
+        names, lines = [each.name for each in self.searched], self._lines
+        given = ", ".join(f"{name}={state}" for name, state in self.known.items())
+        columns = {"exact": self.exact}
+        if self.machine and self.machine.posterior is not None:
+            columns[self.machine.kind] = self.machine.posterior
+        shown = range(len(lines))
+        if len(lines) > _MOST_ROWS:
+            shown = np.argsort(-self.exact, kind="stable")[:_MOST_ROWS].tolist()
+        longest = max(float(column[at]) for column in columns.values() for at in shown)
+        table = [
+            (*lines[at], *(_bar(float(column[at]), longest, blocks) for column in columns.values()))
+            for at in shown
+        ]
+        rows = [
+            f"{self.network}: P({', '.join(names)}{' | ' + given if given else ''})",
+            *_aligned((*names, *columns), table),
+        ]
+        if rest := len(lines) - len(shown):
+            rows.append(f"and {rest:,} less probable ones, together {1 - self.exact[shown].sum():.4f}")
+        if found := self.machine:
+            lost = f"no posterior ({found.stopped}), which counts as a total variation of 1"
+            near = f"total variation from exact inference {found.total_variation:.4f}"
+            rows.append(
+                f"{found.kind}: {found.cycles:,} cycles, {lost if found.posterior is None else near}."
+            )
+            rows.append(f"A {found.kind}, since {found.why}.")
+        return "\n".join(rows) + "\n"
+
+
+def answer(
+    joint: JointDistribution,
+    searched: Sequence[str],
+    known: Mapping[str, str],
+    machine: MachineChoice | None = None,
+) -> Answer:
+    """Return the exact posterior of the searched variables for known states, and that of a machine if one is given.
+
+    Raises:
+        ToolchainError: A variable or state does not exist, the states are impossible together, inference needs a table
+            above the limit, or there is no such machine for the question.
+    """
+    question = joint.ask(searched, list(known))
+    addresses = tuple(symbol.index(known[symbol.name]) for symbol in question.known)
+    network = question.network()
+    exact = network.exact(addresses)
+    return Answer(
+        network=joint.name,
+        searched=question.searched,
+        known=dict(known),
+        exact=exact,
+        machine=None if machine is None else _machine_answer(question, addresses, exact, machine),
+    )
+
+
+def _machine_answer(
+    question: Question, addresses: tuple[int, ...], exact: NDArray[np.float64], choice: MachineChoice
+) -> MachineAnswer:
+    """Run the machine that a build would make, as `inspect` runs it."""
+    options = BuildOptions(
+        uri="ws://nowhere:9090",
+        topic="/readings",
+        type="std_msgs/Float64",
+        machine=choice,  # there is no robot
+    )
+    model, why = model_for(question, options)
+    if isinstance(model, NetworkModel):
+        chains = plan_bm2(model, options, why)
+        kernels = kernels_of(chain_machines(chains))
+        frame = FrameInput(
+            addresses=addresses, target_count=chains.target_count, max_cycles=chains.max_cycles
+        )
+        posterior = BM2.infer(run_batches(kernels, frame), model.names).posterior
+        cycles, stopped = kernels[0].cycles, kernels[0].reason.name
+    else:
+        plan = plan_machine(model, options)
+        p = plan.parameters
+        codes = quantise(model, prob_bits=p.prob_bits, scale=options.scaling, sensor_mode=p.sensor_mode)
+        run = EmulatedBoards(
+            [whole_machine(plan, codes)],
+            target_count=plan.target_count,
+            max_cycles=plan.max_cycles,
+            stop=options.stop,
+        ).run(addresses, 0, 0)
+        posterior, cycles, stopped = run.posterior, run.length, run.reasons[0].name
+    return MachineAnswer(
+        kind="BM2" if isinstance(model, NetworkModel) else "BM1",
+        why=why,
+        cycles=cycles,
+        stopped=stopped.lower(),
+        posterior=posterior,
+        total_variation=1.0 if posterior is None else distance(posterior, exact),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contents:
+    """The variables of a network and, for searched ones, which others a BM1 cannot know together."""
+
+    joint: JointDistribution
+    searched: tuple[str, ...] = ()
+    apart: Mapping[str, tuple[str, ...]]
+    """For each candidate those that are not independent of it given the searched variables."""
+
+    def as_json(self) -> str:
+        """Return the contents as one JSON object."""
+        parents = _parents(self.joint)
+        variables: list[dict[str, Any]] = [
+            {
+                "name": each.name,
+                "states": [each.shown(at) for at in range(each.size)],
+                "parents": list(parents.get(each.name, ())),
+            }
+            | ({"not_with": list(self.apart[each.name])} if each.name in self.apart else {})
+            for each in self.joint.symbols
+        ]
+        content = {
+            "network": self.joint.name,
+            "variables": variables,
+            "tables": len(self.joint.factors),
+            "searched": list(self.searched),
+        }
+        return json.dumps(content) + "\n"
+
+    def report(self) -> str:
+        """Return the contents as a table and a sentence."""
+        parents = _parents(self.joint)
+        heading = ["variable", "states", "depends on"]
+        table: list[tuple[str, ...]] = [
+            (each.name, _states(each), ", ".join(parents.get(each.name, ()))) for each in self.joint.symbols
+        ]
+        if self.searched:
+            heading.append("not known together with")
+            table = [(*row, ", ".join(self.apart.get(row[0], ()))) for row in table]
+        rows = [
+            f"{self.joint.name}: {len(self.joint.symbols):,} variables, {len(self.joint.factors):,} tables",
+            *_aligned(heading, table),
+        ]
+        if self.searched:
+            names = ", ".join(self.searched)
+            rows.append(
+                f"Given {names}, a BM1 takes known variables of which none is in another's last column; a BM2 takes any."
+                if any(self.apart.values())
+                else f"A BM1 takes all others as known variables, since they are independent given {names}."
+            )
+        return "\n".join(rows) + "\n"
+
+
+def contents(joint: JointDistribution, searched: Sequence[str] = (), known: Sequence[str] = ()) -> Contents:
+    """Return the variables of a network; `known` are the candidates for known variables, all others if there are none.
+
+    Raises:
+        ToolchainError: A variable does not exist or is named twice, or there are too many candidates.
+    """
+    if not searched:
+        if known:
+            raise BuildError(f"--known {','.join(known)}: add the searched variables, such as --searched A")
+        return Contents(joint=joint, apart={})
+    names = {joint.symbol(name).name for name in searched}
+    candidates = tuple(known) or tuple(each.name for each in joint.symbols if each.name not in names)
+    if len(candidates) > MOST_CANDIDATES:
+        raise BuildError(
+            f"{joint.name} has {len(candidates)} variables that could be known, of which at most {MOST_CANDIDATES} can be "
+            "compared: name some with --known A,B"
+        )
+    apart: dict[str, list[str]] = {name: [] for name in candidates}
+    for one, other in joint.ask(searched, candidates).dependent():
+        apart[one].append(other)
+        apart[other].append(one)
+    return Contents(
+        joint=joint, searched=tuple(searched), apart={name: tuple(others) for name, others in apart.items()}
+    )
+
+
+def _parents(joint: JointDistribution) -> dict[str, tuple[str, ...]]:
+    return {
+        factor.symbol.name: tuple(each.name for each in factor.given)
+        for factor in joint.factors
+        if isinstance(factor, Distribution)
+    }
+
+
+def _states(symbol: Symbol) -> str:
+    last = symbol.size - 1
+    if not symbol.type.labels:
+        return f"{symbol.shown(0)} to {symbol.shown(last)}"
+    if symbol.size <= _MOST_STATES:
+        return ", ".join(symbol.type.labels)
+    first = ", ".join(symbol.type.labels[: _MOST_STATES - 2])
+    return f"{first} ... {symbol.shown(last)} ({symbol.size})"
+
+
+def _aligned(heading: Sequence[str], table: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(heading, *table, strict=True)]
+    return [
+        "  " + "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in (heading, *table)
+    ]
+
+
+def _bar(value: float, longest: float, blocks: bool) -> str:
+    """Return a probability and its bar, whose length is relative to the longest one."""
+    eighths = round(8 * _BAR * value / longest)
+    bar = "█" * (eighths // 8) + _EIGHTHS[eighths % 8].strip() if blocks else "#" * round(eighths / 8)
+    return f"{value:.4f} {bar:{_BAR}}"

@@ -1,0 +1,92 @@
+"""The commands about a network file without a model of one's own: `query` answers, `show` lists what can be asked."""
+
+import re
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeAlias
+
+import typer
+
+from terminal.output import say_if_slow
+from toolchain.building.options import MachineChoice
+from toolchain.errors import BuildError
+from toolchain.flags import key_values, names_in
+from toolchain.networks import read_network
+
+if TYPE_CHECKING:
+    from toolchain.models.joint import JointDistribution
+
+NetworkPath: TypeAlias = Annotated[
+    Path, typer.Argument(help="Network file: .bif, .xmlbif, .uai, .net, .xdsl (.gz).", metavar="NETWORK")
+]
+Json: TypeAlias = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+
+
+def query(
+    network: NetworkPath,
+    searched: Annotated[str, typer.Option(help="Searched variables.", metavar="A,B")],
+    known: Annotated[
+        list[str] | None,
+        typer.Option(help="A known variable and its state; repeatable.", metavar="NAME=STATE"),
+    ] = None,
+    machine: Annotated[
+        MachineChoice | None,
+        typer.Option(help="Also the posterior of a machine; auto: of the one that a build would choose."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Print the posterior of variables of a network: the exact one and, with --machine, what a machine says.
+
+    For example `toolchain query asia.bif --searched bronc --known smoke=yes --known dysp=yes --machine auto`
+    """
+    from toolchain.analysis.query import answer
+
+    # a comma is also between two of them, but not inside of a state
+    settings = [each for text in known or () for each in re.split(r",(?=[^,=]+=)", text)]
+    states = key_values(settings, "--known", "smoke=yes")
+    names, joint = names_in("--searched", searched), _read(network)
+    with say_if_slow(f"Running the machine of {joint.name}" if machine else f"Summing over {joint.name}"):
+        found = answer(joint, names, states, machine)
+    typer.echo(found.as_json() if json else found.report(blocks=_has_blocks()), nl=False)
+
+
+def show(
+    network: NetworkPath,
+    searched: Annotated[
+        str,
+        typer.Option(
+            help="Also show which variables a BM1 can know together if these are searched.", metavar="A,B"
+        ),
+    ] = "",
+    known: Annotated[
+        str, typer.Option(help="With --searched: only these as known variables.", metavar="A,B")
+    ] = "",
+    json: Json = False,
+) -> None:
+    """List the variables of a network and their states, and which variables may be known together.
+
+    For example `toolchain show asia.bif --searched bronc`
+    """
+    from toolchain.analysis.query import contents
+
+    names, candidates = names_in("--searched", searched), names_in("--known", known)
+    joint = _read(network)
+    with say_if_slow(f"Testing the pairs of variables of {joint.name}"):
+        found = contents(joint, names, candidates)
+    typer.echo(found.as_json() if json else found.report(), nl=False)
+
+
+def _read(network: Path) -> "JointDistribution":
+    if network.is_dir():
+        raise BuildError(
+            f"{network} is a folder; expected a network file, such as asia.bif: a model.py contains its own question"
+        )
+    return read_network(network)
+
+
+def _has_blocks() -> bool:
+    try:
+        "█▏".encode(sys.stdout.encoding or "ascii")
+    except (UnicodeEncodeError, LookupError):
+        return False
+    return True
