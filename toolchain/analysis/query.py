@@ -27,6 +27,7 @@ MOST_CANDIDATES: Final = 100
 """Maximum number of variables of which every pair is tested for independence."""
 _MOST_ROWS: Final = 40
 _MOST_STATES: Final = 8
+_MOST_NAMES: Final = 8
 _BAR: Final = 24
 _EIGHTHS: Final = " ▏▎▍▌▋▊▉"
 
@@ -216,7 +217,7 @@ class Contents:
         ]
         if self.searched:
             heading.append("not known together with")
-            table = [(*row, ", ".join(self.apart.get(row[0], ()))) for row in table]
+            table = [(*row, _some(self.apart.get(row[0], ()))) for row in table]
         rows = [
             f"{self.joint.name}: {len(self.joint.symbols):,} variables, {len(self.joint.factors):,} tables",
             *_aligned(heading, table),
@@ -273,6 +274,11 @@ def _states(symbol: Symbol) -> str:
         return ", ".join(symbol.type.labels)
     first = ", ".join(symbol.type.labels[: _MOST_STATES - 2])
     return f"{first} ... {symbol.shown(last)} ({symbol.size})"
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return ", ".join(names[:_MOST_NAMES]) + more
 
 
 def _aligned(heading: Sequence[str], table: Sequence[Sequence[str]]) -> list[str]:

@@ -159,6 +159,9 @@ def test_show_lists_states_and_parents(asia, tmp_path, monkeypatch):
     assert done(toolchain("show", "n.uai")).stdout.splitlines()[-1].split() == ["0", "0", "to", "2"]
     alone = done(toolchain("show", asia, "--searched", "bronc", "--known", "smoke,asia")).stdout
     assert "A BM1 takes all" in alone
+    monkeypatch.setattr(queries, "_MOST_NAMES", 2)
+    shortened = done(toolchain("show", asia, "--searched", "bronc")).stdout.splitlines()
+    assert shortened[-2].endswith("asia, tub and 4 more")
     monkeypatch.setattr(queries, "MOST_CANDIDATES", 6)
     assert_refused(toolchain("show", asia, "--searched", "bronc"), "7 variables", "--known A,B")
 
