@@ -38,6 +38,17 @@ def corridor(cells=12, *, sigma=1.0, select=False, missing=False):
     )
 
 
+def posts(count, *, floor=0.02):
+    """Ranges to posts along a corridor of ten metres, so many that the likelihoods' product is tiny on every line."""
+    place = interval("x", 0.0, 10.0, cells=20)
+    (x,) = cell_centres(place)
+    known = (
+        normal(f"r{at}", mean=np.abs(x - 10 * at / count), sigma=0.5, values=101, step=0.1, floor=floor)
+        for at in range(count)
+    )
+    return Model(name="posts", searched=(place,), known=tuple(known))
+
+
 def machine_of(model, *, prob_bits=8, **others):
     """The model's machine on one board."""
     quantised = quantise(model, prob_bits=prob_bits)

@@ -2,13 +2,14 @@
 
 Each frame has three posteriors: of the model (float64), of the codes (float64), and of the machine (counts). The
 difference between codes and model is the quantisation loss, that between machine and codes the sampling loss. Means
-over frames have confidence intervals.
+over frames have confidence intervals. A frame without a posterior is not left out of a mean: its total variation is 1,
+and its most probable line is wrong.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Self
+from typing import Final, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,8 @@ EXPECTED_COUNT: Final = 5.0
 """Minimum expected count of a line to get a z-score, because lower counts are not approximately normal."""
 
 _TIE: Final = 1e-9
+_LOST: Final = (1.0, math.nan, 0.0)
+"""Total variation, KL and agreement of a run without a posterior."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,14 +76,17 @@ class Difference:
     """Distances between posteriors, averaged over frames.
 
     Attributes:
-        total_variation: Half the sum of absolute differences, 0 to 1.
-        kl_bits: KL(ours || theirs) in bits. (KL(theirs || ours) is infinite if a count is 0.)
-        map_agreement: Share of frames in which the most probable line is the same.
+        total_variation: Half the sum of absolute differences, 0 to 1; 1 for a frame without a posterior.
+        map_agreement: Share of frames in which the most probable line is the same; it is not without a posterior.
+        kl_bits: KL(ours || theirs) in bits; None where frames without a posterior count. (KL(theirs || ours) is
+            infinite if a count is 0.)
+        alone: The same over the frames with a posterior alone; None if there are none.
     """
 
     total_variation: Interval
-    kl_bits: Interval
     map_agreement: Interval
+    kl_bits: Interval | None = None
+    alone: "Difference | None" = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,7 +134,7 @@ class Accuracy:
     Attributes:
         posteriors: Number of posteriors: one per frame, or one per replica of a frame.
         banks: Number of seed sets with which each was run.
-        impossible: Share of posteriors for which no line can count, although the model, if any, has a posterior.
+        impossible: Share of posteriors for which no line can count.
         without: Share of runs without a posterior, including those whose counts remained 0.
         overflow: Share of runs that ended with an overflow.
         machine: The machine against the model; None without a model.
@@ -150,26 +156,45 @@ class Accuracy:
     cycles: Cycles
 
 
+_Posterior: TypeAlias = NDArray[np.float64] | None
+
+
 class _Differences:
-    """Differences of many frames; runs and replicas of a frame are averaged."""
+    """Differences of many frames, total variation, KL and agreement; runs and replicas of a frame are averaged."""
 
     def __init__(self) -> None:
-        self._frames: dict[int, list[tuple[float, float, float]]] = {}
+        self._all: dict[int, list[NDArray[np.float64]]] = {}
+        self._alone: dict[int, list[NDArray[np.float64]]] = {}
 
-    def add(self, frame: int, ours: list[NDArray[np.float64]], theirs: NDArray[np.float64]) -> None:
-        if ours:
-            mean = np.mean([_difference(each, theirs) for each in ours], axis=0)
-            self._frames.setdefault(frame, []).append(tuple(mean.tolist()))
+    def add(self, frame: int, ours: Sequence[_Posterior], theirs: _Posterior) -> None:
+        runs = [_difference(each, theirs) for each in ours if each is not None and theirs is not None]
+        lost = [_LOST] * (len(ours) - len(runs))
+        self._all.setdefault(frame, []).append(np.mean([*runs, *lost], axis=0))
+        if runs:
+            self._alone.setdefault(frame, []).append(np.mean(runs, axis=0))
 
     def summary(self) -> Difference | None:
-        if not self._frames:
+        if not self._all:
             return None
-        columns = np.array([np.mean(replicas, axis=0) for replicas in self._frames.values()])
+        alone = None
+        if self._alone:
+            variation, divergence, same = _columns(self._alone)
+            alone = Difference(
+                total_variation=bootstrap(variation, np.mean),
+                map_agreement=share_of_frames(float(same.mean()), len(same)),
+                kl_bits=bootstrap(divergence, np.mean),
+            )
+        variation, _, same = _columns(self._all)
         return Difference(
-            total_variation=bootstrap(columns[:, 0], np.mean),
-            kl_bits=bootstrap(columns[:, 1], np.mean),
-            map_agreement=share_of_frames(float(columns[:, 2].mean()), len(columns)),
+            total_variation=bootstrap(variation, np.mean),
+            map_agreement=share_of_frames(float(same.mean()), len(same)),
+            alone=alone,
         )
+
+
+def _columns(frames: dict[int, list[NDArray[np.float64]]]) -> NDArray[np.float64]:
+    """Return total variation, KL and agreement of each frame, averaged over its replicas: float64[3, frames]."""
+    return np.array([np.mean(replicas, axis=0) for replicas in frames.values()]).T
 
 
 def measure(
@@ -185,7 +210,7 @@ def measure(
 
     A replica has the same counts as a single machine with the same bank, so a single machine is run for all
     replicas: successive readings, one per replica, form a frame, which ends when the last one ends. Without a
-    `model`, only the codes are known. Readings that are impossible in the model are omitted. `advance` is
+    `model`, only the codes are known. Readings that are impossible in the model have no posterior. `advance` is
     called after every reading.
 
     Raises:
@@ -199,6 +224,7 @@ def measure(
     parameters = boards.parameters
     banks = max(1, min(banks, parameters.rng_banks if parameters.rng_reset is RngReset.BANK else banks))
     found = _Results(boards, readings, banks)
+    impossible = 0
     for place in range(len(readings) // replicas * replicas):
         exact = None
         if model is not None:
@@ -206,11 +232,10 @@ def measure(
             try:
                 exact = exact_posterior(model, addresses, prior_address=row)
             except ModelError:
-                advance()
-                continue
-        found.add(place, place // replicas, exact)
+                impossible += 1
+        found.add(place, place // replicas, exact, compare=model is not None)
         advance()
-    if not found.posteriors:
+    if impossible == found.posteriors:
         raise ModelError(f"none of the readings ({readings.source}) is possible in the model")
     return found.summary()
 
@@ -233,8 +258,8 @@ class _Results:
     without: int = 0
     overflow: int = 0
 
-    def add(self, place: int, frame: int, exact: NDArray[np.float64] | None) -> None:
-        """Run the reading at an index with every bank; `exact` is the posterior of the model, if any."""
+    def add(self, place: int, frame: int, exact: _Posterior, *, compare: bool) -> None:
+        """Run the reading at an index with every bank, and compare it with `exact`, the posterior of the model, if any."""
         boards, banks = self.boards, self.banks
         inputs, prior_row = self.readings.of_machine(place, boards.machines[0])
         likelihood = np.concatenate(
@@ -247,21 +272,20 @@ class _Results:
         )
         numbers = [(frame * banks + run) % boards.parameters.rng_banks for run in range(banks)]
         ran = [boards.run(inputs, prior_row, bank) for bank in numbers]
-        posteriors = [posterior for each in ran if (posterior := each.posterior) is not None]
+        posteriors = [each.posterior for each in ran]
         self.posteriors += 1
-        self.without += banks - len(posteriors)
+        self.without += sum(each is None for each in posteriors)
         self.overflow += sum(any(reason.name == "OVERFLOW" for reason in each.reasons) for each in ran)
         self.lengths.setdefault(frame, []).append([each.length for each in ran])
-        if not likelihood.any():
+        codes = fuse(likelihood, ()) if likelihood.any() else None
+        if codes is None:
             self.impossible += 1
         else:
-            codes = fuse(likelihood, ())
-            self.of_sampling.add(frame, posteriors, codes)
             self.weights.append(likelihood)
             self.places.append(place)
-            if exact is not None:
-                self.of_codes.add(frame, [codes], exact)
-        if exact is not None:
+        self.of_sampling.add(frame, posteriors, codes)
+        if compare:
+            self.of_codes.add(frame, [codes], exact)
             self.of_machine.add(frame, posteriors, exact)
 
     def summary(self) -> Accuracy:
@@ -288,11 +312,15 @@ class _Results:
         )
 
 
+def addressed_chances(machine: BM1Machine, addresses: Inputs, prior_address: int) -> NDArray[np.float64]:
+    """Return the probability that each cell gives a 1 in a cycle: float64[columns, lines], the prior first."""
+    frame = Start(addresses=addresses, prior_address=prior_address, target_count=1, max_cycles=1)
+    return decode_code(addressed_codes(machine, frame), machine.parameters.prob_bits)
+
+
 def _line_probabilities(machine: BM1Machine, addresses: Inputs, prior_address: int) -> NDArray[np.float64]:
     """Return the probability that each line counts in a cycle: float64[lines]."""
-    frame = Start(addresses=addresses, prior_address=prior_address, target_count=1, max_cycles=1)
-    chances = decode_code(addressed_codes(machine, frame), machine.parameters.prob_bits)
-    product: NDArray[np.float64] = np.prod(chances, axis=0)
+    product: NDArray[np.float64] = np.prod(addressed_chances(machine, addresses, prior_address), axis=0)
     return product
 
 

@@ -53,7 +53,7 @@ class Candidate:
     Attributes:
         refused: The reason why it cannot answer the question; empty if it can.
         setting: Its target count (BM1) or samples (BM2).
-        total_variation: Mean distance from exact inference with this setting.
+        total_variation: Mean distance from exact inference with this setting; 1 for a frame without a posterior.
         cycles: Cycles of a frame, in the median.
         seconds: The time of these cycles at the clock.
         alms, blocks: Estimated logic and memory blocks of one of its boards.

@@ -56,13 +56,20 @@ class ChainInspection:
         count, sizes = self.deployment.machine.target_count, [table.size for table in self.machine.tables]
         lengths = (ran.cycles.median.value, ran.cycles.percentile_95.value, float(ran.cycles.worst))
         shown = [f"{each:,.0f} ({with_unit(each / self.clock_hz, 's')})" for each in lengths]
-        cycles = f"{shown[0]} in the median, {shown[1]} at 95 %, {shown[2]} at worst"
+        at_95 = f"{ran.cycles.percentile_95.low:,.0f}..{ran.cycles.percentile_95.high:,.0f}"
+        cycles = f"{shown[0]} in the median, {shown[1]} at 95 % (95 % interval {at_95}), {shown[2]} at worst"
         resources = f"{cost.alms:,.0f} ALMs ({cost.alm_share:.1%}), "
         resources += f"{cost.memories.blocks:,} memory blocks ({cost.block_share:.1%}); "
         resources += "it fits" if cost.fits else f"it does not fit: {cost.why_not}"
         accuracy = "Give the model with --model for the accuracy."
         if (tv := ran.total_variation) is not None:
-            accuracy = f"Total variation from exact inference: {tv.value:.4f} ({tv.low:.4f}..{tv.high:.4f})."
+            accuracy = f"Total variation from exact inference: {tv.value:.4f} ({tv.low:.4f}..{tv.high:.4f})"
+            if ran.without and ran.alone is not None:
+                accuracy += (
+                    f" over all frames, and 1 for the {ran.without:.1%} of them without a posterior; over the others "
+                    f"{ran.alone.value:.4f} ({ran.alone.low:.4f}..{ran.alone.high:.4f})"
+                )
+            accuracy += "."
         if (e := self.exact) is not None:
             accuracy += (
                 f" Computed: {e.quantising:.2g} by the codes, {e.start:.2g} by the start state, "
@@ -84,7 +91,7 @@ class ChainInspection:
                 f"{count:,} samples after {p.burn_in:,} sweeps, {p.sequencer} order, {p.rng} "
                 f"({p.steps_per_clock} steps per clock, {p.rng_banks} banks)."
             ),
-            f"Readings: {self.readings}. Boards stopped by: {stops}.",
+            f"Readings: {self.readings}. Boards stopped by: {stops}. Without a posterior: {ran.without:.1%} of frames.",
             (
                 f"Cycles of a frame, and time at {with_unit(self.clock_hz, 'Hz')} (no link, no ROS): {cycles}; "
                 f"{ran.sweep_cycles:.2f} per sweep."

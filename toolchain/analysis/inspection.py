@@ -223,14 +223,15 @@ def _time_part(found: Inspection) -> str:
     cycles = found.accuracy.cycles
     rows = [
         f"Cycles of a frame, and time at {with_unit(found.clock_hz, 'Hz')} (the boards' computing alone: no link, no ROS):",
-        "            cycles        time",
+        "            cycles        time   95 % interval, cycles",
     ]
-    for name, count in (
-        ("median", cycles.median.value),
-        ("95 %", cycles.percentile_95.value),
-        ("worst", float(cycles.worst)),
+    for name, count, interval in (
+        ("median", cycles.median.value, cycles.median),
+        ("95 %", cycles.percentile_95.value, cycles.percentile_95),
+        ("worst", float(cycles.worst), None),
     ):
-        rows.append(f"  {name:6}  {count:10,.0f}  {with_unit(count / found.clock_hz, 's'):>10}")
+        row = f"  {name:6}  {count:10,.0f}  {with_unit(count / found.clock_hz, 's'):>10}"
+        rows.append(row + (f"   {interval.low:,.0f}..{interval.high:,.0f}" if interval else ""))
     counted = "posteriors" if found.deployment.machine.replicas > 1 else "frames"
     rows.append(
         f"  {found.accuracy.overflow:.0%} of runs end with an overflow; without a posterior: {found.accuracy.without:.1%} of "
@@ -247,21 +248,29 @@ def _time_part(found: Inspection) -> str:
 
 def _accuracy_part(found: Inspection) -> str:
     accuracy = found.accuracy
-    rows = [
-        f"Accuracy over {accuracy.frames} frames (means with 95 % intervals; frames are resampled, banks within them are not):",
-        "                                       total variation               KL, bits             same MAP",
-    ]
-    for name, difference in (
-        ("the machine against the model", accuracy.machine),
-        ("  of that, by quantising alone", accuracy.quantising),
-        ("the machine against its codes", accuracy.sampling),
+    every = {
+        "the machine against the model": accuracy.machine,
+        "  of that, by quantising alone": accuracy.quantising,
+        "the machine against its codes": accuracy.sampling,
+    }
+    alone = {name: each and each.alone for name, each in every.items()}
+    rows = []
+    title = (
+        f"Accuracy over all {accuracy.frames} frames (means with 95 % intervals; frames are resampled, banks within them are "
+        "not). Without a posterior, the total variation is 1 and the MAP is wrong:"
+    )
+    for heading, differences in (
+        (title, every),
+        (f"Over the {1 - accuracy.without:.1%} of runs with a posterior alone:", alone),
     ):
-        if difference is not None:
-            rows.append(
-                f"  {name:34}{_shown_interval(difference.total_variation, '.4f'):>21}"
-                f"  {_shown_interval(difference.kl_bits, '.4f'):>21}"
-                f"  {_shown_interval(difference.map_agreement, '.0%'):>19}"
-            )
+        rows += [heading, f"{'total variation':>57}{'same MAP':>21}"]
+        for name, each in differences.items():
+            if each is not None:
+                row = f"  {name:34}{_shown_interval(each.total_variation, '.4f'):>21}"
+                row += f"{_shown_interval(each.map_agreement, '.0%'):>21}"
+                rows.append(
+                    row + (f"   KL {_shown_interval(each.kl_bits, '.4f')} bits" if each.kl_bits else "")
+                )
     if accuracy.machine is None:
         rows.append("  Give the model with --model for the quantisation loss.")
     if accuracy.z is not None:

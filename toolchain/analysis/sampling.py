@@ -61,9 +61,11 @@ class Sampled:
     """Results of a BM2 on some readings; intervals are of 95 %, over frames.
 
     Attributes:
-        frames: Frames with a posterior.
-        total_variation: Mean distance of the posteriors from exact inference; None without a model.
-        cycles: Cycles of the longest-running board.
+        frames: All frames.
+        without: Share of frames without a posterior.
+        total_variation: Mean distance from exact inference, 1 for a frame without a posterior; None without a model.
+        alone: The same without these frames.
+        cycles: Cycles of the longest-running board, in frames with a posterior like everything below.
         sweep_cycles: Cycles of a sweep, in the mean; 0 if samples are taken after every move.
         effective_samples: Effective samples of a frame, in the median and at least; 0 if unknown.
         r_hat: The median of frames; 0 for one board, 1e9 if it is infinite.
@@ -71,7 +73,9 @@ class Sampled:
     """
 
     frames: int
+    without: float
     total_variation: Interval | None
+    alone: Interval | None
     cycles: Cycles
     sweep_cycles: float
     effective_samples: tuple[float, float]
@@ -108,9 +112,13 @@ def run_chains(
         raise BuildError(f"none of the readings gives a posterior; boards stopped by: {ends}")
     distances, effective, r_hat, lengths = np.nan_to_num(np.array(rows), posinf=_INFINITE).T
     sweeps = p.burn_in + samples if p.sample_every is SampleEvery.SWEEP else 0
+    lost = len(readings) - len(rows)
+    everywhere = np.concatenate([distances, np.ones(lost)])
     return Sampled(
-        frames=len(rows),
-        total_variation=None if model is None else bootstrap(distances, np.mean),
+        frames=len(readings),
+        without=lost / len(readings),
+        total_variation=None if model is None else bootstrap(everywhere, np.mean),
+        alone=None if model is None else bootstrap(distances, np.mean),
         cycles=Cycles.of(lengths),
         sweep_cycles=float(lengths.mean() / sweeps) if sweeps else 0.0,
         effective_samples=(float(np.median(effective)), float(effective.min())),

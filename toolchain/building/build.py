@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -69,14 +69,16 @@ class Built:
 REPORT_NAME: Final = "report.txt"
 
 
-def build_deployment(plan: MachinePlan | BM2Plan, directory: Path, *, remark: str = "") -> Built:
+def build_deployment(
+    plan: MachinePlan | BM2Plan, directory: Path, *, remarks: Callable[[Built], Iterable[str]] = lambda _: ()
+) -> Built:
     """Write a deployment: `deployment.toml`, an image per board, a report, and the hardware project.
 
-    The same plan gives the same bytes. A deployment in the folder is replaced; `remark` ends the report. A
+    The same plan gives the same bytes. A deployment in the folder is replaced; `remarks` end the report. A
     BuildError if the options contradict the register map, or the folder cannot be written.
     """
     built = assemble(plan)
-    if remark:
+    for remark in remarks(built):
         built = replace(built, report=f"{built.report}\n{remark}\n")
     with file_errors(directory, "written", BuildError, "; choose another folder with -o"):
         directory.mkdir(parents=True, exist_ok=True)

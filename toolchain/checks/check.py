@@ -4,6 +4,7 @@ A model is checked with its build options, a deployment with the codes of its im
 exact: a frame with an impossible reading ends as `impossible` on the machine, and a dead line never counts.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
@@ -12,6 +13,7 @@ from machines.bm2 import BM2Machine
 from pcie_shim.errors import PcieShimError
 from pcie_shim.programming_file import Image
 from toolchain.analysis.emulation import joined
+from toolchain.analysis.lost_frames import lost_frames
 from toolchain.building.bm2_machine import plan_bm2
 from toolchain.building.build import assemble, check_agreement, read_images
 from toolchain.building.machine import MachinePlan, partition_lines, plan_machine
@@ -29,8 +31,9 @@ from toolchain.checks.findings import (
     warning,
 )
 from toolchain.checks.generators import generator_findings
-from toolchain.deployment import Deployment, load_deployment
+from toolchain.deployment import Deployment, Variable, load_deployment
 from toolchain.errors import ToolchainError
+from toolchain.models.distribution import NO, NUMBER, YES
 from toolchain.models.model import Model
 from toolchain.models.network import NetworkModel
 from toolchain.outputs.output_files import Change, compare_files, memory_files, quartus_files
@@ -52,10 +55,16 @@ def check_model(
         plan = plan_machine(model, options) if isinstance(model, Model) else plan_bm2(model, options)
         if refused:
             return refused
-        built = assemble(fit(plan) if isinstance(plan, MachinePlan) else plan)
+        plan = fit(plan) if isinstance(plan, MachinePlan) else plan
+        built = assemble(plan)
     except ToolchainError as reason:
         return [*refused, refusal(reason, "the machine")]
-    losses = loss_findings(built.quantised, options) if built.quantised is not None else ()
+    losses: list[Finding] = []
+    if built.quantised is not None and isinstance(plan, MachinePlan):
+        lost = lost_frames(plan, built.quantised)
+        if lost.advice:
+            losses.append(warning(Check.LOST_FRAMES, "the machine", lost.what, lost.advice))
+        losses += loss_findings(built.quantised, options)
     return _sorted([*_check(built.deployment, built.images, model), *losses])
 
 
@@ -88,6 +97,8 @@ def _check(
         yield from code_findings(machine)
     yield from _same_readings(deployment)
     yield from _ranges(deployment)
+    for variable in deployment.variables:
+        yield from state_findings(variable)
     yield from source_findings(deployment)
     if machine is not None:
         yield from generator_findings(machine)
@@ -173,6 +184,30 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
                 'use on_missing="missing", or on_range="clamp" or "error"',
             )
 
+
+def state_findings(variable: Variable) -> Iterator[Finding]:
+    """Find states that a reading could mean differently than it is taken, as a number or as a bool."""
+    states, shown = variable.states, ", ".join(variable.states[:_MOST_NAMES])
+    for at, name in enumerate(states):
+        number = variable.offset + at * variable.step
+        if NUMBER.fullmatch(name) and abs(float(name) - number) > 1e-6 * abs(variable.step):
+            what = f"a reading of {number:g} as a number selects the state '{name}' ({shown}), since numbers are in equal steps"
+            yield warning(
+                Check.STATES, variable.name, what, "publish names as strings, or give the states other names"
+            )
+            break
+    one = math.floor((1 - variable.offset) / variable.step + 0.5)  # the address of 1, and of true
+    chosen = states[one].lower() if 0 <= one < len(states) else ""
+    unclear = len(states) == 2 and one == 1 and chosen not in YES and not NUMBER.fullmatch(chosen)
+    if chosen in NO or unclear:
+        what = f"a reading of true selects the state '{chosen}' ({shown}), whose number is 1"
+        finding = warning if chosen in NO else note
+        yield finding(
+            Check.STATES, variable.name, what, "publish names as strings if a bool means the other one"
+        )
+
+
+_MOST_NAMES: Final = 6
 
 _WITHOUT_HEADER: Final = frozenset(
     f"geometry_msgs/{name}"

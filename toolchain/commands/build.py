@@ -4,7 +4,7 @@ import json as json_text
 from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 import typer
 
@@ -26,7 +26,16 @@ if TYPE_CHECKING:
     from toolchain.checks.findings import Finding
 
 _NO_ROBOT = TargetOptions(uri="ws://127.0.0.1:9090", topic="/readings", type="std_msgs/Float64MultiArray")
-"""A placeholder for a check, which needs no topics, although the options of a build do."""
+"""Placeholders for what a check may leave out of the options of a build."""
+
+SourcesFlag: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        "--sources",
+        help="Instead of topic and type: a TOML file with several topics on one or more servers.",
+        metavar="FILE",
+    ),
+]
 
 
 def build(
@@ -36,13 +45,7 @@ def build(
     ],
     flags: BuildFlags,
     target: TargetOptions,
-    sources: Annotated[
-        Path | None,
-        typer.Option(
-            help="Instead of topic and type: a TOML file with several topics on one or more servers.",
-            metavar="FILE",
-        ),
-    ] = None,
+    sources: SourcesFlag = None,
 ) -> None:
     """Build a deployment: programming files, deployment.toml, a report, and a BM1's hardware project.
 
@@ -54,10 +57,11 @@ def build(
     `toolchain build asia.bif --searched bronc --known smoke,dysp -o build/asia --uri ws://localhost:9090
     --topic /patient --type clinic_msgs/Patient`
     """
+    from toolchain.analysis.lost_frames import lost_frames
     from toolchain.building.bm2_machine import plan_bm2
-    from toolchain.building.build import REPORT_NAME, build_date, build_deployment
+    from toolchain.building.build import REPORT_NAME, Built, build_date, build_deployment
     from toolchain.building.choice import model_for
-    from toolchain.building.machine import plan_machine
+    from toolchain.building.machine import MachinePlan, plan_machine
     from toolchain.models.network import NetworkModel
 
     file = model_file(model)
@@ -73,7 +77,15 @@ def build(
         plan, why = fit_to_device(plan_machine(chosen, dated), flags.device)
     typer.echo(f"Building a {plan.kind}, since {plan.why}", err=True)
     typer.echo(f"Quantising {plan.model.name} and writing its images", err=True)
-    built = build_deployment(plan, directory, remark=why)
+
+    def remarks(built: Built) -> list[str]:
+        found = [why] if why else []
+        if isinstance(plan, MachinePlan) and built.quantised is not None:
+            lost = lost_frames(plan, built.quantised)
+            found += [f"Warning: {lost.what}; {lost.advice}."] if lost.advice else []
+        return found
+
+    built = build_deployment(plan, directory, remarks=remarks)
     typer.echo(built.report, nl=False)
     typer.echo(f"Wrote {built.deployment.path} and {directory / REPORT_NAME}", err=True)
 
@@ -87,20 +99,27 @@ def check(
         ),
     ],
     flags: BuildFlags,
+    target: TargetOptions,
+    sources: SourcesFlag = None,
+    directory: Annotated[
+        Path | None,
+        typer.Option("--output-dir", "-o", help="As for a build; nothing is written.", metavar="DIR"),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
 ) -> None:
     """Report mistakes before anything runs: in a model as it would be built, or in a deployment.
 
-    For example `toolchain check casestudies/boat --partitions 4`, or `toolchain check build/boat`. The exit
-    code is 2 if there is an error among the findings, otherwise 0.
+    For example `toolchain check casestudies/boat --partitions 4`, or `toolchain check build/boat`. It takes all options
+    of `toolchain build`, and needs none of them. The exit code is 2 if there is an error among the findings, otherwise 0.
     """
+    del directory  # taken so that a command to build is checked by its first word alone
     from toolchain.checks.check import check_deployment
     from toolchain.checks.findings import Severity
     from toolchain.deployment import FILE_NAME
     from toolchain.models import case_study
 
     if is_network(path) or case_study.model_path(path).is_file():
-        findings = _of_model(path, flags)
+        findings = _of_model(path, flags, target, sources)
     elif not (path / FILE_NAME).is_file():
         raise BuildError(
             f"{path} contains neither a model ({case_study.FILE_NAME}) nor a deployment ({FILE_NAME}), and is not a "
@@ -130,12 +149,15 @@ def _model_flags(context: typer.Context) -> list[str]:
     return given
 
 
-def _of_model(path: Path, flags: BuildFlags) -> "list[Finding]":
+def _of_model(path: Path, flags: BuildFlags, target: TargetOptions, sources: Path | None) -> "list[Finding]":
     from toolchain.building.choice import model_for
     from toolchain.checks.check import check_model, refusal
 
+    if sources is None:
+        given = {key: value for key, value in asdict(target).items() if value != ""}
+        target = TargetOptions(**asdict(_NO_ROBOT) | given)
     try:
-        options = build_options(flags, _NO_ROBOT)
+        options = build_options(flags, target, sources)
         model, _ = model_for(read_source(path, flags), options, flags.bits or (), flags.device)
     except ToolchainError as reason:
         return [refusal(reason, "the model")]

@@ -186,7 +186,8 @@ def write_fit(path: Path, fit: Fit) -> None:
             content = fit.file.model_dump(mode="json", by_alias=True)
             partial.write_text(_HEADER + tomli_w.dumps(content), encoding="utf-8")
         else:
-            _write_tables(partial, fit.file.model_dump(mode="json", by_alias=True), fit)
+            counted = {"variables": {"__all__": {"sigma", "bias", "outliers"}}}  # of normals
+            _write_tables(partial, fit.file.model_dump(mode="json", by_alias=True, exclude=counted), fit)
 
 
 def read_fit(path: Path) -> Fit:

@@ -20,9 +20,10 @@ from toolchain.errors import ModelError
 from toolchain.models.conditional import normal_table, wrapped_normal_table
 from toolchain.models.model import MAX_ENTRIES, Normal, check_size, dimension
 
-_NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
+NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
 _NO_AND_YES: Final = ({"false", "true"}, {"no", "yes"}, {"off", "on"})
-_YES: Final = {"true", "yes", "on"}
+NO: Final = frozenset({"false", "no", "off"})
+YES: Final = frozenset({"true", "yes", "on"})
 
 
 def _is_whole(number: object) -> bool:
@@ -132,8 +133,8 @@ class LabelType:
 
     def _numbers(self) -> tuple[float, float]:
         if {label.lower() for label in self.labels} in _NO_AND_YES:
-            return (1.0, -1.0) if self.labels[0].lower() in _YES else (0.0, 1.0)
-        if len(self.labels) > 1 and all(_NUMBER.fullmatch(label) for label in self.labels):
+            return (1.0, -1.0) if self.labels[0].lower() in YES else (0.0, 1.0)
+        if len(self.labels) > 1 and all(NUMBER.fullmatch(label) for label in self.labels):
             values = [float(label) for label in self.labels]
             step = values[1] - values[0]
             slack = 1e-9 * max(map(abs, values))
@@ -217,7 +218,7 @@ class Symbol:
         """Return the index of the value with this label or number, or raise a ModelError."""
         if label in self.type.labels:
             return self.type.labels.index(label)
-        if not self.type.labels and _NUMBER.fullmatch(label):
+        if not self.type.labels and NUMBER.fullmatch(label):
             place = (float(label) - self.type.offset) / self.type.step
             at = math.floor(place + 0.5)
             if 0 <= at < self.size:

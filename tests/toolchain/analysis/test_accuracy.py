@@ -224,7 +224,14 @@ def test_frames_without_a_posterior_are_counted():
     accuracy = measure(boards_of(machine_of(model)), readings, model, banks=3)
     assert accuracy.impossible == 0.5
     assert accuracy.without == 0.5
-    assert accuracy.machine.total_variation.value < 0.05
+    for difference in (accuracy.machine, accuracy.quantising, accuracy.sampling):
+        # the second frame counts as 1 and as wrong
+        alone = difference.alone
+        assert alone.total_variation.value < 0.05
+        assert difference.total_variation.value == pytest.approx((alone.total_variation.value + 1) / 2)
+        assert (alone.map_agreement.value, difference.map_agreement.value) == (1, 0.5)
+    lost = measure(boards_of(machine_of(model)), Readings("", readings.addresses[1:], np.array([-1])), model)
+    assert (lost.machine.total_variation.value, lost.machine.alone) == (1, None)
 
 
 def test_a_selected_prior_and_missing_readings():
@@ -243,6 +250,10 @@ def test_a_selected_prior_and_missing_readings():
 def test_readings_that_the_model_finds_impossible():
     table = np.array([[1.0, 1.0], [0.0, 0.0]])
     model = Model(name="sure", searched=(dimension("s", size=2),), known=(Known(name="A", table=table),))
+    recorded = Readings("by hand", np.array([[0], [1]]), np.array([-1, -1]))
+    accuracy = measure(boards_of(machine_of(model)), recorded, model)
+    assert (accuracy.frames, accuracy.without) == (2, 0.5)
+    assert accuracy.machine.total_variation.value == 0.5
     readings = Readings("by hand", np.array([[1]]), np.array([-1]))
     with pytest.raises(ModelError, match="by hand"):
         measure(boards_of(machine_of(model)), readings, model)

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.toolchain.builders import corridor
+from tests.toolchain.builders import corridor, posts
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis import Sweep
 from toolchain.analysis.logic import DEVICES
 from toolchain.analysis.readings import sample_readings
-from toolchain.analysis.sweep import Point, Results, pareto, run_sweep, run_task, tasks
+from toolchain.analysis.sweep import Point, Results, pareto, run_sweep, run_task, table, tasks
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 
@@ -116,17 +116,35 @@ def test_a_torn_last_line_is_measured_again_and_another_file_is_left_alone(tmp_p
         Results(tmp_path / "there" / "r.jsonl").append(point(1))
 
 
-@given(st.lists(st.tuples(*[st.integers(0, 3)] * 4), min_size=1, max_size=12))
+@given(st.lists(st.tuples(*[st.integers(0, 3)] * 3), min_size=1, max_size=12))
 def test_what_is_not_on_the_front_is_beaten_by_what_is(figures):
-    points = [
-        point(key, variation=a, cycles=b, alms=c, without=d / 3) for key, (a, b, c, d) in enumerate(figures)
-    ]
+    points = [point(key, variation=a, cycles=b, alms=c) for key, (a, b, c) in enumerate(figures)]
     front = {each.key for each in pareto(points)}
     best = [own for own, each in zip(figures, points, strict=True) if each.key in front]
     for own, each in zip(figures, points, strict=True):
         beaten = any(other != own and all(a <= b for a, b in zip(other, own, strict=True)) for other in best)
         assert beaten == (each.key not in front)
-    assert pareto([point(1, None)]) == []
+
+
+def test_a_machine_that_loses_most_frames_gets_no_star():
+    usual, some, most = (
+        point(1),
+        point(2, 0.5, cycles=50.0, without=0.5),
+        point(3, 0.99, 1.0, 1.0, without=0.98),
+    )
+    assert pareto([usual, some, most]) == [usual, some]
+
+
+def test_lost_frames_count_in_a_sweep():
+    model = posts(20)
+    readings = sample_readings(model, 20, seed=1)
+    (task,) = tasks(model, sweep(prob_bits="8", targets="15", rngs="lfsr32"), readings, D8)
+    found = run_task(task, readings, D8, 1)
+    assert found.without > 0.5
+    assert found.total_variation >= found.without
+    assert found.alone_total_variation < 0.4
+    assert found.map_agreement <= 1 - found.without
+    assert "\n* address" not in table([found], pareto([found]))
 
 
 def test_the_command(case):
@@ -139,7 +157,7 @@ def test_the_command(case):
     assert "3 of 3 machines are in" in result.stderr
     assert (case.parent / "sweep.png").read_bytes().startswith(b"\x89PNG")
     rows = result.stdout.splitlines()
-    assert len(rows) == 5
+    assert len(rows) == 6
     assert any(row.startswith("* address") for row in rows)
     # the resources of a stored point are estimated again: the estimator may have been calibrated since
     path = case.parent / "r.jsonl"
@@ -198,7 +216,7 @@ def test_ctrl_c_keeps_what_is_done(case, monkeypatch):
     assert ended.exit_code == 130, ended.stderr
     assert "1 of 2 machines are in" in ended.stderr
     assert len(Results(case.parent / "r.jsonl").points) == 1
-    assert len(ended.stdout.splitlines()) == 3
+    assert len(ended.stdout.splitlines()) == 4
 
 
 def test_a_file_of_results_that_does_not_end_is_refused(tmp_path, monkeypatch):

@@ -54,8 +54,11 @@ def test_boards_that_do_not_finish():
         run_chains([machine_of(model, ops_timeout=1)], [(1,)], model, samples=100, max_cycles=2**40)
     impossible = network({"AB": [[1, 0], [1, 0]]}, known=("B",), searched=("A",))
     found = run_chains([machine_of(impossible)], [(0,), (1,)], None, samples=100, max_cycles=2**40)
-    assert (found.frames, found.total_variation) == (1, None)
+    assert (found.frames, found.without, found.total_variation) == (2, 0.5, None)
     assert found.reasons == {"samples": 1, "impossible": 1}
+    compared = run_chains([machine_of(impossible)], [(0,), (1,)], impossible, samples=100, max_cycles=2**40)
+    assert compared.alone.value < 0.2
+    assert compared.total_variation.value == (compared.alone.value + 1) / 2
 
 
 def test_resources():

@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from typer.main import get_command
 
 from machines.bm1 import Start, StopReason
 from machines.parameters import PriorMode, RngKind, RngReset
 from machines.reference import ReferenceBM1
 from tests.toolchain.builders import boat
-from tests.toolchain.running import OPTIONS, TINY, build_model, toolchain
+from tests.toolchain.running import OPTIONS, TINY, build_model, done, toolchain
 from toolchain.building.build import assemble, build_deployment
 from toolchain.building.machine import plan_machine
-from toolchain.checks.check import check_deployment, check_model, source_findings
+from toolchain.checks.check import check_deployment, check_model, source_findings, state_findings
 from toolchain.checks.findings import Check, Severity, line_name, reading
+from toolchain.commands.main import app
 from toolchain.deployment import Scale, Source, Variable
 from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
@@ -348,6 +350,48 @@ def test_comments_are_not_contents(deployment):
 
 
 MODEL = TINY
+
+
+def test_a_check_takes_what_a_build_takes(case):
+    build, check = (
+        {flag for each in get_command(app).commands[name].params for flag in each.opts}
+        for name in ("build", "check")
+    )
+    assert build - {"model"} <= check
+    sources = case.parent / "sources.toml"
+    sources.write_text(
+        '[[source]]\ntopic = "/a"\ntype = "std_msgs/Float64"\nvariables = { K = "data" }\n'
+        '[[source]]\ntopic = "/b"\ntype = "std_msgs/Float64"\nprior = "data"\nvariables = {}\n'
+    )
+    options = ("--sources", sources, "--uri", "ws://a:1", "--tolerance", "0.001", "--prior-mode", "written")
+    result = toolchain("check", case, "-o", case.parent / "out", *options)
+    assert "warning: /a and /b: " in done(result).stdout
+    assert not (case.parent / "out").exists()
+    refused = toolchain("check", case, "--topic", "no topic")
+    assert (refused.exit_code, "topic" in refused.stdout) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("states", "numbers", "severity"),
+    [
+        (("low", "mid", "high"), {}, None),
+        (("0", "5", "20"), {}, Severity.WARNING),
+        (("1", "2", "many"), {}, Severity.WARNING),
+        (("10", "20", "30"), {}, Severity.WARNING),
+        (("10", "20", "30"), {"offset": 10.0, "step": 10.0}, None),
+        (("0", "1"), {}, None),
+        (("wet", "dry"), {}, Severity.NOTE),
+        (("no", "yes"), {}, None),
+        (("Yes", "No"), {}, Severity.WARNING),
+        (("yes", "no"), {"offset": 1.0, "step": -1.0}, None),
+    ],
+)
+def test_states_that_a_number_or_a_bool_could_mistake(states, numbers, severity):
+    variable = Variable(name="S", bits=3, values=len(states), states=states, **numbers)
+    found_ones = list(state_findings(variable))
+    assert [(each.check, each.severity) for each in found_ones] == (
+        [(Check.STATES, severity)] if severity else []
+    )
 
 
 def test_the_command_as_words_or_json(case):

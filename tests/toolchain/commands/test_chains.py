@@ -33,7 +33,7 @@ def test_check_names_factors_of_a_network_and_of_a_deployment(network, deploymen
     findings = [
         json.loads(line) for line in done(toolchain("check", deployment, "--json")).stdout.splitlines()
     ]
-    assert {each["check"] for each in findings} == {"clipped-factors"}
+    assert {each["check"] for each in findings} == {"clipped-factors", "ambiguous-states"}
     (
         deployment / "bm_arch" / "Memory_MIFs" / next((deployment / "bm_arch" / "Memory_MIFs").iterdir()).name
     ).unlink()

@@ -47,6 +47,39 @@ def test_json(case, deployment):
     assert found["energy_model"]["dynamic_j"] > 0
 
 
+def test_cycles_have_intervals(case, deployment):
+    cycles = json.loads(look(deployment, "--json").stdout)["accuracy"]["cycles"]["percentile_95"]
+    assert cycles["low"] <= cycles["value"] <= cycles["high"]
+    row = next(row for row in look(deployment).stdout.splitlines() if row.startswith("  95 %"))
+    assert row.endswith(f"   {cycles['low']:,.0f}..{cycles['high']:,.0f}")
+
+
+LOSSY = """
+from tests.toolchain.builders import posts
+
+def model(count: int = 20):
+    return posts(count)
+"""
+
+
+def test_lost_frames_are_said_by_build_check_and_inspect(case):
+    (case / "model.py").write_text(LOSSY)
+    report = build(case, "--max-cycles", 10_000).stdout
+    (warning,) = [row for row in report.splitlines() if "get no posterior" in row]
+    assert warning.startswith("Warning: ")
+    assert "% expected)" in warning
+    checked = done(toolchain("check", case, "--max-cycles", 10_000)).stdout
+    assert warning.removeprefix("Warning: ").removesuffix(".") in checked
+    assert "get no posterior" not in build(case, "--set", "count=3").stdout
+    build(case, "--max-cycles", 10_000)
+    rows = look(case.parent / "out", "--model", case, "--banks", 1).stdout.splitlines()
+    every, alone = (
+        float(row.split()[5]) for row in rows if row.startswith("  the machine against the model")
+    )
+    assert alone < 0.4  # the honest one is first
+    assert every > 0.6
+
+
 def test_recorded_readings(case, deployment):
     recording = case.parent / "run.csv"
     recording.write_text("range_m,loud\n3.0,1\n,0\n4.5,0\n")

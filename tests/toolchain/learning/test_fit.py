@@ -186,6 +186,11 @@ def test_counted_tables_and_their_file_survive_a_round_trip(tmp_path):
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     again = read_fit(tmp_path / "a.npz")
     assert again.file == fit.file
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        content = json.loads(archive.read("fit.json"))
+    # as documented in docs/how-to/models.md
+    assert sorted(content) == ["floor", "format", "method", "model", "recording", "variable"]
+    assert content["variable"] == [{"name": "door", "rows": 2}]
     assert np.array_equal(again.tables["door"], fit.tables["door"])
     with pytest.raises(ModelError, match="writes a file that ends in .npz"):
         write_fit(tmp_path / "a.toml", fit)

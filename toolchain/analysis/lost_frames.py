@@ -1,0 +1,138 @@
+"""Frames that a BM1 gives no posterior, predicted from its codes before it runs, and the options that save them.
+
+A frame is lost if every line has a code 0, or if no line counts in any of its cycles. Frames are drawn from the
+model (a sample). The chance to lose one follows from its codes: with u, the probability that some line counts in a
+cycle, it is (1 - u)^cycles. Lines share the numbers of their columns, so u is the volume of a union of boxes, one for
+each line, whose sides are its codes. Karp and Luby's method estimates it: points are drawn in the boxes, and each
+counts as one over the number of boxes that contain it.
+"""
+
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from machines.parameters import PROB_BITS_MAX, RngKind, SensorMode
+from toolchain.analysis.accuracy import addressed_chances
+from toolchain.analysis.emulation import one_replica
+from toolchain.analysis.readings import Readings, readings_of_lines, sample_readings
+from toolchain.building.machine import MachinePlan, plan_machine, whole_machine
+from toolchain.building.options import BuildOptions
+from toolchain.building.quantise import Quantised, quantise
+from toolchain.deployment import Scale
+from toolchain.errors import BuildError
+
+TOLERATED: Final = 0.01
+"""Share of lost frames above which a build and a check warn."""
+_WORK: Final = 2**26
+"""Comparisons of points with codes for one machine, which take less than a second; more only for large models."""
+_MOST_FRAMES: Final = 1000
+_LEAST_FRAMES: Final = 10
+_POINTS: Final = 16
+"""Number of points for a frame."""
+_SEED: Final = 1
+_MOST_CYCLES: Final = 2**26
+"""Cycles above which no more are advised: 0.7 s at 100 MHz."""
+
+
+class LostFrames(NamedTuple):
+    """The expected share of lost frames, what is lost as a clause, and what saves it; that is empty if few are lost."""
+
+    share: float
+    what: str
+    advice: str
+
+
+def lost_frames(plan: MachinePlan, quantised: Quantised) -> LostFrames:
+    """Predict the lost frames of a machine, and compute what helps if there are too many."""
+    size = plan.model.lines * plan.parameters.columns
+    frames = min(_MOST_FRAMES, max(_LEAST_FRAMES, _WORK // (_POINTS * size)))
+    drawn = sample_readings(plan.model, frames, seed=_SEED)
+    chances = _chances(plan, quantised, drawn)
+    share = _share(chances, plan.options, plan.max_cycles)
+    what = (
+        f"{share:.1%} of frames get no posterior, as computed from the codes for {frames} frames drawn from the model: in "
+        f"{(chances == 0).mean():.1%} every line has a code 0, in the others no line counts in {plan.max_cycles} cycles"
+    )
+    return LostFrames(share, what, _advice(plan, drawn) if share > TOLERATED else "")
+
+
+def _chances(plan: MachinePlan, quantised: Quantised, drawn: Readings) -> NDArray[np.float64]:
+    """Return the probability that some line counts in a cycle, for each frame: float64[frames]."""
+    machine = one_replica(whole_machine(plan, quantised))
+    if machine.parameters.sensor_mode is not SensorMode.COLUMN:
+        drawn = readings_of_lines(drawn, plan.model, machine, scale=plan.options.scaling, seed=_SEED)
+    random = np.random.default_rng(_SEED)
+    frames = (addressed_chances(machine, *drawn.of_machine(at, machine)) for at in range(len(drawn)))
+    return np.array([_union(each, random, shared=machine.parameters.shared) for each in frames])
+
+
+def _union(chances: NDArray[np.float64], random: np.random.Generator, *, shared: bool) -> float:
+    """Return the probability that some line counts in a cycle, from that of each cell, float64[columns, lines]."""
+    lines = np.prod(chances, axis=0)
+    total = float(lines.sum())
+    if total == 0:  # or so small that doubles underflow
+        return float(np.finfo(np.float64).tiny) if chances.all(axis=0).any() else 0.0
+    if not shared:  # lines are independent
+        return 1.0 - float(np.prod(1 - lines)) if lines.max() > 1e-9 else total
+    chosen = random.choice(len(lines), _POINTS, p=lines / total)
+    inside = np.ones((_POINTS, len(lines)), dtype=np.bool_)
+    for column in chances:
+        point = random.random(_POINTS) * column[chosen]
+        inside &= point[:, np.newaxis] < column
+    return min(1.0, total * float((1 / inside.sum(axis=1)).mean()))
+
+
+def _share(chances: NDArray[np.float64], options: BuildOptions, cycles: int) -> float:
+    """Return the expected share of lost frames; numbers that repeat add nothing."""
+    width = options.rng.lfsr_bits
+    return float(((1 - chances) ** (cycles if width is None else min(cycles, 2**width - 1))).mean())
+
+
+def _advice(plan: MachinePlan, drawn: Readings) -> str:
+    """Return each option that saves enough frames by itself, or else all together, with fewer sensors if need be."""
+    options, sensors = plan.options, len(plan.model.known)
+    may_scale = options.sensor_mode is SensorMode.COLUMN and options.scaling is not Scale.ADDRESS
+    rng: dict[str, Any] = {"rng": RngKind.LFSR32} if options.rng.lfsr_bits not in {None, 32} else {}
+    groups: list[list[dict[str, Any]]] = [
+        [{"scale": Scale.ADDRESS}] if may_scale else [],
+        [{"prob_bits": bits} for bits in (12, PROB_BITS_MAX) if bits > plan.parameters.prob_bits],
+    ]
+    ways = []
+    for group, longer in (*((group, False) for group in groups), ([rng], True)):
+        tries = (_expected(plan, changes, drawn, sensors, longer=longer) for changes in group)
+        if enough := next((each for each in tries if each[1] <= TOLERATED), None):
+            ways.append(enough)
+    changes = rng | {key: value for group in groups for last in group[-1:] for key, value in last.items()}
+    count, more = sensors, ""
+    while not ways:
+        flags, share = _expected(plan, changes, drawn, count, longer=True)
+        if count < sensors:
+            flags = f"{flags} with only the first {count} known variables".strip()
+            more = "; 'toolchain advise' also tries a BM2"
+        if share <= TOLERATED or count <= 1:
+            ways.append((flags or "another model", share))
+        count = count * 3 // 4
+    return "use " + " or ".join(f"{flags} ({share:.2%} expected)" for flags, share in ways) + more
+
+
+def _expected(
+    plan: MachinePlan, changes: dict[str, Any], drawn: Readings, count: int, *, longer: bool
+) -> tuple[str, float]:
+    """Return changed options as flags, with enough cycles if `longer`, and the share lost with the first `count` sensors."""
+    model, options = replace(plan.model, known=plan.model.known[:count]), replace(plan.options, **changes)
+    try:
+        own = plan_machine(model, options)
+    except BuildError:  # such as codes that are wider than the random numbers
+        return "", 1.0
+    quantised = quantise(
+        model, prob_bits=own.parameters.prob_bits, scale=options.scaling, sensor_mode=options.sensor_mode
+    )
+    chances = _chances(own, quantised, replace(drawn, addresses=drawn.addresses[:, :count]))
+    cycles = own.max_cycles
+    while longer and _share(chances, options, cycles) > TOLERATED and cycles < _MOST_CYCLES:
+        cycles *= 4
+    shown = changes if cycles == own.max_cycles else changes | {"max_cycles": cycles}
+    flags = " ".join(f"--{key.replace('_', '-')} {value}" for key, value in shown.items())
+    return flags, _share(chances, options, cycles)
