@@ -164,19 +164,20 @@ def test_what_cannot_be_is_one_sentence(options, code):
     assert ended.stderr.startswith("error: ")
 
 
-@pytest.mark.parametrize(("page", "programs"), [("README.md", 1), ("docs/how-to/listening.md", 2)])
-async def test_the_programs_of_the_pages(page, programs, capsys):
-    blocks = re.findall(r"^```python\n(.*?)^```", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
+async def test_the_programs_of_the_page(capsys):
+    page = (ROOT / "docs/how-to/listening.md").read_text()
+    blocks = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     blocks = [each for each in blocks if "ws://" in each and "from posteriors import" in each]
-    assert len(blocks) == programs
+    assert len(blocks) == 2
     for block in blocks:
         async with FakeRosbridge() as fake:
-            program = re.sub(r"ws://[^\"]*", fake.uri, block).replace(", function)", ", function, count=3)")
+            program = re.sub(r"ws://[^\"]*", fake.uri, block)
             running = asyncio.create_task(asyncio.to_thread(exec, program, {"__name__": "__main__"}))
             await fake.wait_for_op("subscribe", topic="/BMresults")
             for number in (1, 2, 3):
                 await say(fake, number)
             await asyncio.wait_for(running, PATIENCE)
-        first, *_, last = capsys.readouterr().out.splitlines()
+        first, *_, mean, last = capsys.readouterr().out.splitlines()
         assert first.startswith("1 {'y': 0")
-        assert re.match(r"3 posteriors$|.* too slow: 0$|{'y': 0.0, 'x': 3.0} 803 ", last)
+        assert re.match(r"(3 )?{'y': 0.0, 'x': 3.0} ", mean)
+        assert re.match(r"3 posteriors$|.* too slow: 0$", last)
