@@ -35,6 +35,7 @@ from services.sockets.records import (
     Publish,
     Published,
     Reading,
+    Seen,
     Unusable,
 )
 from services.sockets.status import BUCKETS_S, FrameCounts, StageLatency
@@ -173,6 +174,10 @@ class FrameFlow:
         self._failures: deque[float] = deque(maxlen=RESTARTS + 1)
         self.published = 0
         """Number of results that reached at least one topic."""
+        self.seen: bool | None = None
+        """Whether the publisher has seen a result on the wire, in a run of many frames; None before it is known."""
+        self.looked = asyncio.Event()
+        """Set when `seen` is known."""
         self.newest: Publish | None = None
         """The newest result that went to the publisher."""
         self.first_reading_at: float | None = None
@@ -211,6 +216,9 @@ class FrameFlow:
                 self._take_failure(record)
             case Published():
                 self._take_outcome(record)
+            case Seen():
+                self.seen = record.seen
+                self.looked.set()
             case _:
                 where, what = peer.protocol.where if peer.protocol else peer.role, type(record).__name__
                 self._log.warning(f"{where} sent a {what}, which only another service may send")

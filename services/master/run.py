@@ -35,6 +35,8 @@ _LOCK_EVERY = 0.05
 _PROGRESS_EVERY = 1.0
 _DRAWN_EVERY = 0.2
 """Minimum number of seconds between two pictures, so that drawing takes little time from the frames."""
+_REASON_TIME = 5.0
+"""Seconds in which the publisher may ask the server why no result is seen."""
 _GRACE_PERIOD = 2.0
 """Seconds in which the subscriber may report a missing reading itself, with more details."""
 
@@ -108,6 +110,10 @@ class Master:
                     self._begin_task(self._keep_drawing(show))
                 await peers.start(self._flow)
                 await self._flow.end
+                # a run of few frames may be over before it is known whether anybody can receive them
+                if not self._once:
+                    with contextlib.suppress(TimeoutError):
+                        await asyncio.wait_for(self._flow.looked.wait(), settings.seen_timeout + _REASON_TIME)
                 # the last one, which may be newer than the last picture
                 if show is not None:
                     self._draw(show)
@@ -180,6 +186,8 @@ class Master:
         # results that were published, but not on all of their topics
         if missed := losses.pop(LossReason.SOME_TOPICS, 0):
             text += f", {missed} of them {LossReason.SOME_TOPICS}"
+        if self._flow.seen is False:
+            text += ", but none was seen on the wire"
         lost = ", ".join(f"{count} {reason}" for reason, count in losses.items() if count)
         return f"{text}; not published: {lost}" if lost else text
 

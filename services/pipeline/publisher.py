@@ -22,7 +22,7 @@ from services.pipeline.connections import (
 )
 from services.pipeline.result_topics import RESULTS_DEPTH, ROLE, ResultTopics
 from services.settings import Settings
-from services.sockets.records import AnyRecord, Begin, Outcome, Publish, Published, Ready, Rosbridge
+from services.sockets.records import AnyRecord, Begin, Outcome, Publish, Published, Ready, Rosbridge, Seen
 from services.sockets.serving import MakeLink, Service
 from services.sockets.status import FrameCounts, ProcessStatus, connections, why_not_connected
 from terminal.signals import until_one_ends
@@ -43,6 +43,9 @@ class Publisher(Service):
         self._draining = True
         # Set by the master's `Begin`: the only result must be seen on the wire, or be an error.
         self._once = False
+        # In a run of many frames: `_looks` from `Begin` to the first published result, which sets the event.
+        self._looks = False
+        self._first = asyncio.Event()
         self._deployment = deployment
         # The sentence about topics and servers once they are advertised; empty before.
         self._where = ""
@@ -74,8 +77,8 @@ class Publisher(Service):
     def _take(self, record: AnyRecord) -> None:
         if isinstance(record, Begin):
             self._once = record.once
-            if self._once:
-                self._topics.watch()
+            self._looks = not record.once
+            self._topics.watch()
         elif isinstance(record, Publish):
             if not (self._once or self._draining or self._topics.must_wait):
                 # the usual case: nothing to wait for, and no other task to wake
@@ -98,6 +101,9 @@ class Publisher(Service):
         self._outcomes[published.outcome] += 1
         if published.outcome is Outcome.PUBLISHED:
             self._last = (published.number, time.monotonic_ns())
+            if self._looks:
+                self._looks = False
+                self._first.set()
         if self._logs_frames:
             self._log.debug(
                 published.outcome,
@@ -134,6 +140,35 @@ class Publisher(Service):
             await self._check_delivery(settled=True)
             await asyncio.sleep(CHECK_INTERVAL)
 
+    async def _keep_looking(self) -> NoReturn:
+        """Report in each run of many frames whether the server passes results on; some discard them silently."""
+        limit = self._settings.seen_timeout
+        while True:
+            await self._first.wait()
+            self._first.clear()
+            seen = reported = False
+            while not (seen or self._first.is_set()):
+                seen = await self._topics.seen(limit)
+                # without a connection nothing can be seen
+                if seen or not (reported or why_not_connected(self._topics.rosbridges)):
+                    await self._report_seen(seen=seen, again=reported)
+                    reported = True
+
+    async def _report_seen(self, *, seen: bool, again: bool) -> None:
+        output = self._topics.advertised[0]
+        if again:
+            self._link.notice("info", f"results are seen on {output.name} at {output.uri} now")
+        elif not seen:
+            await self._check_delivery(settled=True)
+            # otherwise the reason has been reported
+            if output.name not in self._refused:
+                self._link.notice(
+                    "warning",
+                    f"no result was seen on {output.name} at {output.uri} within {self._settings.seen_timeout:g} s after "
+                    "the first was published: does the server allow the topic to be published and subscribed?",
+                )
+        self._link.send(Seen(seen))
+
     def _state_changed(self, uri: str, state: State, reason: str) -> None:
         topics, rosbridge = self._topics.served_by(uri)
         if state is State.RECONNECTING:
@@ -165,5 +200,8 @@ class Publisher(Service):
             self._link.keep(Ready(where))
             self._draining = False
             await until_one_ends(
-                self._publish_waiting(), self._keep_checking(), self._topics.standard.keep_reporting()
+                self._publish_waiting(),
+                self._keep_checking(),
+                self._keep_looking(),
+                self._topics.standard.keep_reporting(),
             )

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import math
 import time
+from collections import deque
 from collections.abc import AsyncIterator
 from typing import Any, Literal
 
@@ -59,8 +60,9 @@ class ResultTopics:
         self._outputs: list[tuple[Ros, Publication]] = []
         self._frames: Publication | None = None
         self._samples: Publication | None = None
-        # The subscription to the first output, in a run of one frame.
+        # The subscription to the first output until a result is seen there, and the last results published since.
         self._watched: Subscription | None = None
+        self._unseen: deque[Any] = deque(maxlen=RESULTS_DEPTH)
         # A report precedes its result, so it contains how long the previous result took to send.
         self._previous_out_ns = 0
         self.rosbridges: dict[str, Ros] = {}
@@ -105,7 +107,8 @@ class ResultTopics:
             output = self._deployment.outputs[0]
             self._watched = self._outputs[0][0].subscribe(output.topic, output.type, queue_size=RESULTS_DEPTH)
 
-    async def _seen(self, data: list[float], timeout: float) -> bool:
+    async def seen(self, timeout: float) -> bool:
+        """Return whether a result published since `watch` comes back in time; if so, stop watching."""
         if self._watched is None:
             return False
         # results of other publishers of the topic may arrive before
@@ -115,7 +118,10 @@ class ResultTopics:
                 message = await self._watched.next(timeout=left)
             except NoMessageError:
                 return False
-            if same_numbers(message.msg.get("data"), data):
+            if any(same_numbers(message.msg.get("data"), sent.tolist()) for sent in self._unseen):
+                await self._watched.close()
+                self._watched = None
+                self._unseen.clear()
                 return True
         return False
 
@@ -148,7 +154,7 @@ class ResultTopics:
                 raise error
         published = self.publish_now(publish, inference)
         if look and published.outcome is Outcome.PUBLISHED and inference.posterior is not None:
-            seen = await self._seen(inference.posterior.tolist(), self._settings.seen_timeout)
+            seen = await self.seen(self._settings.seen_timeout)
             published = msgspec.structs.replace(published, seen=seen)
             # the run is about to end
             self.standard.flush()
@@ -183,6 +189,8 @@ class ResultTopics:
             if posterior is not None:
                 for _, publication in self._outputs:
                     missed += not _sent(publication, {"layout": self._layout, "data": posterior})
+                if self._watched is not None:
+                    self._unseen.append(posterior)
         now = time.monotonic_ns()
         self._previous_out_ns = now - started
         self.standard.offer(publish, inference)

@@ -10,6 +10,7 @@
         │                     │ ◀─── FrameResult ──── │                    │
         │                     │ ─────────────── Publish ─────────────────▶ │
         │                     │ ◀────────────── Published ──────────────── │
+        │                     │ ◀───────────────── Seen ────────────────── │
 
 Any service may send `Notice` at any time, and `Trouble` before it ends. `Unusable` replaces a reading, and
 `FrameFailed` a result.
@@ -239,6 +240,15 @@ class Published(Record, tag="published", frozen=True):
     cause: str = ""
 
 
+class Seen(Record, tag="seen", frozen=True):
+    """Publisher to master, in a run of many frames: whether any result was seen on the wire in time.
+
+    It is sent once after the first result, and again if one is seen later.
+    """
+
+    seen: bool
+
+
 # What a decoder accepts, by tag; any other bytes are an error of the connection.
 AnyRecord = (
     Hello
@@ -254,4 +264,5 @@ AnyRecord = (
     | FrameFailed
     | Publish
     | Published
+    | Seen
 )

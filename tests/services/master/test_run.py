@@ -17,7 +17,7 @@ from services.boards.frames import encode_boards
 from services.errors import NoDataError
 from services.master import run
 from services.master.run import ChildrenWatch
-from services.sockets.records import FrameResult, LossReason, Outcome, Published
+from services.sockets.records import FrameResult, LossReason, Outcome, Published, Seen
 from services.sockets.reporting import STUCK_S, serve_status
 from services.sockets.status import ProcessStatus
 from tests.patience import PATIENCE
@@ -85,6 +85,13 @@ async def test_the_summary_names_losses_only(run):
     assert run.master.summary() == publish_
     run.flow.losses[LossReason.FAILED] = 2
     assert run.master.summary() == f"{publish_}; not published: 2 {LossReason.FAILED}"
+
+
+async def test_the_summary_says_that_nobody_saw_a_result(run):
+    run.take(run.publisher, Seen(False))
+    assert run.master.summary() == "0 results published in 0.0 s, but none was seen on the wire"
+    run.take(run.publisher, Seen(True))
+    assert run.master.summary() == "0 results published in 0.0 s"
 
 
 @pytest.mark.parametrize("has_data", [True, False])

@@ -19,7 +19,7 @@ from services.pipeline.publisher import Publisher
 from services.pipeline.result_topics import ResultTopics
 from services.pipeline.standard_topics import StandardTopics
 from services.settings import Settings
-from services.sockets.records import Begin, FrameResult, Notice, Outcome, Publish, Published, Rosbridge
+from services.sockets.records import Begin, FrameResult, Notice, Outcome, Publish, Published, Rosbridge, Seen
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import FACTOR, PATIENCE
 from tests.services.pipeline.conftest import running
@@ -258,6 +258,36 @@ async def test_one_result_that_nobody_can_receive_is_an_error(boat, link, other)
                 await task
         assert caught.value.exit_code == 3
         assert not link.of(Published)
+
+
+async def test_a_server_that_discards_results_silently_is_noticed(boat, link):
+    async with FakeRosbridge() as fake:
+        fake.refused_topics.add("/BMresults")
+        fake.statuses = False
+        async with publisher_of(boat, link, fake.uri):
+            link.take(Begin(once=False))
+            link.take(result(boat, 1))
+            await link.until(lambda: link.of(Seen))
+            (notice,) = link.of(Notice)
+            assert (notice.level, notice.sentence.split(" on ")[1].split()[0]) == ("warning", "/BMresults")
+            fake.refused_topics.clear()
+            fake.know("/BMresults", "std_msgs/Float64MultiArray")
+            await fake.vanish()
+            await fake.come_back()
+            number = 1
+            while len(link.of(Seen)) < 2:
+                link.take(result(boat, number := number + 1))
+                await asyncio.sleep(0.01)
+            assert [each.seen for each in link.of(Seen)] == [False, True]
+
+
+async def test_results_are_looked_for_until_one_is_seen(boat, link):
+    async with FakeRosbridge() as fake, publisher_of(boat, link, fake.uri):
+        link.take(Begin(once=False))
+        link.take(result(boat, 1))
+        await link.until(lambda: link.of(Seen))
+        assert ([each.seen for each in link.of(Seen)], link.of(Notice)) == ([True], [])
+        await fake.wait_for_op("unsubscribe", topic="/BMresults")
 
 
 def test_the_stages_of_a_report_are_the_whole_time_of_its_frame(boat):
