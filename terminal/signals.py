@@ -16,7 +16,7 @@ from terminal.errors import ExitCode, StoppedError
 
 _ENDS = {
     signal.SIGINT: (ExitCode.INTERRUPTED, "interrupted (Ctrl-C)"),
-    signal.SIGTERM: (ExitCode.TERMINATED, "asked to end (SIGTERM)"),
+    signal.SIGTERM: (ExitCode.TERMINATED, "terminated (SIGTERM)"),
     signal.SIGHUP: (ExitCode.HANGUP, "the terminal was closed (SIGHUP)"),
 }
 

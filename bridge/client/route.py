@@ -12,7 +12,7 @@ import ssl
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from os import PathLike, fspath
-from socket import socket
+from socket import SOCK_STREAM, socket
 from typing import Any, Final, TypeVar
 
 from websockets.asyncio.client import connect_http_proxy, connect_socks_proxy
@@ -156,9 +156,11 @@ async def connect_along(
     # The certificate is checked against the host of the URI, also through a proxy.
     hostname = uri.host if route.tls is not None else None
     passage = None if route.proxy is None else await _connect_proxy(route.proxy, uri, shown_uri)
-    if passage is None or isinstance(passage, socket):
-        end: dict[str, Any] = {"sock": passage} if passage else {"host": uri.host, "port": uri.port}
-        return (await loop.create_connection(factory, **end, ssl=route.tls, server_hostname=hostname))[1]
+    secured: dict[str, Any] = {"ssl": route.tls, "server_hostname": hostname}
+    if passage is None:
+        return await _connect_host(uri, factory, secured)
+    if isinstance(passage, socket):
+        return (await loop.create_connection(factory, sock=passage, **secured))[1]
     # An HTTP proxy returns a transport that is already connected, so the protocol must be attached by hand.
     try:
         connection = factory()
@@ -172,6 +174,29 @@ async def connect_along(
         passage.abort()
         raise
     return connection
+
+
+async def _connect_host(
+    uri: WebSocketURI, factory: Callable[[], _ConnectionT], secured: dict[str, Any]
+) -> _ConnectionT:
+    """Connect to the first address of a host that accepts; the error is that of the last one."""
+    loop = asyncio.get_running_loop()
+    # not by `create_connection`, in which uvloop reports a look-up that fails after the attempt has timed out
+    found: list[Any] = await loop.getaddrinfo(uri.host, uri.port, type=SOCK_STREAM)
+    for *_, (address, port, *scope) in found[:-1]:
+        try:
+            return (await loop.create_connection(factory, _with_zone(address, scope), port, **secured))[1]
+        except ssl.SSLError:
+            raise
+        except OSError as error:
+            _log.debug("%s does not accept: %s", address, error)
+    *_, (address, port, *scope) = found[-1]
+    return (await loop.create_connection(factory, _with_zone(address, scope), port, **secured))[1]
+
+
+def _with_zone(address: str, scope: list[int]) -> str:
+    """Return a numeric address with its zone; `scope` is flow and zone of an IPv6 address, empty for IPv4."""
+    return f"{address}%{scope[1]}" if any(scope[1:]) else address
 
 
 async def _connect_proxy(proxy: Proxy, uri: WebSocketURI, shown_uri: str) -> socket | asyncio.Transport:

@@ -15,6 +15,7 @@ from bridge.discovery import ROBOT, Robot, UnknownRobotError
 from services.errors import SettingsError
 from terminal.command_line import CommandLine
 from terminal.one_line import one_line
+from terminal.output import say
 from terminal.signals import check_signals, run_async
 
 _LONGEST_ANSWER: Final = 80
@@ -44,6 +45,8 @@ def discover(
 
     # filled in a coroutine of its own, so that a question to the user does not block an event loop
     robots: list[Robot] = []
+
+    say(f"looking for rosbridge servers on this network for {timeout:g} s ...")
 
     async def look() -> None:
         from bridge.discovery import discover

@@ -162,8 +162,9 @@ async def _serve(
         say(f"hub: {where()}")
 
     def status() -> ProcessStatus:
-        counts = [HubStatus(len(each.clients), len(each.topics), len(each.services)) for each in graphs]
-        why = where() if listening.done() else "not listening yet"
+        at = listening.result() if listening.done() else 0
+        counts = [HubStatus(len(each.clients), len(each.topics), len(each.services), at) for each in graphs]
+        why = where() if at else "not listening yet"
         return ProcessStatus(ready=listening.done(), why=why, hub=counts[0] if counts else None)
 
     async def announce_once_ready(name: str) -> None:

@@ -60,6 +60,8 @@ class Master:
         self._count = 1 if once else count
         self._json = json
         self._plot = plot
+        # Not beside results, which would run into it even through a pipe, if that ends at the same terminal.
+        self._shows_progress = not (once or json or plot)
         # The last published result, for the progress; and the last drawn one, which is drawn only once.
         self._newest: Published | None = None
         self._drawn: Publish | None = None
@@ -97,9 +99,7 @@ class Master:
                 **more,
             )
             await sockets.enter_async_context(report)
-            # results on the terminal show the progress themselves
-            shown = (self._json or self._plot) and sys.stdout.isatty()
-            if not self._once and sys.stderr.isatty() and not shown:
+            if self._shows_progress and sys.stderr.isatty():
                 self._begin_task(self._show_progress())
             self._begin_task(self._expect_data())
             if self._dashboard:

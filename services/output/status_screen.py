@@ -210,7 +210,7 @@ async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) 
     with live or contextlib.nullcontext():
         while True:
             # with --watch, a stack that is gone may come back
-            stack = await ask_stack(directory)
+            stack = await ask_stack(directory, shared=needs_master)
             if not stack.processes and not watch:
                 break
             put(stack)

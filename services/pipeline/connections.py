@@ -89,11 +89,21 @@ async def report_unpublished(ros: Ros, topic: str, report: Callable[[str], None]
     report(f"{topic} has no publisher at {ros.uri} yet{perhaps}")
 
 
+async def check_source_type(ros: Ros, topic: str, type_: str) -> None:
+    """Raise a NotReceivableError if a topic is published with another type, according to rosapi."""
+    known = await ros.topic_type(topic, ROSAPI_TIME)
+    # without a publisher it may still get our type
+    if known and not same_type(known, type_) and await ros.publishers(topic) != []:
+        raise NotReceivableError(
+            f"{topic} is {shown(known[:80])} at {ros.uri}, not {type_}; build with that type"
+        )
+
+
 # --- topics of results ---------------------------------------------------------------------
 
 
 class NotReceivableError(BridgeError):
-    """Raised if the result of a run of one frame cannot be received."""
+    """Raised if readings, or the result of a run of one frame, cannot be received."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
+from urllib.parse import urlsplit
 
 import msgspec
 
@@ -121,11 +122,12 @@ class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HubStatus(msgspec.Struct, frozen=True):
-    """Numbers of clients, topics and services of the hub."""
+    """Numbers of clients, topics and services of the hub, and its port."""
 
     clients: int
     topics: int
     services: int
+    port: int = 0
 
 
 class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
@@ -259,14 +261,24 @@ def _sort_key(name: str) -> tuple[int, int, str]:
     return len(_ORDER), int(digits) if digits.isascii() and digits.isdigit() else 1 << 30, name
 
 
-async def ask_stack(directory: Path) -> StackStatus:
+def _is_foreign_hub(process: ProcessStatus, others: Iterable[ProcessStatus]) -> bool:
+    """Return whether a process is a hub at whose port no other process has a connection."""
+    ports = {urlsplit(connection.uri).port for each in others for connection in each.connections}
+    # None is a robot's name or a default port, which says nothing
+    return process.hub is not None and bool(ports) and not {None, process.hub.port} & ports
+
+
+async def ask_stack(directory: Path, *, shared: bool = False) -> StackStatus:
     """Return the status of the processes in a run directory, queried in parallel.
 
+    Whoever is in a `shared` directory may be of several runs: a hub that no service uses is left out.
     Up to 256 processes take at most about a second.
     """
     turns = asyncio.Semaphore(_AT_ONCE)
     answers = await asyncio.gather(*(_ask(path, turns) for path in _status_sockets(directory)))
     processes = [each for each in answers if isinstance(each, ProcessStatus)]
+    if shared:
+        processes = [each for each in processes if not _is_foreign_hub(each, processes)]
     silent = [each for each in answers if isinstance(each, SilentProcess)]
     # a service that the master has not started may have no status socket at all
     answered = {each.name for each in answers}

@@ -9,13 +9,15 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
+from rosbayes import start
 from rosbayes.__main__ import app
+from rosbayes.start import COMMANDS
 from tests.command_runner import invoke
 from tests.patience import PATIENCE
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-SCRIPTS = {name: place.partition(":")[0] for name, place in PROJECT["scripts"].items() if name != "rosbayes"}
+SCRIPTS = {name: module for name, (module, _) in COMMANDS.items() if ":" not in module}
 HEAVY = {"numba", "numpy", "pydantic", "websockets"}
 
 
@@ -41,6 +43,34 @@ def test_its_subcommands_are_the_other_commands():
     for name, place in SCRIPTS.items():
         loaded = group.resolve_command(None, [name])[1]
         assert loaded.callback.__module__ in {place, f"{place.rpartition('.')[0]}.main"}
+
+
+def test_every_command_has_an_entry_point():
+    scripts = PROJECT["scripts"]
+    assert set(scripts) == {"rosbayes", *SCRIPTS}
+    for name, place in scripts.items():
+        assert place == f"rosbayes.start:{name.replace('-', '_')}"
+        assert callable(getattr(start, place.partition(":")[2]))
+    assert not hasattr(start, "bord")
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("command", ["hub", "rosbayes", "board"])
+def test_ctrl_c_during_the_imports_ends_a_command_silently(command):
+    code = f"""
+import signal, sys
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == "typer":
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+from rosbayes.start import {command}
+{command}()
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, timeout=PATIENCE, check=False
+    )
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, b"", b"")
 
 
 @pytest.mark.parametrize(

@@ -171,7 +171,7 @@ PLACES = {
 @pytest.mark.thorough
 @pytest.mark.parametrize("place", PLACES)
 def test_a_signal_ends_a_command_wherever_it_is(place):
-    assert end_of(PLACES[place]) == (ExitCode.TERMINATED, ["asked to end (SIGTERM)"])
+    assert end_of(PLACES[place]) == (ExitCode.TERMINATED, ["terminated (SIGTERM)"])
 
 
 @pytest.mark.parametrize("ending", ["return", "raise OSError"])
@@ -198,14 +198,14 @@ def test_a_signal_that_arrives_while_a_class_is_made(monkeypatch, capsys):
 
     class Named:
         def __set_name__(self, *_):
-            raise StoppedError(ExitCode.TERMINATED, "asked to end (SIGTERM)")
+            raise StoppedError(ExitCode.TERMINATED, "terminated (SIGTERM)")
 
     def command():
         type("Made", (), {"name": Named()})
 
     monkeypatch.setattr("terminal.ending.ignore_signals", lambda: None)
     assert outcome(command) == ExitCode.TERMINATED
-    assert capsys.readouterr().err == "asked to end (SIGTERM)\n"
+    assert capsys.readouterr().err == "terminated (SIGTERM)\n"
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ def test_a_signal_is_the_reason_of_what_fails_after_it(replaced):
         raise replaced
 
     ended = invoke(app, [])
-    assert (ended.exit_code, ended.output) == (ExitCode.TERMINATED, "asked to end (SIGTERM)\n")
+    assert (ended.exit_code, ended.output) == (ExitCode.TERMINATED, "terminated (SIGTERM)\n")
 
 
 @pytest.mark.thorough

@@ -214,6 +214,7 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
     largest = max((point.alms or 0.0 for point in points), default=0.0) or 1.0
     kinds = sorted({(point.scale, point.rng) for point in points})
     beside = len(kinds) > _KINDS_INSIDE
+    is_stepped = len({point.steps_per_clock for point in points}) > 1
     figure = new_figure(10.2 if beside else 7.2, 4.8)
     axes = figure.subplots()
     for at, (scale, rng) in enumerate(kinds):
@@ -227,6 +228,10 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
             alpha=0.6,
             label=f"{rng}, scale {scale}",
         )
+        for point in of_kind:
+            words = f"{point.prob_bits}, {point.target_count}" + f", {point.steps_per_clock}" * is_stepped
+            at_point = {"xytext": (4, 3), "textcoords": "offset points", "fontsize": 5}
+            axes.annotate(words, (point.cycles_median, point.total_variation), **at_point)
     axes.scatter(
         [point.cycles_median for point in front],
         [point.total_variation for point in front],
@@ -241,7 +246,8 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
         yscale="log",
         xlabel="cycles of a frame (median)",
         ylabel="total variation to exact inference (mean)",
-        title=f"{name}: accuracy against cycles; the larger, the more ALMs",
+        title=f"{name}: accuracy against cycles; the larger, the more ALMs\n"
+        f"(numbers: bits of a code, target count{', steps' * is_stepped})",
     )
     axes.grid(alpha=0.3, which="both")
     if beside:

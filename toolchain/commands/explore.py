@@ -13,6 +13,9 @@ from toolchain.commands.request import ModelFlags, ModelPath, read_model, read_s
 from toolchain.errors import BuildError, NotFusionError
 from toolchain.flags import Bits
 
+RESULTS = Path("build/explore.jsonl")
+"""The file of results, unless a flag names another: beside the usual deployments, which version control ignores."""
+
 
 @contextmanager
 def progress(total: int) -> Iterator[Callable[[str], None]]:
@@ -24,7 +27,7 @@ def progress(total: int) -> Iterator[Callable[[str], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True)) as shown:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         bar = shown.add_task("", total=total)
         yield lambda words: shown.update(bar, advance=1, description=words)
 
@@ -95,7 +98,7 @@ def explore(
         typer.Option(
             "--output", "-o", help="File of results, from which a sweep is resumed.", metavar="FILE"
         ),
-    ] = Path("explore.jsonl"),
+    ] = RESULTS,
     plot: Annotated[
         Path | None, typer.Option(help="Picture of accuracy against cycles.", metavar="PNG")
     ] = None,
@@ -122,6 +125,9 @@ def explore(
         drawn = sample_readings(read, frames, seed=readings.seed)
     else:
         drawn = recorded_readings(readings.readings, read.variables, readings.reading or (), frames=frames)
+    # another folder that does not exist may be a typing error
+    if results == RESULTS:
+        results.parent.mkdir(exist_ok=True)
     kept = sweeps.Results(results)
     found = sweeps.tasks(read, sweep, drawn, device)
     kept.check_writable()

@@ -86,6 +86,7 @@ def test_discover_lists_robots(discovered):
     discovered.append(Robot("Zoë", "wss://zoe.local:9090", None, token=True))
     listed = invoke(discover.app, [])
     assert listed.exit_code == 0
+    assert "for 2 s" in listed.stderr
     for shown in ("[bold]", "ws://192.0.2.7:9090", "Zoë", "wanted", "?"):
         assert shown in listed.stdout
     lines = [json.loads(line) for line in invoke(discover.app, ["--json"]).stdout.splitlines()]

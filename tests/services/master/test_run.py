@@ -110,6 +110,11 @@ async def test_a_run_without_data_ends(boat, monkeypatch, has_data):
     assert isinstance(run.error, NoDataError) is not has_data
 
 
+@pytest.mark.parametrize("given", [{"json": True}, {"plot": True}, {"once": True}, {}])
+async def test_progress_does_not_run_into_results(boat, given):
+    assert Run(boat, **given).master._shows_progress is not bool(given)
+
+
 @pytest.mark.parametrize(("count", "of"), [(9, " of 9"), (None, "")])
 async def test_progress_tells_the_rate_since_the_last_time(boat, monkeypatch, count, of):
     now, shown = [100.0], []

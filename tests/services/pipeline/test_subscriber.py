@@ -11,9 +11,10 @@ import pytest
 from bridge.client import Message
 from bridge.errors import TopicLeftOutError
 from services.errors import RosbridgeLostError
+from services.pipeline.connections import NotReceivableError
 from services.pipeline.subscriber import Subscriber, newest_message
 from services.settings import Settings
-from services.sockets.records import Begin, LossReason, Notice, Reading, Rosbridge, Unusable
+from services.sockets.records import Begin, LossReason, Notice, Reading, Ready, Rosbridge, Unusable
 from tests.fake_rosbridge import FakeRosbridge
 from tests.integration.conftest import READING
 from tests.patience import PATIENCE
@@ -92,6 +93,18 @@ async def test_a_topic_that_nobody_publishes_is_reported_with_similar_names(
         (notice,) = link.of(Notice)
         assert notice.level == "warning"
         assert (existing in notice.sentence) is hinted
+
+
+@pytest.mark.parametrize("publishers", [["/robot"], []])
+async def test_a_topic_of_another_type_is_an_error_at_once_if_somebody_publishes_it(boat, link, publishers):
+    async with FakeRosbridge(rosapi=True) as fake:
+        fake.know("/boat/sensors", "std_msgs/String")
+        fake.serve("/rosapi/publishers", lambda _: {"publishers": publishers})
+        async with running(Subscriber(Settings(uri=fake.uri), boat, link.make), link) as task:
+            if publishers:
+                with pytest.raises(NotReceivableError, match=r"^/boat/sensors is std_msgs/String at "):
+                    await task
+        assert bool(link.of(Ready)) is not bool(publishers)
 
 
 @pytest.mark.parametrize(

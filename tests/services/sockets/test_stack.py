@@ -149,6 +149,18 @@ async def test_one_screen_has_services_boards_rates_and_losses(tmp_path):
     assert row[:4] == ["1", "programmed", "abababababab", "3"]
 
 
+@pytest.mark.parametrize(
+    ("uri", "names"), [("ws://localhost:9091", ["hub", "publisher"]), ("ws://localhost:9090", ["publisher"])]
+)
+async def test_a_hub_that_no_service_uses_is_of_another_run(tmp_path, uri, names):
+    publisher = process(connections=[ConnectionStatus(uri, "connected", 0)])
+    async with served(tmp_path, publisher=publisher, hub=process(hub=HubStatus(3, 5, 7, 9091))):
+        stack = await status.ask_stack(tmp_path, shared=True)
+        named = await status.ask_stack(tmp_path)
+    assert [each.name for each in stack.processes] == names
+    assert len(named.processes) == 2
+
+
 def test_every_process_has_its_cpu_time():
     """Those of the boat report no recent one."""
     shown = io.StringIO()

@@ -12,7 +12,7 @@ from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis import Sweep
 from toolchain.analysis.logic import DEVICES
 from toolchain.analysis.readings import sample_readings
-from toolchain.analysis.sweep import Point, Results, pareto, run_sweep, run_task, table, tasks
+from toolchain.analysis.sweep import Point, Results, draw_sweep, pareto, run_sweep, run_task, table, tasks
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 
@@ -95,6 +95,23 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path):
     run_sweep(found, again.points, measure, again.append, lambda _: None)
     assert measured == [task.key for task in found]
     assert len(Results(tmp_path / "r.jsonl").points) == 4
+
+
+def test_results_are_below_build_unless_a_flag_names_a_file(case, monkeypatch):
+    monkeypatch.chdir(case.parent)
+    done(
+        toolchain("explore", case, "--frames", "2", "--prob-bits", "4", "--targets", "15", "--rngs", "lfsr16")
+    )
+    assert not (case.parent / "explore.jsonl").exists()
+    assert Results(case.parent / "build" / "explore.jsonl").points
+
+
+def test_every_point_of_the_picture_says_which_machine_it_is(tmp_path):
+    points = [point(1), point(2).model_copy(update={"prob_bits": 6, "target_count": 63})]
+    draw_sweep(tmp_path / "p.svg", "m", points, points[:1])
+    picture = (tmp_path / "p.svg").read_text()
+    assert f"<!-- {points[0].prob_bits}, {points[0].target_count} -->" in picture
+    assert "<!-- 6, 63 -->" in picture
 
 
 def test_a_torn_last_line_is_measured_again_and_another_file_is_left_alone(tmp_path):

@@ -2,11 +2,13 @@
 
 import asyncio
 import contextlib
+import gc
 import re
 import socket
 from types import SimpleNamespace
 
 import pytest
+import uvloop
 from websockets.frames import Frame, Opcode
 from websockets.utils import accept_key
 
@@ -113,6 +115,24 @@ async def test_a_host_that_is_switched_on_later_is_not_missed(monkeypatch):
         await opening
         await ros.__aexit__(None, None, None)
     assert states[-3:] == [State.CONNECTING, State.CONNECTED, State.CLOSED]
+
+
+def test_a_look_up_that_fails_after_the_time_is_over_is_not_reported_twice():
+    """With uvloop, which looks names up in threads; the name is too long to leave this machine."""
+    reported = []
+
+    async def connect_late():
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: reported.append(context))
+        host = ".".join("a" * 150)
+        for _ in range(20):
+            await fails(f"ws://{host}:9090", UnreachableError, connect_timeout=1e-6)
+        with contextlib.suppress(OSError):
+            await asyncio.get_running_loop().getaddrinfo(host, 9090)
+        gc.collect()
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        runner.run(connect_late())
+    assert not reported
 
 
 async def test_a_service_that_greets_before_it_is_asked(monkeypatch):

@@ -1,0 +1,50 @@
+"""The start of every command: Ctrl-C during the imports ends it with 130, without a traceback."""
+
+# nothing that takes long to import, because Ctrl-C still shows a traceback meanwhile
+import os
+import signal
+from functools import partial
+
+# each command line, that of a subcommand after a colon, and what it does in the list of `rosbayes --help`
+COMMANDS = {
+    "toolchain": ("toolchain.commands.main", "From a model to a deployment."),
+    "query": ("toolchain.commands.main:query", "Print a posterior of a network, exact and of a machine."),
+    "show": ("toolchain.commands.main:show", "List the variables of a network."),
+    "master": ("services.commands.master", "Move readings to the boards and posteriors back."),
+    "listen": ("services.commands.listen", "Print, draw or save the posteriors of a running stack."),
+    "dashboard": ("services.commands.dashboard", "Show posteriors in a browser."),
+    "status": ("services.commands.status", "Show the whole stack in one screen."),
+    "hub": ("services.commands.hub", "Serve rosbridge without ROS."),
+    "discover": ("services.commands.discover", "List the rosbridge servers on this network."),
+    "subscriber": ("services.commands.subscriber", "Take variables out of a ROS topic."),
+    "publisher": ("services.commands.publisher", "Publish posteriors over rosbridge."),
+    "pcie-app": ("services.commands.pcie_app", "Drive the boards of a mini-cluster."),
+    "board": ("services.commands.board", "Emulate boards of the mini-cluster."),
+    "loader": ("services.commands.loader", "Program a board with an image."),
+    "boat-simulator": ("casestudies.boat.simulator", "Publish the readings of a simulated boat."),
+    "boat-normaliser": ("casestudies.boat.normaliser", "Turn raw readings into whole numbers in range."),
+    "boat-viewer": ("casestudies.boat.viewer", "Show posteriors beside the boat's true position."),
+    "sprinkler-garden": (
+        "casestudies.sprinkler.garden",
+        "Publish whether a simulated garden's grass is wet.",
+    ),
+    "sprinkler-viewer": ("casestudies.sprinkler.viewer", "Show how the estimate of rain converges."),
+}
+
+
+
+def __getattr__(name: str) -> object:
+    """Return the function behind the entry point of a command: `pcie_app` is that of `pcie-app`."""
+    module, _ = COMMANDS.get(name.replace("_", "-"), ("rosbayes.__main__" if name == "rosbayes" else "", ""))
+    if not module:
+        raise AttributeError(name)
+    return partial(_start, module)
+
+
+def _start(module: str) -> None:
+    # until the command line has its own handlers (`terminal.signals`), when most modules are imported
+    signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    from importlib import import_module
+
+    command = import_module(module)
+    getattr(command, "main", command.app)()
