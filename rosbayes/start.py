@@ -32,7 +32,6 @@ COMMANDS = {
 }
 
 
-
 def __getattr__(name: str) -> object:
     """Return the function behind the entry point of a command: `pcie_app` is that of `pcie-app`."""
     module, _ = COMMANDS.get(name.replace("_", "-"), ("rosbayes.__main__" if name == "rosbayes" else "", ""))
