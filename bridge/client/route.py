@@ -183,20 +183,15 @@ async def _connect_host(
     loop = asyncio.get_running_loop()
     # not by `create_connection`, in which uvloop reports a look-up that fails after the attempt has timed out
     found: list[Any] = await loop.getaddrinfo(uri.host, uri.port, type=SOCK_STREAM)
-    for *_, (address, port, *scope) in found[:-1]:
+    while True:
+        *_, address = found.pop(0)
+        # an IPv6 address has its zone at the end
+        host = f"{address[0]}%{address[3]}" if any(address[3:]) else address[0]
         try:
-            return (await loop.create_connection(factory, _with_zone(address, scope), port, **secured))[1]
-        except ssl.SSLError:
-            raise
+            return (await loop.create_connection(factory, host, address[1], **secured))[1]
         except OSError as error:
-            _log.debug("%s does not accept: %s", address, error)
-    *_, (address, port, *scope) = found[-1]
-    return (await loop.create_connection(factory, _with_zone(address, scope), port, **secured))[1]
-
-
-def _with_zone(address: str, scope: list[int]) -> str:
-    """Return a numeric address with its zone; `scope` is flow and zone of an IPv6 address, empty for IPv4."""
-    return f"{address}%{scope[1]}" if any(scope[1:]) else address
+            if not found or isinstance(error, ssl.SSLError):
+                raise
 
 
 async def _connect_proxy(proxy: Proxy, uri: WebSocketURI, shown_uri: str) -> socket | asyncio.Transport:

@@ -89,14 +89,16 @@ async def report_unpublished(ros: Ros, topic: str, report: Callable[[str], None]
     report(f"{topic} has no publisher at {ros.uri} yet{perhaps}")
 
 
-async def check_source_type(ros: Ros, topic: str, type_: str) -> None:
-    """Raise a NotReceivableError if a topic is published with another type, according to rosapi."""
-    known = await ros.topic_type(topic, ROSAPI_TIME)
-    # without a publisher it may still get our type
-    if known and not same_type(known, type_) and await ros.publishers(topic) != []:
-        raise NotReceivableError(
-            f"{topic} is {shown(known[:80])} at {ros.uri}, not {type_}; build with that type"
-        )
+async def check_types(topics: Iterable[tuple[Ros, str, str]]) -> None:
+    """Raise a NotReceivableError if a topic is published with another type than ours, according to rosapi."""
+    asked = list(topics)
+    types = await asyncio.gather(*(ros.topic_type(topic, ROSAPI_TIME) for ros, topic, _ in asked))
+    for known, (ros, topic, own) in zip(types, asked, strict=True):
+        # without a publisher it may still get our type
+        if known and not same_type(known, own) and await ros.publishers(topic) != []:
+            raise NotReceivableError(
+                f"{topic} is {shown(known[:80])} at {ros.uri}, not {own}; build with that type"
+            )
 
 
 # --- topics of results ---------------------------------------------------------------------

@@ -15,6 +15,7 @@ from bridge.client import State
 from services.pipeline.connections import (
     CHECK_INTERVAL,
     SETTLED_TIME,
+    AdvertisedTopic,
     NotReceivableError,
     reconnect_now,
     refusals,
@@ -142,32 +143,28 @@ class Publisher(Service):
 
     async def _keep_looking(self) -> NoReturn:
         """Report in each run of many frames whether the server passes results on; some discard them silently."""
-        limit = self._settings.seen_timeout
         while True:
             await self._first.wait()
             self._first.clear()
             seen = reported = False
             while not (seen or self._first.is_set()):
-                seen = await self._topics.seen(limit)
+                seen = await self._topics.seen(self._settings.seen_timeout)
                 # without a connection nothing can be seen
-                if seen or not (reported or why_not_connected(self._topics.rosbridges)):
-                    await self._report_seen(seen=seen, again=reported)
+                if not (seen or reported or why_not_connected(self._topics.rosbridges)):
                     reported = True
+                    await self._report_unseen(self._topics.advertised[0])
+            if seen:
+                self._link.send(Seen(True))
 
-    async def _report_seen(self, *, seen: bool, again: bool) -> None:
-        output = self._topics.advertised[0]
-        if again:
-            self._link.notice("info", f"results are seen on {output.name} at {output.uri} now")
-        elif not seen:
-            await self._check_delivery(settled=True)
-            # otherwise the reason has been reported
-            if output.name not in self._refused:
-                self._link.notice(
-                    "warning",
-                    f"no result was seen on {output.name} at {output.uri} within {self._settings.seen_timeout:g} s after "
-                    "the first was published: does the server allow the topic to be published and subscribed?",
-                )
-        self._link.send(Seen(seen))
+    async def _report_unseen(self, output: AdvertisedTopic) -> None:
+        await self._check_delivery(settled=True)
+        if output.name not in self._refused:
+            sentence = (
+                f"no result was seen on {output.name} at {output.uri} within {self._settings.seen_timeout:g} s after the "
+                "first was published: does the server allow the topic to be published and subscribed?"
+            )
+            self._link.notice("warning", sentence)
+        self._link.send(Seen(False))
 
     def _state_changed(self, uri: str, state: State, reason: str) -> None:
         topics, rosbridge = self._topics.served_by(uri)

@@ -16,13 +16,7 @@ import msgspec
 from bridge.client import Message, Ros, State, Subscription
 from bridge.errors import NoMessageError, TopicLeftOutError
 from services.errors import RosbridgeLostError, VariableError
-from services.pipeline.connections import (
-    NotReceivableError,
-    check_source_type,
-    connect_all,
-    reconnect_now,
-    report_unpublished,
-)
+from services.pipeline.connections import check_types, connect_all, reconnect_now, report_unpublished
 from services.pipeline.frames import FrameAssembler
 from services.settings import Settings
 from services.sockets.local_socket import MAX_RECORD
@@ -162,7 +156,8 @@ class Subscriber(Service):
                 max_size=settings.message_bytes,
             )
             rosbridges = [by_uri[settings.uri or source.uri] for source in sources]
-            await self._check_types(rosbridges)
+            needed = [at for at in range(len(sources)) if self._assembler.needs(at)]
+            await check_types((rosbridges[at], sources[at].topic, sources[at].type) for at in needed)
             self._link.keep(Ready(f"connected to {', '.join(by_uri)}"))
             # not only when the boards are programmed, which may take much longer
             warn = partial(self._link.notice, "warning")
@@ -183,17 +178,6 @@ class Subscriber(Service):
             ended, _ = await asyncio.wait([*tasks, self._lost], return_when=asyncio.FIRST_EXCEPTION)
             for each in ended:
                 each.result()
-
-    async def _check_types(self, rosbridges: list[Ros]) -> None:
-        checks = [
-            check_source_type(ros, source.topic, source.type)
-            for ros, source in zip(rosbridges, self._deployment.sources, strict=True)
-        ]
-        for at, found in enumerate(await asyncio.gather(*checks, return_exceptions=True)):
-            if isinstance(found, NotReceivableError) and not self._assembler.needs(at):
-                self._link.notice("warning", f"{found}; frames go on without it")
-            elif isinstance(found, BaseException):
-                raise found
 
     async def _follow(self, ros: Ros, at: int, source: Source, hint: asyncio.Future[None]) -> None:
         subscription = ros.subscribe(
