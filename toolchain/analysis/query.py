@@ -26,7 +26,6 @@ from toolchain.models.network import NetworkModel
 MOST_CANDIDATES: Final = 100
 """Maximum number of variables of which every pair is tested for independence."""
 _MOST_ROWS: Final = 40
-_MOST_STATES: Final = 8
 _MOST_NAMES: Final = 8
 _BAR: Final = 24
 _EIGHTHS: Final = " ▏▎▍▌▋▊▉"
@@ -72,19 +71,13 @@ class Answer:
             | ({} if ours is None else {"machine": float(ours[line])})
             for line, states in enumerate(self._lines)
         ]
-        found = self.machine and {
-            "type": self.machine.kind,
-            "why": self.machine.why,
-            "cycles": self.machine.cycles,
-            "stopped": self.machine.stopped,
-            "has_posterior": ours is not None,
-            "total_variation": self.machine.total_variation,
-        }
+        keys = ("kind", "why", "cycles", "stopped", "total_variation")
+        found = {key: getattr(self.machine, key) for key in keys} if self.machine else None
         content = {"network": self.network, "searched": names, "known": dict(self.known)}
         return json.dumps(content | {"posterior": rows, "machine": found}) + "\n"
 
-    def report(self, *, blocks: bool = True) -> str:
-        """Return the answer as bars and a sentence; `blocks` permits characters beyond ASCII for bars."""
+    def report(self) -> str:
+        """Return the answer as bars and sentences."""
         names, lines = [each.name for each in self.searched], self._lines
         given = ", ".join(f"{name}={state}" for name, state in self.known.items())
         columns = {"exact": self.exact}
@@ -94,23 +87,16 @@ class Answer:
         if len(lines) > _MOST_ROWS:
             shown = np.argsort(-self.exact, kind="stable")[:_MOST_ROWS].tolist()
         longest = max(float(column[at]) for column in columns.values() for at in shown)
-        table = [
-            (*lines[at], *(_bar(float(column[at]), longest, blocks) for column in columns.values()))
-            for at in shown
-        ]
-        rows = [
-            f"{self.network}: P({', '.join(names)}{' | ' + given if given else ''})",
-            *_aligned((*names, *columns), table),
-        ]
+        table = [(*lines[at], *(_bar(float(each[at]), longest) for each in columns.values())) for at in shown]
+        question = f"P({', '.join(names)}{' | ' + given if given else ''})"
+        rows = [f"{self.network}: {question}", *_aligned([(*names, *columns), *table])]
         if rest := len(lines) - len(shown):
             rows.append(f"and {rest:,} less probable ones, together {1 - self.exact[shown].sum():.4f}")
         if found := self.machine:
             lost = f"no posterior ({found.stopped}), which counts as a total variation of 1"
             near = f"total variation from exact inference {found.total_variation:.4f}"
-            rows.append(
-                f"{found.kind}: {found.cycles:,} cycles, {lost if found.posterior is None else near}."
-            )
-            rows.append(f"A {found.kind}, since {found.why}.")
+            ends = lost if found.posterior is None else near
+            rows += [f"{found.kind}: {found.cycles:,} cycles, {ends}.", f"A {found.kind}, since {found.why}."]
         return "\n".join(rows) + "\n"
 
 
@@ -143,12 +129,8 @@ def _machine_answer(
     question: Question, addresses: tuple[int, ...], exact: NDArray[np.float64], choice: MachineChoice
 ) -> MachineAnswer:
     """Run the machine that a build would make, as `inspect` runs it."""
-    options = BuildOptions(
-        uri="ws://nowhere:9090",
-        topic="/readings",
-        type="std_msgs/Float64",
-        machine=choice,  # there is no robot
-    )
+    # there is no robot
+    options = BuildOptions(uri="ws://no:1", topic="/readings", type="std_msgs/Float64", machine=choice)
     model, why = model_for(question, options)
     if isinstance(model, NetworkModel):
         chains = plan_bm2(model, options, why)
@@ -185,7 +167,7 @@ class Contents:
 
     joint: JointDistribution
     searched: tuple[str, ...] = ()
-    apart: Mapping[str, tuple[str, ...]]
+    apart: Mapping[str, Sequence[str]]
     """For each candidate those that are not independent of it given the searched variables."""
 
     def as_json(self) -> str:
@@ -195,41 +177,30 @@ class Contents:
             {
                 "name": each.name,
                 "states": [each.shown(at) for at in range(each.size)],
-                "parents": list(parents.get(each.name, ())),
+                "parents": parents.get(each.name, ()),
             }
-            | ({"not_with": list(self.apart[each.name])} if each.name in self.apart else {})
+            | ({"not_with": self.apart[each.name]} if each.name in self.apart else {})
             for each in self.joint.symbols
         ]
-        content = {
-            "network": self.joint.name,
-            "variables": variables,
-            "tables": len(self.joint.factors),
-            "searched": list(self.searched),
-        }
+        content = {"network": self.joint.name, "searched": self.searched, "variables": variables}
         return json.dumps(content) + "\n"
 
     def report(self) -> str:
         """Return the contents as a table and a sentence."""
         parents = _parents(self.joint)
-        heading = ["variable", "states", "depends on"]
-        table: list[tuple[str, ...]] = [
-            (each.name, _states(each), ", ".join(parents.get(each.name, ()))) for each in self.joint.symbols
-        ]
+        rows = [("variable", "states", "depends on", "not known together with" if self.searched else "")]
+        for each in self.joint.symbols:
+            last = "(searched)" if each.name in self.searched else _some(self.apart.get(each.name, ()))
+            if not self.searched or each.name in self.searched or each.name in self.apart:
+                rows.append((each.name, _states(each), ", ".join(parents.get(each.name, ())), last))
+        size = f"{len(self.joint.symbols):,} variables, {len(self.joint.factors):,} tables"
+        text = [f"{self.joint.name}: {size}", *_aligned(rows)]
         if self.searched:
-            heading.append("not known together with")
-            table = [(*row, _some(self.apart.get(row[0], ()))) for row in table]
-        rows = [
-            f"{self.joint.name}: {len(self.joint.symbols):,} variables, {len(self.joint.factors):,} tables",
-            *_aligned(heading, table),
-        ]
-        if self.searched:
-            names = ", ".join(self.searched)
-            rows.append(
-                f"Given {names}, a BM1 takes known variables of which none is in another's last column; a BM2 takes any."
-                if any(self.apart.values())
-                else f"A BM1 takes all others as known variables, since they are independent given {names}."
+            text.append(
+                f"Given {', '.join(self.searched)}, a BM1 takes known variables of which none is in another's last column; "
+                "a BM2 takes any."
             )
-        return "\n".join(rows) + "\n"
+        return "\n".join(text) + "\n"
 
 
 def contents(joint: JointDistribution, searched: Sequence[str] = (), known: Sequence[str] = ()) -> Contents:
@@ -253,9 +224,7 @@ def contents(joint: JointDistribution, searched: Sequence[str] = (), known: Sequ
     for one, other in joint.ask(searched, candidates).dependent():
         apart[one].append(other)
         apart[other].append(one)
-    return Contents(
-        joint=joint, searched=tuple(searched), apart={name: tuple(others) for name, others in apart.items()}
-    )
+    return Contents(joint=joint, searched=tuple(searched), apart=apart)
 
 
 def _parents(joint: JointDistribution) -> dict[str, tuple[str, ...]]:
@@ -267,13 +236,9 @@ def _parents(joint: JointDistribution) -> dict[str, tuple[str, ...]]:
 
 
 def _states(symbol: Symbol) -> str:
-    last = symbol.size - 1
-    if not symbol.type.labels:
-        return f"{symbol.shown(0)} to {symbol.shown(last)}"
-    if symbol.size <= _MOST_STATES:
-        return ", ".join(symbol.type.labels)
-    first = ", ".join(symbol.type.labels[: _MOST_STATES - 2])
-    return f"{first} ... {symbol.shown(last)} ({symbol.size})"
+    if symbol.type.labels:
+        return _some(symbol.type.labels)
+    return f"{symbol.shown(0)} to {symbol.shown(symbol.size - 1)}"
 
 
 def _some(names: Sequence[str]) -> str:
@@ -281,16 +246,15 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:_MOST_NAMES]) + more
 
 
-def _aligned(heading: Sequence[str], table: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(heading, *table, strict=True)]
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
-        "  " + "  ".join(f"{cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in (heading, *table)
+        "".join(f"  {cell:{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
     ]
 
 
-def _bar(value: float, longest: float, blocks: bool) -> str:
+def _bar(value: float, longest: float) -> str:
     """Return a probability and its bar, whose length is relative to the longest one."""
-    eighths = round(8 * _BAR * value / longest)
-    bar = "█" * (eighths // 8) + _EIGHTHS[eighths % 8].strip() if blocks else "#" * round(eighths / 8)
+    whole, part = divmod(round(8 * _BAR * value / longest), 8)
+    bar = "█" * whole + _EIGHTHS[part].strip()
     return f"{value:.4f} {bar:{_BAR}}"

@@ -3,18 +3,14 @@
 import re
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import Annotated, TypeAlias
 
 import typer
 
 from terminal.output import say_if_slow
 from toolchain.building.options import MachineChoice
-from toolchain.errors import BuildError
 from toolchain.flags import key_values, names_in
 from toolchain.networks import read_network
-
-if TYPE_CHECKING:
-    from toolchain.models.joint import JointDistribution
 
 NetworkPath: TypeAlias = Annotated[
     Path, typer.Argument(help="Network file: .bif, .xmlbif, .uai, .net, .xdsl (.gz).", metavar="NETWORK")
@@ -44,10 +40,11 @@ def query(
     # a comma is also between two of them, but not inside of a state
     settings = [each for text in known or () for each in re.split(r",(?=[^,=]+=)", text)]
     states = key_values(settings, "--known", "smoke=yes")
-    names, joint = names_in("--searched", searched), _read(network)
+    names, joint = names_in("--searched", searched), read_network(network)
     with say_if_slow(f"Running the machine of {joint.name}" if machine else f"Summing over {joint.name}"):
         found = answer(joint, names, states, machine)
-    typer.echo(found.as_json() if json else found.report(blocks=_has_blocks()), nl=False)
+    text, encoding = found.as_json() if json else found.report(), sys.stdout.encoding
+    typer.echo(text.encode(encoding, "replace").decode(encoding), nl=False)  # bars are not ASCII
 
 
 def show(
@@ -70,23 +67,5 @@ def show(
     from toolchain.analysis.query import contents
 
     names, candidates = names_in("--searched", searched), names_in("--known", known)
-    joint = _read(network)
-    with say_if_slow(f"Testing the pairs of variables of {joint.name}"):
-        found = contents(joint, names, candidates)
+    found = contents(read_network(network), names, candidates)
     typer.echo(found.as_json() if json else found.report(), nl=False)
-
-
-def _read(network: Path) -> "JointDistribution":
-    if network.is_dir():
-        raise BuildError(
-            f"{network} is a folder; expected a network file, such as asia.bif: a model.py contains its own question"
-        )
-    return read_network(network)
-
-
-def _has_blocks() -> bool:
-    try:
-        "█▏".encode(sys.stdout.encoding or "ascii")
-    except (UnicodeEncodeError, LookupError):
-        return False
-    return True

@@ -209,54 +209,51 @@ class Question:
         """Return why the question is not a naive fusion, or None if it is one."""
         observed = [symbol.name for symbol in self.observed]
         active = [without_idle(factor) for factor in self.joint.factors]
-        factors, terms = self._factors(active, observed)
-        links = Links(terms, factors, {*(symbol.name for symbol in self.searched), *self.given})
+        _, links = self._linked(active, observed)
         if any(len(component.intersection(observed)) > 1 for component in links.components()):
-            return self._refusal(active, observed)
+            return self._refusal(active)
         return None
 
     def dependent(self) -> list[tuple[str, str]]:
         """Return the pairs of known symbols that are not independent given the searched ones: no BM1 knows both."""
-        observed = [symbol.name for symbol in self.observed]
-        active = [without_idle(factor) for factor in self.joint.factors]
-        factors, pairs = self._pairs(active, observed)
-        return [(one, other) for _, one, other in pairs if self._between(factors, one, other)[0]]
+        factors, pairs = self._pairs([without_idle(factor) for factor in self.joint.factors])
+        return [
+            (one, other) for _, one, other in pairs if self._linked(factors, [one, other])[1].path(one, other)
+        ]
 
-    def _pairs(
-        self, active: Sequence[Factor], observed: Sequence[str]
-    ) -> tuple[list[Factor], list[tuple[int, str, str]]]:
+    def _linked(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], Links]:
+        """Return the relevant factors for some observed symbols, and their links without the searched and given ones."""
+        factors, terms = self._factors(active, observed)
+        return factors, Links(terms, factors, {*(symbol.name for symbol in self.searched), *self.given})
+
+    def _pairs(self, active: Sequence[Factor]) -> tuple[list[Factor], list[tuple[int, str, str]]]:
         """Return the factors of all observed symbols, and the pairs that these join, with the lengths of their paths.
 
         The factors of two symbols are among those of all, so no other pair is dependent, and the path of a pair is not
         shorter than that among all.
         """
-        factors, terms = self._factors(active, observed)
-        among_all = Links(terms, factors, {*(symbol.name for symbol in self.searched), *self.given})
+        observed = [symbol.name for symbol in self.observed]
+        factors, links = self._linked(active, observed)
         return factors, [
             (length, one, other)
             for at, one in enumerate(observed)
-            for other, length in among_all.lengths(one, observed[at + 1 :]).items()
+            for other, length in links.lengths(one, observed[at + 1 :]).items()
         ]
 
-    def _between(self, active: Sequence[Factor], one: str, other: str) -> tuple[list[str], Links]:
-        """Return the shortest path between two observed symbols, empty if they are independent, and the links."""
-        factors, terms = self._factors(active, [one, other])
-        links = Links(terms, factors, {*(symbol.name for symbol in self.searched), *self.given})
-        return links.path(one, other), links
-
-    def _refusal(self, active: Sequence[Factor], observed: Sequence[str]) -> NotFusionError:
+    def _refusal(self, active: Sequence[Factor]) -> NotFusionError:
         """Return an error with two dependent observed symbols, the path between them, and advice.
 
         If the observed symbols are not all independent, two of them are dependent, regardless of the others (a property
         of d-separation).
         """
-        factors, pairs = self._pairs(active, observed)
+        factors, pairs = self._pairs(active)
         path: list[str] = []
         drawn = ""
         for length, one, other in sorted(pairs, key=itemgetter(0)):  # because there may be thousands
             if path and len(path) <= length:
                 break
-            between, links = self._between(factors, one, other)
+            _, links = self._linked(factors, [one, other])
+            between = links.path(one, other)
             if between and (not path or len(between) < len(path)):
                 path, drawn = between, links.drawn(between)
         ends = f"{path[0]} or {path[-1]}"
