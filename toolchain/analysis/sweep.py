@@ -230,7 +230,7 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
         )
         for point in of_kind:
             words = f"{point.prob_bits}, {point.target_count}" + f", {point.steps_per_clock}" * is_stepped
-            at_point = {"xytext": (4, 3), "textcoords": "offset points", "fontsize": 5}
+            at_point = {"xytext": (8, -2), "textcoords": "offset points", "fontsize": 6.5}
             axes.annotate(words, (point.cycles_median, point.total_variation), **at_point)
     axes.scatter(
         [point.cycles_median for point in front],
@@ -254,7 +254,7 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
         figure.legend(loc="outside right center", fontsize="small", frameon=False)
     else:
         axes.legend(fontsize="small", frameon=False)
-    save_figure(figure, path, dpi=75)
+    save_figure(figure, path, dpi=120)
 
 
 @dataclass(frozen=True, slots=True)
