@@ -111,7 +111,7 @@ class Master:
                 await peers.start(self._flow)
                 await self._flow.end
                 # a run of few frames may be over before it is known whether anybody can receive them
-                if not self._once:
+                if self._flow.published and not self._once:
                     with contextlib.suppress(TimeoutError):
                         await asyncio.wait_for(self._flow.looked.wait(), settings.seen_timeout + _REASON_TIME)
                 # the last one, which may be newer than the last picture
