@@ -216,7 +216,7 @@ class Robot:
     async def watch_stack(self, directory: Path) -> None:
         """Read the status sockets of this machine until cancelled."""
         while True:
-            status = await ask_stack(directory)
+            status = await ask_stack(directory, shared=self._settings.run_directory is None)
             self.why = status.why
             lost: Counter[str] = Counter()
             folder = ""
@@ -253,7 +253,7 @@ class Robot:
         return self._axes if ours == list(zip(frame.labels, frame.values.shape, strict=True)) else ()
 
     def words_for(self, frame: Frame) -> dict[str, tuple[str, tuple[str, ...]]]:
-        """Return the unit and the names of the values of a frame's variables by their names, as far as they are known."""
+        """Return the unit and the states of each variable of a frame, as far as they are known."""
         deployment = self._deployment_of(frame)
         known = deployment.variables if deployment is not None else ()
         return {each.name: (each.unit, each.states) for each in known}
