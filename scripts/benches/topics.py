@@ -1,4 +1,4 @@
-"""Cycle time with and without the topics for robot tools, in turns, on stacks that are started anew in each round."""
+"""The cycle with and without the topics for robot tools, measured alternately; each round starts new stacks."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """The view of one browser: the newest frame or an earlier one, and its marginals, as messages for the page.
 
 A message is binary: the length of its head (4 bytes, little-endian), the head (JSON), and the picture: a byte a
-cell of a heat map, relative to the highest cell, or a little-endian float32 a bar and then, of a BM2, one a bar's error.
+cell of a heat map, relative to the highest cell, or a little-endian float32 a bar; the errors of a BM2's bars follow
+in the same form.
 """
 
 import struct
@@ -73,7 +74,7 @@ class View:
     def message(
         self, frame: Frame, axes: Sequence[Axis], words: Mapping[str, tuple[str, tuple[str, ...]]]
     ) -> bytes:
-        """Return the message for the frame that is shown; `words` are the units and the names of values of variables."""
+        """Return the message for the frame that is shown; `words` are the unit and the states of each variable."""
         head, picture = _encoded(frame, self.labels(frame), tuple(axes))
         kept = self._feed.frames
         now_ns = time.time_ns()

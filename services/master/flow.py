@@ -175,7 +175,7 @@ class FrameFlow:
         self.published = 0
         """Number of results that reached at least one topic."""
         self.seen: bool | None = None
-        """Whether the publisher has seen a result on the wire, in a run of many frames; None before it is known."""
+        """True if the server passed a result of `--loop` back to the publisher; None until the publisher has looked."""
         self.looked = asyncio.Event()
         """Set when `seen` is known."""
         self.newest: Publish | None = None

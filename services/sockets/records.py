@@ -241,9 +241,9 @@ class Published(Record, tag="published", frozen=True):
 
 
 class Seen(Record, tag="seen", frozen=True):
-    """Publisher to master, in a run of many frames: whether any result was seen on the wire in time.
+    """Publisher to master, with `--loop`: whether the server passed a result back to the publisher in time.
 
-    It is sent once after the first result, and again if one is seen later.
+    It is sent once after the first result, and again if a later one comes back.
     """
 
     seen: bool
