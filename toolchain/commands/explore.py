@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from toolchain.analysis import AdviceOptions, InspectOptions, ReadingOptions, Sweep
+from toolchain.bounded_files import file_errors
 from toolchain.commands.request import ModelFlags, ModelPath, read_model, read_source
 from toolchain.errors import BuildError, NotFusionError
 from toolchain.flags import Bits
@@ -127,7 +128,8 @@ def explore(
         drawn = recorded_readings(readings.readings, read.variables, readings.reading or (), frames=frames)
     # another folder that does not exist may be a typing error
     if results == RESULTS:
-        results.parent.mkdir(exist_ok=True)
+        with file_errors(results, "written", BuildError, "; name another file with -o"):
+            results.parent.mkdir(exist_ok=True)
     kept = sweeps.Results(results)
     found = sweeps.tasks(read, sweep, drawn, device)
     kept.check_writable()

@@ -106,6 +106,14 @@ def test_results_are_below_build_unless_a_flag_names_a_file(case, monkeypatch):
     assert Results(case.parent / "build" / "explore.jsonl").points
 
 
+def test_a_file_where_the_results_folder_should_be_is_one_sentence(case, monkeypatch):
+    monkeypatch.chdir(case.parent)
+    Path("build").touch()
+    result = toolchain("explore", case, "--frames", "2", "--prob-bits", "4", "--targets", "15")
+    assert result.exit_code == 2
+    assert "build/explore.jsonl cannot be written: File exists; name another file with -o" in result.output
+
+
 def test_every_point_of_the_picture_says_which_machine_it_is(tmp_path):
     points = [point(1), point(2).model_copy(update={"prob_bits": 6, "target_count": 63})]
     draw_sweep(tmp_path / "p.svg", "m", points, points[:1])
