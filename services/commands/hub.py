@@ -176,18 +176,18 @@ async def _serve(
             say(f"hub: announced as robot:{name}")
             await asyncio.Event().wait()
 
-    hub = serve_hub(
-        host,
-        port,
-        access=access,
-        limits=limits,
-        ros_version=ros_version,
-        on_ready=on_ready,
-        on_graph=graphs.append,
-        stop=asyncio.Event(),
-    )
     directory = status_directory(settings.run_directory, "hub")
     async with serve_status(directory, "hub", status, metrics=settings.metrics):
+        hub = serve_hub(
+            host,
+            port,
+            access=access,
+            limits=limits,
+            ros_version=ros_version,
+            on_ready=on_ready,
+            on_graph=graphs.append,
+            stop=asyncio.Event(),
+        )
         # an announcement that fails ends the hub, since its users would wait in vain
         await until_one_ends(hub, *([announce_once_ready(announce)] if announce is not None else []))
     return 0
