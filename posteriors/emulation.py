@@ -7,7 +7,7 @@ from pathlib import Path
 from posteriors.errors import LabelError, PosteriorError
 from posteriors.posterior import Posterior
 from toolchain.bounded_files import nearest_name
-from toolchain.deployment import load_deployment
+from toolchain.deployment import Variable, load_deployment
 
 
 def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int = 0) -> Posterior:
@@ -16,7 +16,7 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
     Args:
         folder: The folder that `toolchain build` wrote.
         readings: The readings by the names of their variables, as in messages: numbers in their units, or names of
-            states. A variable that is not named has no reading.
+            states. A variable that is not named, or is None, has no reading, whatever its `on_missing` says of messages.
         bank: Set of seeds; each gives another draw of the same distribution.
 
     Returns:
@@ -28,6 +28,8 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
         ToolchainError: The deployment is damaged, or a reading cannot be used.
         NoPosteriorError: All counts are 0 for these readings.
     """
+    import numpy as np
+
     from machines.kind import FrameInput
     from pcie_shim.programming_file import read_image
     from toolchain.deployment.address import to_address
@@ -43,9 +45,15 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
         raise PosteriorError(
             f"the machine of {folder} has replicas or readings for each line: use machines.posterior with its image"
         )
-    addresses, row = deployment.machine_addresses(
-        [to_address(variable, readings.get(variable.name)) for variable in deployment.variables]
-    )
+
+    def address(variable: Variable) -> int | None:
+        value = readings.get(variable.name)
+        if isinstance(value, np.generic):
+            value = value.item()
+        # every machine can do without a reading; `on_missing` is about messages that lack one by mistake
+        return None if value is None else to_address(variable, value)
+
+    addresses, row = deployment.machine_addresses(map(address, deployment.variables))
     frame = FrameInput(
         addresses=addresses,
         prior_address=row,

@@ -7,6 +7,7 @@ from posteriors import LabelError, Posterior, PosteriorError, posterior
 from toolchain.building.build import build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.building.options import BuildOptions
+from toolchain.errors import ReadingMissingError
 from toolchain.models import Known, Model, dimension
 from toolchain.models.model import exact_posterior
 
@@ -19,8 +20,8 @@ def model():
         name="rooms",
         searched=(dimension("floor", size=2), dimension("room", size=3, states=("hall", "attic", "yard"))),
         known=tuple(
-            Known(name=name, table=table, step=1.0, states=("dark", "light"), on_missing="missing")
-            for name, table in (("seen", LIKELY), ("felt", LIKELY[:, ::-1]))
+            Known(name=name, table=table, step=1.0, states=("dark", "light"), on_missing=on_missing)
+            for name, table, on_missing in (("seen", LIKELY, "missing"), ("felt", LIKELY[:, ::-1], "error"))
         ),
     )
 
@@ -44,13 +45,17 @@ def test_it_has_the_shape_and_the_labels_of_the_model(build, partitions):
     exact = exact_posterior(model(), [1, 0]).reshape(2, 3)
     assert np.abs(found.values - exact).max() < 0.02
     assert found.best() == dict(zip(found.labels, divmod(int(exact.argmax()), 3), strict=True))
-    missing = posterior(folder, {"seen": 1}).values
-    assert np.abs(missing - exact_posterior(model(), [1, None]).reshape(2, 3)).max() < 0.02
+    # a message without "felt" is an error, but not a question without it
+    for readings in ({"seen": 1}, {"seen": np.int64(1), "felt": None}):
+        missing = posterior(folder, readings).values
+        assert np.abs(missing - exact_posterior(model(), [1, None]).reshape(2, 3)).max() < 0.02
 
 
 def test_what_it_refuses(build):
     folder = build()
     with pytest.raises(LabelError, match="did you mean 'seen'"):
         posterior(folder, {"sen": 1})
+    with pytest.raises(ReadingMissingError):
+        posterior(folder, {"felt": float("nan")})
     with pytest.raises(PosteriorError):
         posterior(build(replicas=2), {"seen": 1})
