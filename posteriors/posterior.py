@@ -35,6 +35,13 @@ _MAX_DIMENSIONS: Final = 32
 """Limit of NumPy."""
 
 
+def reading_order(labels: Sequence[str]) -> list[int]:
+    """Return the places of labels in the order in which a person reads them: x before y, whatever the array's order."""
+    coordinates = [at for at, label in enumerate(labels) if label.lower() in {"x", "y", "z"}]
+    moved = dict(zip(coordinates, sorted(coordinates, key=lambda at: labels[at].lower()), strict=True))
+    return [moved.get(at, at) for at in range(len(labels))]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Posterior:
     """A posterior: a probability for each cell of the searched variables' grid, with the data of its frame."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
 import numpy as np
 
 from bridge.stamps import header, stamp
-from posteriors.posterior import REPLICA
+from posteriors.posterior import REPLICA, reading_order
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -220,13 +220,14 @@ def decision_statuses(
 
 
 def _best(row: NDArray[np.float64], dimensions: Sequence[Dimension]) -> dict[str, str]:
-    """Return the most probable value of each variable: the name of a state, or a number with its unit."""
+    """Return the most probable value of each variable, x before y: the name of a state, or a number with its unit."""
     indices = np.unravel_index(int(row.argmax()), [each.size for each in dimensions])
+    ordered = [(dimensions[at], indices[at]) for at in reading_order([each.label for each in dimensions])]
     return {
         each.label: each.states[index]
         if each.states
         else f"{each.value(int(index)):.9g} {each.unit}".rstrip()
-        for each, index in zip(dimensions, indices, strict=True)
+        for each, index in ordered
     }
 
 

@@ -102,7 +102,7 @@ def far_apart(instances: Iterable[Instance], count: int = POSITIONS_SHOWN) -> tu
 
 
 def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence[Truth] = ()) -> None:
-    """Draw figure 4.4: for each instance the true position and, next to it, the posterior over y and x.
+    """Draw figure 4.4: for each instance the true position and, next to it, the posterior over x and y.
 
     The true positions of the whole route are drawn faintly.
 

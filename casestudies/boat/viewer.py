@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
-HEADING: Final = "frame     true y, x     mean y, x  distance     cycles   time (ms)"
+HEADING: Final = "frame     true x, y     mean x, y  distance     cycles   time (ms)"
 
 
 Numbers = dict[str, Any]
@@ -46,16 +46,16 @@ def numbers_of(instance: "Instance") -> Numbers:
     )
     if truth is not None:
         column, row = grid.cell(truth.x, truth.y)
-        places["true_position"] = {"y": truth.y, "x": truth.x}
+        places["true_position"] = {"x": truth.x, "y": truth.y}
         places["true_position_age_ms"] = instance.truth_age_ns / 1e6
-        places["true_cell"] = {"y": row, "x": column}
+        places["true_cell"] = {"x": column, "y": row}
     if posterior is not None:
         x, y = grid.mean(posterior.probabilities)
-        mean = (y - grid.y_low) / grid.cell_height - 0.5, (x - grid.x_low) / grid.cell_width - 0.5
-        places["mean"] = dict(zip(("y", "x"), mean, strict=True))
-        places["mean_value"] = {"y": y, "x": x}
+        mean = (x - grid.x_low) / grid.cell_width - 0.5, (y - grid.y_low) / grid.cell_height - 0.5
+        places["mean"] = dict(zip(("x", "y"), mean, strict=True))
+        places["mean_value"] = {"x": x, "y": y}
         if truth is not None:
-            places["distance_cells"] = math.dist((row, column), mean)
+            places["distance_cells"] = math.dist((column, row), mean)
     latency_us = posterior.latency_us if posterior else None
     return {
         "frame": report.number if report else None,
@@ -79,7 +79,7 @@ def line(numbers: Numbers) -> str:
     def shown(key: str, form: str, unknown: str = "-") -> str:
         value = numbers[key]
         if isinstance(value, dict):
-            return f"{value['y']:{form}}, {value['x']:{form}}"
+            return f"{value['x']:{form}}, {value['y']:{form}}"
         return unknown if value is None else f"{value:{form}}"
 
     start = f"{shown('frame', 'd'):>5}  {shown('true_position', '.1f', 'not known'):>12}"

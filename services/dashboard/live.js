@@ -224,7 +224,7 @@ export default {
       if (plot.error != null) parts.push(`sampling error ±${number(plot.error, 2)}`);
       if (plot.mean) {
         const [down, across] = plot.axes;
-        const mean = `mean ${down.label} ${value(down, plot.mean[0])}, ${across.label} ${value(across, plot.mean[1])}`;
+        const mean = `mean ${across.label} ${value(across, plot.mean[1])}, ${down.label} ${value(down, plot.mean[0])}`;
         parts.push(`${mean} (ellipse: 2 standard deviations)`);
       }
       const truth = this.placed() && (drag ?? head.truth);

@@ -120,7 +120,8 @@ class Dashboard:
             """Offer the marginals of the newest posterior; an update is sent only if they are new."""
             frame = self._feed.newest
             labels = frame.searched if frame is not None else ()
-            options = {each: " by ".join(map(printable, each)) for each in choices(labels)}
+            # what goes across is named first, as in a position
+            options = {each: " by ".join(map(printable, reversed(each))) for each in choices(labels)}
             if labels:  # a frame without a posterior has none
                 marginals.set_visibility(len(labels) > 1)
             if labels and options != marginals.options:

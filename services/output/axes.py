@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from posteriors.posterior import Posterior
+from posteriors.posterior import Posterior, reading_order
 from toolchain.deployment import Deployment, Dimension
 
 _LABEL: Final = 24
@@ -66,8 +66,9 @@ def deployment_axes(deployment: Deployment) -> list[Axis]:
 
 
 def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
-    """Return a cell, or a mean, in words: `y 2.5 m, x -0.5 m`, `room hall`, or `cell y 1, x 2` without values."""
-    words = ", ".join(f"{printable(axis.label)} {axis.shown(indices[axis.label])}" for axis in axes)
+    """Return a cell, or a mean, in words: `x -0.5 m, y 2.5 m`, `room hall`, or `cell x 2, y 1` without values."""
+    ordered = [axes[at] for at in reading_order([axis.label for axis in axes])]
+    words = ", ".join(f"{printable(axis.label)} {axis.shown(indices[axis.label])}" for axis in ordered)
     return words if any(axis.dimension for axis in axes) else f"cell {words}"
 
 

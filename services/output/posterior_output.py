@@ -146,9 +146,11 @@ def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool,
     width, rows = min(width, WIDTH), max(min(rows, ROWS), 2)
     if len(axes) == 1:
         return _bars(posterior.values, axes[0], width, rows, colour)
-    # in the order of the deployment, so that y stays down and x across
     largest = sorted(sorted(range(len(axes)), key=lambda at: -axes[at].size)[:2])
     down, across = (axes[at] for at in largest)
+    # x goes across, as on a map; otherwise the order is the deployment's
+    if (down.label.lower(), across.label.lower()) == ("x", "y"):
+        down, across = across, down
     text = _heat(posterior.marginal(down.label, across.label), down, across, (width, rows), colour)
     if summed := [printable(axis.label) for at, axis in enumerate(axes) if at not in largest]:
         text.append(f"\nsummed over {', '.join(summed)}")

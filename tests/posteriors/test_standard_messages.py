@@ -187,6 +187,11 @@ def test_a_decision_has_name_probability_margin_and_entropy():
     }
 
 
+def test_a_decision_gives_x_before_y():
+    ((_, _, message, _),) = decided([0, 0, 0, 0, 0, 1], Y, X)
+    assert message == "x 0 m, y 10.5 m"
+
+
 def test_a_decision_without_a_posterior_or_of_a_biased_one_is_not_valid():
     ((_, level, message, values),) = decided(None, X, why="no posterior: impossible")
     assert (level, message, values["valid"]) == (Level.WARN, "no posterior: impossible", "false")

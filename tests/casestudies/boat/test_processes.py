@@ -92,7 +92,7 @@ async def test_from_the_simulator_to_the_pictures(tmp_path):
         raws = fake.ops("publish", topic="/boat/raw")
     assert code == 0, err
     heading, *lines, total, first_picture, second_picture = out.splitlines()
-    words = ["frame", "true", "y,", "x", "mean", "y,", "x", "distance", "cycles", "time", "(ms)"]
+    words = ["frame", "true", "x,", "y", "mean", "x,", "y", "distance", "cycles", "time", "(ms)"]
     assert heading.split() == words
     assert [int(line.split()[0]) for line in lines] == list(range(1, 13))
     assert all("  0.00  " in line for line in lines)
@@ -105,13 +105,13 @@ async def test_from_the_simulator_to_the_pictures(tmp_path):
     assert numbers["results"] == len(numbers["frames"]) == 12
     first = numbers["frames"][0]
     assert first["true_position_age_ms"] == 0
-    # the posterior is certain of the true cell: within half a cell, in the model's order
+    # the posterior is certain of the true cell: within half a cell
     assert first["mean"] == first["true_cell"]
-    assert list(first["mean_value"]) == list(first["true_position"]) == ["y", "x"]
+    assert list(first["mean_value"]) == list(first["true_position"]) == ["x", "y"]
     for label, half in (("y", GRID.cell_height / 2), ("x", GRID.cell_width / 2)):
         assert first["mean_value"][label] == pytest.approx(first["true_position"][label], abs=half)
     printed = re.findall(r"-?[\d.]+, -?[\d.]+", lines[0])
-    assert printed == ["{y:.1f}, {x:.1f}".format(**first[key]) for key in ("true_position", "mean_value")]
+    assert printed == ["{x:.1f}, {y:.1f}".format(**first[key]) for key in ("true_position", "mean_value")]
     assert [stage["stage"] for stage in numbers["stages"]][::5] == ["rosbridge in", "rosbridge out"]
     assert sum(stage["share"] for stage in numbers["stages"]) == pytest.approx(1)
     # the server says that it speaks for ROS 2, and the stamp is kept from the raw reading on

@@ -83,7 +83,7 @@ async def test_listen_prints_and_saves_until_it_is_ended(stage, boat, tmp_path):
     saving = stage.start("listen", "--uri", robot.uri, "--json", "--save", str(tmp_path / "out.npz"))
     assert await counting.end() == 0
     lines = [line for line in counting.out.splitlines() if not line.startswith("frame -:")]
-    pattern = r"frame \d+: y [-\d.]+, x [-\d.]+ with [\d.]+; mean y [-\d.]+, x [-\d.]+; \d+ cycles; [\d.]+ ms"
+    pattern = r"frame \d+: x [-\d.]+, y [-\d.]+ with [\d.]+; mean x [-\d.]+, y [-\d.]+; \d+ cycles; [\d.]+ ms"
     assert [line for line in lines if not re.fullmatch(pattern, line)] == []
     await until(lambda: saving.out.count("\n") > 3)
     saving.send(signal.SIGINT)

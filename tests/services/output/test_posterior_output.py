@@ -75,9 +75,9 @@ class TestLine:
     def test_indices_or_values_in_their_units(self):
         posterior = made([[0, 0, 1], [1, 0, 2]], "y", "x")
         assert line(posterior, axes_of(posterior, None)) == (
-            "frame 7: cell y 1, x 2 with 0.5; mean cell y 0.75, x 1.5; 812 cycles; 3.21 ms"
+            "frame 7: cell x 2, y 1 with 0.5; mean cell x 1.5, y 0.75; 812 cycles; 3.21 ms"
         )
-        assert "y 2.5, x -0.5 with 0.5; mean y 2, x -0.625;" in line(posterior, axes_of(posterior, GRID))
+        assert "x -0.5, y 2.5 with 0.5; mean x -0.625, y 2;" in line(posterior, axes_of(posterior, GRID))
 
     def test_replicas_have_a_posterior_each(self):
         posterior = made([[0, 0, 1], [0, 0, 0], [1, 2, 1]], "replica", "x")
@@ -124,6 +124,13 @@ class TestPicture:
         rows = picture(posterior, axes_of(posterior, GRID), width=60, colour=False).plain.splitlines()
         assert rows[:3] == ["  y", "2.5 |::  ++|", "0.5 |    @@|"]
         assert rows[3].split() == ["-1", "x", "-0.5"]
+
+    def test_x_goes_across_whatever_the_order_of_the_dimensions(self):
+        maps = []
+        for values, labels in (([[0, 0, 4], [1, 0, 2]], "yx"), ([[0, 1], [0, 0], [4, 2]], "xy")):
+            posterior = made(values, *labels)
+            maps.append(picture(posterior, axes_of(posterior, None), width=60, colour=False).plain)
+        assert maps[0] == maps[1]
 
     def test_in_colour_cells_are_coloured(self):
         posterior = made([[0, 1], [0, 0]], "y", "x")
