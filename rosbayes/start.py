@@ -7,6 +7,7 @@ from functools import partial
 
 # each command line, that of a subcommand after a colon, and what it does in the list of `rosbayes --help`
 COMMANDS = {
+    "demo": ("casestudies.demo", "Run the boat or the sprinkler from end to end, without a robot."),
     "toolchain": ("toolchain.commands.main", "From a model to a deployment."),
     "query": ("toolchain.commands.main:query", "Print a posterior of a network, exact and of a machine."),
     "show": ("toolchain.commands.main:show", "List the variables of a network."),

@@ -6,15 +6,11 @@ parent ◀─ standard error ──────── child   lines for the user
 
 import asyncio
 import contextlib
-import ctypes
 import os
-import shutil
 import signal
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Final, NoReturn
 
 import msgspec
@@ -23,6 +19,7 @@ from services.errors import ReportedError, StackError
 from terminal.errors import ExitCode, StoppedError, exit_code_of
 from terminal.logs import PARENT_VARIABLE
 from terminal.output import ERROR_DESCRIPTOR, relay, say_error
+from terminal.processes import ask_for_end_with_parent
 from terminal.run_directory import LockedRunDirectory
 from terminal.signals import ENDING_SIGNALS, raise_on_signals, stopped_error
 
@@ -34,14 +31,6 @@ LONGEST_LINE: Final = 1 << 20
 
 RESTARTS = 3
 """A process may be restarted three times within the setting `restart_window`; then its master gives up."""
-
-
-def own_command(name: str) -> list[str]:
-    """Return the command line of one of our commands in this environment; a path is used unchanged."""
-    if "/" in name:
-        return [name]
-    beside = Path(sys.executable).with_name(name)
-    return [str(beside)] if beside.exists() else [shutil.which(name) or name]
 
 
 def describe_exit(code: int | None) -> str:
@@ -319,13 +308,6 @@ async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
 
 
 # --- in the child -----------------------------------------------------------------------------------
-
-_PR_SET_PDEATHSIG = 1
-
-
-def ask_for_end_with_parent() -> None:
-    """Make the kernel send SIGTERM to this process when its parent exits; this survives an exec."""
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
 def end_with_parent() -> None:

@@ -36,6 +36,12 @@ class ReaderGoneError(Exception):
     exit_code = ExitCode.DONE
 
 
+class ProcessError(Exception):
+    """A process that a command or a script has started failed; it has that process's exit code."""
+
+    exit_code: int = ExitCode.CHILD
+
+
 class OutputError(Exception):
     """A file or folder that a command writes at the user's request cannot be written."""
 

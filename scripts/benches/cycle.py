@@ -24,8 +24,10 @@ from rich.table import Table
 
 from bridge.client import Publication, Ros, Subscription, connect
 from bridge.stamps import header, header_stamp_ns
+from casestudies.demo import build
 from scripts.running.flags import ScriptParser
-from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
+from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, run_script
+from terminal.processes import Process
 
 STAGES = (
     *("wire_in", "rosbridge_in", "local_hops", "waited", "register_writes", "compute", "reads"),

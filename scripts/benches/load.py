@@ -25,10 +25,12 @@ from rich.console import Console
 from rich.table import Table
 
 from bridge.client import connect
+from casestudies.demo import build
 from scripts.benches.bare import Bare, advertise, bare, frame, publish, settled, subscribe
 from scripts.benches.cycle import BOAT_FLAGS, WINDOW, message, processes_of, quantile, readings
 from scripts.running.flags import ScriptParser
-from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, Process, build, run_script
+from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, run_script
+from terminal.processes import Process
 
 TOPICS, PUBLISHERS, SLOW = 200, 50, 50
 RATE, SLOT = 2000, 0.01

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from casestudies.demo import build
 from casestudies.mrclam.model import (
     BEARING_SIGMA,
     FLOOR,
@@ -32,7 +33,8 @@ from casestudies.mrclam.model import (
 )
 from casestudies.mrclam.player import RecordedFrame, area_grid, median_distance, play, read_recording
 from scripts.running.flags import ScriptParser
-from scripts.running.processes import ROOT, Process, build, run_script
+from scripts.running.processes import ROOT, run_script
+from terminal.processes import Process
 from toolchain.deployment.address import to_address
 from toolchain.models import Model, cell_centres, exact_posterior, interval
 from toolchain.models.model import fuse
@@ -113,7 +115,7 @@ async def fit(arguments: argparse.Namespace) -> Model:
     """Return the model with the learnt tables in a file; if it does not exist, learn them from robot 3 first.
 
     Raises:
-        StackError: The toolchain failed.
+        ProcessError: The toolchain failed.
     """
     landmarks = arguments.data / "landmarks.csv"
     if not arguments.fit.exists():

@@ -18,7 +18,7 @@ from scripts.campaigning.accounts import Counters
 from scripts.campaigning.connections import Proxy, process_status
 from scripts.campaigning.expected import BOARDS
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
-from scripts.running.processes import Process
+from terminal.processes import Process
 
 SERVICES = ("subscriber", "publisher", "pcie-app")
 BOARD_NAMES = tuple(f"board{at}" for at in range(BOARDS))

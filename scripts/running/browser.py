@@ -19,9 +19,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
+from casestudies.demo import build
 from scripts.running.patience import FACTOR
-from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, Process, build
+from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE
 from scripts.verifications.installation import install_programs, use_packages
+from terminal.processes import Process
 
 if TYPE_CHECKING:
     from PIL import Image

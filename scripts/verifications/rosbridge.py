@@ -35,12 +35,15 @@ from bridge.client.protocol import Compression
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import BridgeError, EncodeError, GoalError, NoMessageError, ServiceError
 from casestudies.boat import sensors
+from casestudies.demo import build
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR
-from scripts.running.processes import BOAT_TOPIC, ROOT, Process, build, run_script
+from scripts.running.processes import BOAT_TOPIC, ROOT, run_script
 from scripts.verifications import real_rosbridge
 from scripts.verifications.checks import CheckError, Tally, expect
 from services.errors import SettingsError, StackError
+from terminal.errors import ProcessError
+from terminal.processes import Process
 
 LIMIT: Final = 600.0 * FACTOR
 """Time limit of the verification, in seconds."""
@@ -717,7 +720,14 @@ async def verify(kinds: list[str], only: str) -> int:
                 try:
                     await stand.start()
                     await check(stand)
-                except (CheckError, StackError, BridgeError, OSError, ConnectionClosed) as error:
+                except (
+                    CheckError,
+                    ProcessError,
+                    StackError,
+                    BridgeError,
+                    OSError,
+                    ConnectionClosed,
+                ) as error:
                     why = f"{type(error).__name__}: {error}"
                     await stand.stop()  # the next check gets a new server
                 tally.report(f"{stand.kind}: {name}", started, why, stand.tails() if why else "")

@@ -3,9 +3,10 @@
 from pathlib import Path
 
 from pcie_shim.endpoint import Endpoint
-from services.child import RESTARTS, own_command
+from services.child import RESTARTS
 from services.settings import Settings
 from services.sockets.reporting import shifted
+from terminal.processes import own_command
 from toolchain.deployment import Deployment
 
 METRICS_PORTS = {"subscriber": 1, "publisher": 2, "pcie-app": 3, "board": 4}

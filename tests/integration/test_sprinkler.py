@@ -15,7 +15,7 @@ from casestudies.sprinkler.model import exact_rain
 @pytest.mark.process
 async def test_the_demo_answers_within_its_own_error(stage, tmp_path):
     demo = stage.start(
-        *(sys.executable, "-m", "scripts.running.demo", "--sprinkler"),
+        *(sys.executable, "-m", "rosbayes", "demo", "--sprinkler"),
         *("--count", "12", "--seed", "2", "--out", str(tmp_path)),
     )
     assert await demo.end() == 0, demo.err + demo.out

@@ -1,11 +1,8 @@
-"""scripts/test and scripts/demo: which failures are forgiven, and a robot's name in place of its URI."""
-
-import sys
+"""scripts/test: which failures are forgiven."""
 
 import pytest
 
-from bridge.discovery import UnknownRobotError
-from scripts.running import demo, tests
+from scripts.running import tests
 
 PASSED, ODD = (0, []), (2, [])
 """A run of pytest that passed, and one in which no test failed, but pytest itself."""
@@ -39,14 +36,3 @@ def test_what_is_run_again_and_what_fails(outcomes, code, said, monkeypatch, cap
     assert all(run == ("a", "b") for run in runs[2:] if len(said) < 3)
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if line.startswith(("FLAKY", "FAILED"))][-len(said) or 99 :] == said
-
-
-def test_a_robot_is_looked_up_before_anything_starts(tmp_path, monkeypatch, capsys):
-    async def resolve(name):
-        raise UnknownRobotError(f"no robot called {name}")
-
-    monkeypatch.setattr("bridge.discovery.resolve", resolve)
-    monkeypatch.setattr(demo.Process, "start", pytest.fail)
-    monkeypatch.setattr(sys, "argv", ["demo", "--uri", "robot:Adam", "--out", str(tmp_path)])
-    assert demo.main() == UnknownRobotError.exit_code
-    assert "no robot called Adam" in capsys.readouterr().err

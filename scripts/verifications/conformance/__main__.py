@@ -20,9 +20,10 @@ from typing import Any, Final
 from bridge.client import GoalRequest, connect
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR
-from scripts.running.processes import Process, run_script
+from scripts.running.processes import run_script
 from scripts.verifications.checks import Tally
 from scripts.verifications.installation import install_node_packages, install_roslibpy
+from terminal.processes import Process
 
 NODE_SCRIPT: Final = Path(__file__).with_name("roslib.mjs")
 LIMIT: Final = 240 * FACTOR

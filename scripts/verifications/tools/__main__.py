@@ -12,6 +12,7 @@ import base64
 import json
 import math
 import os
+import shutil
 import socket
 import sys
 import tempfile
@@ -34,6 +35,7 @@ from scripts.running.processes import ROOT, run_script
 from scripts.verifications.checks import CheckError, Tally
 from scripts.verifications.installation import install_node_packages, install_programs
 from services.errors import StackError
+from terminal.errors import ProcessError
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -108,11 +110,11 @@ async def rviz(scene: Scene) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
-    screen = ("Xvfb", "-displayfd", "1", "-screen", "0", "800x560x24", "-nolisten", "tcp")
+    screen = ("/usr/bin/Xvfb", "-displayfd", "1", "-screen", "0", "800x560x24", "-nolisten", "tcp")
     display = ":" + await stand.start("Xvfb", r"^\d+$", *screen)
     variables = {"DISPLAY": display, "ROS_MASTER_URI": f"http://127.0.0.1:{port}", "ROS_IP": "127.0.0.1"}
     variables |= {"HOME": str(folder), "LIBGL_ALWAYS_SOFTWARE": "1"}
-    ros = ("env", *(f"{name}={value}" for name, value in variables.items()))
+    ros = ("/usr/bin/env", *(f"{name}={value}" for name, value in variables.items()))
     # it says nothing, and a node waits for it
     await stand.start("rosmaster", "", *ros, "sh", "-c", f"echo; exec rosmaster --core -p {port}")
     await stand.start("node", "published", *ros, "/usr/bin/python3", str(HERE / "ros_node.py"), str(messages))
@@ -185,7 +187,7 @@ async def foxglove(scene: Scene) -> None:
     """Check that Foxglove's readers decode each topic, as its application would."""
     modules, decoded = install_node_packages("foxglove", HERE), scene.folder / "decoded.json"
     command = (
-        "node",
+        shutil.which("node") or "node",
         str(HERE / "foxglove.mjs"),
         str(modules),
         scene.stand.uri,
@@ -218,7 +220,7 @@ async def verify(only: str, *, pictures: bool) -> int:
                     started, why = time.monotonic(), None
                     try:
                         await check(scene)
-                    except (CheckError, StackError, BridgeError, TimeoutError) as error:
+                    except (CheckError, ProcessError, StackError, BridgeError, TimeoutError) as error:
                         why = str(error) or type(error).__name__
                     tally.report(name, started, why, scene.stand.tails() if why else "")
             finally:

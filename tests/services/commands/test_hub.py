@@ -9,10 +9,10 @@ import pytest
 from websockets.asyncio.client import connect
 
 from bridge.discovery import Robot, UnknownRobotError
-from services.child import own_command
 from services.commands import discover, hub
 from services.errors import SettingsError
 from services.settings import load_settings
+from terminal.processes import own_command
 from tests.command_runner import invoke
 from tests.patience import PATIENCE
 

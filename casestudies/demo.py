@@ -1,0 +1,187 @@
+"""The command `demo`: a case study from end to end, whose processes are started in order and ended together."""
+
+import asyncio
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from terminal.command_line import CommandLine
+from terminal.errors import OutputError
+from terminal.output import check_writable
+from terminal.processes import Process, Screen
+from terminal.signals import run_async
+
+FIRST_TIMEOUT: Final = 180.0
+"""Seconds until the viewer's first result: before it, the deployment is built and kernels are compiled."""
+PORT: Final = "9090"
+"""Port of the hub in a demo that runs until Ctrl-C."""
+FIRST_RESULT: Final = r"^ *[0-9]+ "
+"""A viewer's line for a frame."""
+
+app = CommandLine()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """A case study as the demo runs it; its commands get `--uri` besides their options."""
+
+    name: str
+    topic: str
+    type: str
+    boards: int
+    options: Sequence[str] = ()
+    """Options of the build."""
+    viewer: str
+    publishers: Mapping[str, Sequence[str]]
+    """The commands on the robot's side with their options, in the order of their start."""
+
+
+def boat(rates: Sequence[str], *, array: bool) -> Case:
+    """Return the boat on four boards; with `array`, its readings are plain arrays."""
+    flags = ["--array"] if array else []
+    return Case(
+        name="boat",
+        topic="/boat/sensors",
+        type="std_msgs/Float64MultiArray" if array else "boat_msgs/Sensors",
+        boards=4,
+        options=("--set", "array=true") if array else (),
+        viewer="boat-viewer",
+        publishers={"boat-normaliser": flags, "boat-simulator": [*rates, *flags]},
+    )
+
+
+def sprinkler(rates: Sequence[str], count: int) -> Case:
+    """Return the sprinkler on two chains, with a bank of seeds for each frame, so that no frame repeats another."""
+    options = {"machine": "bm2", "samples": 50_000, "stream": 4096, "rng-banks": min(max(count, 16), 256)}
+    return Case(
+        name="sprinkler",
+        topic="/sprinkler/grass",
+        type="std_msgs/UInt8",
+        boards=2,
+        options=[text for name, value in options.items() for text in (f"--{name}", str(value))],
+        viewer="sprinkler-viewer",
+        publishers={"sprinkler-garden": rates},
+    )
+
+
+async def build(
+    case_study: str, deployment: Path, uri: str, topic: str, type_: str, *options: str, boards: int = 4
+) -> None:
+    """Build a case study's deployment; the report goes to DEPLOYMENT.log.
+
+    Raises:
+        ProcessError: The toolchain failed.
+    """
+    toolchain = Process("toolchain", deployment.with_name(deployment.name + ".log"))
+    await toolchain.start(
+        *("toolchain", "build", str(Path(__file__).with_name(case_study)), "-o", str(deployment)),
+        *("--partitions", str(boards), "--uri", uri, "--topic", topic, "--type", type_, *options),
+    )
+    await toolchain.succeed()
+
+
+@app.command()
+def demo(
+    is_sprinkler: Annotated[
+        bool, typer.Option("--sprinkler", help="Run the sprinkler instead, on two BM2.")
+    ] = False,
+    uri: Annotated[
+        str | None,
+        typer.Option(
+            help="A rosbridge server.", metavar="ws://HOST:PORT|robot:NAME", show_default="the embedded hub"
+        ),
+    ] = None,
+    count: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 25,
+    stay: Annotated[
+        bool,
+        typer.Option(
+            "--stay",
+            help=f"Run until Ctrl-C, with the hub on port {PORT}, so that `listen` and others can connect.",
+        ),
+    ] = False,
+    dashboard: Annotated[
+        bool,
+        typer.Option(
+            "--dashboard", help="Run until Ctrl-C, as --stay, with a page in the browser on port 8080."
+        ),
+    ] = False,
+    rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings per second.")] = 10.0,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of what is simulated.", show_default="a new one each time")
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(help="Folder for the pictures, the deployment and logs.", metavar="DIR")
+    ] = Path("out"),
+) -> int:
+    """Run a case study from end to end, without a robot: the boat."""
+    if dashboard and find_spec("nicegui") is None:
+        raise OutputError(
+            "--dashboard needs NiceGUI, which is not installed: pip install 'rosbayes[dashboard]', or leave it out"
+        )
+    check_writable(out)
+    rates = ["--rate", str(rate), *(() if seed is None else ("--seed", str(seed)))]
+    # a real server accepts only installed message types
+    case = sprinkler(rates, count) if is_sprinkler else boat(rates, array=uri is not None)
+    stay |= dashboard
+    return run_async(_run(case, uri, None if stay else count, out.resolve(), dashboard=dashboard))
+
+
+async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, dashboard: bool) -> int:
+    """Build, start everything, wait for the viewer's last picture, and end everything; no count: run until Ctrl-C."""
+    started = time.monotonic()
+    screen = Screen()
+    # the page shows what the viewer prints, whose lines would hide the page's address
+    shown = {"master"} if dashboard else {case.viewer, "master"}
+    processes = {
+        name: Process(name, out / f"{name}.log", show=screen.show if name in shown else None)
+        for name in ("hub", case.viewer, "master", *case.publishers, "dashboard")
+    }
+    hub, viewer, master, *_ = processes.values()
+    deployment = out / "deployment"
+    saying = asyncio.create_task(screen.say_what_it_waits_for())
+    try:
+        screen.waits_for = "building the deployment"
+        if uri is None:
+            screen.show(
+                f"starting the hub (the embedded rosbridge server), building the {case.name}'s deployment ..."
+            )
+            await hub.start("hub", "--port", PORT if count is None else "0")
+            uri = (await hub.line(r"ws://\S+"))[0]
+        else:
+            from bridge.discovery import announced_uri
+
+            uri = await announced_uri(uri)  # once, instead of in each process
+            screen.show(f"using the rosbridge server at {uri}, building the {case.name}'s deployment ...")
+        counted = () if count is None else ("--count", str(count))
+        await viewer.start(
+            *(case.viewer, "--uri", uri, *counted, "--out", str(out)),
+            *("--first-timeout", str(FIRST_TIMEOUT)),
+        )
+        building = asyncio.create_task(
+            build(case.name, deployment, uri, case.topic, case.type, *case.options, boards=case.boards)
+        )
+        await asyncio.gather(building, viewer.line("listening"))
+        screen.waits_for = "waiting for results; a first start compiles kernels"
+        await master.start("master", "--loop", *counted, "-d", str(deployment), "--uri", uri)
+        for name, options in case.publishers.items():
+            await processes[name].start(name, "--uri", uri, *options)
+        if dashboard:
+            await viewer.line(FIRST_RESULT)
+            await processes["dashboard"].start("dashboard", "--uri", uri, "-d", str(deployment))
+            address = await processes["dashboard"].line(r"http://\S+")
+            saying.cancel()
+            screen.show(f"open {address[0]} in a browser; on the page, drag the boat")
+        await master.succeed()
+        screen.waits_for = "drawing the pictures"
+        await viewer.succeed()
+        screen.show(f"done in {time.monotonic() - started:.1f} s; pictures are in {out}")
+        screen.show("to watch it live in a browser, and to drag the boat: the same command with --dashboard")
+    finally:
+        saying.cancel()
+        await asyncio.gather(*(process.end() for process in reversed(processes.values())))
+    return 0

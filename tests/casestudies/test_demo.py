@@ -1,0 +1,30 @@
+"""The command demo: what it refuses before anything starts."""
+
+import pytest
+
+from bridge.discovery import UnknownRobotError
+from casestudies import demo
+from tests.command_runner import invoke
+
+
+@pytest.fixture(autouse=True)
+def _nothing_may_start(monkeypatch):
+    monkeypatch.setattr(demo.Process, "start", pytest.fail)
+
+
+def test_a_robot_is_looked_up_before_anything_starts(tmp_path, monkeypatch):
+    async def resolve(name):
+        raise UnknownRobotError(f"no robot called {name}")
+
+    monkeypatch.setattr("bridge.discovery.resolve", resolve)
+    ended = invoke(demo.app, ["--uri", "robot:Adam", "--out", str(tmp_path)])
+    assert ended.exit_code == UnknownRobotError.exit_code
+    assert "no robot called Adam" in ended.stderr
+
+
+def test_a_missing_page_is_named_before_anything_starts(tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "find_spec", lambda _name: None)
+    ended = invoke(demo.app, ["--dashboard", "--out", str(tmp_path / "out")])
+    assert ended.exit_code == 2
+    assert "pip install 'rosbayes[dashboard]'" in ended.stderr
+    assert not (tmp_path / "out").exists()
