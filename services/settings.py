@@ -5,8 +5,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, ValidationInfo, field_validator
-from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from bridge.discovery import ROBOT, find_uri
 from pcie_shim.endpoint import Endpoint, parse_endpoint
@@ -23,10 +22,10 @@ ENV_PREFIX = "BM_"
 _DEPLOYMENTS = "the deployment's"
 
 
-class Settings(BaseSettings):
+class Settings(BaseModel):
     """Settings of a user. None or "" means the value of the deployment, or the default behaviour."""
 
-    model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
     # --- what is computed, and for whom ---
     deployment: Annotated[Path | None, Flag(("--deployment", "-d"), "DIR")] = Field(
@@ -59,11 +58,11 @@ class Settings(BaseSettings):
     )
 
     # --- the boards ---
-    boards: Annotated[
-        tuple[str, ...], NoDecode, Flag(metavar="ENDPOINT,...|unix:DIR/", otherwise=_DEPLOYMENTS)
-    ] = Field(
-        default=(),
-        description="Running boards, comma-separated in the order of the partitions, or the folder of `board --directory`.",
+    boards: Annotated[tuple[str, ...], Flag(metavar="ENDPOINT,...|unix:DIR/", otherwise=_DEPLOYMENTS)] = (
+        Field(
+            default=(),
+            description="Running boards, comma-separated in the order of the partitions, or the folder of `board --directory`.",
+        )
     )
     stop: Annotated[Literal["slices", "own"] | None, Flag(otherwise=_DEPLOYMENTS)] = Field(
         default=None, description="When boards stop: slices (together) or own (each independently)."
@@ -130,7 +129,6 @@ class Settings(BaseSettings):
     @field_validator("boards", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
-        # commas as in a flag, also in a variable, where pydantic would expect JSON
         if isinstance(value, str):
             return tuple(part.strip() for part in value.split(",") if part.strip())
         return value
@@ -165,8 +163,12 @@ def load_settings(**flags: Any) -> Settings:
     """
     # a misspelt variable would otherwise be ignored, for example in a unit file
     known = {ENV_PREFIX + name.upper() for name in Settings.model_fields}
+    variables: dict[str, Any] = {}
     for name in sorted(os.environ):
-        if name.upper().startswith(ENV_PREFIX) and name.upper() not in known:
+        if not name.upper().startswith(ENV_PREFIX):
+            continue
+        variables[name.upper().removeprefix(ENV_PREFIX).lower()] = os.environ[name]
+        if name.upper() not in known:
             near = difflib.get_close_matches(name.upper(), known, 1, 0.5)
             hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(sorted(known))}"
             raise SettingsError(
@@ -176,7 +178,7 @@ def load_settings(**flags: Any) -> Settings:
     given = {name: value for name, value in flags.items() if value is not None and value != ()}
     # of several mistakes the first is reported: the others may follow from it
     try:
-        settings = Settings(**given)
+        settings = Settings(**variables | given)
     except ValidationError as error:
         first = error.errors()[0]
         name = str(first["loc"][0]) if first["loc"] else "?"

@@ -1,6 +1,6 @@
 """Flags made from the fields of a model, so that meaning, limits and default of each are written once.
 
-    class Settings(BaseSettings):                         def listen(settings: Settings, plot: ...)
+    class Settings(BaseModel):                            def listen(settings: Settings, plot: ...)
         uri: Annotated[str, Flag(...)] = Field(...)  ──▶      listen --uri URI --plot
 
 Typer reads the flags of a command from its signature. `expanded` returns the command with a signature in which

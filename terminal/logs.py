@@ -1,7 +1,7 @@
 """Lines on standard error, in one format for every process: text, or one JSON object per line.
 
     say, show_progress (terminal.output) ──┐
-    get_logger (structlog) ────────────────┼──▶ text or JSON ──▶ write_line ──▶ standard error
+    get_logger ────────────────────────────┼──▶ text or JSON ──▶ write_line ──▶ standard error
     logging of libraries ──────────────────┤
     relayed lines of children ─────────────┘
 
@@ -14,12 +14,10 @@ import logging
 import os
 import sys
 from contextlib import suppress
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Final, TextIO
-
-import structlog
-from structlog.typing import EventDict, FilteringBoundLogger
+from typing import Final, TextIO
 
 from terminal.one_line import lines_of, one_line
 
@@ -28,12 +26,8 @@ PARENT_VARIABLE: Final = "ROSBAYES_PARENT"
 FORMAT_VARIABLE: Final = "BM_LOG_FORMAT"
 
 _CLEAR_LINE: Final = "\r\x1b[K"
-
-_stamp: Final = structlog.processors.TimeStamper(fmt="iso", utc=True, key="time")
-_json: Final = structlog.processors.JSONRenderer(default=str)
-_text: Final = structlog.dev.ConsoleRenderer(
-    colors=False, sort_keys=False, pad_event_to=0, pad_level=False, timestamp_key="time", event_key="message"
-)
+_QUOTED: Final = frozenset(" \t=\r\n\"'")
+"""Characters of a value in a text line that would end it, or look like the next field."""
 
 
 class _Process:
@@ -79,8 +73,12 @@ def _own_name() -> str:
 
 def json_line(level: str, message: str, *, process: str = "", **fields: object) -> str:
     """Return a JSON object on one line, in ASCII."""
-    record = {"level": level, "process": process or _own_name(), "message": message, **fields}
-    return str(_json(None, level, _stamp(None, level, record)))
+    record = {"level": level, "process": process or _own_name(), "message": message, **fields, "time": _now()}
+    return json.dumps(record, default=str)
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
 def formatted(level: str, text: str, *, name: str = "") -> str:
@@ -146,42 +144,48 @@ class SurvivingStream:
 # --- loggers ----------------------------------------------------------------------------------------
 
 
-class _StandardError:
-    """Destination of structlog: a method for each level, which prints the line."""
+class Logger:
+    """The log of a process. Lines below its level are omitted; fields whose names begin with `_` are only in JSON."""
 
-    def info(self, line: str) -> None:
-        write_line(line)
+    def __init__(self, role: str, level: str) -> None:
+        self._role = role
+        self._lowest = logging.getLevelNamesMapping()[level.upper()]
 
-    debug = warning = error = critical = info
+    def debug(self, message: str, **fields: object) -> None:
+        """Log a step of one frame."""
+        self._log(logging.DEBUG, message, fields)
+
+    def info(self, message: str, **fields: object) -> None:
+        """Log a change of state."""
+        self._log(logging.INFO, message, fields)
+
+    def warning(self, message: str, **fields: object) -> None:
+        """Log something that the user should know, and that does not end the run."""
+        self._log(logging.WARNING, message, fields)
+
+    def _log(self, level: int, message: str, fields: dict[str, object]) -> None:
+        if level < self._lowest:
+            return
+        name = logging.getLevelName(level).lower()
+        if log_format() is LogFormat.JSON:
+            known = {key.lstrip("_"): value for key, value in fields.items()}
+            write_line(json_line(name, message, process=self._role, **known))
+            return
+        shown = {key: value for key, value in fields.items() if not key.startswith("_")}
+        texts = (f"{key}={_quoted(value)}" for key, value in {"process": self._role, **shown}.items())
+        write_line(one_line(f"{_now()} [{name}] {message} {' '.join(texts)}"))
 
 
-def get_logger(role: str, level: str = "info") -> FilteringBoundLogger:
-    """Return the logger of a process; its lines contain the name of the process, and the number of the frame if any.
+def _quoted(value: object) -> str:
+    text = str(value)
+    return repr(text) if _QUOTED & set(text) else text
 
-    The first call in a process sets the minimum level: debug, info or warning.
-    """
+
+def get_logger(role: str, level: str = "info") -> Logger:
+    """Return the logger of a process; its lines contain the name of the process, and the number of the frame if any."""
     # our own records cover the warnings of libraries; only their errors are new
     log_libraries(logging.ERROR, "%(name)s: %(message)s")
-    if not structlog.is_configured():
-        structlog.configure(
-            processors=[structlog.processors.add_log_level, _stamp, _line],
-            wrapper_class=structlog.make_filtering_bound_logger(
-                logging.getLevelNamesMapping()[level.upper()]
-            ),
-            logger_factory=_StandardError,
-            cache_logger_on_first_use=True,
-        )
-    logger: FilteringBoundLogger = structlog.get_logger().bind(process=role)
-    return logger
-
-
-def _line(logger: Any, level: str, record: EventDict) -> str:
-    """Return a record as a line; fields whose names begin with `_` are only in JSON."""
-    record["message"] = record.pop("event")
-    if log_format() is LogFormat.JSON:
-        return str(_json(logger, level, {key.lstrip("_"): value for key, value in record.items()}))
-    shown = {key: value for key, value in record.items() if not key.startswith("_")}
-    return one_line(_text(logger, level, shown))
+    return Logger(role, level)
 
 
 def log_libraries(level: int, form: str) -> None:

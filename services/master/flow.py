@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from structlog.typing import FilteringBoundLogger
 
 from services.child import RESTARTS
 from services.errors import (
@@ -39,6 +38,7 @@ from services.sockets.records import (
     Unusable,
 )
 from services.sockets.status import BUCKETS_S, FrameCounts, StageLatency
+from terminal.logs import Logger
 from toolchain.deployment import Deployment
 
 QUEUE_ALL_DEPTH = 256
@@ -133,7 +133,7 @@ class FrameFlow:
         settings: Settings,
         deployment: Deployment,
         peers: Peers,
-        log: FilteringBoundLogger,
+        log: Logger,
         *,
         once: bool,
         count: int | None,

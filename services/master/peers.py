@@ -17,8 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from structlog.typing import FilteringBoundLogger
-
 from pcie_shim.endpoint import Endpoint
 from services.child import RESTARTS, Child, end_all
 from services.errors import (
@@ -36,6 +34,7 @@ from services.sockets.records import AnyRecord, Begin, Notice, Ready, Rosbridge,
 from services.sockets.serving import board_endpoints, endpoint_from
 from services.sockets.status import PeerStatus
 from terminal.errors import ExitCode
+from terminal.logs import Logger
 from terminal.output import say
 from terminal.run_directory import LockedRunDirectory
 from toolchain.deployment import Deployment
@@ -123,9 +122,7 @@ class PeerEvents(Protocol):
 class Peers:
     """The three services, and the boards' process if the master starts it."""
 
-    def __init__(
-        self, settings: Settings, deployment: Deployment, log: FilteringBoundLogger, *, once: bool
-    ) -> None:
+    def __init__(self, settings: Settings, deployment: Deployment, log: Logger, *, once: bool) -> None:
         self._settings = settings
         self._deployment = deployment
         self._log = log
