@@ -62,6 +62,11 @@ class Answer:
     def _lines(self) -> list[tuple[str, ...]]:
         return list(product(*([each.shown(at) for at in range(each.size)] for each in self.searched)))
 
+    def _most_probable(self) -> list[int]:
+        """Return the most probable line, and that of the machine if it has one."""
+        ours = self.machine.posterior if self.machine else None
+        return [int(each.argmax()) for each in (self.exact, ours) if each is not None]
+
     def as_json(self) -> str:
         """Return the answer as one JSON object, with an object per line."""
         names = [each.name for each in self.searched]
@@ -74,28 +79,34 @@ class Answer:
         keys = ("kind", "why", "cycles", "stopped", "total_variation")
         found = {key: getattr(self.machine, key) for key in keys} if self.machine else None
         content = {"network": self.network, "searched": names, "known": dict(self.known)}
-        return json.dumps(content | {"posterior": rows, "machine": found}) + "\n"
+        best = [rows[line]["states"] for line in self._most_probable()]
+        found = found and found | {"map": best[1] if best[1:] else None}
+        return json.dumps(content | {"map": best[0], "posterior": rows, "machine": found}) + "\n"
 
-    def report(self) -> str:
-        """Return the answer as bars and sentences."""
+    def report(self, *, best: bool = False) -> str:
+        """Return the answer as bars and sentences; with `best`, of the most probable states alone."""
         names, lines = [each.name for each in self.searched], self._lines
         given = ", ".join(f"{name}={state}" for name, state in self.known.items())
         columns = {"exact": self.exact}
         if self.machine and self.machine.posterior is not None:
             columns[self.machine.kind] = self.machine.posterior
-        shown = range(len(lines))
-        if len(lines) > _MOST_ROWS:
+        shown: Sequence[int] = range(len(lines))
+        if best:
+            shown = list(dict.fromkeys(self._most_probable()))
+        elif len(lines) > _MOST_ROWS:
             shown = np.argsort(-self.exact, kind="stable")[:_MOST_ROWS].tolist()
         longest = max(float(column[at]) for column in columns.values() for at in shown)
         table = [(*lines[at], *(_bar(float(each[at]), longest) for each in columns.values())) for at in shown]
-        question = f"P({', '.join(names)}{' | ' + given if given else ''})"
+        question = f"{'max ' if best else ''}P({', '.join(names)}{' | ' + given if given else ''})"
         rows = [f"{self.network}: {question}", *_aligned([(*names, *columns), *table])]
-        if rest := len(lines) - len(shown):
+        if (rest := len(lines) - len(shown)) and not best:
             rows.append(f"and {rest:,} less probable ones, together {1 - self.exact[shown].sum():.4f}")
         if found := self.machine:
             lost = f"no posterior ({found.stopped}), which counts as a total variation of 1"
             near = f"total variation from exact inference {found.total_variation:.4f}"
             ends = lost if found.posterior is None else near
+            if best and found.posterior is not None:
+                ends += ", other most probable states" if shown[1:] else ", the same most probable states"
             rows += [f"{found.kind}: {found.cycles:,} cycles, {ends}.", f"A {found.kind}, since {found.why}."]
         return "\n".join(rows) + "\n"
 

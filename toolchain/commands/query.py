@@ -29,6 +29,10 @@ def query(
         MachineChoice | None,
         typer.Option(help="Also the posterior of a machine; auto: of the one that a build would choose."),
     ] = None,
+    best: Annotated[
+        bool,
+        typer.Option("--map", help="Print only the most probable states of the searched variables together."),
+    ] = False,
     json: Json = False,
 ) -> None:
     """Print the posterior of variables of a network: the exact one and, with --machine, what a machine says.
@@ -43,7 +47,7 @@ def query(
     names, joint = names_in("--searched", searched), read_network(network)
     with say_if_slow(f"Running the machine of {joint.name}" if machine else f"Summing over {joint.name}"):
         found = answer(joint, names, states, machine)
-    text, encoding = found.as_json() if json else found.report(), sys.stdout.encoding
+    text, encoding = found.as_json() if json else found.report(best=best), sys.stdout.encoding
     typer.echo(text.encode(encoding, "replace").decode(encoding), nl=False)  # bars are not ASCII
 
 

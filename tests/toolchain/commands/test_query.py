@@ -4,6 +4,7 @@ import itertools
 import json
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from rosbayes.__main__ import app
 from tests.command_runner import invoke
 from tests.toolchain.running import TARGET, assert_refused, done, toolchain
 from toolchain.analysis import query as queries
+from toolchain.building.options import MachineChoice
 from toolchain.networks import read_network
 
 PAGE = (Path(__file__).parents[3] / "docs" / "how-to" / "query.md").read_text()
@@ -96,6 +98,32 @@ def test_a_machine_without_a_posterior(tmp_path):
     said = done(toolchain("query", *question)).stdout.splitlines()
     assert said[1].split() == ["x", "exact"]
     assert "no posterior" in said[-2]
+
+
+def test_the_most_probable_states_together(tmp_path):
+    # x = b is more probable than x = a, but not together with any state of y
+    path = tmp_path / "pair.bif"
+    path.write_text(
+        "variable x { type discrete [ 2 ] { a, b }; }\nvariable y { type discrete [ 3 ] { c, d, e }; }\n"
+        "probability ( x ) { table 0.4, 0.6; }\nprobability ( y | x ) { (a) 1, 0, 0; (b) 0.1, 0.45, 0.45; }\n"
+    )
+    question = (path, "--searched", "x,y", "--machine", "bm1")
+    said = done(toolchain("query", *question, "--map")).stdout.splitlines()
+    assert said[0] == "pair: max P(x, y)"
+    assert said[2].split()[:3] == ["a", "c", "0.4000"]
+    assert len(said) == 5
+    assert said[3].endswith(", the same most probable states.")
+    found = asked(*question)
+    assert found["map"] == found["machine"]["map"] == {"x": "a", "y": "c"}
+    answer = queries.answer(read_network(path), ["x", "y"], {}, MachineChoice.BM1)
+    other = replace(answer.machine, posterior=np.eye(6)[4])
+    rows = replace(answer, machine=other).report(best=True).splitlines()
+    assert [row.split()[:2] for row in rows[2:4]] == [["a", "c"], ["b", "d"]]
+    assert rows[4].endswith(", other most probable states.")
+    assert json.loads(replace(answer, machine=other).as_json())["machine"]["map"] == {"x": "b", "y": "d"}
+    lost = replace(answer, machine=replace(other, posterior=None))
+    assert json.loads(lost.as_json())["machine"]["map"] is None
+    assert len(lost.report(best=True).splitlines()) == 5
 
 
 def test_of_many_combinations_the_most_probable_are_shown(asia):
