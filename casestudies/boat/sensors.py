@@ -62,6 +62,11 @@ TRUE_POSE_TOPIC: Final = "/boat/true_pose"
 TRUE_POSE_TYPE: Final = "geometry_msgs/PoseStamped"
 SET_POSE_TOPIC: Final = "/boat/set_pose"
 """Topic of poses where anybody may put the boat, of the same type as the true pose."""
+DRIVE_TOPIC: Final = "/cmd_vel"
+"""Topic of the velocity at which anybody may drive the boat."""
+DRIVE_TYPE: Final = "geometry_msgs/Twist"
+COMPASS_TOPIC: Final = "/boat/imu"
+COMPASS_TYPE: Final = "sensor_msgs/Imu"
 BEACONS_TOPIC: Final = "/boat/beacons"
 BEACONS_TYPE: Final = "visualization_msgs/MarkerArray"
 MAP_FRAME: Final = "map"
@@ -93,8 +98,8 @@ class BadReadingError(Exception):
     """A message on the raw topic holds something that is not a number."""
 
 
-class BadPoseError(Exception):
-    """A message on `/boat/set_pose` does not hold a position; `field` is the coordinate that is wrong."""
+class BadNumberError(Exception):
+    """A message that moves the boat lacks a number that it needs; `field` is the one that is wrong."""
 
     def __init__(self, field: str, value: object) -> None:
         super().__init__(f"{field} must be a finite number, not {shown(repr(value))}")
@@ -102,14 +107,20 @@ class BadPoseError(Exception):
 
 
 def read_set_pose(message: dict[str, Any]) -> tuple[float, float]:
-    """Return x and y of a geometry_msgs/PoseStamped, or raise a BadPoseError."""
-    found = []
-    for path in ("pose.position.x", "pose.position.y"):
-        value = Field(path).value(message)[1]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise BadPoseError(path, value)
-        found.append(float(value))
-    return found[0], found[1]
+    """Return x and y of a geometry_msgs/PoseStamped, or raise a BadNumberError."""
+    return _number(message, "pose.position.x"), _number(message, "pose.position.y")
+
+
+def read_drive(message: dict[str, Any]) -> tuple[float, float]:
+    """Return the speed forward and the turn to the left of a geometry_msgs/Twist, or raise a BadNumberError."""
+    return _number(message, "linear.x"), _number(message, "angular.z")
+
+
+def _number(message: dict[str, Any], path: str) -> float:
+    value = Field(path).value(message)[1]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise BadNumberError(path, value)
+    return float(value)
 
 
 def beacon_markers(head: dict[str, Any]) -> dict[str, Any]:
@@ -132,15 +143,31 @@ def beacon_markers(head: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def true_pose(x: float, y: float, head: dict[str, Any]) -> dict[str, Any]:
-    """Return a geometry_msgs/PoseStamped at (x, y), without rotation."""
+def true_pose(x: float, y: float, head: dict[str, Any], heading: float = 0.0) -> dict[str, Any]:
+    """Return a geometry_msgs/PoseStamped at (x, y), with a heading in radians."""
     return {
         "header": head,
-        "pose": {
-            "position": {"x": x, "y": y, "z": 0.0},
-            "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-        },
+        "pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": _rotation(heading)},
     }
+
+
+def compass(heading: float, head: dict[str, Any]) -> dict[str, Any]:
+    """Return a heading in radians as a sensor_msgs/Imu, which marks what it does not measure by a covariance of -1."""
+    nothing = {"x": 0.0, "y": 0.0, "z": 0.0}
+    unknown = [-1.0, *[0.0] * 8]
+    return {
+        "header": head,
+        "orientation": _rotation(heading),
+        "orientation_covariance": [0.0] * 9,
+        "angular_velocity": nothing,
+        "angular_velocity_covariance": unknown,
+        "linear_acceleration": nothing,
+        "linear_acceleration_covariance": unknown,
+    }
+
+
+def _rotation(heading: float) -> dict[str, float]:
+    return {"x": 0.0, "y": 0.0, "z": math.sin(heading / 2), "w": math.cos(heading / 2)}
 
 
 def readings_message(

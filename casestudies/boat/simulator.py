@@ -1,6 +1,7 @@
-"""Simulator in place of Gazebo: a boat that sails or is dragged, and publishes its sensors' readings.
+"""Simulator in place of Gazebo: a boat that sails, is driven or is dragged, and publishes its sensors' readings.
 
-/boat/set_pose, services /boat/... ─▶ Boat ─▶ /boat/true_pose, /boat/raw at each step, and at once after a change
+/cmd_vel ───────────────────────────▶ Boat ─▶ /boat/true_pose, /boat/imu, /boat/raw at each step
+/boat/set_pose, services /boat/... ─▶                                           and at once after these
 """
 
 import asyncio
@@ -22,7 +23,11 @@ from casestudies.boat.sensors import (
     BEACONS_TYPE,
     BEARING_NAMES,
     BEARING_SIGMA,
+    COMPASS_TOPIC,
+    COMPASS_TYPE,
     DISTANCE_NAMES,
+    DRIVE_TOPIC,
+    DRIVE_TYPE,
     LONGEST_DISTANCE,
     MAP_FRAME,
     MAP_HIGH,
@@ -33,11 +38,13 @@ from casestudies.boat.sensors import (
     SET_POSE_TOPIC,
     TRUE_POSE_TOPIC,
     TRUE_POSE_TYPE,
-    BadPoseError,
+    BadNumberError,
     beacon_markers,
     bearing,
+    compass,
     distance,
     distance_sigma,
+    read_drive,
     read_set_pose,
     readings_message,
     true_pose,
@@ -65,7 +72,9 @@ _SHORE = 2.0  # waypoints are at least this far from the map's edge
 _SEEDS = 1_000_000
 # Minimum number of seconds between a reading and another one that a change causes: a mouse moves 1000 times a second.
 _SHORTEST = 0.02
-_POSE_BYTES = 65_536  # a larger message on the topic of poses is no pose, and is discarded
+_POSE_BYTES = 65_536  # a larger message on the topics that move the boat is no such message, and is discarded
+DRIVE_TIMEOUT: Final = 1.0
+"""Seconds after which the boat stops without another velocity, as robots do."""
 
 
 class Boat:
@@ -74,25 +83,35 @@ class Boat:
     Two boats with the same seed and the same switches sail the same route and measure the same readings.
 
     Attributes:
-        switches: Whether each of `SWITCHES` is on. `put` turns `sail` off.
+        heading: Where the bow points, in radians counter-clockwise from the x axis.
+        switches: Whether each of `SWITCHES` is on. `put` and `drive` turn `sail` off.
         changed: Set when somebody has moved the boat or set a switch, until the next reading shows it.
     """
 
     def __init__(self, seed: int, speed: float) -> None:
-        """Put the boat in the middle of the map; `speed` is in map units per second."""
+        """Put the boat in the middle of the map; `speed` is its highest, in map units per second."""
         self._random = random.Random(seed)
         self._speed = speed
         self.x = (MAP_LOW + MAP_HIGH) / 2
         self.y = (MAP_LOW + MAP_HIGH) / 2
+        self.heading = 0.0
+        # The velocity of the last `drive` (map units and radians per second), and for how many seconds it still holds.
+        self._forward = self._turn = self._driven = 0.0
         self._waypoint = self._next_waypoint()
         self.switches = dict.fromkeys(SWITCHES, True)
         self.changed = asyncio.Event()
 
     def put(self, x: float, y: float) -> None:
         """Put the boat at (x, y), or on the nearest shore if that is outside the map; it lies still there."""
-        self.x = min(max(x, MAP_LOW), MAP_HIGH)
-        self.y = min(max(y, MAP_LOW), MAP_HIGH)
+        self._place(x, y)
+        self._driven = 0.0
         self.switch("sail", on=False)
+
+    def drive(self, forward: float, turn: float) -> None:
+        """Move at this velocity, no faster than the boat can, for `DRIVE_TIMEOUT` seconds; `turn` is radians a second."""
+        self._forward, self._turn = min(max(forward, -self._speed), self._speed), turn
+        self._driven = DRIVE_TIMEOUT
+        self.switches["sail"] = False
 
     def switch(self, name: str, *, on: bool) -> str:
         """Set one of `SWITCHES`, and return what now holds."""
@@ -101,10 +120,20 @@ class Boat:
         return SWITCHES[name][0 if on else 1]
 
     def sail(self, seconds: float) -> None:
-        """Sail along the waypoints for that many seconds, unless the boat lies still."""
+        """Sail along the waypoints for that many seconds, or as it is driven, unless the boat lies still."""
+        if not self.switches["sail"]:
+            driven = min(seconds, self._driven)
+            self._driven -= driven
+            middle = self.heading + self._turn * driven / 2
+            self._place(
+                self.x + self._forward * driven * math.cos(middle),
+                self.y + self._forward * driven * math.sin(middle),
+            )
+            self.heading = math.remainder(self.heading + self._turn * driven, math.tau)
         left = self._speed * seconds if self.switches["sail"] else 0.0
         while left > 0:
             to_go = math.dist((self.x, self.y), self._waypoint)
+            self.heading = math.atan2(self._waypoint[1] - self.y, self._waypoint[0] - self.x)
             if to_go > left:
                 self.x += (self._waypoint[0] - self.x) * left / to_go
                 self.y += (self._waypoint[1] - self.y) * left / to_go
@@ -132,6 +161,9 @@ class Boat:
             measured[name] = math.radians(degrees)
         return tuple(measured[name] if self.switches[f"{name}/plugged"] else None for name in SENSOR_NAMES)
 
+    def _place(self, x: float, y: float) -> None:
+        self.x, self.y = min(max(x, MAP_LOW), MAP_HIGH), min(max(y, MAP_LOW), MAP_HIGH)
+
     def _next_waypoint(self) -> tuple[float, float]:
         low, high = MAP_LOW + _SHORE, MAP_HIGH - _SHORE
         return self._random.uniform(low, high), self._random.uniform(low, high)
@@ -148,8 +180,8 @@ async def simulate(
 ) -> None:
     """Sail and publish `count` readings, or until cancelled; a BridgeError if no server answers at the URI.
 
-    Each step publishes the true pose and then the readings, with the same stamp, on `topic`: `boat_msgs/Raw`, or with
-    `array` std_msgs/Float64MultiArray. So does a change of the boat from outside, at once. While the server is away
+    Each step publishes true pose, compass and then the readings, with the same stamp, on `topic`: `boat_msgs/Raw`, or
+    with `array` std_msgs/Float64MultiArray. So does a change of the boat from outside, at once. While the server is away
     the boat sails on.
     """
     from bridge.client import connect
@@ -164,12 +196,14 @@ async def simulate(
     ):
         ros_version = await ros.detect_ros_version()
         poses = LossyPublication(await ros.advertise(TRUE_POSE_TOPIC, TRUE_POSE_TYPE))
+        headings = LossyPublication(await ros.advertise(COMPASS_TOPIC, COMPASS_TYPE))
         type_ = ARRAY_TYPE if array else RAW_TYPE
         readings = LossyPublication(await ros.advertise(topic, type_))
         for work in (
             report_refused(ros, topic, type_),
             _show_beacons(ros),
-            _follow_poses(ros, boat),
+            _follow(ros, SET_POSE_TOPIC, TRUE_POSE_TYPE, lambda message: boat.put(*read_set_pose(message))),
+            _follow(ros, DRIVE_TOPIC, DRIVE_TYPE, lambda message: boat.drive(*read_drive(message))),
             _serve_switches(ros, boat),
         ):
             at_the_end.callback(asyncio.create_task(work).cancel)
@@ -179,7 +213,8 @@ async def simulate(
         while count is None or published < count:
             boat.changed.clear()
             head = header(time.time_ns(), MAP_FRAME, ros_version)
-            await poses.publish(true_pose(boat.x, boat.y, head))
+            await poses.publish(true_pose(boat.x, boat.y, head, boat.heading))
+            await headings.publish(compass(boat.heading, head))
             if await readings.publish(readings_message(boat.measure(), head, array=array)):
                 readiness.record()
             published += 1
@@ -209,20 +244,20 @@ async def _show_beacons(ros: "Ros") -> None:
     await markers.publish(beacon_markers(header(time.time_ns(), MAP_FRAME, ros.ros_version)))
 
 
-async def _follow_poses(ros: "Ros", boat: Boat) -> None:
-    """Put the boat where messages on `/boat/set_pose` say; the first unusable ones of each kind are reported."""
+async def _follow(ros: "Ros", topic: str, type_: str, take: Callable[[dict[str, Any]], None]) -> None:
+    """Move the boat as the messages of a topic say; the first unusable ones of each kind are reported."""
     from bridge.errors import TopicLeftOutError
 
     reported: set[str] = set()
-    poses = ros.subscribe(SET_POSE_TOPIC, TRUE_POSE_TYPE, queue_size=1, max_bytes=_POSE_BYTES)
+    messages = ros.subscribe(topic, type_, queue_size=1, max_bytes=_POSE_BYTES)
     # a message that is too large for the connection ends the topic; the client has warned, and the boat sails on
     with contextlib.suppress(TopicLeftOutError):
-        async for message in poses:
+        async for message in messages:
             try:
-                boat.put(*read_set_pose(message.msg))
-            except BadPoseError as error:
+                take(message.msg)
+            except BadNumberError as error:
                 if error.field not in reported:
-                    warn(f"a message on {SET_POSE_TOPIC} is refused: {error}")
+                    warn(f"a message on {topic} is refused: {error}")
                     reported.add(error.field)
 
 
@@ -264,7 +299,9 @@ def boat_simulator(
     ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings per second.")] = 10.0,
     topic: Annotated[str, typer.Option(help="Topic of the raw readings.", metavar="TOPIC")] = RAW_TOPIC,
-    speed: Annotated[float, typer.Option(min=0.0, help="The boat's speed, in map units per second.")] = 60.0,
+    speed: Annotated[
+        float, typer.Option(min=0.0, help="The boat's highest speed, in map units per second.")
+    ] = 60.0,
     count: Annotated[int | None, typer.Option(min=1, help="Exit after this many readings.")] = None,
     array: Annotated[
         bool, typer.Option("--array", help="Publish std_msgs/Float64MultiArray instead of boat_msgs/Raw.")
@@ -272,7 +309,8 @@ def boat_simulator(
 ) -> int:
     """Sail a boat about its map: publish noisy ranges and bearings, and the true pose on /boat/true_pose.
 
-    A pose on /boat/set_pose moves the boat; services below /boat/ switch noise, beacons and sensors.
+    A velocity on /cmd_vel drives the boat, and a pose on /boat/set_pose moves it; services below /boat/ switch noise,
+    beacons and sensors.
     """
     chosen = random.SystemRandom().randrange(_SEEDS) if seed is None else seed
     say(f"boat-simulator: seed {chosen}, {rate:g} readings a second on {topic}, {uri}")

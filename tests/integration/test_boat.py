@@ -4,6 +4,7 @@ boat-simulator -> hub -> boat-normaliser -> hub -> master and its processes -> h
 """
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -259,3 +260,30 @@ async def test_the_posterior_follows_what_is_done_to_the_world(stage, tmp_path):
 
         await until(lambda: len(readings()["D3"]) >= 3)
         assert {name for name, values in readings().items() if len(values) > 1} == {"D3", "B3"}
+
+
+@pytest.mark.process
+async def test_the_program_of_the_page_drives_the_boat_to_its_goal(stage, whole_boat):
+    _, uri = await stage.hub()
+    page = (ROOT / "docs/how-to/driving.md").read_text()
+    (program,) = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    goal = tuple(
+        float(number) for number in re.search(r"^GOAL = \((.*), (.*)\)", program, re.MULTILINE).groups()
+    )
+    async with Robot(uri, {"/boat/true_pose": "geometry_msgs/PoseStamped"}) as robot:
+        stage.start("master", "--loop", "-d", str(whole_boat), "--uri", uri)
+        stage.start("boat-normaliser", "--uri", uri)
+        await stage.start("boat-simulator", "--uri", uri, "--rate", "10", "--seed", "5").says("seed")
+        await robot.have(2)
+        driving = stage.start(sys.executable, "-c", program.replace("ws://127.0.0.1:9090", uri))
+        assert await driving.end() == 0, driving.err
+        there = len(robot.heard["/boat/true_pose"])
+        assert re.fullmatch(r"at the goal: [0-4]\.\d m from it.*\n", driving.out)
+
+        def places():
+            poses = [each["pose"]["position"] for each in robot.heard["/boat/true_pose"][there:]]
+            return [(each["x"], each["y"]) for each in poses]
+
+        # it lies still there, by the truth too, within the error of a posterior
+        await until(lambda: len(places()) >= 5 and len(set(places()[-5:])) == 1, lambda: f"{places()}")
+        assert np.hypot(*np.subtract(places()[-1], goal)) < 25

@@ -15,12 +15,13 @@ from casestudies.boat.sensors import (
     BEARING_SIGMA,
     LONGEST_DISTANCE,
     SENSOR_NAMES,
-    BadPoseError,
+    BadNumberError,
     BadReadingError,
     bearing,
     distance,
     distance_sigma,
     map_grid,
+    read_drive,
     read_raw,
     read_set_pose,
     readings_message,
@@ -183,8 +184,53 @@ def test_a_boat_that_is_put_somewhere_lies_still_until_it_sails_on():
     ],
 )
 def test_a_place_that_is_no_place_is_refused(message, field):
-    with pytest.raises(BadPoseError, match=field):
+    with pytest.raises(BadNumberError, match=field):
         read_set_pose(message)
+
+
+def twist(forward, turn):
+    return {"linear": {"x": forward}, "angular": {"z": turn}}
+
+
+@pytest.mark.parametrize(
+    ("message", "field"), [({}, "linear.x"), (twist(math.nan, 0), "linear.x"), (twist(1, None), "angular.z")]
+)
+def test_a_velocity_that_is_none_is_refused(message, field):
+    with pytest.raises(BadNumberError, match=field):
+        read_drive(message)
+
+
+def test_a_boat_that_is_driven_follows_the_velocity_for_a_second_and_stays_on_the_map():
+    boat = Boat(5, 60)
+    boat.drive(*read_drive(twist(10.0, 0.0)))
+    for _ in range(20):  # two seconds: the velocity is too old in the second one
+        boat.sail(0.1)
+    assert (boat.x, boat.y, boat.heading) == (pytest.approx(10), 0, 0)
+    boat.drive(0.0, math.pi / 2)
+    boat.sail(1.0)
+    boat.drive(-5.0, 0.0)
+    boat.sail(1.0)
+    assert (boat.x, boat.y, boat.heading) == (
+        pytest.approx(10),
+        pytest.approx(-5),
+        pytest.approx(math.pi / 2),
+    )
+    boat.drive(1e300, 0.0)  # no faster than its speed
+    boat.sail(0.5)
+    assert boat.y == pytest.approx(25)
+    boat.sail(0.5)
+    assert boat.y == 50
+    boat.switch("sail", on=True)
+    boat.sail(0.5)
+    assert math.dist((boat.x, boat.y), (10, 50)) > 1
+
+
+def test_a_turn_while_driving_is_an_arc_to_the_left():
+    boat = Boat(5, 60)
+    for _ in range(1000):  # a quarter of a circle of radius 20
+        boat.drive(20.0, 1.0)
+        boat.sail(math.pi / 2000)
+    assert (boat.x, boat.y) == (pytest.approx(20), pytest.approx(20))
 
 
 def test_switches_of_the_boat():
