@@ -28,8 +28,8 @@ def rosbayes(
 ) -> None:
     """Bayesian machines for any ROS robot.
 
-    Each subcommand is also a command of its own: `rosbayes hub` and `hub` are the same, and so are `rosbayes query` and
-    `toolchain query`.
+    Start with `rosbayes demo`. Each other subcommand is also a command of its own, `rosbayes hub` is `hub`, or one of
+    the toolchain: `rosbayes build` is `toolchain build`.
     """
 
 

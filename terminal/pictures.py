@@ -1,18 +1,9 @@
-"""Pictures: matplotlib without a display, if it is installed."""
+"""Pictures: matplotlib without a display."""
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from terminal.errors import OutputError
-
-
-def check_pictures_possible(flag: str) -> None:
-    """Raise an OutputError if matplotlib is missing, so that a long run does not end without its pictures."""
-    if find_spec("matplotlib") is None:
-        raise OutputError(
-            f"{flag} needs matplotlib, which is not installed: run pip install matplotlib, or leave it out"
-        )
 
 
 def new_figure(width: float, height: float) -> Any:

@@ -107,7 +107,7 @@ def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence
     The true positions of the whole route are drawn faintly.
 
     Raises:
-        OutputError: matplotlib is missing, a posterior is not two-dimensional, or the file cannot be written.
+        OutputError: A posterior is not two-dimensional, or the file cannot be written.
     """
     across = 2 if len(instances) > 1 else 1
     down = math.ceil(len(instances) / across)

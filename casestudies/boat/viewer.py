@@ -15,7 +15,6 @@ from posteriors.errors import NoResultError
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import check_writable, say, warn, write_json
-from terminal.pictures import check_pictures_possible
 
 if TYPE_CHECKING:
     from casestudies.topics import Instance, Truth
@@ -230,7 +229,6 @@ def boat_viewer(
 
     viewer = Viewer(count)
     if out is not None:
-        check_pictures_possible("--out")
         check_writable(out)
     if numbers is not None:
         check_writable(numbers.parent)

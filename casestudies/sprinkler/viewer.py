@@ -23,7 +23,7 @@ from posteriors.posterior import SAMPLES_TOPIC, SAMPLES_TYPE, Posterior, read_sa
 from terminal.command_line import CommandLine
 from terminal.connection import report_connection
 from terminal.output import check_writable, say, warn
-from terminal.pictures import check_pictures_possible, new_figure, save_figure
+from terminal.pictures import new_figure, save_figure
 from toolchain.errors import counted
 
 PICTURE: Final = "sprinkler.png"
@@ -216,7 +216,6 @@ def sprinkler_viewer(
     """
     viewer = Viewer(count)
     if out is not None:
-        check_pictures_possible("--out")
         check_writable(out)
     run_viewer(viewer.watch(uri, first_limit_s=first_timeout, limit_s=timeout), partial(viewer.finish, out))
 

@@ -118,17 +118,17 @@ def check(
     from toolchain.deployment import FILE_NAME
     from toolchain.models import case_study
 
-    if is_network(path) or case_study.model_path(path).is_file():
+    if (path / FILE_NAME).is_file() and not (path / case_study.FILE_NAME).is_file():
+        for flag in _model_flags(context):
+            raise BuildError(f"{flag} is for a model; {path} is a deployment, which was built with its own")
+        findings = check_deployment(path)
+    elif is_network(path) or case_study.model_path(path).is_file():
         findings = _of_model(path, flags, target, sources)
-    elif not (path / FILE_NAME).is_file():
+    else:
         raise BuildError(
             f"{path} contains neither a model ({case_study.FILE_NAME}) nor a deployment ({FILE_NAME}), and is not a "
             "network's file"
         )
-    else:
-        for flag in _model_flags(context):
-            raise BuildError(f"{flag} is for a model; {path} is a deployment, which was built with its own")
-        findings = check_deployment(path)
     for finding in findings:
         typer.echo(json_text.dumps(asdict(finding)) if json else finding.sentence)
     counts = Counter(finding.severity for finding in findings)

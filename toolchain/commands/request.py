@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 ModelPath: TypeAlias = Annotated[
     Path,
     typer.Argument(
-        help="Folder with model.py, or a network file: .bif, .xmlbif, .uai, .net, .xdsl (.gz).",
+        help="Folder with model.py, a network file (.bif, .xmlbif, .uai, .net, .xdsl; .gz), or an installed model: boat.",
         metavar="MODEL",
     ),
 ]

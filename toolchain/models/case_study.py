@@ -57,10 +57,23 @@ def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
     return model
 
 
+def installed_models() -> dict[str, Path]:
+    """Return the models that are installed with rosbayes, such as `boat`, by name.
+
+    Only the name of their package is known here, because the toolchain imports no case study.
+    """
+    package = importlib.util.find_spec("casestudies")
+    folders = (package and package.submodule_search_locations) or ()
+    return {path.parent.name: path for each in folders for path in sorted(Path(each).glob(f"*/{FILE_NAME}"))}
+
+
 def model_path(case: Path) -> Path:
-    """Return the path of a case study's model: in its folder, or the given file."""
+    """Return the path of a case study's model: in its folder, the given file, or that of an installed model."""
     case = Path(case)
-    return case if case.name == FILE_NAME and case.is_file() else case / FILE_NAME
+    if case.name == FILE_NAME and case.is_file():
+        return case
+    path = case / FILE_NAME
+    return path if path.is_file() else installed_models().get(str(case), path)
 
 
 def existing_model_path(case: Path) -> Path:
@@ -73,8 +86,8 @@ def existing_model_path(case: Path) -> Path:
         elif Path(case).exists():
             what = "is not a model"
         raise ModelError(
-            f"{case} {what}; expected a folder with a {FILE_NAME} that defines model(), or a network file (.bif, "
-            ".xmlbif, .uai, .net or .xdsl, with or without .gz)"
+            f"{case} {what}; expected a folder with a {FILE_NAME} that defines model(), a network file (.bif, "
+            f".xmlbif, .uai, .net or .xdsl, with or without .gz), or one of {', '.join(installed_models())}"
         )
     return path
 

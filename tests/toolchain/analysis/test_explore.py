@@ -174,7 +174,6 @@ def test_lost_frames_count_in_a_sweep():
 
 def test_the_command(case):
     lists = ["--prob-bits", "4,8", "--targets", "15", "--rngs", "lfsr8,lfsr16", "--scales", "address"]
-    pytest.importorskip("matplotlib")
     lists += ["--plot", case.parent / "sweep.png"]
     result = done(run(case, *lists))
     # An LFSR of 8 bits is too narrow for codes of 8: three machines are left.
@@ -206,7 +205,6 @@ def test_a_recording_is_explored(case):
     ("option", "name"), [("-o", "nowhere/r.jsonl"), ("--plot", "nowhere/sweep.png"), ("--plot", "sweep.bmp")]
 )
 def test_an_unwritable_file_is_refused_before_anything_is_measured(case, option, name):
-    pytest.importorskip("matplotlib")
     result = run(case, "--prob-bits", "4", "--targets", "15", option, case.parent / name)
     assert_refused(result, case.parent / name)
     results = case.parent / "r.jsonl"

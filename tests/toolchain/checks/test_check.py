@@ -409,6 +409,14 @@ def test_the_command_as_words_or_json(case):
     assert list(finding.values())[:3] == ["error", "cannot-be-built", "the machine"]
 
 
+def test_a_deployment_is_checked_although_an_installed_model_has_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert toolchain("check", "boat", "--partitions", "4").exit_code == 0
+    build_model(model(), tmp_path / "boat")
+    refused = toolchain("check", "boat", "--partitions", "4")
+    assert (refused.exit_code, "boat is a deployment" in refused.stderr) == (2, True)
+
+
 def test_json_stays_json_when_a_model_prints(case):
     file = case / "model.py"
     text = file.read_text().replace("):\n    return", "):\n    print('a call')\n    return")

@@ -112,8 +112,18 @@ def test_mistakes_in_the_file(case, text, line):
 def test_no_folder_and_no_model(tmp_path):
     with pytest.raises(ModelError, match=r"has no model\.py"):
         load_model(tmp_path, {})
-    with pytest.raises(ModelError, match="does not exist"):
+    with pytest.raises(ModelError, match="does not exist; .* boat, mrclam, sprinkler$"):
         load_model(tmp_path / "nowhere", {})
+
+
+def test_an_installed_model_has_a_name_that_a_folder_with_a_model_takes_over(case, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    boat, small = Path("boat"), {"width": "4", "height": "4"}
+    assert load_model(boat, small).lines == 16
+    boat.mkdir()  # of a deployment, for example
+    assert load_model(boat, small).lines == 16
+    case(MODEL.replace("size: int = 4", "size: int = 5")).joinpath("model.py").rename(boat / "model.py")
+    assert load_model(boat, {}).lines == 5
 
 
 def test_a_module_beside_the_model_can_be_imported_and_nothing_stays_behind(case):
