@@ -3,7 +3,6 @@
 Column order D1, D2, D3, B1, B2, B3; line = y * width + x from the lower left corner.
 """
 
-import math
 from typing import Literal
 
 import numpy as np
@@ -20,7 +19,15 @@ from casestudies.boat.sensors import (
     distance_sigma,
 )
 from toolchain.errors import ModelError
-from toolchain.models import Known, Model, cell_centres, interval, normal, wrapped_normal
+from toolchain.models import (
+    IntegerType,
+    IntervalType,
+    JointDistribution,
+    Question,
+    Symbol,
+    conditional_normal,
+    uniform,
+)
 
 DISTANCE_BITS = 7
 BEARING_BITS = 9
@@ -34,8 +41,8 @@ def model(
     bearing_step: int = 1,
     array: bool = False,
     on_missing: Literal["error", "missing"] = "missing",
-) -> Model:
-    """Return the boat's model; the likelihood of a cell is that of its centre.
+) -> Question:
+    """Return the question: where is the boat, given what it measures? The likelihood of a cell is that of its centre.
 
     Args:
         width: Cells along x; the thesis ran 32 and describes 64.
@@ -54,38 +61,23 @@ def model(
         raise ModelError(f"distance_step is {distance_step}, expected 1 to {LONGEST_DISTANCE}")
     if bearing_step < 1 or TURN % bearing_step:
         raise ModelError(f"bearing_step is {bearing_step}, expected a number of degrees that divides {TURN}")
-    rows = interval("y", MAP_LOW, MAP_HIGH, cells=height)
-    columns = interval("x", MAP_LOW, MAP_HIGH, cells=width)
-    y, x = cell_centres(rows, columns)
+    y = Symbol("y", IntervalType(MAP_LOW, MAP_HIGH, height))
+    x = Symbol("x", IntervalType(MAP_LOW, MAP_HIGH, width))
     path = {name: f"data[{place}]" if array else "" for place, name in enumerate(SENSOR_NAMES)}
-    known: list[Known] = []
+    distance_type = IntegerType(0, LONGEST_DISTANCE // distance_step, scale=distance_step, unit="m")
+    bearing_type = IntegerType(0, TURN // bearing_step - 1, wraps=True, scale=bearing_step, unit="deg")
+    north, east = y.values()[:, np.newaxis], x.values()
+    factors = [uniform(y), uniform(x)]
     for name, (beacon_x, beacon_y) in zip(DISTANCE_NAMES, BEACONS, strict=True):
-        true_distance = np.hypot(x - beacon_x, y - beacon_y)
-        known.append(
-            normal(
-                name,
-                mean=true_distance,
-                sigma=np.array([distance_sigma(d) for d in true_distance.tolist()]),
-                values=math.floor(LONGEST_DISTANCE / distance_step) + 1,
-                step=distance_step,
-                unit="m",
-                bits=DISTANCE_BITS,
-                path=path[name],
-                on_missing=on_missing,
-            )
+        distance = Symbol(
+            name, distance_type, path[name], DISTANCE_BITS, on_range="clamp", on_missing=on_missing
+        )
+        away = np.hypot(east - beacon_x, north - beacon_y)
+        factors.append(
+            conditional_normal(distance, [y, x], mean=away, sigma=np.vectorize(distance_sigma)(away))
         )
     for name, (beacon_x, beacon_y) in zip(BEARING_NAMES, BEACONS, strict=True):
-        known.append(
-            wrapped_normal(
-                name,
-                mean=np.degrees(np.arctan2(y - beacon_y, x - beacon_x)),
-                sigma=BEARING_SIGMA,
-                values=TURN // bearing_step,
-                step=bearing_step,
-                unit="deg",
-                bits=BEARING_BITS,
-                path=path[name],
-                on_missing=on_missing,
-            )
-        )
-    return Model(name="boat", searched=(rows, columns), known=tuple(known))
+        bearing = Symbol(name, bearing_type, path[name], BEARING_BITS, on_missing=on_missing)
+        direction = np.degrees(np.arctan2(north - beacon_y, east - beacon_x))
+        factors.append(conditional_normal(bearing, [y, x], mean=direction, sigma=BEARING_SIGMA))
+    return JointDistribution("boat", tuple(factors)).ask(searched=[y, x], known=SENSOR_NAMES)

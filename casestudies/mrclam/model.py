@@ -13,7 +13,15 @@ import numpy as np
 from toolchain.errors import ModelError
 from toolchain.learning.fitted import with_fit
 from toolchain.learning.recording import read_recording
-from toolchain.models import Known, Model, cell_centres, interval, normal, wrapped_normal
+from toolchain.models import (
+    IntegerType,
+    IntervalType,
+    JointDistribution,
+    Model,
+    Symbol,
+    conditional_normal,
+    uniform,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,33 +84,23 @@ def model(
         raise ModelError(
             f"bearing_values is {bearing_values}, expected the number of bearings in a turn, from 1"
         )
-    rows = interval("y", *Y_LIMITS, cells=height, unit="m")
-    columns = interval("x", *X_LIMITS, cells=width, unit="m")
-    y, x = cell_centres(rows, columns)
-    known: list[Known] = []
+    y = Symbol("y", IntervalType(*Y_LIMITS, height, unit="m"))
+    x = Symbol("x", IntervalType(*X_LIMITS, width, unit="m"))
+    range_type = IntegerType(0, range_values - 1, scale=range_step, unit="m")
+    bearing_type = IntegerType(
+        0, bearing_values - 1, wraps=True, scale=2 * np.pi / bearing_values, unit="rad"
+    )
+    north, east = y.values()[:, np.newaxis], x.values()
+    factors, known = [uniform(y), uniform(x)], []
     for landmark in read_landmarks(landmarks):
-        known.append(
-            normal(
-                f"range_{landmark.number}",
-                mean=np.hypot(landmark.x - x, landmark.y - y),
-                sigma=RANGE_SIGMA,
-                values=range_values,
-                step=range_step,
-                unit="m",
-                floor=floor,
-                on_missing="missing",
-            )
-        )
-        known.append(
-            wrapped_normal(
-                f"bearing_{landmark.number}",
-                mean=np.arctan2(landmark.y - y, landmark.x - x),
-                sigma=BEARING_SIGMA,
-                values=bearing_values,
-                step=2 * np.pi / bearing_values,
-                unit="rad",
-                floor=floor,
-                on_missing="missing",
-            )
-        )
-    return with_fit(Model(name="mrclam", searched=(rows, columns), known=tuple(known)), fit)
+        up, right = landmark.y - north, landmark.x - east
+        away = Symbol(f"range_{landmark.number}", range_type, on_range="clamp", on_missing="missing")
+        bearing = Symbol(f"bearing_{landmark.number}", bearing_type, on_missing="missing")
+        known += [away, bearing]
+        for symbol, mean, sigma in (
+            (away, np.hypot(right, up), RANGE_SIGMA),
+            (bearing, np.arctan2(up, right), BEARING_SIGMA),
+        ):
+            factors.append(conditional_normal(symbol, [y, x], mean=mean, sigma=sigma, floor=floor))
+    question = JointDistribution("mrclam", tuple(factors)).ask(searched=[y, x], known=known)
+    return with_fit(question.model(), fit)

@@ -69,7 +69,7 @@ async def test_frames_are_as_good_as_float64_fusion(stage, whole_boat, tmp_path)
     readings = {stamp_of(each): each for each in messages["/boat/sensors"]}
     variables = load_deployment(whole_boat, images=False).variables
     assert [variable.name for variable in variables] == list(SENSOR_NAMES)
-    model = boat_model()
+    model = boat_model().model()
     grid = map_grid()
     dimensions = messages["/BMresults"][0]["layout"]["dim"]
     assert [tuple(each.values()) for each in dimensions] == [("y", 32, 1024), ("x", 32, 32)]
@@ -200,7 +200,7 @@ async def test_the_posterior_follows_what_is_done_to_the_world(stage, tmp_path):
     """A sensor is unplugged, the boat is dragged, and a beacon fails, by another client of the same hub."""
     _, uri = await stage.hub()
     deployment = build_boat(tmp_path / "deployment", cells=16)
-    model, grid = boat_model(16, 16), map_grid(16, 16)
+    model, grid = boat_model(16, 16).model(), map_grid(16, 16)
     environment = {"PYTHONPATH": str(ROOT)}
 
     async def do(name, message):

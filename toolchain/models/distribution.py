@@ -33,13 +33,16 @@ def _is_whole(number: object) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class IntegerType:
-    """The whole numbers `low` to `high`; with `wraps` they are on a circle, and `high` is adjacent to `low`."""
+    """The whole numbers `low` to `high`, each times `scale`; a reading in between counts as the nearest.
+
+    With `wraps` they are on a circle, and `high` is adjacent to `low`.
+    """
 
     low: int
     high: int
     wraps: bool = False
     unit: str = ""
-    step: ClassVar[float] = 1.0
+    scale: float = 1.0
     labels: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
@@ -47,6 +50,8 @@ class IntegerType:
             raise ModelError(f"an integer type from {self.low!r} to {self.high!r}: expected whole numbers")
         if self.high < self.low:
             raise ModelError(f"an integer type from {self.low} to {self.high} has no values")
+        if not 0 < self.scale < math.inf:
+            raise ModelError(f"an integer type with a scale of {self.scale:g}: expected a positive number")
 
     @property
     def size(self) -> int:
@@ -56,7 +61,12 @@ class IntegerType:
     @property
     def offset(self) -> float:
         """The first value."""
-        return float(self.low)
+        return self.low * self.scale
+
+    @property
+    def step(self) -> float:
+        """Difference between adjacent values."""
+        return self.scale
 
 
 @dataclass(frozen=True, slots=True)

@@ -296,8 +296,9 @@ def without_idle(factor: Factor) -> Factor:
     """Return the factor without symbols on which its values do not depend."""
     scope, table = list(factor.scope), factor.table
     for axis in range(len(scope) - 1, 0, -1):
-        first = np.take(table, [0], axis=axis)
-        if np.array_equal(np.broadcast_to(first, table.shape), table):
+        first, last = np.take(table, [0], axis=axis), np.take(table, [-1], axis=axis)
+        # most tables differ here already, and large ones need no further look
+        if np.array_equal(first, last) and np.array_equal(np.broadcast_to(first, table.shape), table):
             table = first.squeeze(axis=axis)
             del scope[axis]
     if isinstance(factor, Distribution):

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
 from operator import itemgetter
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ from toolchain.models.model import (
 from toolchain.models.network import NetworkModel, network_model
 
 Named: TypeAlias = Symbol | str
+_ROUNDING: Final = 1e-12
+"""Largest difference from 1 that the rounding of a distribution's sum explains."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +275,7 @@ class Question:
             name: product(terms, (name, *searched), sizes).reshape(sizes[name], -1)
             for name, terms in own.items()
         }
-        sums = {name: table.sum(axis=0) for name, table in tables.items()}
+        sums = {name: _sums(table) for name, table in tables.items()}
         prior = _scaled(weight)
         for total in sums.values():
             prior = _scaled(prior * total)
@@ -320,13 +322,22 @@ class Question:
         return Normal(mean=mean, sigma=sigma, floor=factor.normal.floor, outliers=factor.normal.outliers)
 
 
+def _sums(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum of each line, float64[lines], as exactly 1 where only rounding keeps it from that."""
+    sums: NDArray[np.float64] = table.sum(axis=0)
+    sums[np.abs(sums - 1) < _ROUNDING] = 1
+    return sums
+
+
 def _given_line(
     together: NDArray[np.float64], total: NDArray[np.float64], prior: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return P(K | S) from any multiple of it, float64[values, lines].
 
-    An impossible line gets P(K), which does not change the codes of other lines.
+    An impossible line gets P(K), which does not change the codes of other lines. A distribution stays as it is, to the bit.
     """
+    if np.all(total == 1):
+        return together
     safe = np.where(total > 0, total, 1)
     table: NDArray[np.float64] = together / safe
     marginal = table @ np.where(total > 0, prior, 0)

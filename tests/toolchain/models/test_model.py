@@ -225,6 +225,7 @@ def numbers(type_):
     ("type_", "expected"),
     [
         (IntegerType(-1, 2), [-1, 0, 1, 2]),
+        (IntegerType(-1, 2, scale=0.05), [-0.05, 0, 0.05, 0.1]),
         (IntervalType(0, 10, 4), [1.25, 3.75, 6.25, 8.75]),
         (LabelType("low", "middle", "high"), [0, 1, 2]),
         (LabelType("10", "20", "30"), [10, 20, 30]),
@@ -274,6 +275,7 @@ def test_a_label_is_its_value_or_the_labels_are_listed():
     [
         lambda: IntegerType(3, 2),
         lambda: IntegerType(0, 3.5),
+        lambda: IntegerType(0, 3, scale=0.0),
         lambda: IntervalType(0, 1, 4.0),
         lambda: IntervalType(1, 1, 3),
         lambda: IntervalType(0, 1, 0),
