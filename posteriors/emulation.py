@@ -2,15 +2,113 @@
 
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from posteriors.errors import LabelError, PosteriorError
 from posteriors.posterior import Posterior
 from toolchain.bounded_files import nearest_name
-from toolchain.deployment import Variable, load_deployment
+from toolchain.deployment import Deployment, Variable, load_deployment
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from toolchain.models import Model, Question
 
 
-def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int = 0) -> Posterior:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class EmulatedPosterior(Posterior):
+    """A posterior of `posterior`, which can be compared with the exact one for the same readings."""
+
+    deployment: Deployment = field(compare=False)
+    addresses: tuple[int | None, ...]
+    """The reading of each variable of the deployment; None without one."""
+
+    def exact(self, model: "Path | str | Model | Question | None" = None, **settings: object) -> Posterior:
+        """Return the exact posterior for the same readings, by inference in float64.
+
+        Args:
+            model: The model from which the deployment was built: a folder with `model.py`, a network file, or what these
+                give. Without it, the result is that of the rounded probabilities in the machine's memories, which differ
+                from the model by what quantising lost; only a BM1 has these.
+            settings: Parameters of `model()`, as `--set` gave them to the build.
+
+        Returns:
+            The posterior, whose `details` say of what it is: `exact` is `model` or `codes`.
+
+        Raises:
+            PosteriorError: The deployment is that of a BM2, and there is no model.
+            ToolchainError: The model has an error, or the deployment was not built from it.
+        """
+        what = "codes" if model is None else "model"
+        values = self._of_codes() if model is None else self._of_model(model, settings)
+        return Posterior(
+            probabilities=tuple(values.tolist()),
+            labels=self.labels,
+            sizes=self.sizes,
+            dimensions=self.dimensions,
+            heard_ns=self.heard_ns,
+            details={"exact": what},
+        )
+
+    def _of_codes(self) -> "NDArray[np.float64]":
+        from machines.encode import decode_code
+        from toolchain.analysis.emulation import joined
+        from toolchain.building.build import read_images
+        from toolchain.models.model import fuse
+
+        if not self.deployment.machine.is_divided:
+            raise PosteriorError(
+                "the codes of a BM2 are odds of single bits, which have no exact posterior: name the model, such as "
+                "exact('clinic.bif')"
+            )
+        whole = joined([image.machine for image in read_images(self.deployment)])
+        addresses, row = self.deployment.machine_addresses(self.addresses)
+        codes = [whole.prior[row]]
+        codes += [table[at] for table, at in zip(whole.tables, addresses, strict=True) if at is not None]
+        prior, *likelihoods = (decode_code(each, whole.parameters.prob_bits) for each in codes)
+        return fuse(prior, likelihoods)
+
+    def _of_model(
+        self, model: "Path | str | Model | Question", settings: Mapping[str, object]
+    ) -> "NDArray[np.float64]":
+        from toolchain.analysis.chain_inspection import check_same
+        from toolchain.analysis.emulation import joined
+        from toolchain.analysis.inspection import losses_of
+        from toolchain.building.build import read_images
+        from toolchain.building.choice import network_for
+        from toolchain.models.case_study import load_question
+        from toolchain.models.joint import Question
+        from toolchain.models.model import exact_posterior
+        from toolchain.networks import is_network, read_network
+
+        deployment, machines = self.deployment, [image.machine for image in read_images(self.deployment)]
+        select = deployment.prior_select
+        source = model
+        if isinstance(source, str | Path):
+            if is_network(Path(source)):
+                known = [variable.name for variable in deployment.sensors]
+                source = read_network(Path(source)).ask(
+                    self.labels, known, prior_select=None if select is None else select.name
+                )
+            else:
+                source = load_question(Path(source), {key: str(value) for key, value in settings.items()})
+        if not deployment.machine.is_divided:
+            network = network_for(source)
+            check_same(deployment, machines[0], network)
+            return network.exact(self.addresses)
+        fusion = source.model() if isinstance(source, Question) else source
+        bits = {variable.name: variable.bits for variable in deployment.variables}
+        known_bits = [replace(known, bits=bits.get(known.name, known.bits)) for known in fusion.known]
+        losses_of(deployment, joined(machines), replace(fusion, known=tuple(known_bits)))
+        addresses, _ = deployment.machine_addresses(self.addresses)
+        row = None if select is None else self.addresses[deployment.variables.index(select)]
+        return exact_posterior(fusion, addresses, prior_address=row)
+
+
+def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int = 0) -> EmulatedPosterior:
     """Run the machines of a deployment, without boards, processes or a rosbridge server.
 
     Args:
@@ -20,7 +118,7 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
         bank: Set of seeds; each gives another draw of the same distribution.
 
     Returns:
-        The posterior in the shape of the model, with its labels; `report` is None.
+        The posterior in the shape of the model, with its labels and units; `report` is None.
 
     Raises:
         LabelError: The deployment has no variable of this name.
@@ -53,9 +151,10 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
         # every machine can do without a reading; `on_missing` is about messages that lack one by mistake
         return None if value is None else to_address(variable, value)
 
-    addresses, row = deployment.machine_addresses(map(address, deployment.variables))
+    addresses = tuple(map(address, deployment.variables))
+    columns, row = deployment.machine_addresses(addresses)
     frame = FrameInput(
-        addresses=addresses,
+        addresses=columns,
         prior_address=row,
         target_count=deployment.machine.target_count,
         max_cycles=deployment.machine.max_cycles,
@@ -63,10 +162,13 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
     )
     machines = [read_image(deployment.image_path(board)).machine for board in range(len(deployment.boards))]
     values, details = deployment.machine.kind.posterior(machines, frame, deployment.machine.variables)
-    return Posterior(
+    return EmulatedPosterior(
         probabilities=tuple(values.tolist()),
         labels=tuple(dimension.label for dimension in deployment.searched),
         sizes=tuple(dimension.size for dimension in deployment.searched),
+        dimensions=deployment.searched,
         heard_ns=time.time_ns(),
         details=details,
+        deployment=deployment,
+        addresses=addresses,
     )

@@ -1,15 +1,17 @@
-"""`/BMresults`: posteriors as labelled arrays, and their conversion from and to messages."""
+"""Posteriors as labelled arrays, shown in notebooks, and their conversion from and to messages on `/BMresults`."""
 
 import base64
 import difflib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from pydantic import Field, FiniteFloat, NonNegativeInt, TypeAdapter
 
+from posteriors.axes import Axis, deployment_axes, in_words, printable
 from posteriors.errors import BadResultError, LabelError
 from posteriors.frame_report import FrameReport, StageTimes
 from posteriors.messages import Part, validated
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from toolchain.deployment import Deployment
+    from toolchain.deployment import Deployment, Dimension
 
 RESULTS_TOPIC: Final = "/BMresults"
 RESULTS_TYPE: Final = "std_msgs/Float64MultiArray"
@@ -35,16 +37,12 @@ _MAX_DIMENSIONS: Final = 32
 """Limit of NumPy."""
 
 
-def reading_order(labels: Sequence[str]) -> list[int]:
-    """Return the places of labels in the order in which a person reads them: x before y, whatever the array's order."""
-    coordinates = [at for at, label in enumerate(labels) if label.lower() in {"x", "y", "z"}]
-    moved = dict(zip(coordinates, sorted(coordinates, key=lambda at: labels[at].lower()), strict=True))
-    return [moved.get(at, at) for at in range(len(labels))]
-
-
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Posterior:
-    """A posterior: a probability for each cell of the searched variables' grid, with the data of its frame."""
+    """A posterior: a probability for each cell of the searched variables' grid, with the data of its frame.
+
+    A notebook shows it as a table with bars or a map.
+    """
 
     probabilities: tuple[float, ...]
     """Row-major over the labelled dimensions, the first slowest; they sum to 1. If the first label is
@@ -61,6 +59,8 @@ class Posterior:
     """Its `/bm/frame`; None if that was lost."""
     details: Mapping[str, str] = field(default_factory=dict)
     """Statistics of a BM2's samples, by their keys in `/bm/frame`; empty for a BM1."""
+    dimensions: "tuple[Dimension, ...]" = ()
+    """Units and names of states of the labels; empty if the deployment is not known (`with_units`)."""
 
     @cached_property
     def values(self) -> "NDArray[np.float64]":
@@ -86,7 +86,39 @@ class Posterior:
         own = self.probabilities[at * each : (at + 1) * each]
         if not any(own):
             raise LabelError(f"replica {at} has no posterior in this frame: all its counts are 0")
-        return replace(self, probabilities=own, labels=self.labels[1:], sizes=self.sizes[1:])
+        return replace(
+            self,
+            probabilities=own,
+            labels=self.labels[1:],
+            sizes=self.sizes[1:],
+            dimensions=self.dimensions[1:],
+        )
+
+    def with_units(self, deployment: "Deployment | Path | str") -> "Posterior":
+        """Return this posterior with the units and states of the deployment that publishes it, or of that folder.
+
+        Raises:
+            LabelError: Its dimensions are others.
+            ToolchainError: There is no deployment in the folder.
+        """
+        from toolchain.deployment import Deployment, load_deployment
+
+        if not isinstance(deployment, Deployment):
+            deployment = load_deployment(Path(deployment), images=False)
+        ours = [(axis.label, axis.size) for axis in deployment_axes(deployment)]
+        # another deployment's values would be shown with plausible units
+        if (theirs := list(zip(self.labels, self.sizes, strict=True))) != ours:
+            raise LabelError(
+                f"the received posterior has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}; "
+                "name the deployment that publishes them"
+            )
+        return replace(self, dimensions=deployment.result_dimensions)
+
+    @property
+    def axes(self) -> list[Axis]:
+        """The dimensions, with units and names of states if they are known."""
+        known = self.dimensions or (None,) * len(self.labels)
+        return [Axis(*each) for each in zip(self.labels, self.sizes, known, strict=True)]
 
     @property
     def number(self) -> int | None:
@@ -150,6 +182,46 @@ class Posterior:
             means[label] = float(marginal / marginal.sum() @ range(size))
         return means
 
+    def best_value(self) -> dict[str, float | str]:
+        """Return the most probable cell as a value in its unit, or the name of a state, for each label.
+
+        Raises:
+            LabelError: The deployment is not known.
+        """
+        best = self.best()
+        return {axis.label: axis.value(best[axis.label]) for axis in self._known_axes()}
+
+    def mean_value(self) -> dict[str, float | str]:
+        """Return the mean in its unit for each label without names of states; a LabelError as for `best_value`."""
+        mean = self.mean()
+        return {
+            axis.label: axis.value(mean[axis.label]) for axis in self._known_axes() if not axis.has_states
+        }
+
+    def _known_axes(self) -> list[Axis]:
+        if not self.dimensions:
+            raise LabelError(
+                "the units of this posterior are not known: use best() and mean(), which are indices, or with_units(FOLDER) with the folder of its deployment"
+            )
+        return self.axes
+
+    @property
+    def entropy(self) -> float:
+        """Entropy in bits: 0 if one cell is certain, log2 of the number of cells if all are alike."""
+        import numpy as np
+
+        likely = self.values[self.values > 0] / self.values.sum()
+        return float(-(likely * np.log2(likely)).sum()) + 0.0  # without it, certainty is -0.0
+
+    def total_variation(self, other: "Posterior") -> float:
+        """Return half the sum of the absolute differences, 0 to 1; a LabelError if the dimensions differ."""
+        import numpy as np
+
+        ours, theirs = (list(zip(each.labels, each.sizes, strict=True)) for each in (self, other))
+        if ours != theirs:
+            raise LabelError(f"the posteriors have different dimensions: {_grid(ours)} and {_grid(theirs)}")
+        return float(np.abs(self.values - other.values).sum() / 2)
+
     def marginal(self, *labels: str) -> "NDArray[np.float64]":
         """Return the marginal posterior of some of the searched variables, without repetition.
 
@@ -184,12 +256,59 @@ class Posterior:
             line = line * size + index
         return self.probabilities[line]
 
+    def __repr__(self) -> str:
+        best = f"{in_words(self.axes, self.best())} with {self.probability:.3g}"
+        return f"<Posterior over {' x '.join(map(str, self.sizes))} cells: most probable {best}>"
+
+    def _repr_html_(self) -> str:
+        """Return the table and the picture that a notebook shows."""
+        from posteriors.showing import as_html
+
+        if self.replicas > 1:
+            return f"<p>{self.replicas} replicas, each with a posterior: replica(0) returns the first</p>"
+        facts = [
+            f"probability of the most probable cell: {self.probability:.4g}",
+            f"entropy: {self.entropy:.2f} of {math.log2(len(self.probabilities)):.2f} bits",
+        ]
+        if self.number is not None:
+            facts.append(f"frame {self.number}")
+        if self.cycles is not None:
+            facts.append(f"{self.cycles:,} cycles")
+        facts += [
+            f"{printable(key).replace('_', ' ')}: {printable(text)}" for key, text in self.details.items()
+        ]
+        return as_html(self.axes, self.values, facts)
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw bars for one dimension, or a map of the two longest, over which the others are summed out.
+
+        Args:
+            axes: matplotlib's Axes to draw in; without them, pyplot makes a figure, which a notebook shows.
+
+        Returns:
+            The Axes.
+
+        Raises:
+            LabelError: These are the posteriors of several replicas.
+        """
+        from posteriors.showing import draw
+
+        if self.replicas > 1:
+            raise LabelError(
+                f"these are the posteriors of {self.replicas} replicas: draw one, such as replica(0).plot()"
+            )
+        return draw(self.axes, self.values, axes)
+
     def _dimension(self, label: str) -> int:
         if label in self.labels:
             return self.labels.index(label)
         near = difflib.get_close_matches(label, self.labels, 1, 0.5)
         hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(self.labels)}"
         raise LabelError(f"the posterior has no variable {label!r}; {hint}")
+
+
+def _grid(dimensions: Iterable[tuple[str, int]]) -> str:
+    return " x ".join(f"{printable(label)} {size}" for label, size in dimensions)
 
 
 def posterior_layout(deployment: "Deployment") -> dict[str, Any]:

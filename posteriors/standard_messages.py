@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
 import numpy as np
 
 from bridge.stamps import header, stamp
-from posteriors.posterior import REPLICA, reading_order
+from posteriors.axes import reading_order
+from posteriors.posterior import REPLICA
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,9 +1,15 @@
 """Pictures: matplotlib without a display."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from terminal.errors import OutputError
+
+VIRIDIS: Final = (
+    *((68, 1, 84), (72, 36, 117), (64, 67, 135), (52, 94, 141), (41, 120, 142), (32, 144, 140)),
+    *((34, 167, 132), (68, 190, 112), (121, 209, 81), (189, 222, 38), (253, 231, 36)),
+)
+"""The colour map in eleven steps."""
 
 
 def new_figure(width: float, height: float) -> Any:

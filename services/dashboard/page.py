@@ -18,11 +18,11 @@ from fastapi import FastAPI, Response, WebSocket, WebSocketDisconnect
 from nicegui import ui
 from nicegui.element import Element
 
+from posteriors.axes import printable
 from services.dashboard.feed import STAGES, Feed
 from services.dashboard.robot import Robot
 from services.dashboard.saving import archive, same_shape, table
 from services.dashboard.view import View, choices, packed
-from services.output.axes import printable
 from terminal.signals import until_one_ends
 
 _STATS_EVERY: Final = 0.5

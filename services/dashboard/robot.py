@@ -16,12 +16,12 @@ from bridge.client import Publication, Ros, connect
 from bridge.discovery import announced_uri
 from bridge.errors import BridgeError, NotRosbridgeError, TopicLeftOutError, UnreachableError
 from bridge.stamps import header
+from posteriors.axes import Axis, deployment_axes, state_in_words
 from posteriors.errors import BadResultError
 from posteriors.listening import posteriors
 from posteriors.posterior import MAX_RESULT, SAMPLES_TOPIC, SAMPLES_TYPE, Posterior, read_samples
 from posteriors.standard_messages import pose_at
 from services.dashboard.feed import Feed, Frame
-from services.output.axes import Axis, deployment_axes, state_in_words
 from services.settings import Settings
 from services.sockets.records import Outcome
 from services.sockets.status import ask_stack

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from posteriors.axes import Axis
 from services.dashboard.feed import Frame
-from services.output.axes import Axis
 from services.output.posterior_file import cell_names
 
 _NOT_KNOWN = -1

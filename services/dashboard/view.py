@@ -16,10 +16,10 @@ from typing import Any, Final
 import numpy as np
 import orjson
 
+from posteriors.axes import Axis
 from posteriors.frame_report import FrameReport
 from posteriors.standard_messages import moments
 from services.dashboard.feed import Feed, Frame
-from services.output.axes import Axis
 
 _LENGTH: Final = struct.Struct("<I")
 _NO_REPORT: Final = FrameReport(stamp_ns=0, outcome="posterior without a report")

@@ -9,12 +9,12 @@ from collections.abc import Coroutine, Iterable
 from pathlib import Path
 from typing import Any
 
+from posteriors.axes import deployment_axes
 from services.child import Child, end_all
 from services.errors import NoDataError, StackError
 from services.master.command_lines import dashboard_command
 from services.master.flow import FrameFlow
 from services.master.peers import ROLE, Peer, Peers
-from services.output.axes import deployment_axes
 from services.output.master_output import posterior_of, print_json, sentence
 from services.output.posterior_output import Show, drawing
 from services.settings import Settings

@@ -4,11 +4,11 @@ from typing import Final
 
 from bridge.client import connect
 from bridge.discovery import announced_uri
-from posteriors.errors import BadResultError, NoResultError
+from posteriors.axes import Axis
+from posteriors.errors import BadResultError, LabelError, NoResultError
 from posteriors.listening import posteriors
 from posteriors.posterior import MAX_RESULT, Posterior
 from services.errors import SettingsError
-from services.output.axes import Axis, axes_of
 from services.output.posterior_file import ResultFile
 from services.output.posterior_output import Show
 from services.settings import Settings
@@ -83,8 +83,8 @@ async def show_frames(
                 if isinstance(one, Posterior):
                     taken += 1
                     try:
-                        axes = axes_of(one, deployment)
-                    except ValueError as error:
+                        axes = (one if deployment is None else one.with_units(deployment)).axes
+                    except LabelError as error:
                         raise SettingsError(str(error)) from error
                 # saved first: the reader of standard output may end this command
                 if file is not None:

@@ -3,9 +3,9 @@
 import time
 from collections.abc import Sequence
 
+from posteriors.axes import Axis, deployment_axes, in_words
 from posteriors.posterior import Posterior
 from services.errors import StackError
-from services.output.axes import Axis, deployment_axes, in_words
 from services.pipeline.inference import infer, report_of
 from services.sockets.records import Publish, Published
 from terminal.output import print_json_line

@@ -13,10 +13,10 @@ from typing import Any, Final
 
 import orjson
 
+from posteriors.axes import Axis
 from posteriors.pairing import FrameOutcome
 from posteriors.posterior import Posterior
 from services.errors import SettingsError
-from services.output.axes import Axis
 
 MOST_NUMBERS: Final = 1 << 26
 """Maximum number of probabilities in an archive (512 MiB), because it stays in memory until it is written."""

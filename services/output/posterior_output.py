@@ -12,13 +12,14 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
 
+from posteriors.axes import Axis, in_words, printable
 from posteriors.errors import LabelError
 from posteriors.pairing import FrameOutcome
 from posteriors.posterior import Posterior
-from services.output.axes import Axis, in_words, printable
 from services.output.posterior_file import record
 from terminal.one_line import one_line
 from terminal.output import print_json_line
+from terminal.pictures import VIRIDIS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,12 +36,6 @@ ROWS: Final = 32
 WIDTH: Final = 160
 """Maximum width in characters."""
 _SHADES: Final = " .:-=+*#%@"
-_COLOURS: Final = (
-    *((68, 1, 84), (72, 36, 117), (64, 67, 135), (52, 94, 141), (41, 120, 142), (32, 144, 140)),
-    *((34, 167, 132), (68, 190, 112), (121, 209, 81), (189, 222, 38), (253, 231, 36)),
-)
-"""Viridis in eleven steps."""
-
 Show = Callable[[FrameOutcome, list[Axis]], None]
 """Function that shows a frame; the axes are those of its posterior."""
 
@@ -220,5 +215,5 @@ def _range(axis: Axis, first: int, last: int) -> str:
 
 
 def _style(share: float) -> str:
-    red, green, blue = _COLOURS[round(share * (len(_COLOURS) - 1))]
+    red, green, blue = VIRIDIS[round(share * (len(VIRIDIS) - 1))]
     return f"on rgb({red},{green},{blue})"

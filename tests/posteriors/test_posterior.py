@@ -106,6 +106,19 @@ class TestPosterior:
             with pytest.raises(LabelError):
                 posterior.at(cell)
 
+    def test_values_need_the_deployment(self):
+        posterior = made([[1, 3]], ("y", "x"))
+        for values in (posterior.best_value, posterior.mean_value):
+            with pytest.raises(LabelError, match="with_units"):
+                values()
+
+    def test_entropy_and_total_variation(self):
+        even, sure = made([1, 1, 1, 1], ("x",)), made([0, 1, 0, 0], ("x",))
+        assert (even.entropy, sure.entropy) == (2.0, 0.0)
+        assert (even.total_variation(even), even.total_variation(sure)) == (0.0, 0.75)
+        with pytest.raises(LabelError):
+            even.total_variation(made([1, 1, 1, 1], ("y",)))
+
     def test_its_report_tells_its_frame_and_its_times_where_clocks_agree(self):
         bare = made([1, 1], ("x",))
         assert (bare.number, bare.stamp_ns, bare.cycles) == (None, None, None)

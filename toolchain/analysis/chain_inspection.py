@@ -120,7 +120,7 @@ def inspect_chain(
         drawn = np.random.default_rng(options.seed).integers(0, sizes, (frames, len(sizes)))
         readings, exact = [tuple(each) for each in drawn.tolist()], None
     else:
-        _check_same(deployment, machine, model)
+        check_same(deployment, machine, model)
         source = f"{frames} frames drawn from the model (seed {options.seed})"
         readings = drawn_readings(model, frames, options.seed)
         exact = chain_error(machine, model, samples=limits.target_count)
@@ -144,7 +144,7 @@ def inspect_chain(
     )
 
 
-def _check_same(deployment: Deployment, machine: BM2Machine, model: NetworkModel) -> None:
+def check_same(deployment: Deployment, machine: BM2Machine, model: NetworkModel) -> None:
     """Raise a BuildError if the codes of the model are not those of the deployment."""
     p = machine.parameters
     place = {name: at for at, name in enumerate(model.names)}.__getitem__

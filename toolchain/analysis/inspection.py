@@ -60,7 +60,7 @@ def inspect_deployment(
     device = device_named(options.device)
     machines = tuple(image.machine for image in read_images(deployment))
     whole = joined(machines)
-    losses = None if model is None else _losses(deployment, whole, model)
+    losses = None if model is None else losses_of(deployment, whole, model)
     readings = _readings(deployment, whole, model, options)
     section = deployment.machine
     boards = EmulatedBoards(
@@ -89,8 +89,8 @@ def inspect_deployment(
     )
 
 
-def _losses(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[ColumnLoss, ...]:
-    """Return the quantisation loss of the model, after checking that its codes are those of the deployment."""
+def losses_of(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[ColumnLoss, ...]:
+    """Return the quantisation loss of the model, or raise a BuildError if its codes are not those of the deployment."""
     if model.lines == deployment.machine.lines and len(model.known) == whole.parameters.sensors:
         quantised = quantise(
             model,

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from posteriors.axes import Axis, deployment_axes
 from posteriors.frame_report import VariableReading
 from services.dashboard.feed import Feed
 from services.dashboard.saving import archive, same_shape, table
 from services.dashboard.view import View, choices, default_labels
-from services.output.axes import Axis, deployment_axes
 from tests.services.dashboard.frames import posterior, report
 from toolchain.deployment import Dimension
 

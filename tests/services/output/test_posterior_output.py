@@ -13,11 +13,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from posteriors.axes import Axis
+from posteriors.errors import LabelError
 from posteriors.frame_report import FrameReport, VariableReading
 from posteriors.posterior import Posterior
 from services.errors import SettingsError
 from services.output import posterior_file
-from services.output.axes import Axis, axes_of
 from services.output.master_output import print_json, sentence
 from services.output.posterior_file import open_result_file, record
 from services.output.posterior_output import ROWS, drawing, line, picture
@@ -66,6 +67,10 @@ def made(values, *labels, number=7):
     )
 
 
+def axes_of(posterior, deployment):
+    return (posterior.with_units(deployment) if deployment else posterior).axes
+
+
 EMPTY = FrameReport(
     stamp_ns=9, heard_ns=0, outcome="no posterior: impossible", number=8, published=False, missing=("D2",)
 )
@@ -104,7 +109,7 @@ class TestLine:
         assert len(line(made([1, 3], "x" * 500), axes_of(made([1, 3], "x" * 500), None))) < 200
 
     def test_a_posterior_of_another_deployment(self):
-        with pytest.raises(ValueError, match="deployment of"):
+        with pytest.raises(LabelError, match="deployment of"):
             axes_of(made([[1, 0], [0, 0]], "y", "x"), GRID)
 
 

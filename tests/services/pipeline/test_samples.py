@@ -15,13 +15,13 @@ from machines.bm2_kind import BM2
 from machines.errors import MachineError
 from machines.kind import FrameInput
 from posteriors import posterior
+from posteriors.axes import Axis
 from posteriors.frame_report import read_frame_report
 from posteriors.pairing import Pairing
 from posteriors.posterior import read_posterior, read_samples
 from services.boards.deployed import images_of
 from services.boards.frames import decode_boards, result_record
 from services.errors import InputLineError
-from services.output.axes import Axis
 from services.output.posterior_file import record
 from services.output.posterior_output import line
 from services.pipeline.frames import FrameAssembler

@@ -1,11 +1,11 @@
-"""Dimensions of posteriors with units and names of states, and cells in words, for all commands."""
+"""Dimensions of posteriors with units and names of states, and cells in words."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
-from posteriors.posterior import Posterior, reading_order
-from toolchain.deployment import Deployment, Dimension
+if TYPE_CHECKING:
+    from toolchain.deployment import Deployment, Dimension
 
 _LABEL: Final = 24
 
@@ -16,7 +16,7 @@ class Axis:
 
     label: str
     size: int
-    dimension: Dimension | None = None
+    dimension: "Dimension | None" = None
 
     @property
     def unit(self) -> str:
@@ -45,24 +45,16 @@ class Axis:
         return f"{value:.6g} {self.unit}".rstrip()
 
 
-def axes_of(posterior: Posterior, deployment: Deployment | None) -> list[Axis]:
-    """Return the dimensions of a received posterior; a ValueError if they differ from the deployment's."""
-    if deployment is None:
-        return [Axis(label, size) for label, size in zip(posterior.labels, posterior.sizes, strict=True)]
-    # another deployment's values would be shown with plausible units
-    ours = [(dimension.label, dimension.size) for dimension in deployment.result_dimensions]
-    theirs = list(zip(posterior.labels, posterior.sizes, strict=True))
-    if ours != theirs:
-        raise ValueError(
-            f"the received posterior has {_grid(theirs)}, but the deployment of {deployment.directory} has {_grid(ours)}; "
-            "name the deployment that publishes them"
-        )
-    return deployment_axes(deployment)
-
-
-def deployment_axes(deployment: Deployment) -> list[Axis]:
+def deployment_axes(deployment: "Deployment") -> list[Axis]:
     """Return the dimensions of a deployment's posteriors, in their order."""
     return [Axis(dimension.label, dimension.size, dimension) for dimension in deployment.result_dimensions]
+
+
+def reading_order(labels: Sequence[str]) -> list[int]:
+    """Return the places of labels in the order in which a person reads them: x before y, whatever the array's order."""
+    coordinates = [at for at, label in enumerate(labels) if label.lower() in {"x", "y", "z"}]
+    moved = dict(zip(coordinates, sorted(coordinates, key=lambda at: labels[at].lower()), strict=True))
+    return [moved.get(at, at) for at in range(len(labels))]
 
 
 def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
@@ -72,7 +64,7 @@ def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
     return words if any(axis.dimension for axis in axes) else f"cell {words}"
 
 
-def state_in_words(dimensions: Sequence[Dimension], codes: Sequence[int]) -> str:
+def state_in_words(dimensions: "Sequence[Dimension]", codes: Sequence[int]) -> str:
     """Return a sampled state in words, `rain=yes  grass=wet`; without dimensions, its words in hexadecimal."""
     if not dimensions:
         return " ".join(f"{word:08x}" for word in reversed(codes))
@@ -87,7 +79,3 @@ def printable(text: str) -> str:
     # labels come over the wire: they must not fill the screen, nor control it
     text = text if len(text) <= _LABEL else text[: _LABEL - 3] + "..."
     return text if text.isprintable() else repr(text)
-
-
-def _grid(dimensions: list[tuple[str, Any]]) -> str:
-    return " x ".join(f"{printable(label)} {size}" for label, size in dimensions)
