@@ -40,6 +40,10 @@ class Settings(BaseModel):
     ros_version: Literal["auto", "1", "2"] = Field(
         default="auto", description="Spelling of stamps and types: that of ROS 1 or 2."
     )
+    use_sim_time: bool = Field(
+        default=False,
+        description="Readings age by the simulated time on /clock, and those without a stamp get it.",
+    )
     queue: Annotated[Literal["latest", "all"] | None, Flag(otherwise=_DEPLOYMENTS)] = Field(
         default=None,
         description="Readings that wait while a frame is computed: the latest, or all in order, up to 256.",

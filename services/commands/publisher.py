@@ -21,7 +21,7 @@ app = CommandLine(
 @app.command(help=app.info.help)
 @options.with_settings(
     *("deployment", "uri", "ca", "ros_version", "connect_timeout", "seen_timeout"),
-    *("metrics", "log_level", "log_format"),
+    *("use_sim_time", "metrics", "log_level", "log_format"),
 )
 def publisher(settings: Settings, listen: options.Listen = None, insecure: options.Insecure = False) -> int:
     """Publish posteriors over rosbridge."""

@@ -27,7 +27,7 @@ app = CommandLine(
 @app.command(help=app.info.help)
 @options.with_settings(
     *("deployment", "uri", "ca", "queue", "ros_version", "message_bytes", "topic_bytes"),
-    *("connect_timeout", "first_data_timeout", "metrics", "log_level", "log_format"),
+    *("connect_timeout", "first_data_timeout", "use_sim_time", "metrics", "log_level", "log_format"),
 )
 def subscriber(
     settings: Settings,
@@ -55,6 +55,8 @@ def subscriber(
         loaded = deployment_for(settings)
         link = listening(listen, ROLE, settings, loaded, insecure=insecure)
         return run_async(Subscriber(settings, loaded, link).run())
+    if settings.use_sim_time:
+        raise SettingsError("--use-sim-time needs a master: alone, a subscriber does not follow /clock")
     if settings.deployment is not None:
         loaded = deployment_for(settings)
         return run_async(print_addresses(settings, loaded, count))

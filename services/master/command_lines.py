@@ -49,9 +49,9 @@ def dashboard_command(settings: Settings, deployment: Deployment, directory: Pat
 _SETTINGS = {
     "subscriber": (
         *("uri", "ca", "ros_version", "connect_timeout", "first_data_timeout"),
-        *("message_bytes", "topic_bytes", "queue"),
+        *("message_bytes", "topic_bytes", "queue", "use_sim_time"),
     ),
-    "publisher": ("uri", "ca", "ros_version", "connect_timeout", "seen_timeout"),
+    "publisher": ("uri", "ca", "ros_version", "connect_timeout", "seen_timeout", "use_sim_time"),
     "pcie-app": ("boards", "stop", "peer_timeout", "board_timeout", "key_file"),
 }
 """Settings of one service beyond those that all services have. They become flags, so that `ps` shows them."""
@@ -63,7 +63,9 @@ def service_command(role: str, endpoint: Endpoint, settings: Settings, *, reprog
     for name in ("deployment", "log_level", *_SETTINGS[role]):
         value = getattr(settings, name)
         # without a value, the child takes that of the deployment as this process does
-        if value not in (None, ()):
+        if value is True:
+            command.append(f"--{name.replace('_', '-')}")
+        elif value not in (None, (), False):
             text = ",".join(value) if isinstance(value, tuple) else str(value)
             command += [f"--{name.replace('_', '-')}", text]
     return [*command, "--reprogram"] if reprogram else command

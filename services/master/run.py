@@ -162,7 +162,8 @@ class Master:
             why = f"waiting for {' and '.join(waiting)}"
         elif age is None:
             why = "no result yet: waiting for a complete reading"
-        elif age > self._settings.ready_timeout:
+        # in a simulation, which may be paused, the subscriber knows whether readings are due
+        elif age > self._settings.ready_timeout and not self._settings.use_sim_time:
             why = f"no result for {age:.0f} s"
         else:
             why = ""

@@ -1,6 +1,6 @@
 """Assembly of complete readings from the messages of one or several topics.
 
-It has no sockets and no clock: messages go in, complete sets of addresses come out.
+It has no sockets: messages go in, complete sets of addresses come out.
 """
 
 import math
@@ -12,6 +12,7 @@ from bridge.errors import BridgeError
 from bridge.fields import Field, all_missing
 from bridge.stamps import header_stamp_ns
 from services.errors import VariableError
+from services.pipeline.clock import Clock
 from services.pipeline.synchroniser import Synchroniser
 from services.sockets.records import Addresses, Reading, Values
 from toolchain.deployment import Deployment, Variable
@@ -119,10 +120,11 @@ class StampGap:
     def __str__(self) -> str:
         bare = " and ".join(self.without_header)
         receipts = f" ({bare} without a header, so by time of receipt)" if bare else ""
+        simulated = "pass --use-sim-time if a simulation stamps them, " if bare else ""
         return (
             f"messages come on all topics but make no frame: the newest of {self.oldest} is {self.apart_s:.3g} s older than "
             f"that of {self.newest}{receipts}, and the tolerance is {self.tolerance_s:g} s; "
-            "set the clocks, or build with a larger --tolerance"
+            f"set the clocks, {simulated}or build with a larger --tolerance"
         )
 
 
@@ -130,10 +132,11 @@ class FrameAssembler:
     """Assembly of complete readings from the messages of a deployment's topics.
 
     With one topic, every message is a frame. With several, messages are paired by stamp (see `Synchroniser`),
-    and unpaired ones are counted in `unpaired`.
+    and unpaired ones are counted in `unpaired`. The clock of a simulation replaces the times of receipt.
     """
 
-    def __init__(self, deployment: Deployment) -> None:
+    def __init__(self, deployment: Deployment, clock: Clock | None = None) -> None:
+        self._clock = clock if clock is not None and clock.simulated else None
         count = len(deployment.sources)
         self._readers = [_SourceReader(deployment, source) for source in range(count)]
         self._width = len(deployment.variables)
@@ -155,7 +158,7 @@ class FrameAssembler:
 
     @property
     def deadline(self) -> int | None:
-        """Monotonic ns at which `due` has a reading, unless messages complete it earlier; None if none waits."""
+        """Tick at which `due` has a reading, unless messages complete it earlier; None if none waits."""
         return self._synchroniser.deadline
 
     def take(
@@ -169,9 +172,12 @@ class FrameAssembler:
             VariableError: A variable is missing or unusable; the sentence names topic and variable.
         """
         stamp_ns = header_stamp_ns(message)
+        now_ns, tick = received_ns, received_tick
+        if self._clock is not None:
+            now_ns, tick = self._clock.time_ns(), self._clock.tick()
         addresses, values, prior_codes = self._readers[source].read(message)
         taken = Reading(
-            stamp_ns=received_ns if stamp_ns is None else stamp_ns,
+            stamp_ns=now_ns if stamp_ns is None else stamp_ns,
             received_ns=received_ns,
             received_tick=received_tick,
             addresses=addresses,
@@ -183,11 +189,11 @@ class FrameAssembler:
             return [taken]
         self._newest[source] = taken.stamp_ns, stamp_ns is not None
         self._since_pair[source] += 1
-        self._synchroniser.add(source, taken.stamp_ns, received_tick, taken)
-        return self.due(received_tick)
+        self._synchroniser.add(source, taken.stamp_ns, tick, taken)
+        return self.due(tick)
 
     def due(self, tick: int) -> list[Reading]:
-        """Return the readings that are complete at this monotonic time (ns)."""
+        """Return the readings that are complete at this tick (ns)."""
         readings = []
         while (chosen := self._synchroniser.take_set(tick)) is not None:
             readings.append(self._joined(chosen))
@@ -199,16 +205,19 @@ class FrameAssembler:
         values: Values = [None] * self._width
         ticks = [0] * self._width
         prior_codes = b""
+        # the latency of a frame counts from the message that completed it
+        last = max(chosen.values(), key=lambda each: each.received_tick)
+        newest_ns = max(each.stamp_ns for each in chosen.values())
         for source, reading in chosen.items():
             prior_codes = prior_codes or reading.prior_codes
             for at, column in enumerate(self._readers[source].columns):
                 addresses[column], values[column] = reading.addresses[at], reading.values[at]
                 ticks[column] = reading.received_tick
+                if self._clock is not None:  # older by simulated time than the newest one
+                    ticks[column] = last.received_tick - (newest_ns - reading.stamp_ns)
         self._since_pair = [0] * len(self._since_pair)
-        # the latency of a frame counts from the message that completed it
-        last = max(chosen.values(), key=lambda each: each.received_tick)
         return Reading(
-            stamp_ns=max(each.stamp_ns for each in chosen.values()),
+            stamp_ns=newest_ns,
             received_ns=last.received_ns,
             received_tick=last.received_tick,
             addresses=addresses,

@@ -196,9 +196,11 @@ class Publisher(Service):
             self._where = where
             self._link.keep(Ready(where))
             self._draining = False
+            standard = self._topics.standard
             await until_one_ends(
                 self._publish_waiting(),
                 self._keep_checking(),
                 self._keep_looking(),
-                self._topics.standard.keep_reporting(),
+                standard.keep_reporting(),
+                *([standard.follow_clock()] if self._settings.use_sim_time else []),
             )

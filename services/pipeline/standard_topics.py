@@ -28,6 +28,7 @@ from posteriors.standard_messages import (
     pose_message,
     status,
 )
+from services.pipeline.clock import Clock
 from services.pipeline.connections import AdvertisedTopic
 from services.settings import Settings
 from services.sockets.records import Publish
@@ -70,7 +71,8 @@ class StandardTopics:
         self._publications: dict[str, Publication] = {}
         # Of a deployment whose grid or pose is published.
         self._plane: Plane | None = None
-        # The last frame with the monotonic time (ns) of its publication, and whether it still has to be sent; `_timer`
+        self._clock = Clock(simulated=settings.use_sim_time)
+        # The last frame with the tick (ns) of its publication, and whether it still has to be sent; `_timer`
         # then calls `_send`.
         self._last: tuple[Publish, Inference, int] | None = None
         self._waiting = False
@@ -113,7 +115,7 @@ class StandardTopics:
 
     def offer(self, publish: Publish, inference: Inference) -> None:
         """Send the topics of a frame later, unless a newer one takes its place."""
-        self._last, self._waiting = (publish, inference, time.monotonic_ns()), True
+        self._last, self._waiting = (publish, inference, self._clock.tick()), True
         if self._timer is None and self._publications:
             loop = asyncio.get_running_loop()
             wait = self._sent_at + INTERVAL - time.monotonic()
@@ -174,9 +176,19 @@ class StandardTopics:
             self._deployment,
             why="" if _is_sound(inference) else inference.outcome,
             number=publish.result.number,
-            age_ms=(time.monotonic_ns() - publish.received_tick) / 1e6,
+            age_ms=self._age_ns(publish) / 1e6,
         )
         return diagnostics(statuses, publish.stamp_ns, "bm", self._ros_version)
+
+    def _age_ns(self, publish: Publish) -> int:
+        if self._clock.simulated:
+            return max(self._clock.time_ns() - publish.stamp_ns, 0)
+        return time.monotonic_ns() - publish.received_tick
+
+    async def follow_clock(self) -> None:
+        """Follow the simulated time until cancelled."""
+        if self._ros is not None:
+            await self._clock.follow(self._ros)
 
     # --- health --------------------------------------------------------------------------------
 
@@ -197,7 +209,7 @@ class StandardTopics:
     def _health(self) -> dict[str, Any]:
         boards = list(self._boards())
         self._levels = [each["level"] for each in boards]
-        return diagnostics([*boards, *self._services()], time.time_ns(), "", self._ros_version)
+        return diagnostics([*boards, *self._services()], self._clock.time_ns(), "", self._ros_version)
 
     def _changed_health(self) -> dict[str, Any] | None:
         """Return the health if the level of a board differs from the published one, which is due only each second."""
@@ -218,7 +230,7 @@ class StandardTopics:
                 result = inference.boards[at]
                 level, message = Level.OK if _is_sound(inference) else Level.WARN, reasons[result.reason]
                 values |= {"frame": publish.result.number, "cycles": result.cycles, "reason": message}
-                if time.monotonic_ns() - tick > silence_s * 1e9:
+                if self._clock.tick() - tick > silence_s * 1e9:
                     level, message = Level.STALE, f"no frame for {silence_s:g} s"
             if there := known.get(at):
                 values |= {"endpoint": there.endpoint, "state": there.state, "restarts": there.restarts}

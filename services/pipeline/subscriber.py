@@ -3,7 +3,7 @@
     topic ──message──▶ _follow ──▶ FrameAssembler.take ──readings──▶ _forward ──Reading──▶ master
     timer ───────────▶ _wake ────▶ FrameAssembler.due ───readings──▶
 
-The timer runs while a set of messages waits for a topic that may be missing.
+The timer runs while a set of messages waits for a topic that may be missing. In a simulation, `/clock` replaces it.
 """
 
 import asyncio
@@ -16,13 +16,14 @@ import msgspec
 from bridge.client import Message, Ros, State, Subscription
 from bridge.errors import NoMessageError, TopicLeftOutError
 from services.errors import RosbridgeLostError, VariableError
+from services.pipeline.clock import CLOCK_TOPIC, Clock
 from services.pipeline.connections import check_types, connect_all, reconnect_now, report_unpublished
 from services.pipeline.frames import FrameAssembler
 from services.settings import Settings
 from services.sockets.local_socket import MAX_RECORD
 from services.sockets.records import AnyRecord, Begin, LossReason, Notice, Reading, Ready, Rosbridge, Unusable
 from services.sockets.serving import MakeLink, Service
-from services.sockets.status import FrameCounts, ProcessStatus, connections, seconds_since, why_not_connected
+from services.sockets.status import FrameCounts, ProcessStatus, connections, why_not_connected
 from toolchain.deployment import Deployment, Source
 
 ROLE = "subscriber"
@@ -59,8 +60,9 @@ class Subscriber(Service):
     def __init__(self, settings: Settings, deployment: Deployment, link: MakeLink) -> None:
         super().__init__(settings, link)
         self._deployment = deployment
-        self._assembler = FrameAssembler(deployment)
-        # At the assembler's deadline (monotonic, ns), `_wake` forwards the readings that are due.
+        self._clock = Clock(simulated=settings.use_sim_time)
+        self._assembler = FrameAssembler(deployment, self._clock)
+        # At the assembler's deadline (a tick, ns), `_wake` forwards the readings that are due.
         self._timer: asyncio.TimerHandle | None = None
         self._timer_deadline: int | None = None
         self._queue_all = (settings.queue or deployment.queue) == "all"
@@ -77,8 +79,9 @@ class Subscriber(Service):
         self._received = self._completed = self._unusable = 0
         self._passed_over = self._passed_over_sent = 0
         self._unpaired_sent = 0
-        # Receipt of the last complete reading (monotonic, ns); 0 before the first one.
+        # Receipt of the last complete reading (monotonic, ns; 0 before the first one), and the tick of its sending.
         self._last_tick = 0
+        self._last_sent: int | None = None
         # What was reported already: a gap between stamps (until the next reading), and topics without which frames
         # are formed.
         self._gap_reported = False
@@ -97,7 +100,7 @@ class Subscriber(Service):
     def status(self) -> ProcessStatus:
         """Return the status of this process."""
         why = why_not_connected(self._rosbridges)
-        age = seconds_since(self._last_tick)
+        age = None if self._last_sent is None else (self._clock.tick() - self._last_sent) / 1e9
         limit = self._settings.ready_timeout
         # without a run no readings are expected, and the master may be waiting for us to be ready
         if not why and self._begun.is_set() and self._link.has_master and (age is None or age > limit):
@@ -172,6 +175,10 @@ class Subscriber(Service):
                 asyncio.ensure_future(self._follow(rosbridges[at], at, source, hints[at]))
                 for at, source in enumerate(sources)
             ]
+            if self._clock.simulated:
+                hints.append(asyncio.ensure_future(report_unpublished(rosbridges[0], CLOCK_TOPIC, warn)))
+                stack.callback(hints[-1].cancel)
+                tasks.append(asyncio.ensure_future(self._clock.follow(rosbridges[0], self._wake_if_due)))
             for task in tasks:
                 stack.callback(task.cancel)
             # the first error ends the service; a topic that is left out ends without one
@@ -241,9 +248,13 @@ class Subscriber(Service):
             self._link.notice("warning", str(gap))
             self._gap_reported = True
 
+    def _wake_if_due(self) -> None:
+        if self._timer_deadline is not None and self._timer_deadline <= self._clock.tick():
+            self._wake()
+
     def _wake(self) -> None:
         self._timer = self._timer_deadline = None
-        self._forward(self._assembler.due(time.monotonic_ns()))
+        self._forward(self._assembler.due(self._clock.tick()))
 
     def _forward(self, readings: list[Reading]) -> None:
         """Send readings to the master, and set the timer for those that wait."""
@@ -254,7 +265,7 @@ class Subscriber(Service):
             if self._timer is not None:
                 self._timer.cancel()
             self._timer, self._timer_deadline = None, deadline
-            if deadline is not None:
+            if deadline is not None and not self._clock.simulated:
                 delay = max(deadline - time.monotonic_ns(), 0) / 1e9
                 self._timer = asyncio.get_running_loop().call_later(delay, self._wake)
 
@@ -266,7 +277,7 @@ class Subscriber(Service):
                 "warning",
                 f"frames go on without {topic}: it brought nothing within {self._deployment.tolerance_s:g} s of the others",
             )
-        self._last_tick = reading.received_tick
+        self._last_tick, self._last_sent = reading.received_tick, self._clock.tick()
         # a master that reads slowly gets the newest readings, not all of them late
         if self._link.backlog > _BACKLOG_LIMIT and not self._queue_all:
             self._passed_over += 1

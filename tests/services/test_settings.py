@@ -80,6 +80,7 @@ def test_every_flag_is_one_of_the_command(command, tmp_path):
         boards=("unix:/a.sock", "unix:/b.sock"),
         topic_bytes=10**6,
         metrics="9400",
+        use_sim_time=True,
         **given,
     )
     line = service_command(role, parse_endpoint("unix:/s.sock"), settings, reprogram=role == "pcie-app")
@@ -88,6 +89,7 @@ def test_every_flag_is_one_of_the_command(command, tmp_path):
         ended.stderr
     )  # the folder is empty
     assert line[line.index("--deployment") + 1] == str(tmp_path)
+    assert ("--use-sim-time" in line) is (role != "pcie-app")
     if role == "pcie-app":
         assert line[line.index("--boards") + 1] == "unix:/a.sock,unix:/b.sock"
         assert line[-1] == "--reprogram"
@@ -97,4 +99,6 @@ def test_a_setting_without_a_value_is_no_flag(tmp_path):
     line = service_command(
         "subscriber", parse_endpoint("unix:/s.sock"), Settings(deployment=tmp_path), reprogram=False
     )
-    assert not {"--uri", "--ca", "--topic-bytes", "--queue", "--boards", "--metrics"} & set(line)
+    assert not {"--uri", "--ca", "--topic-bytes", "--queue", "--boards", "--metrics", "--use-sim-time"} & set(
+        line
+    )

@@ -1,6 +1,7 @@
 """Status and metrics of a run, and its posteriors in the command `listen`."""
 
 import asyncio
+import itertools
 import json
 import re
 import signal
@@ -10,7 +11,7 @@ import urllib.request
 import numpy as np
 import pytest
 
-from tests.integration.conftest import until
+from tests.integration.conftest import status_of, until
 from tests.patience import PROCESS_PATIENCE
 
 PROCESSES = {"hub", "master", "subscriber", "publisher", "pcie-app", "board0", "board1", "board2", "board3"}
@@ -74,6 +75,24 @@ async def test_the_status_of_a_run(stage, boat):
     master.send(signal.SIGKILL)
     await stage.nothing_left("hub")
     assert (await ask(stage))[0] == 2
+
+
+@pytest.mark.process
+async def test_a_paused_simulation_is_ready_until_its_clock_goes_on(stage, boat):
+    _, robot, _ = await stage.loop(boat, "--use-sim-time", environment={"BM_READY_TIMEOUT": "1"})
+    robot.stop_publishing()
+    paused = await stage.status("master", lambda status: status["frames"]["last_age_s"] > 2)
+    assert paused["ready"]
+    seconds = itertools.count()
+
+    async def is_late():
+        clock = {"clock": {"sec": next(seconds), "nanosec": 0}}
+        await robot._socket.send(json.dumps({"op": "publish", "topic": "/clock", "msg": clock}))
+        status = await status_of(stage.runs, "subscriber")
+        return not status["ready"] and re.match("no complete reading for .*/boat/sensors", status["why"])
+
+    assert (await status_of(stage.runs, "subscriber"))["ready"]
+    await until(is_late)
 
 
 @pytest.mark.process

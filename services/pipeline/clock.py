@@ -1,0 +1,47 @@
+"""The clock by which readings age: this computer's, or with `use_sim_time` that of a simulation on `/clock`."""
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from bridge.client import Ros
+from bridge.stamps import stamp_ns
+
+CLOCK_TOPIC: Final = "/clock"
+_CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
+_INTERVAL_MS: Final = 10
+"""Minimum time between two messages, of which simulators publish a thousand a second."""
+
+
+class Clock:
+    """Times for stamps, and ticks for ages.
+
+    A simulation runs at any rate, pauses, and begins again. Its time then jumps back; ticks never do.
+    """
+
+    def __init__(self, *, simulated: bool) -> None:
+        self.simulated = simulated
+        # The last time on /clock, and by how much it has advanced in all, both in ns.
+        self._time: int | None = None
+        self._tick = 0
+
+    def time_ns(self) -> int:
+        """Return the time as in stamps; that of a simulation is 0 before the first message."""
+        return (self._time or 0) if self.simulated else time.time_ns()
+
+    def tick(self) -> int:
+        """Return the nanoseconds of a clock that never goes back, with an arbitrary beginning."""
+        return self._tick if self.simulated else time.monotonic_ns()
+
+    async def follow(self, ros: Ros, moved: Callable[[], None] | None = None) -> None:
+        """Follow `/clock` until cancelled, and call `moved` after each message."""
+        messages = ros.subscribe(
+            CLOCK_TOPIC, _CLOCK_TYPE, throttle_rate=_INTERVAL_MS, queue_length=1, queue_size=1
+        )
+        async for message in messages:
+            if (now := stamp_ns(message.msg.get("clock"))) is None:
+                continue
+            self._tick += max(now - (now if self._time is None else self._time), 0)
+            self._time = now
+            if moved is not None:
+                moved()
