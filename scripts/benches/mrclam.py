@@ -21,22 +21,13 @@ from rich.console import Console
 from rich.table import Table
 
 from casestudies.demo import build
-from casestudies.mrclam.model import (
-    BEARING_SIGMA,
-    FLOOR,
-    RANGE_SIGMA,
-    X_LIMITS,
-    Y_LIMITS,
-    Landmark,
-    model,
-    read_landmarks,
-)
+from casestudies.mrclam.model import BEARING_SIGMA, FLOOR, RANGE_SIGMA, Landmark, model, read_landmarks
 from casestudies.mrclam.player import RecordedFrame, area_grid, median_distance, play, read_recording
 from scripts.running.flags import ScriptParser
 from scripts.running.processes import ROOT, run_script
 from terminal.processes import Process
 from toolchain.deployment.address import to_address
-from toolchain.models import Model, cell_centres, exact_posterior, interval
+from toolchain.models import Model, exact_posterior
 from toolchain.models.model import fuse
 
 TOPIC, TYPE = "/mrclam/sightings", "mrclam_msgs/Sightings"
@@ -71,7 +62,10 @@ def unquantised_posterior(
     There is one reading for each landmark, in the same order. The density of outliers is the floor everywhere,
     relative to the peak. Without a floor, readings that are impossible on every line raise a ModelError.
     """
-    y, x = cell_centres(interval("y", *Y_LIMITS, cells=height), interval("x", *X_LIMITS, cells=width))
+    grid = area_grid(width, height)
+    rows = grid.y_low + (np.arange(height) + 0.5) * grid.cell_height
+    columns = grid.x_low + (np.arange(width) + 0.5) * grid.cell_width
+    y, x = np.repeat(rows, width), np.tile(columns, height)
     factors = []
     for landmark, reading in zip(landmarks, readings, strict=True):
         if reading.range_m is not None:

@@ -6,8 +6,28 @@ from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters
 from toolchain.building.quantise import quantise
 from toolchain.deployment import BM1Section, BoardSection, Deployment, Dimension, Source, Variable
-from toolchain.models.conditional import normal
-from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
+from toolchain.models.conditional import normal_table, wrapped_normal_table
+from toolchain.models.distribution import IntervalType, Symbol
+from toolchain.models.model import Known, Model, Normal, PriorSelect, cell_centres
+
+
+def interval(label, low, high, *, cells):
+    """A searched dimension of equal cells."""
+    return Symbol(label, IntervalType(low, high, cells)).dimension()
+
+
+def normal(name, *, mean, sigma, values, offset=0.0, step=1.0, floor=0.0, outliers=0.0, period=None, **rule):
+    """A known variable that is normal given S, and clamps its readings, or wraps them if it has a period."""
+    shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
+    make = wrapped_normal_table if period else normal_table
+    table = make(name, shape, values=values, offset=offset, step=step)
+    rule = {"on_range": "error" if period else "clamp", "period": period} | rule
+    return Known(name=name, table=table, offset=offset, step=step, floor=floor, normal=shape, **rule)
+
+
+def wrapped_normal(name, *, values, **others):
+    """A known variable on a circle that is a wrapped normal given S."""
+    return normal(name, values=values, period=values, **others)
 
 
 def corridor(cells=12, *, sigma=1.0, select=False, missing=False):

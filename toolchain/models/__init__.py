@@ -1,6 +1,5 @@
 """Models: searched and known variables, and the exact posterior (thesis 2.1.2, 3.4); the names for a `model.py`."""
 
-from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.distribution import (
     IntegerType,
     IntervalType,
@@ -13,15 +12,7 @@ from toolchain.models.distribution import (
     uniform,
 )
 from toolchain.models.joint import JointDistribution, Question
-from toolchain.models.model import (
-    Known,
-    Model,
-    PriorSelect,
-    cell_centres,
-    dimension,
-    exact_posterior,
-    interval,
-)
+from toolchain.models.model import Known, Model, PriorSelect, dimension, exact_posterior
 
 __all__ = [
     "IntegerType",
@@ -33,15 +24,11 @@ __all__ = [
     "PriorSelect",
     "Question",
     "Symbol",
-    "cell_centres",
     "conditional_normal",
     "dimension",
     "exact_posterior",
     "function",
-    "interval",
-    "normal",
     "potential",
     "table",
     "uniform",
-    "wrapped_normal",
 ]

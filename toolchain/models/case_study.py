@@ -31,7 +31,7 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
 def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
     """Return the model or the question of a folder with a `model.py`, or of that file itself.
 
-    It defines `model(...)`, which returns a `toolchain.models.Model` or a `toolchain.models.Question`, and can import
+    It defines `model(...)`, which returns a `toolchain.models.Question` or a `toolchain.models.Model`, and can import
     modules in its folder. The settings are values for the parameters of `model()` as text; each is converted to the
     annotated type of its parameter (int, float, bool, str, Path, an Enum, a Literal).
 
@@ -51,8 +51,8 @@ def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
         sys.path.remove(folder)
     if not isinstance(model, Model | Question):
         raise ModelError(
-            f"{path}: model() returned {type(model).__name__}, expected a toolchain.models.Model or a "
-            "toolchain.models.Question"
+            f"{path}: model() returned {type(model).__name__}, expected a toolchain.models.Question or a "
+            "toolchain.models.Model"
         )
     return model
 
@@ -106,7 +106,7 @@ def _model_function(path: Path) -> Callable[..., object]:
     function: object = getattr(module, "model", None)
     if not callable(function):
         raise ModelError(
-            f"{path} does not define model(); expected a function that returns a toolchain.models.Model"
+            f"{path} does not define model(); expected a function that returns a toolchain.models.Question"
         )
     return function
 

@@ -5,107 +5,18 @@ is the integral of the Gaussian over the bin, not the density at the centre, so 
 """
 
 import math
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from toolchain.errors import ModelError
-from toolchain.models.model import Known, Normal, check_table
+from toolchain.models.model import Normal, check_table
 
 # Copies of a wrapped normal that are further away than this many sigma add less than 1e-32.
 _FARTHEST_COPY: Final = 12.0
 # A wrapped normal whose sigma is two turns is uniform to 1e-34, and so is any wider one.
 _UNIFORM: Final = 2.0
-
-
-def normal(
-    name: str,
-    *,
-    mean: NDArray[np.float64],
-    sigma: ArrayLike,
-    values: int,
-    offset: float = 0.0,
-    step: float = 1.0,
-    unit: str = "",
-    bits: int = 0,
-    floor: float = 0.0,
-    outliers: float = 0.0,
-    on_range: Literal["error", "clamp", "missing"] = "clamp",
-    on_missing: Literal["error", "missing"] = "error",
-    path: str = "",
-) -> Known:
-    """Return a known variable that is normal given S; the end bins include the tails (clamped readings).
-
-    Args:
-        name: The variable's name.
-        mean: float64[lines], the mean on every line, in the unit of the reading.
-        sigma: The standard deviation, float64[lines] or one for all, in the unit of the reading.
-        values: The number of bins (addresses).
-        offset: The centre of the first bin.
-        step: The width of a bin.
-        unit: The unit of the readings, such as m.
-        bits: Address bits; 0 for the minimum.
-        floor: Added to each bin for outliers, relative to the peak of the bin likelihood.
-        outliers: Share of readings that do not depend on S, spread over all bins.
-        on_range: Treatment of a reading beyond the end bins.
-        on_missing: `missing` if a reading may be missing.
-        path: Path of the variable in the message.
-
-    Raises:
-        ModelError: A sigma, step, floor, share or number of values that is not positive.
-    """
-    shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
-    table = normal_table(name, shape, values=values, offset=offset, step=step)
-    return Known(
-        name=name,
-        table=table,
-        bits=bits,
-        offset=offset,
-        step=step,
-        unit=unit,
-        on_range=on_range,
-        on_missing=on_missing,
-        path=path,
-        floor=floor,
-        normal=shape,
-    )
-
-
-def wrapped_normal(
-    name: str,
-    *,
-    mean: NDArray[np.float64],
-    sigma: ArrayLike,
-    values: int,
-    offset: float = 0.0,
-    step: float = 1.0,
-    unit: str = "",
-    bits: int = 0,
-    floor: float = 0.0,
-    outliers: float = 0.0,
-    on_missing: Literal["error", "missing"] = "error",
-    path: str = "",
-) -> Known:
-    """Return a known variable on a circle of `values * step` that is a wrapped normal given S.
-
-    Arguments and errors are those of `normal`: `values` are the bins of a turn, and a mean may lie in any turn.
-    """
-    shape = Normal(mean=mean, sigma=sigma, floor=floor, outliers=outliers)
-    table = wrapped_normal_table(name, shape, values=values, offset=offset, step=step)
-    return Known(
-        name=name,
-        table=table,
-        bits=bits,
-        offset=offset,
-        step=step,
-        unit=unit,
-        period=values,
-        on_missing=on_missing,
-        path=path,
-        floor=floor,
-        normal=shape,
-    )
 
 
 def normal_table(name: str, shape: Normal, *, values: int, offset: float, step: float) -> NDArray[np.float64]:

@@ -263,16 +263,6 @@ def dimension(
         raise ModelError(f"searched dimension {label!r}: {_first(reason)}") from None
 
 
-def interval(label: str, low: float, high: float, *, cells: int, unit: str = "") -> Dimension:
-    """Return a searched dimension that divides [low, high] into equal cells, or raise a ModelError."""
-    if cells < 1 or not low < high:
-        raise ModelError(
-            f"searched dimension {label!r}: [{low:g}, {high:g}] cannot be divided into {cells} cells"
-        )
-    step = (high - low) / cells
-    return dimension(label, size=cells, offset=low + step / 2, step=step, unit=unit)
-
-
 def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:
     """Return the value of each dimension at the centre of every line's cell: float64[lines] per dimension."""
     check_size("the grid of cells", math.prod(each.size for each in searched), MAX_LINES)

@@ -6,21 +6,20 @@ them.
 
 import numpy as np
 
-from toolchain.models import Known, Model, interval
+from toolchain.models import IntegerType, IntervalType, JointDistribution, Question, Symbol, table, uniform
 
 CELLS = 16
 VALUES = {"near": 7, "far": 5}
 
 
-def model() -> Model:
-    """Return the model."""
-    place = interval("x", 0.0, 16.0, cells=CELLS)
+def model() -> Question:
+    """Return the question."""
+    place = Symbol("x", IntervalType(0.0, 16.0, CELLS))
     x = np.arange(CELLS)
-    known = []
+    factors = [uniform(place)]
     for name, values in VALUES.items():
+        sensor = Symbol(name, IntegerType(0, values - 1), on_missing="missing", on_range="clamp")
         peak = np.arange(values)[:, np.newaxis] * (CELLS - 1) / (values - 1)
-        table = np.exp(-np.abs(x - peak) / 4) + 0.01
-        known.append(
-            Known(name=name, table=table / table.sum(axis=0), on_missing="missing", on_range="clamp")
-        )
-    return Model(name="campaign", searched=(place,), known=tuple(known))
+        likely = np.exp(-np.abs(x - peak) / 4) + 0.01
+        factors.append(table(sensor, likely / likely.sum(axis=0), given=[place]))
+    return JointDistribution("campaign", tuple(factors)).ask(searched=[place], known=list(VALUES))

@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 
 from machines.parameters import RngKind, RngReset
 from pcie_shim.programming_file import read_image
+from tests.toolchain.builders import interval, normal, wrapped_normal
 from tests.toolchain.running import OPTIONS, build_model
 from toolchain.building.build import assemble, build_date, build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Queue, Scale, Stop, load_deployment
 from toolchain.errors import BuildError, DeploymentError, ToolchainError
-from toolchain.models.conditional import normal, wrapped_normal
-from toolchain.models.model import Known, Model, cell_centres, interval
+from toolchain.models.model import Known, Model, cell_centres
 
 
 def model(size=5, sensors=2):

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 
 from machines.encode import decode_code, encode_probability
 from machines.errors import ParameterError
+from tests.toolchain.builders import normal, wrapped_normal
 from toolchain.building.machine import partition_lines
 from toolchain.building.quantise import quantise
 from toolchain.deployment import Scale
 from toolchain.errors import BuildError
-from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.model import Known, Model, PriorSelect, dimension
 
 

@@ -10,15 +10,18 @@ from toolchain.errors import DamagedDeploymentError
 
 MODEL = """
 import numpy as np
-from toolchain.models.conditional import normal
-from toolchain.models.model import Model, cell_centres, interval
+from toolchain.models import *
 
 def model(sigma: float = 1.0, values: int = 12, cells: int = 8, swapped: bool = False, other: str = "D2"):
-    place = interval("x", 0, 10, cells=cells)
-    (x,) = cell_centres(place)
-    known = [normal("D1", mean=x, sigma=sigma, values=values, floor=0.05, path="data[0]"),
-             normal(other, mean=10 - x, sigma=2.0, values=12, floor=0.05, path="data[1]")]
-    return Model(name="small", searched=(place,), known=tuple(known[::-1] if swapped else known))
+    place = Symbol("x", IntervalType(0, 10, cells))
+    one = Symbol("D1", IntegerType(0, values - 1), path="data[0]", on_range="clamp")
+    two = Symbol(other, IntegerType(0, 11), path="data[1]", on_range="clamp")
+    joint = JointDistribution("small", (
+        uniform(place),
+        conditional_normal(one, [place], mean=lambda x: x, sigma=sigma, floor=0.05),
+        conditional_normal(two, [place], mean=lambda x: 10 - x, sigma=2.0, floor=0.05),
+    ))
+    return joint.ask(searched=[place], known=[two, one] if swapped else [one, two])
 """
 OPTIONS = ("--partitions", "2", "--scale", "column", "--bits", "D1=6", "--prob-bits", "7")
 

@@ -14,7 +14,7 @@ from typer.main import get_command
 from machines.bm1 import Start, StopReason
 from machines.parameters import PriorMode, RngKind, RngReset
 from machines.reference import ReferenceBM1
-from tests.toolchain.builders import boat
+from tests.toolchain.builders import boat, interval, normal, wrapped_normal
 from tests.toolchain.running import OPTIONS, TINY, build_model, done, toolchain
 from toolchain.building.build import assemble, build_deployment
 from toolchain.building.machine import plan_machine
@@ -22,8 +22,7 @@ from toolchain.checks.check import check_deployment, check_model, source_finding
 from toolchain.checks.findings import Check, Severity, line_name, reading
 from toolchain.commands.main import app
 from toolchain.deployment import Scale, Source, Variable
-from toolchain.models.conditional import normal, wrapped_normal
-from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, interval
+from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension
 from toolchain.outputs.mif import mif_lines
 
 

@@ -13,32 +13,36 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.toolchain.builders import interval, normal, wrapped_normal
 from tests.toolchain.running import done, toolchain
 from toolchain.errors import ModelError
 from toolchain.learning import FitMethod, FitOptions, FitPrior
 from toolchain.learning.fit import LEAST_READINGS, fit_model, locate, mixture
 from toolchain.learning.fitted import Fit, apply_fit, cell_spread, mean_slopes, read_fit, with_fit, write_fit
 from toolchain.models.case_study import load_model
-from toolchain.models.conditional import normal, wrapped_normal
-from toolchain.models.model import Known, Model, cell_centres, dimension, interval
+from toolchain.models.model import Known, Model, cell_centres, dimension
 
 TURN = 2 * np.pi
 
 CASE = """
 import numpy as np
 from pathlib import Path
-from toolchain.models.conditional import normal
 from toolchain.learning.fitted import with_fit
-from toolchain.models.model import Known, Model, cell_centres, interval
+from toolchain.models import *
 
 def model(fit: Path | None = None):
-    place = interval("x", 0.0, 10.0, cells=100)
-    (x,) = cell_centres(place)
-    near = np.where(x < 5, 0.8, 0.2)
-    wall = normal("wall", mean=10.0 - x, sigma=1.0, values=101, step=0.1, on_missing="missing")
-    back = normal("back", mean=x, sigma=1.0, values=101, step=0.1, on_missing="missing")
-    door = Known(name="door", table=np.array([1 - near, near]), states=("shut", "open"), on_missing="missing")
-    return with_fit(Model(name="corridor", searched=(place,), known=(wall, back, door)), fit)
+    place = Symbol("x", IntervalType(0.0, 10.0, 100))
+    wall, back = (Symbol(name, IntegerType(0, 100, scale=0.1), on_range="clamp", on_missing="missing")
+                  for name in ("wall", "back"))
+    door = Symbol("door", LabelType("shut", "open"), on_missing="missing")
+    near = np.where(place.values() < 5, 0.8, 0.2)
+    joint = JointDistribution("corridor", (
+        uniform(place),
+        conditional_normal(wall, [place], mean=lambda x: 10.0 - x, sigma=1.0),
+        conditional_normal(back, [place], mean=lambda x: x, sigma=1.0),
+        table(door, [1 - near, near], given=[place]),
+    ))
+    return with_fit(joint.ask(searched=[place], known=[wall, back, door]).model(), fit)
 """
 
 

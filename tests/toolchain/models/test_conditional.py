@@ -7,8 +7,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from tests.toolchain.builders import normal, wrapped_normal
 from toolchain.errors import ModelError
-from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.distribution import (
     MAX_ENTRIES,
     IntegerType,

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.toolchain.builders import interval, normal, wrapped_normal
 from tests.toolchain.running import OPTIONS, refused_within
 from toolchain.building.machine import partition_lines, plan_machine
 from toolchain.errors import BuildError, ModelError
-from toolchain.models.conditional import normal, wrapped_normal
 from toolchain.models.distribution import (
     IntegerType,
     IntervalType,
@@ -19,16 +19,7 @@ from toolchain.models.distribution import (
     table,
 )
 from toolchain.models.joint import JointDistribution
-from toolchain.models.model import (
-    Known,
-    Model,
-    PriorSelect,
-    cell_centres,
-    dimension,
-    exact_posterior,
-    fuse,
-    interval,
-)
+from toolchain.models.model import Known, Model, PriorSelect, cell_centres, dimension, exact_posterior, fuse
 
 
 def known(name="K", values=3, lines=4, **fields):
@@ -100,7 +91,6 @@ def model_with(**fields):
         lambda: model_with(name=3),
         lambda: model_with(prior=np.full(3, 1 / 3)),
         lambda: model_with(prior=np.full(4, 0.3)),
-        lambda: interval("x", 1, 1, cells=3),
         lambda: dimension("", size=1),
     ],
 )
@@ -133,7 +123,6 @@ def question(lines, *sizes):
 @pytest.mark.parametrize(
     "too_large",
     [
-        lambda: interval("x", 0, 1, cells=10**9),
         lambda: dimension("x", size=2**24 + 1),
         lambda: cell_centres(AXIS, AXIS),
         lambda: normal("K", mean=np.zeros(2), sigma=1, values=10**9),

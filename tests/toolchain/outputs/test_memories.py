@@ -17,11 +17,11 @@ from machines.parameters import PriorMode, RngKind, RngReset
 from machines.rng import POLYNOMIALS, random_numbers
 from pcie_shim.programming_file import read_image
 from tests.patience import PROCESS_PATIENCE
+from tests.toolchain.builders import interval, normal
 from tests.toolchain.running import TARGET, TINY, build_model, contents
 from toolchain.deployment import load_deployment
 from toolchain.errors import MifError
-from toolchain.models.conditional import normal
-from toolchain.models.model import Known, Model, PriorSelect, cell_centres, interval
+from toolchain.models.model import Known, Model, PriorSelect, cell_centres
 from toolchain.outputs.mif import Mif, mif_lines, parse_mif, random_table, read_mif
 
 HEAD = "WIDTH=8; DEPTH=8; ADDRESS_RADIX=HEX; DATA_RADIX=HEX;\nCONTENT BEGIN\n"
