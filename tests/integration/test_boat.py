@@ -5,11 +5,13 @@ boat-simulator -> hub -> boat-normaliser -> hub -> master and its processes -> h
 
 import json
 import re
+import shlex
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from casestudies.boat.model import model as boat_model
 from casestudies.boat.sensors import SENSOR_NAMES, map_grid
@@ -260,6 +262,19 @@ async def test_the_posterior_follows_what_is_done_to_the_world(stage, tmp_path):
 
         await until(lambda: len(readings()["D3"]) >= 3)
         assert {name for name, values in readings().items() if len(values) > 1} == {"D3", "B3"}
+
+
+@pytest.mark.process
+async def test_one_command_draws_the_figures_of_the_thesis(stage, tmp_path):
+    page = (ROOT / "docs/case-studies/boat.md").read_text()
+    (command,) = re.findall(r"^    (rosbayes demo .*)$", page, re.MULTILINE)
+    demo = stage.start(*shlex.split(command), "--count", "6", "--out", str(tmp_path))
+    assert await demo.end() == 0, demo.err + demo.out
+    figures = [str(tmp_path / f"figure-4.{number}.png") for number in (4, 5)]
+    assert re.findall(r"^wrote (.*)$", demo.out, re.MULTILINE) == figures
+    for figure in figures:
+        assert imread(figure).shape[1] > 800
+    await stage.nothing_left()
 
 
 @pytest.mark.process
