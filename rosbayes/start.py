@@ -7,7 +7,7 @@ from functools import partial
 
 # each command line, that of a subcommand after a colon, and what it does in the list of `rosbayes --help`
 COMMANDS = {
-    "demo": ("casestudies.demo", "Run the boat or the sprinkler from end to end, without a robot."),
+    "demo": ("casestudies.demo", "Run the boat or the sprinkler, without a robot."),
     "toolchain": ("toolchain.commands.main", "From a model to a deployment."),
     "new": ("toolchain.commands.main:new", "Create a model from a template."),
     "build": ("toolchain.commands.main:build", "Build a deployment from a model or a network."),

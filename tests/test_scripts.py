@@ -14,7 +14,7 @@ SCRIPTS = sorted(path for path in (ROOT / "scripts").iterdir() if path.is_file()
 
 PARTS = {
     "bench": ("bridge", "cycle", "load", "mrclam", "topics"),
-    "verify": ("conformance", "containers", "hdl", "networks", "resources", "rosbridge", "tools"),
+    "verify": ("conformance", "containers", "hdl", "networks", "resources", "rosbridge", "tools", "wheel"),
 }
 
 

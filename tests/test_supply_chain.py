@@ -15,6 +15,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from tests.patience import PROCESS_PATIENCE
+from toolchain import hardware
 
 pytestmark = pytest.mark.thorough
 
@@ -61,7 +62,8 @@ def test_a_wheel_built_twice_is_the_same_bytes(tmp_path):
     assert (len(wheels), len(digests)) == (2, 1)
     with zipfile.ZipFile(wheels[0]) as archive:
         assert "services/commands/master.py" in archive.namelist()
-        assert not any(name.startswith(("tests", "scripts", "hdl")) for name in archive.namelist())
+        assert {f"hdl/{each}" for each in hardware.SOURCES} <= set(archive.namelist())
+        assert not any(name.startswith(("tests", "scripts", "hdl/test")) for name in archive.namelist())
 
 
 def test_an_installed_wheel_has_commands_and_packages(tmp_path):
