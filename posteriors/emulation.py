@@ -117,6 +117,8 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
             states. A variable that is not named, or is None, has no reading, whatever its `on_missing` says of messages.
         bank: Set of seeds; each gives another draw of the same distribution.
 
+    The posterior of a filter is that of its first frame.
+
     Returns:
         The posterior in the shape of the model, with its labels and units; `report` is None.
 

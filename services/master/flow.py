@@ -21,6 +21,7 @@ from services.errors import (
     VariableError,
 )
 from services.master.peers import ANSWER_TIME, Awaited, Peer, Peers
+from services.pipeline.inference import infer
 from services.settings import Settings
 from services.sockets.records import (
     AnyRecord,
@@ -40,6 +41,7 @@ from services.sockets.records import (
 from services.sockets.status import BUCKETS_S, FrameCounts, StageLatency
 from terminal.logs import Logger
 from toolchain.deployment import Deployment
+from toolchain.deployment.filter import Filter
 
 QUEUE_ALL_DEPTH = 256
 """Maximum number of frames that wait with `queue = all` before the run ends with an error."""
@@ -64,10 +66,14 @@ _LOSSES = {
 
 @dataclass(frozen=True, slots=True)
 class _WaitingReading:
-    """A reading that waits for the boards, and the time of its arrival (monotonic, ns)."""
+    """A reading that waits for the boards, and the time of its arrival (monotonic, ns).
+
+    `steps` is 1 and the readings since the one before that no board gets: a filter predicts as many frames.
+    """
 
     reading: Reading
     arrived: int
+    steps: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +169,11 @@ class FrameFlow:
         # For the status: complete readings so far, and the number of the last published frame with its time (ns).
         self._received = 0
         self._last = (0, 0)
+        # The belief of a deployment with [filter]: that of the last frame sent to the boards, predicted when it is sent,
+        # then its posterior. It outlives boards and pcie-app; a lost frame leaves the prediction.
+        self._filter = deployment.new_filter()
+        # Readings since the last one in `_readings` that were lost: steps of the filter without an update.
+        self._skipped = 0
         self.losses: Counter[LossReason] = Counter()
         """Readings and results lost so far, by reason."""
         # Causes of unusable messages, and of frames without a posterior or with a biased one: the user is warned once
@@ -256,12 +267,16 @@ class FrameFlow:
             self.first_reading_at = time.monotonic()
         self.losses[LossReason.PASSED_OVER] += reading.passed_over
         self.losses[LossReason.UNPAIRED] += reading.unpaired
+        # the subscriber counts messages, of which each topic brings one for a reading
+        self._skipped += reading.passed_over // len(self._deployment.sources)
         if self._peers.publisher.away and not self._once:
             # computing it would only delay a later one, whose result can be received
             self.losses[LossReason.ROSBRIDGE_AWAY] += 1
+            self._skipped += 1
             return
         if not self._keeps_all:
             self.losses[LossReason.PASSED_OVER] += len(self._readings)
+            self._skipped += sum(each.steps for each in self._readings)
             self._readings.clear()
         # an error instead of a loss, because who keeps all readings wants every result
         elif len(self._readings) >= QUEUE_ALL_DEPTH:
@@ -272,7 +287,8 @@ class FrameFlow:
                 )
             )
             return
-        self._readings.append(_WaitingReading(reading, time.monotonic_ns()))
+        self._readings.append(_WaitingReading(reading, time.monotonic_ns(), 1 + self._skipped))
+        self._skipped = 0
         self._send_next()
 
     def _take_unusable(self, record: Unusable) -> None:
@@ -281,6 +297,7 @@ class FrameFlow:
             self.fail(VariableError(record.sentence))
             return
         self.losses[LossReason.UNUSABLE] += 1
+        self._skipped += 1
         self._warn_once(record.cause, f"{record.sentence}; such messages are skipped and counted")
 
     def _warn_once(self, cause: str, sentence: str) -> None:
@@ -304,9 +321,20 @@ class FrameFlow:
         reading, number = waiting.reading, self._number
         bank = number % self._deployment.machine.rng_banks
         self._computing = _Computing(number, waiting, time.monotonic_ns())
-        app.protocol.send(FrameRequest(number, reading.addresses, bank, reading.prior_codes))
+        codes = reading.prior_codes if self._filter is None else self._predict(self._filter, waiting.steps)
+        app.protocol.send(FrameRequest(number, reading.addresses, bank, codes))
         if self._follows:
             self._follow(number, bank, waiting)
+
+    def _predict(self, own: Filter, steps: int) -> bytes:
+        """Move the belief to the frame that is sent next, and return it as the codes of its prior."""
+        if self._number == 1:
+            self._log.info("the filter begins with its start distribution")
+            steps = 1  # nothing happened before the first frame
+        if steps > own.most_steps:
+            sentence = f"{steps - 1} readings were lost before frame {self._number}, and the filter predicts {own.most_steps} at most"
+            self._warn_once("steps", f"{sentence}; later ones are not reported")
+        return own.predict(steps).astype("<u2").tobytes()
 
     def _follow(self, number: int, bank: int, waiting: _WaitingReading) -> None:
         """Log a sent frame, and tell the subscriber its number, for its own log."""
@@ -324,6 +352,8 @@ class FrameFlow:
         if computing is None or computing.number != result.number:
             return
         self._computing = None
+        if self._filter is not None:
+            self._filter.update(infer(result, self._deployment).posterior)
         reading = computing.waiting.reading
         publisher = self._peers.publisher.protocol
         record = Publish(

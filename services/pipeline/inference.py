@@ -33,10 +33,11 @@ def report_of(
     hops_ns = tick - publish.reading_sent_tick - publish.waited_ns - boards_ns
     reasons = deployment.machine.kind.reasons
     names = [variable.name for variable in deployment.variables]
+    lost = deployment.filter is not None and inference.posterior is None
     ticks = publish.ticks or [publish.received_tick] * len(names)
     return FrameReport(
         stamp_ns=publish.stamp_ns,
-        outcome=inference.outcome,
+        outcome=inference.outcome + ("; the filter goes on with its prediction" if lost else ""),
         deployment=deployment.name,
         published=inference.posterior is not None,
         number=result.number,

@@ -10,7 +10,9 @@ import numpy as np
 from pcie_shim.errors import FrameInputError
 from pcie_shim.host.mini_cluster import FrameOutput
 from services.boards.deployed import DeployedBoards
+from services.boards.frames import result_record
 from services.errors import InputLineError
+from services.pipeline.inference import infer
 from services.pipes.lines import blocking_lines, decoded
 from services.sockets.records import Addresses, FrameRequest, Values
 from terminal.output import print_json_line, say, say_if_slow
@@ -44,17 +46,21 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
     with say_if_slow("waiting for the boards"):
         opened = boards.open()
     say(opened)
-    reasons = boards.deployment.machine.kind.reasons
+    deployment = boards.deployment
+    reasons, own = deployment.machine.kind.reasons, deployment.new_filter()
     try:
         for number, line in blocking_lines():
             reading = reading_from_line(line, number)
-            codes = np.array(reading.prior_codes, "<u2").tobytes()
+            prior = np.array(reading.prior_codes, "<u2") if own is None else own.predict()
+            codes = prior.astype("<u2").tobytes()
             # as the master chooses it, so that the same readings give the same counts
             frame = FrameRequest(number, reading.addresses, number % banks, codes)
             try:
                 output = boards.run(frame)
             except FrameInputError as error:
                 raise InputLineError(f"line {number} of standard input: {error}") from error
+            if own is not None:
+                own.update(infer(result_record(number, output), deployment).posterior)
             print_json_line(_line(number, output, reading, reasons))
     finally:
         boards.close()

@@ -22,7 +22,9 @@ from typer.main import get_command
 from bridge.client import connect
 from bridge.hub.limits import HubLimits
 from machines.parameters import BM1Parameters
+from machines.posterior import posterior as run_machine
 from pcie_shim import errors, framing
+from pcie_shim.programming_file import read_image
 from rosbayes.__main__ import app
 from services.settings import ENV_PREFIX, Settings
 from terminal.flags import default_of, field_flag
@@ -32,7 +34,7 @@ from tests.patience import PATIENCE
 from tests.toolchain.running import TARGET, assert_refused, toolchain
 from toolchain.building.options import read_sources
 from toolchain.checks.findings import Check
-from toolchain.deployment import BM1Section, BM2Section, DeploymentFile, Variable
+from toolchain.deployment import BM1Section, BM2Section, DeploymentFile, Variable, load_deployment
 from toolchain.models.case_study import load_model
 
 ROOT = Path(__file__).parents[2]
@@ -145,7 +147,7 @@ def test_every_option_of_the_toolchain_is_described():
     ):
         assert {key.split(" ")[0] for key in documented(page, heading)} == options_of(command)
     section = PAGES["docs/reference/toolchain.md"].split("\n## One part again", 1)[1].split("\n## ", 1)[0]
-    question = {"--set", "--searched", "--known", "--given", "--prior-select", "--on-missing"}
+    question = {"--set", "--searched", "--known", "--given", "--prior-select", "--previous", "--on-missing"}
     options = set().union(*(options_of("regenerate", part) for part in ("memories", "project", "deployment")))
     assert not {name for name in options - question if name not in section}
 
@@ -357,18 +359,28 @@ def test_the_models_page_works_as_printed(tmp_path, monkeypatch):
     models = tmp_path / "models"
     for name in ("mymodel", "boiler"):
         (models / name).mkdir(parents=True)
-    for name, language in (("garden.bif", "bif"), ("mymodel/walks.csv", "csv")):
-        (text,) = blocks(language)
+    texts = (*blocks("bif"), *blocks("csv"))
+    for name, text in zip(("garden.bif", "umbrella.bif", "mymodel/walks.csv"), texts, strict=True):
         (models / name).write_text(text)
     boiler, *_ = blocks("python")
     (models / "boiler" / "model.py").write_text(boiler)
     commands = re.findall(r"^    (toolchain .*)$", MODELS, re.MULTILINE)
-    assert len(commands) == 11
+    assert len(commands) == 13
     for command in commands:
         if "fit=" in command:  # of a model that the reader has changed
             continue
         result = toolchain(*shlex.split(command)[1:])
         assert result.exit_code == 0, f"{command}\n{result.stderr}"
+    (days,) = re.findall(r"```text\n(umbrella .*?)```", MODELS, re.DOTALL)
+    umbrella = load_deployment(Path("build/umbrella"))
+    own, machine = umbrella.new_filter(), read_image(umbrella.image_path(0)).machine
+    for number, line in enumerate(days.splitlines(), start=1):
+        codes = own.predict()
+        address = int(line.startswith("umbrella no"))
+        own.update(
+            run_machine(machine, [address], prior_codes=codes, bank=number % umbrella.machine.rng_banks)
+        )
+        assert line.endswith(f"rain {own.belief[0]:.2f}")
 
 
 def test_the_sources_of_the_deployment_page(tmp_path):

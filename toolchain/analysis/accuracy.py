@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from machines.bm1 import BM1Machine, Start, addressed_codes
 from machines.encode import decode_code
 from machines.parameters import RngReset
-from toolchain.analysis.emulation import EmulatedBoards, Inputs, inputs_of_boards
+from toolchain.analysis.emulation import EmulatedBoards, Inputs, inputs_of_boards, priors_of_boards
 from toolchain.analysis.readings import Readings
+from toolchain.deployment.filter import Filter
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.model import Model, exact_posterior, fuse
 
@@ -204,6 +205,7 @@ def measure(
     *,
     banks: int = 4,
     replicas: int = 1,
+    own: Filter | None = None,
     advance: Callable[[], None] = lambda: None,
 ) -> Accuracy:
     """Run a machine on readings and compare its posteriors with exact inference.
@@ -211,7 +213,8 @@ def measure(
     A replica has the same counts as a single machine with the same bank, so a single machine is run for all
     replicas: successive readings, one per replica, form a frame, which ends when the last one ends. Without a
     `model`, only the codes are known. Readings that are impossible in the model have no posterior. `advance` is
-    called after every reading.
+    called after every reading. With the filter `own`, the readings are a sequence, in which every frame has one bank, and
+    the machine is compared with the exact filter.
 
     Raises:
         BuildError: Fewer readings than replicas.
@@ -222,18 +225,25 @@ def measure(
             f"a frame of {replicas} replicas needs {replicas} readings, but there are {len(readings)} ({readings.source})"
         )
     parameters = boards.parameters
+    banks = 1 if own is not None else banks
     banks = max(1, min(banks, parameters.rng_banks if parameters.rng_reset is RngReset.BANK else banks))
     found = _Results(boards, readings, banks)
     impossible = 0
+    belief = None if own is None else own.transition.start
     for place in range(len(readings) // replicas * replicas):
-        exact = None
+        exact = codes = None
+        if own is not None and belief is not None:
+            belief, codes = own.transition.after(belief), own.predict()
         if model is not None:
             addresses, row = readings.of_model(place)
             try:
-                exact = exact_posterior(model, addresses, prior_address=row)
+                exact = exact_posterior(model, addresses, prior_address=row, prior=belief)
             except ModelError:
                 impossible += 1
-        found.add(place, place // replicas, exact, compare=model is not None)
+        last = found.add(place, place // replicas, exact, codes, compare=model is not None)
+        if own is not None:
+            own.update(last)
+            belief = belief if exact is None else exact
         advance()
     if impossible == found.posteriors:
         raise ModelError(f"none of the readings ({readings.source}) is possible in the model")
@@ -252,41 +262,52 @@ class _Results:
     of_sampling: _Differences = field(default_factory=_Differences)
     lengths: dict[int, list[list[int]]] = field(default_factory=dict)
     places: list[int] = field(default_factory=list)
+    priors: list[NDArray[np.uint16] | None] = field(default_factory=list)
     weights: list[NDArray[np.float64]] = field(default_factory=list)
     posteriors: int = 0
     impossible: int = 0
     without: int = 0
     overflow: int = 0
 
-    def add(self, place: int, frame: int, exact: _Posterior, *, compare: bool) -> None:
-        """Run the reading at an index with every bank, and compare it with `exact`, the posterior of the model, if any."""
+    def add(
+        self, place: int, frame: int, exact: _Posterior, prior: NDArray[np.uint16] | None, *, compare: bool
+    ) -> _Posterior:
+        """Run the reading at an index with every bank, and compare it with `exact`, the posterior of the model, if any.
+
+        `prior` is a written one. Return the posterior of the last bank.
+        """
         boards, banks = self.boards, self.banks
         inputs, prior_row = self.readings.of_machine(place, boards.machines[0])
         likelihood = np.concatenate(
             [
-                _line_probabilities(machine, own, prior_row)
-                for machine, own in zip(
-                    boards.machines, inputs_of_boards(inputs, boards.machines), strict=True
+                _line_probabilities(machine, own, prior_row, codes)
+                for machine, own, codes in zip(
+                    boards.machines,
+                    inputs_of_boards(inputs, boards.machines),
+                    priors_of_boards(prior, boards.machines),
+                    strict=True,
                 )
             ]
         )
         numbers = [(frame * banks + run) % boards.parameters.rng_banks for run in range(banks)]
-        ran = [boards.run(inputs, prior_row, bank) for bank in numbers]
+        ran = [boards.run(inputs, prior_row, bank, prior) for bank in numbers]
         posteriors = [each.posterior for each in ran]
         self.posteriors += 1
         self.without += sum(each is None for each in posteriors)
         self.overflow += sum(any(reason.name == "OVERFLOW" for reason in each.reasons) for each in ran)
         self.lengths.setdefault(frame, []).append([each.length for each in ran])
-        codes = fuse(likelihood, ()) if likelihood.any() else None
-        if codes is None:
+        of_codes = fuse(likelihood, ()) if likelihood.any() else None
+        if of_codes is None:
             self.impossible += 1
         else:
             self.weights.append(likelihood)
             self.places.append(place)
-        self.of_sampling.add(frame, posteriors, codes)
+            self.priors.append(prior)
+        self.of_sampling.add(frame, posteriors, of_codes)
         if compare:
-            self.of_codes.add(frame, [codes], exact)
+            self.of_codes.add(frame, [of_codes], exact)
             self.of_machine.add(frame, posteriors, exact)
+        return posteriors[-1]
 
     def summary(self) -> Accuracy:
         lengths = np.array([np.max(each, axis=0) for each in self.lengths.values()])
@@ -296,7 +317,7 @@ class _Results:
         z = None
         if (by_themselves > 0).any():
             usual = int(np.median(by_themselves[by_themselves > 0]))
-            z = _z_scores(self.boards, self.readings, self.places, self.weights, usual)
+            z = _z_scores(self.boards, self.readings, self.places, self.priors, self.weights, usual)
         return Accuracy(
             frames=len(self.lengths),
             posteriors=self.posteriors,
@@ -312,15 +333,22 @@ class _Results:
         )
 
 
-def addressed_chances(machine: BM1Machine, addresses: Inputs, prior_address: int) -> NDArray[np.float64]:
+def addressed_chances(
+    machine: BM1Machine, addresses: Inputs, prior_address: int, prior: NDArray[np.uint16] | None = None
+) -> NDArray[np.float64]:
     """Return the probability that each cell gives a 1 in a cycle: float64[columns, lines], the prior first."""
-    frame = Start(addresses=addresses, prior_address=prior_address, target_count=1, max_cycles=1)
+    frame = Start(
+        addresses=addresses, prior_address=prior_address, prior_codes=prior, target_count=1, max_cycles=1
+    )
     return decode_code(addressed_codes(machine, frame), machine.parameters.prob_bits)
 
 
-def _line_probabilities(machine: BM1Machine, addresses: Inputs, prior_address: int) -> NDArray[np.float64]:
+def _line_probabilities(
+    machine: BM1Machine, addresses: Inputs, prior_address: int, prior: NDArray[np.uint16] | None = None
+) -> NDArray[np.float64]:
     """Return the probability that each line counts in a cycle: float64[lines]."""
-    product: NDArray[np.float64] = np.prod(addressed_chances(machine, addresses, prior_address), axis=0)
+    chances = addressed_chances(machine, addresses, prior_address, prior)
+    product: NDArray[np.float64] = np.prod(chances, axis=0)
     return product
 
 
@@ -338,6 +366,7 @@ def _z_scores(
     boards: EmulatedBoards,
     readings: Readings,
     places: list[int],
+    priors: list[NDArray[np.uint16] | None],
     weights: list[NDArray[np.float64]],
     cycles: int,
 ) -> ZScores | None:
@@ -345,10 +374,10 @@ def _z_scores(
     free = boards.parameters.rng_reset is RngReset.FREE
     drawn: dict[int, NDArray[np.float64]] = {}
     beyond = 0
-    for frame, chance in zip(places, weights, strict=True):
+    for frame, prior, chance in zip(places, priors, weights, strict=True):
         addresses, row = readings.of_machine(frame, boards.machines[0])
         bank = frame % boards.parameters.rng_banks
-        ran = boards.run_for(addresses, row, bank, cycles)
+        ran = boards.run_for(addresses, row, bank, cycles, prior)
         looked_at = (chance * cycles >= EXPECTED_COUNT) & (chance < 1)
         if not looked_at.any():
             continue

@@ -74,8 +74,13 @@ class EmulatedBoards:
         """Lines of all boards."""
         return sum(machine.parameters.lines for machine in self.machines)
 
-    def run(self, addresses: Inputs, prior_address: int, bank: int) -> FrameRun:
-        """Run a frame like the host: in slices of 256 * 2^k cycles until a board overflows, or each board alone."""
+    def run(
+        self, addresses: Inputs, prior_address: int, bank: int, prior: NDArray[np.uint16] | None = None
+    ) -> FrameRun:
+        """Run a frame like the host: in slices of 256 * 2^k cycles until a board overflows, or each board alone.
+
+        `prior` is a written prior, uint16[all lines].
+        """
         end = first_slice(self.target_count) if self.stop is Stop.SLICES else 0
         if end >= self.max_cycles:
             end = 0
@@ -87,7 +92,7 @@ class EmulatedBoards:
             bank=bank,
             run_until=end,
         )
-        reasons = self._start(start, addresses)
+        reasons = self._start(start, addresses, prior)
         while StopReason.SLICE in reasons and StopReason.OVERFLOW not in reasons:
             end = 2 * end if 2 * end < self.max_cycles else 0
             reasons = [
@@ -96,7 +101,14 @@ class EmulatedBoards:
             ]
         return self._shown()
 
-    def run_for(self, addresses: Inputs, prior_address: int, bank: int, cycles: int) -> FrameRun:
+    def run_for(
+        self,
+        addresses: Inputs,
+        prior_address: int,
+        bank: int,
+        cycles: int,
+        prior: NDArray[np.uint16] | None = None,
+    ) -> FrameRun:
         """Run every board that can count for this many cycles, regardless of its counts."""
         start = Start(
             addresses=(),
@@ -105,13 +117,16 @@ class EmulatedBoards:
             max_cycles=cycles,
             bank=bank,
         )
-        self._start(start, addresses)
+        self._start(start, addresses, prior)
         return self._shown()
 
-    def _start(self, start: Start, addresses: Inputs) -> list[StopReason]:
+    def _start(self, start: Start, addresses: Inputs, prior: NDArray[np.uint16] | None) -> list[StopReason]:
+        inputs = inputs_of_boards(addresses, self.machines)
         return [
-            kernel.start(replace(start, addresses=own))
-            for kernel, own in zip(self._kernels, inputs_of_boards(addresses, self.machines), strict=True)
+            kernel.start(replace(start, addresses=own, prior_codes=codes))
+            for kernel, own, codes in zip(
+                self._kernels, inputs, priors_of_boards(prior, self.machines), strict=True
+            )
         ]
 
     def _shown(self) -> FrameRun:
@@ -130,6 +145,15 @@ def inputs_of_boards(inputs: Inputs, machines: Sequence[BM1Machine]) -> list[Inp
     return [
         inputs[:, end - machine.parameters.lines : end] for end, machine in zip(ends, machines, strict=True)
     ]
+
+
+def priors_of_boards(
+    prior: NDArray[np.uint16] | None, machines: Sequence[BM1Machine]
+) -> Sequence[NDArray[np.uint16] | None]:
+    """Return each board's part of a written prior, if there is one."""
+    if prior is None:
+        return [None] * len(machines)
+    return np.split(prior, np.cumsum([machine.parameters.lines for machine in machines])[:-1])
 
 
 def one_replica(machine: BM1Machine) -> BM1Machine:

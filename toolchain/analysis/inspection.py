@@ -1,7 +1,7 @@
 """Inspection of a deployment: losses, accuracy, cycles, resources and energy, as text or as a JSON object."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -75,7 +75,13 @@ def inspect_deployment(
     banks = options.banks or (SLOW_BANKS if _is_slow(whole) else BANKS)
     with progress(len(readings)) as advance:
         accuracy = measure(
-            boards, readings, model, banks=banks, replicas=section.replicas, advance=lambda: advance("frames")
+            boards,
+            readings,
+            model,
+            banks=banks,
+            replicas=section.replicas,
+            own=deployment.new_filter(),
+            advance=lambda: advance("frames"),
         )
     return Inspection(
         deployment=deployment,
@@ -110,7 +116,7 @@ def losses_of(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[
 def _readings(
     deployment: Deployment, whole: BM1Machine, model: Model | None, options: InspectOptions
 ) -> Readings:
-    replicas = deployment.machine.replicas
+    replicas, own = deployment.machine.replicas, deployment.new_filter()
     frames = options.frames
     if frames is None:
         slow = _is_slow(whole)
@@ -130,6 +136,7 @@ def _readings(
             options.reading or (),
             frames=frames * replicas,
             tolerance_s=options.tolerance_s,
+            in_sequence=own is not None,
         )
     if model is None and mode is SensorMode.THRESHOLD:
         raise BuildError(
@@ -139,12 +146,14 @@ def _readings(
     source = "the model" if model is not None else "the codes"
     if model is None:
         model = model_of_codes(deployment.name, deployment.searched, deployment.variables, whole)
+        model = model if own is None else replace(model, prior=None, transition=own.transition)
     of_each = f" of readings for {replicas} replicas," if replicas > 1 else ""
     drawn = sample_readings(
         model,
         frames * replicas,
         seed=options.seed,
-        source=f"{frames} frames{of_each} drawn from {source} (seed {options.seed})",
+        source=f"{frames} frames{of_each}{'' if own is None else ' in sequence,'} drawn from {source} (seed {options.seed})",
+        in_sequence=own is not None,
     )
     if mode is SensorMode.COLUMN:
         return drawn
@@ -248,9 +257,14 @@ def _time_part(found: Inspection) -> str:
 
 def _accuracy_part(found: Inspection) -> str:
     accuracy = found.accuracy
+    is_filter = found.deployment.filter is not None
     every = {
-        "the machine against the model": accuracy.machine,
-        "  of that, by quantising alone": accuracy.quantising,
+        "machine against the exact filter"
+        if is_filter
+        else "the machine against the model": accuracy.machine,
+        "  of that, codes, earlier frames"
+        if is_filter
+        else "  of that, by quantising alone": accuracy.quantising,
         "the machine against its codes": accuracy.sampling,
     }
     alone = {name: each and each.alone for name, each in every.items()}

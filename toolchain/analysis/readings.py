@@ -83,12 +83,23 @@ def check_frames(frames: int) -> None:
         raise BuildError(f"--frames is {frames}, expected 1 to {MOST_FRAMES}")
 
 
-def sample_readings(model: Model, frames: int, *, seed: int, source: str = "") -> Readings:
-    """Draw a line from the prior, or from an equally probable selection, then its readings."""
+def sample_readings(
+    model: Model, frames: int, *, seed: int, source: str = "", in_sequence: bool = False
+) -> Readings:
+    """Draw a line from the prior, or from an equally probable selection, then its readings.
+
+    With `in_sequence`, the lines of a model with a transition are drawn one after the other.
+    """
     check_frames(frames)
     random = np.random.default_rng(seed)
     rows = np.full(frames, MISSING, dtype=np.int64)
-    if model.prior_select is None:
+    if in_sequence and model.transition is not None:
+        line, drawn_lines = random.choice(model.lines, p=_normalised(model.transition.start)), []
+        for _ in range(frames):
+            line = random.choice(model.lines, p=_normalised(model.transition.table[line]))
+            drawn_lines.append(line)
+        lines = np.array(drawn_lines)
+    elif model.prior_select is None:
         lines = random.choice(model.lines, size=frames, p=_normalised(model.prior_distribution))
     else:
         rows = random.integers(0, model.prior_select.values, frames)
@@ -189,9 +200,17 @@ def _normalised(distribution: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def recorded_readings(
-    path: Path, variables: Sequence[Variable], given: Sequence[str], *, frames: int, tolerance_s: float = 0.1
+    path: Path,
+    variables: Sequence[Variable],
+    given: Sequence[str],
+    *,
+    frames: int,
+    tolerance_s: float = 0.1,
+    in_sequence: bool = False,
 ) -> Readings:
     """Return at most `frames` readings of a recording (CSV, MCAP or bag), spread over its length.
+
+    With `in_sequence`, they are the first ones, and a row that does not fit has no readings instead of being left out.
 
     `given` are NAME=COLUMN for variables whose column has another name, with `*` for the same text in both;
     in a bag, messages of other topics may be `tolerance_s` apart from a row.
@@ -205,7 +224,9 @@ def recorded_readings(
     recording = read_recording(path, list(dict.fromkeys(columns.values())), tolerance_s=tolerance_s)
     rows: list[list[int]] = []
     refused, first = 0, ""
-    for at in np.unique(np.linspace(0, recording.rows - 1, min(frames, recording.rows)).astype(int)).tolist():
+    count = min(frames, recording.rows)
+    spread = np.unique(np.linspace(0, recording.rows - 1, count).astype(int)).tolist()
+    for at in range(count) if in_sequence else spread:
         try:
             row = [
                 to_address(variable, recording.columns[columns[variable.name]][at])
@@ -215,9 +236,11 @@ def recorded_readings(
             ]
         except ReadingError as error:
             refused, first = refused + 1, first or str(error)
+            if in_sequence:
+                rows.append([MISSING] * len(variables))
             continue
         rows.append([MISSING if address is None else address for address in row])
-    if not rows:
+    if not rows or refused == len(rows):
         raise ModelError(f"{path} has no row that fits this machine" + (f": {first}" if first else ""))
     addresses = np.array(rows, dtype=np.int64).reshape(len(rows), len(variables))
     sensors = [at for at, variable in enumerate(variables) if variable.kind == "sensor"]

@@ -43,13 +43,22 @@ from toolchain.deployment import (
     BoardSection,
     Deployment,
     Dimension,
+    FilterSection,
     Output,
     Variable,
     write_deployment,
 )
 from toolchain.deployment.deployment import with_hash
+from toolchain.deployment.filter import Transition
 from toolchain.errors import BuildError, DeploymentError
-from toolchain.outputs.output_files import image_files, memory_files, quartus_files, text_file, write_files
+from toolchain.outputs.output_files import (
+    filter_file,
+    image_files,
+    memory_files,
+    quartus_files,
+    text_file,
+    write_files,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,6 +73,8 @@ class Built:
     """The codes of a BM1 before they were divided among boards, and the quantisation loss; None for a BM2."""
     report: str
     """The content of `report.txt`."""
+    transition: Transition | None = None
+    """The content of the file of `[filter]`, if there is one."""
 
 
 REPORT_NAME: Final = "report.txt"
@@ -86,6 +97,7 @@ def build_deployment(
         (directory / FILE_NAME).unlink(missing_ok=True)
     for part in (
         image_files(built.deployment, built.images),
+        filter_file(built.transition),
         memory_files(built.deployment, built.images),
         quartus_files(built.deployment, built.images),
         text_file(REPORT_NAME, built.report),
@@ -138,6 +150,7 @@ def assemble(
         images=images,
         quantised=quantised,
         report=report(deployment=deployment, interface_reason=layout.reason),
+        transition=None if isinstance(plan, BM2Plan) else plan.model.transition,
     )
 
 
@@ -183,6 +196,7 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
     model, options = plan.model, plan.options
     own: dict[str, Any]
     hidden: tuple[Dimension, ...] = ()
+    own_filter: FilterSection | None = None
     section: type[BM1Section | BM2Section]
     if isinstance(plan, BM2Plan):
         section, keys, own = BM2Section, BM2_KEYS, {"variables": plan.model.names}
@@ -191,6 +205,9 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
         hidden = tuple(each.dimension() for each in symbols if each.name not in asked)
     else:
         section, keys, own = BM1Section, MACHINE_KEYS, {"scale": options.scaling, "stop": options.stop}
+        if plan.model.transition is not None:
+            content = plan.model.transition.content()
+            own_filter = FilterSection(hash=hashlib.sha256(content).hexdigest())
     own |= {key: getattr(plan.parameters, key) for key in keys}
     try:
         deployment = Deployment(
@@ -209,6 +226,7 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
                 **own,
             ),
             prior=options.written_prior,
+            filter=own_filter,
             boards=tuple(
                 BoardSection(
                     image=f"boards/board{index}.bm",

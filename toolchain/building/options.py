@@ -227,7 +227,7 @@ class CommonOptions:
     ] = MachineChoice.AUTO
     partitions: Partitions = 1
     prob_bits: Annotated[
-        int | None, typer.Option(help="Bits of a code.", min=1, max=16, show_default="8; BM2: 16")
+        int | None, typer.Option(help="Bits of a code.", min=1, max=16, show_default="8; BM2, filter: 16")
     ] = None
     target_count: Annotated[int | None, TARGET_COUNT] = None
     max_cycles: Annotated[

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from machines.encode import decode_code, encode_probability
 from machines.parameters import PROB_BITS_MAX, SensorMode
 from toolchain.deployment import Scale
+from toolchain.deployment.filter import prediction_codes
 from toolchain.models.conditional import middle_bin
 from toolchain.models.model import Known, Model
 
@@ -127,7 +128,12 @@ def _quantised_prior(model: Model, prob_bits: int, scale: Scale) -> tuple[NDArra
     plain = model.prior_distribution[np.newaxis]
     select = model.prior_select
     if select is None:
-        codes = encode_probability(scaled(plain, scale), prob_bits)
+        is_filter = model.transition is not None
+        codes = (
+            prediction_codes(plain, prob_bits)
+            if is_filter
+            else encode_probability(scaled(plain, scale), prob_bits)
+        )
         return codes, _loss("prior", 0, plain, decode_code(codes, prob_bits))
     served = encode_probability(scaled(np.vstack([select.table, plain]), scale), prob_bits)
     codes = np.zeros((1 << select.bits, model.lines), dtype=np.uint16)

@@ -22,6 +22,7 @@ from toolchain.models.joint import Question
 from toolchain.models.model import Model
 from toolchain.outputs.output_files import (
     Change,
+    filter_file,
     image_files,
     memory_files,
     quartus_files,
@@ -119,6 +120,7 @@ def regenerate_memories(
     built = assemble(plan, lambda new: _with_places(new, deployment))
     parts = [
         image_files(built.deployment, built.images),
+        filter_file(built.transition),
         memory_files(built.deployment, built.images),
         text_file(REPORT_NAME, built.report),
         text_file(

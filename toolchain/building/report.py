@@ -173,6 +173,8 @@ def _prior_paragraph(model: Model, deployment: Deployment) -> list[str]:
         ]
     if deployment.machine.prior_mode is not PriorMode.WRITTEN:
         return []
+    if deployment.filter is not None:
+        return ["Prior: written every frame, predicted by the filter from the posterior of the frame before."]
     if deployment.prior is None:
         return ["Prior: written by the host; the model's own until it is."]
     return [f"Prior: written every frame, from {deployment.prior.path} of the message."]

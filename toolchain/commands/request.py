@@ -45,6 +45,12 @@ class ModelFlags:
     prior_select: Annotated[
         str, typer.Option(help="Variable whose readings select the prior.", metavar="NAME")
     ] = ""
+    previous: Annotated[
+        str,
+        typer.Option(
+            help="For a filter: the searched variables one frame earlier, in the same order.", metavar="A0,B0"
+        ),
+    ] = ""
     on_missing: Annotated[OnMissing, typer.Option(help="Meaning of an absent reading.")] = OnMissing.ERROR
 
     @property
@@ -55,6 +61,7 @@ class ModelFlags:
             "--known": self.known,
             "--given": self.given,
             "--prior-select": self.prior_select,
+            "--previous": self.previous,
             "--on-missing": self.on_missing is not OnMissing.ERROR,
         }
         return [flag for flag, value in values.items() if value]
@@ -127,6 +134,7 @@ def _network_question(path: Path, flags: ModelFlags, settings: dict[str, str]) -
         names_in("--known", flags.known),
         given=key_values(flags.given or (), "--given", "smoke=yes"),
         prior_select=flags.prior_select or None,
+        previous=names_in("--previous", flags.previous),
     )
 
 

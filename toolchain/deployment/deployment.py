@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import tomli_w
 from pydantic import Field, model_validator
@@ -16,6 +16,7 @@ from toolchain.deployment.sections import (
     BoardSection,
     Choice,
     Dimension,
+    FilterSection,
     MachineSection,
     Name,
     Output,
@@ -30,8 +31,13 @@ from toolchain.deployment.sections import (
 )
 from toolchain.errors import DamagedDeploymentError, DeploymentError, DeploymentVersionError
 
+if TYPE_CHECKING:
+    from toolchain.deployment.filter import Filter
+
 FORMAT: Final = 1
 FILE_NAME: Final = "deployment.toml"
+MOST_TRANSITIONS: Final = 2**24
+"""Maximum number of transitions of a filter, lines x lines (128 MiB as float64)."""
 REPLICA: Final = "replica"
 """Label of the dimension of replicas, the first dimension of a published result."""
 
@@ -50,6 +56,7 @@ class DeploymentFile(Section):
     hidden: Sequence[Dimension] = Field(default=(), exclude_if=lambda hidden: not hidden)
     machine: MachineSection
     prior: WrittenPrior | None = Field(default=None, exclude_if=lambda prior: prior is None)
+    filter: FilterSection | None = Field(default=None, exclude_if=lambda section: section is None)
     boards: Sequence[BoardSection] = Field(validation_alias="board", min_length=1)
     outputs: Sequence[Output] = Field(default=(Output(),), validation_alias="output")
     topics: Topics = Field(default=Topics(), exclude_if=lambda topics: topics == Topics())
@@ -97,9 +104,19 @@ class DeploymentFile(Section):
         if bits != self.machine.prior_bits:
             who = f"{selects[0].name} selects it with {bits}" if selects else "no variable selects it"
             raise ValueError(f"the prior has {self.machine.prior_bits} address bits (prior_bits), but {who}")
+        machine, is_written = self.machine, self.machine.prior_mode is PriorMode.WRITTEN
+        if self.filter is not None and not (is_written and machine.is_plain and self.prior is None):
+            raise ValueError(
+                "[filter] writes the prior of a single machine with one reading per variable (prior_mode = written), and is "
+                "not used with [prior]"
+            )
+        if self.filter is not None and machine.lines**2 > MOST_TRANSITIONS:
+            raise ValueError(
+                f"[filter] has {machine.lines} x {machine.lines} transitions; the maximum is {MOST_TRANSITIONS}"
+            )
         if self.prior is None:
             return
-        if self.machine.prior_mode is not PriorMode.WRITTEN:
+        if not is_written:
             raise ValueError(
                 "[prior] is for a written prior, but the prior of the machine is a table (prior_mode)"
             )
@@ -167,6 +184,16 @@ class Deployment(DeploymentFile):
     def image_path(self, board: int) -> Path:
         """Return the path of a board's image."""
         return self.directory / self.boards[board].image
+
+    def new_filter(self) -> "Filter | None":
+        """Return a filter that begins, from the file of `[filter]`, or raise a DeploymentError; None without this section."""
+        # here, because a subscriber loads a deployment without NumPy
+        from toolchain.deployment.filter import Filter, Transition
+
+        if self.filter is None:
+            return None
+        path, machine = self.directory / self.filter.file, self.machine
+        return Filter(Transition.read(path, machine.lines, self.filter.hash), machine.prob_bits)
 
     def output_uri(self, output: Output) -> str:
         """Return the rosbridge server on which an output is published."""
@@ -238,6 +265,7 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
     deployment = Deployment(**dict(file), directory=directory)
     if images:
         _check_images(deployment)
+        deployment.new_filter()
     return deployment
 
 

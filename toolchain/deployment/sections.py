@@ -15,7 +15,6 @@ from pydantic import (
     FailFast,
     Field,
     Tag,
-    field_validator,
     model_validator,
 )
 
@@ -84,6 +83,13 @@ def _matching(pattern: re.Pattern[str], what: str) -> AfterValidator:
     return AfterValidator(check)
 
 
+def _inside(name: str) -> str:
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts or not path.name:
+        raise ValueError(f"{name!r} must be a path inside the deployment's folder")
+    return name
+
+
 def _not_zero(step: float) -> float:
     if step == 0:
         raise ValueError("a step of 0 would give every value the same address")
@@ -108,6 +114,8 @@ PathOrName = Annotated[str, _matching(re.compile(f"(?:{MESSAGE_PATH.pattern})?")
 Name = Annotated[str, Field(min_length=1, max_length=NAME_MAX), AfterValidator(_printable)]
 """One printable line, because names also come from network files."""
 Sha256 = Annotated[str, _matching(_SHA256, "a SHA-256 hash; expected 64 hexadecimal digits")]
+OwnPath = Annotated[str, AfterValidator(_inside)]
+"""A path in the folder of the deployment."""
 Step = Annotated[float, AfterValidator(_not_zero)]
 TOPIC_BYTES_MIN, TOPIC_BYTES_MAX = 1 << 10, 1 << 28
 """Smallest and largest limit of the size of a topic's messages, in bytes."""
@@ -388,22 +396,21 @@ class WrittenPrior(Section):
     on_missing: Literal["error", "model"] = "error"
 
 
+class FilterSection(Section):
+    """`[filter]`: the prior of a frame is predicted from the posterior of the frame before (`deployment.filter`)."""
+
+    file: OwnPath = "filter.npy"
+    hash: Sha256
+
+
 class BoardSection(Section):
     """`[[board]]`: one board of the mini-cluster, its image and its lines of the machine."""
 
-    image: str
+    image: OwnPath
     image_hash: Sha256
     line_offset: int = Field(ge=0)
     lines: int = Field(ge=1)
     endpoint: str = ""
-
-    @field_validator("image")
-    @classmethod
-    def _inside(cls, image: str) -> str:
-        path = PurePosixPath(image)
-        if path.is_absolute() or ".." in path.parts or not path.name:
-            raise ValueError(f"{image!r} must be a path inside the deployment's folder")
-        return image
 
 
 class Output(Section):

@@ -247,10 +247,9 @@ def _counted(
 
 def _counted_prior(model: Model, truth: TrueCells, options: FitOptions) -> NDArray[np.float64]:
     """Return P(S), float64[lines], from the number of rows in each cell."""
-    if model.prior_select is not None:
-        raise ModelError(
-            f"--learn-prior: the prior of {model.name} is selected by {model.prior_select.name}; omit the flag"
-        )
+    if model.prior_select is not None or model.transition is not None:
+        how = f"selected by {model.prior_select.name}" if model.prior_select else "predicted by its filter"
+        raise ModelError(f"--learn-prior: the prior of {model.name} is {how}; omit the flag")
     counts = np.bincount(truth.lines, minlength=model.lines)
     base = (
         model.prior_distribution if options.prior is FitPrior.MODEL else np.full(model.lines, 1 / model.lines)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from graphlib import CycleError, TopologicalSorter
 from operator import itemgetter
 from typing import Final, TypeAlias
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from toolchain.bounded_files import nearest_name
+from toolchain.deployment.filter import Transition
 from toolchain.errors import ModelError, NotFusionError
 from toolchain.models.distribution import Distribution, Factor, Symbol
 from toolchain.models.inference import Links, Term, eliminate, product, reduced, relevant, without_idle
@@ -92,6 +93,7 @@ class JointDistribution:
         *,
         given: Mapping[str, str] | None = None,
         prior_select: Named | None = None,
+        previous: Sequence[Named] = (),
     ) -> Question:
         """Return the question P(searched | known).
 
@@ -100,6 +102,8 @@ class JointDistribution:
             known: The symbols known in every frame, in the order of the machine's columns.
             given: Symbols with a fixed value, by name: the label or number of the value.
             prior_select: A known symbol that selects the prior instead of being a column (thesis 2.1.2).
+            previous: For a filter: the searched symbols one frame earlier, in the same order. The arcs from them are
+                the transition, and their own distribution is that before the first frame.
 
         Raises:
             ModelError: A symbol does not exist, or is in the question twice.
@@ -113,12 +117,14 @@ class JointDistribution:
             known=tuple(self.symbol(each) for each in known),
             given=fixed,
             prior_select=None if prior_select is None else self.symbol(prior_select),
+            previous=tuple(self.symbol(each) for each in previous),
         )
-        names = [each.name for each in (*question.searched, *question.observed)] + list(fixed)
+        symbols = (*question.searched, *question.observed, *question.previous)
+        names = [each.name for each in symbols] + list(fixed)
         for name in names:
             if names.count(name) > 1:
                 raise ModelError(
-                    f"{self.name}: {name} is in the question twice; it can be either searched, known or given"
+                    f"{self.name}: {name} is in the question twice; it can be either searched, known, given or previous"
                 )
         if not question.searched:
             raise ModelError(f"{self.name}: the question does not search anything")
@@ -139,6 +145,8 @@ class Question:
     """The index of each fixed value, by its symbol's name."""
     prior_select: Symbol | None
     """The symbol that selects the prior, or None."""
+    previous: tuple[Symbol, ...] = ()
+    """The searched symbols one frame earlier, for a filter; or none."""
 
     def __repr__(self) -> str:
         known = [*(each.name for each in self.observed), *(f"{name}={at}" for name, at in self.given.items())]
@@ -188,7 +196,69 @@ class Question:
             else:
                 common += left
         common += [term for term in terms if set(term.scope) <= set(searched)]
-        return self._fusion(own, product(common, searched, sizes).ravel(), sizes)
+        model = self._fusion(own, product(common, searched, sizes).ravel(), sizes)
+        return replace(model, prior=None, transition=self._transition()) if self.previous else model
+
+    def _transition(self) -> Transition:
+        """Return the start and the transition of the filter, or a ModelError if the question is not one."""
+        name, lines = self.joint.name, math.prod(symbol.size for symbol in self.searched)
+        pairs = list(zip(self.searched, self.previous, strict=False))
+        if len(self.previous) != len(self.searched):
+            raise ModelError(
+                f"{name}: {len(self.searched)} searched and {len(self.previous)} previous variables; name the earlier self of "
+                "each searched one, in the same order"
+            )
+        for symbol, before in pairs:
+            if symbol.type != before.type:
+                raise ModelError(
+                    f"{name}: {before.name}, the previous {symbol.name}, does not have the same values"
+                )
+        if self.given or self.prior_select:
+            other = self.prior_select.name if self.prior_select else next(iter(self.given))
+            raise ModelError(
+                f"{name}: a filter has searched, known and previous variables alone: leave {other} out"
+            )
+        advice = ": search fewer variables or values"
+        check_size(f"{name}: the transition between {lines} lines", lines * lines, MAX_ENTRIES, advice)
+        earlier = {symbol.name for symbol in self.previous}
+        start: list[Term] = []
+        moves: list[Term] = []
+        active = [without_idle(factor) for factor in self.joint.factors]
+        for factor in relevant(active, earlier | {symbol.name for symbol in self.searched}):
+            if not isinstance(factor, Distribution):
+                raise ModelError(f"{name}: a filter needs distributions, but {factor.title} is none")
+            others = {symbol.name for symbol in factor.given} - earlier
+            if factor.symbol.name in earlier and others:
+                raise ModelError(
+                    f"{name}: {factor.symbol.name}, which is previous, depends on {min(others)}, which is not"
+                )
+            terms = start if factor.symbol.name in earlier else moves
+            terms.append(Term(tuple(symbol.name for symbol in factor.scope), factor.table))
+        if not any(earlier.intersection(term.scope) for term in moves):
+            names = [" and ".join(each.name for each in group) for group in zip(*pairs, strict=True)]
+            raise ModelError(f"{name}: {names[0]} does not depend on {names[1]}, the previous {names[0]}")
+        self._check_known(earlier)
+        sizes = {symbol.name: symbol.size for symbol in self.joint.symbols}
+        scope = [symbol.name for symbol in (*self.previous, *self.searched)]
+        hidden = {each for term in moves for each in term.scope} - set(scope)
+        table = product(eliminate(moves, hidden, sizes), scope, sizes).reshape(lines, lines)
+        first = product(start, scope[: len(self.previous)], sizes).ravel()
+        return Transition(first / first.sum(), table / table.sum(axis=1, keepdims=True))
+
+    def _check_known(self, earlier: set[str]) -> None:
+        """Raise a ModelError if a known symbol is not independent of the previous ones given the searched ones."""
+        active = [without_idle(factor) for factor in self.joint.factors]
+        _, links = self._linked(active, [*(symbol.name for symbol in self.known), *earlier])
+        for component in links.components():
+            for symbol in self.known if component & earlier else ():
+                for before in sorted(component & earlier) if symbol.name in component else ():
+                    _, own = self._linked(active, [symbol.name, before])
+                    if path := own.path(symbol.name, before):
+                        searched = ", ".join(each.name for each in self.searched)
+                        raise ModelError(
+                            f"{self.joint.name}: {symbol.name} is not independent of the previous frame given {searched}: "
+                            f"{own.drawn(path)} joins it with {before}; search what is between, or leave {symbol.name} out"
+                        )
 
     def network(self) -> NetworkModel:
         """Return the network that a BM2 samples, or raise a ModelError; what selects the prior is one of the known."""

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from toolchain.deployment import Dimension, Variable
+from toolchain.deployment.filter import Transition
 from toolchain.deployment.sections import NAME_MAX
 from toolchain.errors import ModelError
 
@@ -163,6 +164,8 @@ class Model:
     """P(S), float64[lines] summing to 1; None for a uniform one or, with a `prior_select`, for the mean of its rows."""
     prior_select: PriorSelect | None = None
     """The variable that selects the prior; then `prior` is the prior without a selection."""
+    transition: Transition | None = None
+    """The searched variable from frame to frame, for a filter; then `prior` is the prediction for the first frame."""
 
     def __post_init__(self) -> None:
         name = self.name if isinstance(self.name, str) else ""  # a user's file is not type-checked
@@ -190,10 +193,22 @@ class Model:
                     f"P({known.name} | S) has {known.table.shape[1]} lines, but the searched dimensions "
                     f"({' x '.join(str(d.size) for d in self.searched)}) have {self.lines} cells"
                 )
+        if self.transition is not None and self.prior_select is not None:
+            raise ModelError(
+                f"model {self.name!r} has a transition, so {self.prior_select.name} cannot select its prior"
+            )
+        if self.transition is not None and self.transition.start.shape != (self.lines,):
+            raise ModelError(
+                f"the transition has {self.transition.start.size} lines, but the searched dimensions have {self.lines} cells"
+            )
         if self.prior is not None and np.shape(self.prior) != (self.lines,):
             raise ModelError(f"the prior P(S) has shape {np.shape(self.prior)}, expected ({self.lines},)")
         prior = self._default_prior() if self.prior is None else np.array(self.prior, float)
         _check_distribution("the prior P(S)", prior)
+        if self.transition is not None and not np.array_equal(prior, self._default_prior()):
+            raise ModelError(
+                f"the prior of model {self.name!r} is predicted from its transition: leave out another one"
+            )
         if self.prior_select is not None:
             self._default_prior()  # checks that its rows have the lines of this model
         prior.flags.writeable = False
@@ -212,6 +227,8 @@ class Model:
         return self.known if self.prior_select is None else (*self.known, self.prior_select)
 
     def _default_prior(self) -> NDArray[np.float64]:
+        if self.transition is not None:
+            return self.transition.after(self.transition.start)
         if self.prior_select is None:
             return np.full(self.lines, 1 / self.lines)
         rows = self.prior_select.table
@@ -299,13 +316,17 @@ def _first(reason: ValidationError) -> str:
 
 
 def exact_posterior(
-    model: Model, addresses: Sequence[int | NDArray[np.int64] | None], *, prior_address: int | None = None
+    model: Model,
+    addresses: Sequence[int | NDArray[np.int64] | None],
+    *,
+    prior_address: int | None = None,
+    prior: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Return P(S | readings) of the unquantised model, float64[lines].
 
     There is an address per known variable, in the order of the columns; None for a missing reading. If lines have
     their own readings (`sensor_mode = cell`), it is int64[lines]. `prior_address` is the row of the selected prior;
-    None for the prior without a selection.
+    None for the prior without a selection. `prior` replaces that of the model.
 
     Raises:
         ModelError: The number of addresses is wrong, an address is not supported, or the readings are
@@ -326,7 +347,7 @@ def exact_posterior(
             raise ModelError(f"variable {known.name}: address {address} is not one of its {known.values}")
         factors.append(known.table[address])
     if prior_address is None:
-        return fuse(model.prior_distribution, factors)
+        return fuse(model.prior_distribution if prior is None else prior, factors)
     rows = None if model.prior_select is None else model.prior_select.table
     if rows is None or not 0 <= prior_address < len(rows):
         raise ModelError(f"model {model.name!r} has no prior of address {prior_address}")

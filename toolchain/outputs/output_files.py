@@ -13,7 +13,8 @@ from typing import Final
 from machines.parameters import RngKind
 from pcie_shim.programming_file import Image, image_bytes
 from toolchain.bounded_files import file_errors, whole_file
-from toolchain.deployment import Deployment
+from toolchain.deployment import Deployment, FilterSection
+from toolchain.deployment.filter import Transition
 from toolchain.errors import BuildError
 from toolchain.outputs.memories import MEMORIES_FOLDER, Memory, memories
 from toolchain.outputs.mif import printable
@@ -161,6 +162,14 @@ def image_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
     """Return the programming files."""
     pairs = zip(deployment.boards, images, strict=True)
     return OutputFiles({board.image: map(image_bytes, [image]) for board, image in pairs}, _IMAGES)
+
+
+def filter_file(transition: Transition | None) -> OutputFiles:
+    """Return the file of a filter; none without a transition."""
+    name = str(FilterSection.model_fields["file"].default)
+    return OutputFiles(
+        {} if transition is None else {name: [transition.content()]}, re.compile(re.escape(name))
+    )
 
 
 def text_file(name: str, text: str) -> OutputFiles:

@@ -45,8 +45,11 @@ class Run:
         self.peers = self.master._peers
         self.peers._events = self.flow
         self.warnings = []
+        self.infos = []
         self.flow._log = SimpleNamespace(
-            warning=lambda sentence, **_: self.warnings.append(sentence), debug=lambda *_, **__: None
+            warning=lambda sentence, **_: self.warnings.append(sentence),
+            info=self.infos.append,
+            debug=lambda *_, **__: None,
         )
         for role in ("subscriber", "publisher", "pcie-app"):
             self.peers._by_role[role] = Peer(role, None, None)

@@ -4,8 +4,11 @@ Run.read ──▶ FrameFlow ──▶ app.frames;  computed(), failed() ──�
 """
 
 import msgspec
+import numpy as np
 import pytest
 
+from machines.kind import BoardResult
+from services.boards.frames import encode_boards
 from services.child import RESTARTS
 from services.errors import (
     BoardFailedError,
@@ -15,6 +18,7 @@ from services.errors import (
     VariableError,
 )
 from services.master.flow import MOST_AT_PUBLISHER, QUEUE_ALL_DEPTH, REMEMBERED, Latencies
+from services.pipeline.inference import infer, report_of
 from services.sockets.records import (
     FailureReason,
     FrameFailed,
@@ -28,6 +32,10 @@ from services.sockets.records import (
     Unusable,
 )
 from tests.services.master.conftest import Run
+from tests.toolchain.running import build_model
+from toolchain.deployment import load_deployment
+from toolchain.deployment.filter import Transition
+from toolchain.models.model import Known, Model, dimension
 
 RAW = msgspec.Raw(b"\xc1")  # bytes that no decoder takes
 
@@ -362,3 +370,96 @@ async def test_only_published_frames_count(run):
     for number, outcome in ((1, Outcome.PUBLISHED), (2, Outcome.ROSBRIDGE_AWAY), (3, Outcome.NO_POSTERIOR)):
         run.take(run.publisher, Published(number, outcome, None, 0, 1.0, 1, 1))
     assert {each.frames for each in run.flow.latencies.summary()} == {1}
+
+
+MOVES = np.array([[0.9, 0.1, 0.0], [0.0, 0.7, 0.3], [0.2, 0.0, 0.8]])
+
+
+@pytest.fixture
+def filtered(tmp_path):
+    """A deployment with a filter: three rooms, in order."""
+    known = (Known(name="heard", table=np.full((2, 3), 0.5)),)
+    transition = Transition(np.array([1.0, 0, 0]), MOVES)
+    model = Model(name="rooms", searched=(dimension("room", size=3),), known=known, transition=transition)
+    build_model(model, tmp_path)
+    return load_deployment(tmp_path)
+
+
+def counted(run, *counts):
+    """The result of the last frame."""
+    boards = encode_boards([BoardResult(np.array(counts, "<u4").tobytes(), 100, 1)])
+    run.take(run.app, FrameResult(run.app.frames[-1], boards, 0, 0, 0, 0))
+
+
+def codes_of(belief):
+    """The codes of a prior, computed here, number by number."""
+    scaled = [each / max(belief) * 65536 for each in belief]
+    return [min(65535, max(1, int(each + 0.5))) if each else 0 for each in scaled]
+
+
+def prior_of(frame):
+    return np.frombuffer(frame.prior_codes, "<u2").tolist()
+
+
+async def test_the_posterior_of_a_frame_becomes_the_prior_of_the_next(filtered):
+    run = Run(filtered, queue="all")
+    run.read(3)
+    assert len(run.app.frames) == 1  # the next prior needs this posterior
+    assert prior_of(run.app.records[0]) == codes_of([0.9, 0.1, 0])
+    assert run.infos == ["the filter begins with its start distribution"]
+    counted(run, 10, 30, 0)
+    assert prior_of(run.app.records[1]) == codes_of(0.25 * MOVES[0] + 0.75 * MOVES[1])
+    counted(run, 0, 0, 0)  # without a posterior, the prediction stays
+    assert prior_of(run.app.records[2]) == codes_of((0.25 * MOVES[0] + 0.75 * MOVES[1]) @ MOVES)
+    assert len(run.infos) == 1
+    assert Run(filtered).flow._filter.belief.tolist() == [1, 0, 0]  # another master begins again
+    run.flow.end.cancel()
+
+
+async def test_every_lost_reading_is_a_step_of_the_filter(filtered):
+    run = Run(filtered)
+    run.read(2, passed_over=7)  # the first reading is the first step, whatever was before
+    belief = np.array([1.0, 0, 0]) @ MOVES
+    assert prior_of(run.app.records[0]) == codes_of(belief)
+    run.read(2, passed_over=1)  # passed over: 7 and 1 and 1 by the subscriber, and two that waited
+    run.take(run.subscriber, Unusable("a", "room is missing"))
+    failed(run)
+    belief = belief @ np.linalg.matrix_power(MOVES, 12)
+    assert prior_of(run.app.records[1]) == codes_of(belief)
+    counted(run, 0, 0, 4)
+    run.take(run.publisher, Rosbridge(connected=False))
+    run.read(3)
+    run.take(run.publisher, Rosbridge(connected=True))
+    run.read()  # after the unusable one and three that nobody could have received
+    belief = np.array([0, 0, 1.0]) @ np.linalg.matrix_power(MOVES, 5)
+    assert prior_of(run.app.records[2]) == codes_of(belief)
+    run.flow.lost(run.peers.app)  # with its frame, whose prediction stays
+    run.read()
+    assert prior_of(run.app.records[3]) == codes_of(belief @ MOVES)
+    assert run.lost[LossReason.PASSED_OVER] == 7 + 7 + 1 + 1 + 2
+    run.flow.end.cancel()
+
+
+async def test_a_prediction_that_would_take_too_long_is_shortened_and_reported(filtered):
+    run = Run(filtered)
+    run.flow._filter.most_steps = 4
+    run.read()
+    counted(run, 0, 1, 0)
+    for _ in range(2):
+        run.read(passed_over=1000)
+        counted(run, 0, 1, 0)
+    assert prior_of(run.app.records[1]) == codes_of(np.linalg.matrix_power(MOVES, 4)[1])
+    (warning,) = run.warnings
+    assert warning.startswith("1000 readings were lost before frame 2, and the filter predicts 4 at most")
+    run.flow.end.cancel()
+
+
+async def test_a_report_says_what_the_filter_does_without_a_posterior(filtered):
+    run = Run(filtered)
+    run.read(2)
+    counted(run, 0, 0, 0)
+    (publish,) = run.publisher.records
+    inference = infer(publish.result, filtered)
+    report = report_of(publish, inference, filtered, now=(0, 0), previous_out_ns=0)
+    assert report.outcome == inference.outcome + "; the filter goes on with its prediction"
+    run.flow.end.cancel()

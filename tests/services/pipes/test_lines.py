@@ -5,18 +5,25 @@ import json
 import os
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 from machines.bm1_kind import BM1
+from machines.kind import BoardResult
+from pcie_shim.host.mini_cluster import FrameOutput
 from services.boards.frames import decode_boards
 from services.commands import master, subscriber
 from services.errors import InputLineError
-from services.pipes import lines
+from services.pipes import lines, pcie_app
 from services.pipes.pcie_app import reading_from_line
 from services.pipes.publisher import result_from_line
 from tests.command_runner import invoke
-from toolchain.deployment import BM1Section
+from tests.toolchain.running import build_model
+from toolchain.deployment import BM1Section, load_deployment
+from toolchain.deployment.filter import Transition
+from toolchain.models.model import Known, Model, dimension
 
 BOAT = Path(__file__).parents[3] / "casestudies" / "boat"
 
@@ -135,3 +142,30 @@ async def test_a_line_has_a_limit_however_it_arrives(monkeypatch, tmp_path):
             while transports:
                 transports.pop().close()
                 await asyncio.sleep(0)
+
+
+def test_pcie_app_filters_its_lines(tmp_path, monkeypatch, capsys):
+    moves = np.array([[0.5, 0.5], [0.25, 0.75]])
+    known = (Known(name="heard", table=np.full((2, 2), 0.5)),)
+    transition = Transition(np.array([1.0, 0]), moves)
+    build_model(
+        Model(name="m", searched=(dimension("s", size=2),), known=known, transition=transition), tmp_path
+    )
+    boards, priors = Mock(deployment=load_deployment(tmp_path), open=lambda: "open"), []
+
+    def run(frame):
+        priors.append(np.frombuffer(frame.prior_codes, "<u2").tolist())
+        words = np.array([0, 5 if frame.number == 1 else 0], "<u4").tobytes()
+        times = dict.fromkeys(("register_writes_ns", "compute_ns", "reads_ns", "boards_compute_ns"), 0)
+        return FrameOutput(boards=(BoardResult(words, 9, 1),), slices=1, **times)
+
+    boards.run = run
+    monkeypatch.setattr(pcie_app, "blocking_lines", lambda: [(at, b'{"addresses": [0]}') for at in (1, 2, 3)])
+    assert pcie_app.compute_lines(boards, 16) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 3
+    last = np.array([0.25, 0.75]) @ moves  # the second line has no posterior, so it is predicted twice
+    assert priors == [
+        [65535, 65535],
+        [int(65536 / 3 + 0.5), 65535],
+        [int(65536 * last[0] / last[1] + 0.5), 65535],
+    ]

@@ -7,6 +7,7 @@ import json
 import math
 import re
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from tests.toolchain.builders import interval, normal, wrapped_normal
 from tests.toolchain.running import done, toolchain
+from toolchain.deployment.filter import Transition
 from toolchain.errors import ModelError
 from toolchain.learning import FitMethod, FitOptions, FitPrior
 from toolchain.learning.fit import LEAST_READINGS, fit_model, locate, mixture
@@ -221,6 +223,10 @@ def test_a_learnt_prior_is_dirichlets(tmp_path):
     other = Model(name="other", searched=(dimension("x", size=cells + 1),), known=())
     with pytest.raises(ModelError, match="prior"):
         apply_fit(other, Fit(file=fit.file.replace(variables=()), tables={}, prior=fit.prior))
+    moving = replace(door(), prior=None, transition=Transition(np.full(cells, 1 / cells), np.eye(cells)))
+    with pytest.raises(ModelError, match="--learn-prior: the prior of .* is predicted by its filter"):
+        learn(moving, truth, readings, **options)
+    assert apply_fit(moving, unlearnt).transition is moving.transition
 
 
 def archive(path, members):

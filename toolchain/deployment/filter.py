@@ -1,0 +1,125 @@
+"""The filter of a deployment, which makes the posterior of a frame the prior of the next one.
+
+    start ─▶ belief ──predict──▶ prediction ──codes──▶ written prior of the boards ──▶ posterior
+                ▲                                                                          │
+                └───────────────────────────────── update ─────────────────────────────────┘
+
+A frame without a posterior leaves the prediction as the belief.
+"""
+
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from machines.encode import encode_probability
+from toolchain.bounded_files import read_bounded
+from toolchain.errors import DamagedDeploymentError, DeploymentError, ModelError
+
+_SUM_TOLERANCE: Final = 1e-6
+_MOST_WORK: Final = 2**28
+"""Maximum number of multiplications of a prediction, which take about 0.2 s."""
+_HEADER_BYTES: Final = 4096
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Transition:
+    """The searched variable from frame to frame; a ModelError if a distribution does not sum to 1."""
+
+    start: NDArray[np.float64]
+    """P(S) before the first frame, float64[lines]."""
+    table: NDArray[np.float64]
+    """P(S | its value one frame before), float64[lines, lines]; a row for each value before."""
+
+    def __post_init__(self) -> None:
+        lines = np.shape(self.start)
+        if len(lines) != 1 or not lines[0] or np.shape(self.table) != lines * 2:
+            raise ModelError(
+                f"the transition has shape {np.shape(self.table)} and its start {np.shape(self.start)}, expected (lines, "
+                "lines) and (lines,)"
+            )
+        for name, rows in (("start", self.start), ("table", self.table)):
+            own = np.array(rows, np.float64)
+            if not (own >= 0).all() or not (abs(own.sum(axis=-1) - 1) <= _SUM_TOLERANCE).all():
+                raise ModelError(
+                    f"the {name} of the transition has a negative number, or a distribution that does not sum to 1"
+                )
+            object.__setattr__(self, name, own)
+
+    def after(self, belief: NDArray[np.float64], steps: int = 1) -> NDArray[np.float64]:
+        """Return the distribution some frames later, float64[lines], without readings."""
+        for _ in range(steps):
+            belief = belief @ self.table
+        later: NDArray[np.float64] = belief / belief.sum()
+        return later
+
+    def content(self) -> bytes:
+        """Return the content of the file: a NumPy array of float64[1 + lines, lines], the start and then the table."""
+        file = io.BytesIO()
+        rows = np.vstack([self.start, self.table]).astype("<f8")
+        np.lib.format.write_array(file, rows, version=(1, 0), allow_pickle=False)
+        return file.getvalue()
+
+    @classmethod
+    def read(cls, path: Path, lines: int, sha256: str) -> "Transition":
+        """Read the file of a deployment, or raise a DeploymentError."""
+        if not path.is_file():
+            raise DamagedDeploymentError(
+                f"{path}, the filter's start and transition, does not exist: build it again with 'toolchain build'"
+            )
+        data = read_bounded(path, 8 * (lines + 1) * lines + _HEADER_BYTES, DeploymentError)
+        if (found := hashlib.sha256(data).hexdigest()) != sha256:
+            raise DamagedDeploymentError(
+                f"{path} is of another build, or damaged: its hash is {found[:16]}, deployment.toml names {sha256[:16]}"
+            )
+        file, shape = io.BytesIO(data), (lines + 1, lines)
+        try:
+            version = np.lib.format.read_magic(file)
+            found_shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+            rows = np.frombuffer(data, "<f8", offset=file.tell()).reshape(shape)
+            if (version, found_shape, fortran, dtype) == ((1, 0), shape, False, rows.dtype):
+                return cls(rows[0], rows[1:])
+            why = f"it has {dtype}{list(found_shape)}"
+        except (ValueError, ModelError) as reason:
+            why = str(reason)
+        raise DamagedDeploymentError(
+            f"{path} is not float64{list(shape)}, the filter's start and transition: {why}"
+        )
+
+
+def prediction_codes(prediction: NDArray[np.float64], prob_bits: int) -> NDArray[np.uint16]:
+    """Return the codes of a predicted prior, uint16[lines], relative to its maximum.
+
+    A code is at least 1 where the prediction is above 0. With 0, no reading could ever bring back a value that was
+    refuted once, if it is rarely left or entered.
+    """
+    codes = encode_probability(prediction / prediction.max(), prob_bits)
+    codes[(codes == 0) & (prediction > 0)] = 1
+    return codes
+
+
+class Filter:
+    """The belief about the searched variable, from frame to frame."""
+
+    def __init__(self, transition: Transition, prob_bits: int) -> None:
+        """Begin with the start distribution; `prob_bits` is the width of the codes."""
+        self.transition: Final = transition
+        self._prob_bits = prob_bits
+        self.most_steps: Final = max(1, _MOST_WORK // transition.table.size)
+        """Maximum number of frames of a prediction; for more, as many are predicted."""
+        self.belief: NDArray[np.float64] = transition.start
+        """P(S | all readings so far), float64[lines]; after `predict` that of the next frame before its readings."""
+
+    def predict(self, steps: int = 1) -> NDArray[np.uint16]:
+        """Move the belief some frames on, and return its codes, the prior of the frame: uint16[lines]."""
+        self.belief = self.transition.after(self.belief, min(steps, self.most_steps))
+        return prediction_codes(self.belief, self._prob_bits)
+
+    def update(self, posterior: NDArray[np.float64] | None) -> None:
+        """Take the posterior of the frame as the belief; without one, the prediction remains."""
+        if posterior is not None:
+            self.belief = posterior
