@@ -47,6 +47,10 @@ _TURN_FRAMES: Final = 128
 _TURN_BYTES: Final = 64 * 1024
 _SLICE_BYTES: Final = 4 * 1024
 _TURN_MESSAGES: Final = 32
+# Seconds for which the hub polls its sockets after a prompt response, and for which it does not after polling was in
+# vain, at first and at most (see `_Hub.stay_awake`).
+_AWAKE: Final = 200e-6
+_PAUSES: Final = (1e-3, 1.0)
 # Seconds between two checks for silent and stuck clients.
 _SWEEP: Final = 1.0
 # Seconds that a client has to end a connection which the hub closed.
@@ -153,6 +157,12 @@ class _Hub:
         # The next `sweep`, and when the last one was: a hub that was late must not blame its clients.
         self._sweeper: asyncio.TimerHandle | None = None
         self._swept = time.monotonic()
+        # Monotonic seconds: until when a response is prompt, from when on sockets may be polled for it, and when polling
+        # was last in vain.
+        self._prompt_until = self._poll_from = self._in_vain = -inf
+        # Seconds without polling after the next one in vain, and True while `_poll` is scheduled.
+        self._pause = _PAUSES[0]
+        self._is_polling = False
         # Lines about connections since `_log_since` (see `warn`).
         self._log_lines = 0
         self._log_since = -inf
@@ -229,6 +239,29 @@ class _Hub:
         if deadline != self._timer_deadline:
             self._set_timer(deadline)
 
+    def stay_awake(self, now: float) -> None:
+        """Poll the sockets for a moment after a response at `now`, if responses are prompt.
+
+        Otherwise client and hub sleep in turn while one message is on its way, and waking up takes longer than all the
+        rest. A publisher that waits for nothing gets its core.
+        """
+        is_prompt, self._prompt_until = now < self._prompt_until, now + _AWAKE
+        if self._is_polling:
+            self._pause = _PAUSES[0]
+        elif now < self._in_vain + _AWAKE:  # a client on the same core had to wait for the end of the polling
+            self._in_vain, self._poll_from = -inf, now + self._pause
+            self._pause = min(2 * self._pause, _PAUSES[1])
+        elif is_prompt and now >= self._poll_from:
+            self._poll()
+
+    def _poll(self) -> None:
+        now = time.monotonic()
+        self._is_polling = now < self._prompt_until
+        if self._is_polling:
+            asyncio.get_running_loop().call_soon(self._poll)  # with a call to make, the loop does not sleep
+        else:
+            self._in_vain = now
+
     def _set_timer(self, deadline: float) -> None:
         if self._timer is not None:
             self._timer.cancel()
@@ -268,6 +301,8 @@ class _Connection(WebSocketTransport):
         self._pinged_at: float | None = None
         self._stuck_since: float | None = None
         self._close_by = inf
+        # True from output to the client until its next message, which may be a response.
+        self._is_answered = False
         # True while the next turn of `_flush_backlog` is scheduled.
         self._flushing = False
 
@@ -336,7 +371,10 @@ class _Connection(WebSocketTransport):
             performed = self._hub.broker.receive_turn(self._client, messages, self.last_heard)
             if performed < len(messages):
                 self.postpone(messages[performed:])
+            responds, self._is_answered = self._is_answered, False
             self._hub.serve()
+            if responds:
+                self._hub.stay_awake(self.last_heard)
 
     def close_expected(self) -> None:
         """Give the client limited time to end the connection."""
@@ -364,6 +402,7 @@ class _Connection(WebSocketTransport):
         outbox = client.outbox
         if outbox.wire:
             payloads, outbox.wire = outbox.wire, []
+            self._is_answered = True
             self.send(payloads)
         if outbox.wire is None or not outbox.empty:
             self._flush_backlog(outbox)

@@ -4,6 +4,7 @@ import asyncio
 import dataclasses
 import re
 from contextlib import AsyncExitStack
+from types import SimpleNamespace
 
 import pytest
 from websockets.asyncio.client import connect
@@ -138,6 +139,57 @@ async def test_a_delayed_hub_closes_no_client():
     assert swept
     hub.connections.clear()
     await hub.close()
+
+
+async def test_only_prompt_responses_keep_the_hub_awake(monkeypatch):
+    polls: list[None] = []
+    poll = server._Hub._poll
+    monkeypatch.setattr(server._Hub, "_poll", lambda hub: (polls.append(None), poll(hub)))
+    monkeypatch.setattr(server, "_AWAKE", 3600.0)
+    async with running_hub() as port, client(port) as hears, client(port) as robot:
+        await hears.send(op="subscribe", topic="/t", type="a/B")
+        await hears.sync()  # the first message is not a response, and a single response is no habit
+        for _ in range(3):
+            await robot.send(op="publish", topic="/t", type="a/B", msg={})
+            await hears.receive()
+        assert not polls
+        await hears.sync()
+        await hears.sync()
+        assert polls  # and the hub still works, and ends
+
+
+async def test_polling_in_vain_is_not_repeated_at_once(monkeypatch):
+    now = 0.0
+    monkeypatch.setattr(server, "time", SimpleNamespace(monotonic=lambda: now))
+    hub = server._Hub(HubLimits(), AccessPolicy(), 1, loopback=True)
+
+    async def polls_after(*responses: int) -> bool:
+        nonlocal now
+        for microseconds in responses:
+            now = microseconds * 1e-6
+            hub.stay_awake(now)
+        await asyncio.sleep(0)
+        return hub._is_polling
+
+    async def nothing_until(microseconds: int) -> None:
+        nonlocal now
+        now = microseconds * 1e-6
+        await asyncio.sleep(0)
+
+    assert not await polls_after(0)
+    assert await polls_after(100)
+    await nothing_until(400)  # but as soon as the core is free
+    assert not await polls_after(500, 600, 1300, 1400)
+    assert await polls_after(1550)
+    await nothing_until(1900)
+    assert not await polls_after(2000, 3000, 3100, 3900)  # twice as long
+    assert await polls_after(4050, 4100)  # not in vain
+    await nothing_until(4500)
+    assert not await polls_after(4600, 5500)
+    assert await polls_after(5650)
+    await nothing_until(6000)
+    assert not await polls_after(100_000)
+    assert await polls_after(100_100)  # a pause of the client is not held against polling
 
 
 def test_every_limit_must_be_positive():
