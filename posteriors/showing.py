@@ -124,7 +124,8 @@ def draw(all_axes: Sequence[Axis], all_values: NDArray[np.float64], into: Any) -
     axes, values, rest = _plane(all_axes, all_values)
     across = axes[-1]
     if len(axes) == 1:
-        into.bar([_place(across, at) for at in range(across.size)], values, width=abs(_step(across)))
+        width = 0.8 if across.has_states else abs(_step(across))
+        into.bar([_place(across, at) for at in range(across.size)], values, width=width)
         into.set_ylabel("probability")
     else:
         extent = [_place(axis, at) for axis in (across, axes[0]) for at in (-0.5, axis.size - 0.5)]
