@@ -1,6 +1,8 @@
 """The command `demo`: a case study from end to end, whose processes are started in order and ended together."""
 
 import asyncio
+import os
+import socket
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -107,9 +109,12 @@ def demo(
     dashboard: Annotated[
         bool,
         typer.Option(
-            "--dashboard", help="Run until Ctrl-C, as --stay, with a page in the browser on port 8080."
+            "--dashboard", help="Run until Ctrl-C, as --stay, with a page in the browser on --page-port."
         ),
     ] = False,
+    page_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the page; 0 selects a free one.")
+    ] = 8080,
     rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings per second.")] = 10.0,
     seed: Annotated[
         int | None, typer.Option(min=0, help="Seed of what is simulated.", show_default="a new one each time")
@@ -123,20 +128,30 @@ def demo(
         raise OutputError(
             "--dashboard needs NiceGUI, which is not installed: pip install 'rosbayes[dashboard]', or leave it out"
         )
+    if dashboard:
+        # the page is started last, when it is late to say that its port is taken
+        try:
+            socket.create_server(("127.0.0.1", page_port)).close()
+        except OSError as error:
+            raise OutputError(
+                f"the page cannot listen on port {page_port} ({os.strerror(error.errno or 0)}): end the process that listens "
+                "there, or choose another --page-port"
+            ) from None
     check_writable(out)
     rates = ["--rate", str(rate), *(() if seed is None else ("--seed", str(seed)))]
     # a real server accepts only installed message types
     case = sprinkler(rates, count) if is_sprinkler else boat(rates, array=uri is not None)
     stay |= dashboard
-    return run_async(_run(case, uri, None if stay else count, out.resolve(), dashboard=dashboard))
+    port = page_port if dashboard else None
+    return run_async(_run(case, uri, None if stay else count, out.resolve(), page_port=port))
 
 
-async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, dashboard: bool) -> int:
+async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, page_port: int | None) -> int:
     """Build, start everything, wait for the viewer's last picture, and end everything; no count: run until Ctrl-C."""
     started = time.monotonic()
     screen = Screen()
     # the page shows what the viewer prints, whose lines would hide the page's address
-    shown = {"master"} if dashboard else {case.viewer, "master"}
+    shown = {case.viewer, "master"} if page_port is None else {"master"}
     processes = {
         name: Process(name, out / f"{name}.log", show=screen.show if name in shown else None)
         for name in ("hub", case.viewer, "master", *case.publishers, "dashboard")
@@ -170,9 +185,11 @@ async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, das
         await master.start("master", "--loop", *counted, "-d", str(deployment), "--uri", uri)
         for name, options in case.publishers.items():
             await processes[name].start(name, "--uri", uri, *options)
-        if dashboard:
+        if page_port is not None:
             await viewer.line(FIRST_RESULT)
-            await processes["dashboard"].start("dashboard", "--uri", uri, "-d", str(deployment))
+            await processes["dashboard"].start(
+                *("dashboard", "--uri", uri, "-d", str(deployment), "--page-port", str(page_port))
+            )
             address = await processes["dashboard"].line(r"http://\S+")
             saying.cancel()
             screen.show(f"open {address[0]} in a browser; on the page, drag the boat")

@@ -53,7 +53,10 @@ def dashboard(
         str, typer.Option(help="Topic of the true pose (PoseStamped).", metavar="TOPIC")
     ] = TRUTH_TOPIC,
     host: Annotated[str, typer.Option(help="Address to listen on.", metavar="ADDRESS")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 selects a free one.")] = 8080,
+    # the second name is that of master and demo, which pass the error on that names it
+    port: Annotated[
+        int, typer.Option("--port", "--page-port", min=0, max=65535, help="Port; 0 selects a free one.")
+    ] = 8080,
     tls_cert: options.TlsCert = None,
     tls_key: options.TlsKey = None,
     token_file: options.TokenFile = None,
@@ -105,7 +108,7 @@ def _listening(host: str, port: int) -> socket.socket:
     except OSError as error:
         raise SettingsError(
             f"the dashboard cannot listen on {shown(host)} port {port} ({os.strerror(error.errno or 0)}): "
-            "end the process that listens there, or choose another --port"
+            "end the process that listens there, or choose another --page-port"
         ) from None
 
 

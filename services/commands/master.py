@@ -49,6 +49,9 @@ def master(
     dashboard: Annotated[
         bool, typer.Option("--dashboard", help="Start the page in the browser too (see `dashboard`).")
     ] = False,
+    page_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the page; 0 selects a free one.")
+    ] = 8080,
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print the resulting settings and exit.")
     ] = False,
@@ -85,8 +88,9 @@ def master(
     check_metrics(settings.metrics, insecure=insecure)
     # loaded before processes start, so that a damaged folder is reported at once
     loaded = deployment_for(settings)
+    page = page_port if dashboard else None
     return run_async(
-        run_master(settings, loaded, once=once, count=count, json=json, plot=plot, dashboard=dashboard)
+        run_master(settings, loaded, once=once, count=count, json=json, plot=plot, page_port=page)
     )
 
 

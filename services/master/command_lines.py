@@ -31,7 +31,9 @@ def boards_command(boards: int, directory: Path, settings: Settings, *, once: bo
     ]
 
 
-def dashboard_command(settings: Settings, deployment: Deployment, directory: Path | None) -> list[str]:
+def dashboard_command(
+    settings: Settings, deployment: Deployment, directory: Path | None, port: int
+) -> list[str]:
     """Return the command of the page in the browser for the results of a run, with the folder of its sockets."""
     command = [*own_command("dashboard"), "--deployment", str(deployment.directory)]
     values = {
@@ -39,6 +41,7 @@ def dashboard_command(settings: Settings, deployment: Deployment, directory: Pat
         "ca": settings.ca,
         "ros-version": settings.ros_version,
         "run-directory": directory,
+        "page-port": str(port),
     }
     for name, value in values.items():
         if value:

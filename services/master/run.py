@@ -53,7 +53,7 @@ class Master:
         count: int | None,
         json: bool,
         plot: bool = False,
-        dashboard: bool = False,
+        page_port: int | None = None,
     ) -> None:
         self._settings = settings
         self._once = once
@@ -71,8 +71,8 @@ class Master:
         self._flow = FrameFlow(
             settings, deployment, self._peers, self._log, once=once, count=self._count, show=self._show
         )
-        # The page in the browser, which only reads: its failure never ends the run. Made in `run`, if it is wanted.
-        self._dashboard = dashboard
+        # The page in the browser, which only reads: its failure never ends the run. Made in `run`, if it has a port.
+        self._page_port = page_port
         self._page: Child | None = None
         # Work beside the frames, until the end of the run.
         self._tasks: list[asyncio.Task[None]] = []
@@ -102,8 +102,9 @@ class Master:
             if self._shows_progress and sys.stderr.isatty():
                 self._begin_task(self._show_progress())
             self._begin_task(self._expect_data())
-            if self._dashboard:
-                self._page = Child("dashboard", dashboard_command(settings, self._deployment, run_directory))
+            if self._page_port is not None:
+                command = dashboard_command(settings, self._deployment, run_directory, self._page_port)
+                self._page = Child("dashboard", command)
                 self._begin_task(self._keep_page(self._page))
             with drawing() if self._plot else contextlib.nullcontext() as show:
                 if show is not None:
@@ -285,8 +286,8 @@ async def run_master(
     count: int | None,
     json: bool,
     plot: bool,
-    dashboard: bool = False,
+    page_port: int | None = None,
 ) -> int:
     """Create a master inside the event loop, to which its futures belong, and run it to its end (see `Master.run`)."""
-    master = Master(settings, deployment, once=once, count=count, json=json, plot=plot, dashboard=dashboard)
+    master = Master(settings, deployment, once=once, count=count, json=json, plot=plot, page_port=page_port)
     return await master.run()

@@ -1,5 +1,7 @@
 """The command demo: what it refuses before anything starts."""
 
+import socket
+
 import pytest
 
 from bridge.discovery import UnknownRobotError
@@ -20,6 +22,16 @@ def test_a_robot_is_looked_up_before_anything_starts(tmp_path, monkeypatch):
     ended = invoke(demo.app, ["--uri", "robot:Adam", "--out", str(tmp_path)])
     assert ended.exit_code == UnknownRobotError.exit_code
     assert "no robot called Adam" in ended.stderr
+
+
+def test_a_port_that_is_taken_is_named_before_anything_starts(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        ended = invoke(demo.app, ["--dashboard", "--page-port", port, "--out", str(tmp_path / "out")])
+    assert ended.exit_code == 2
+    assert f"port {port}" in ended.stderr
+    assert "--page-port" in ended.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_missing_page_is_named_before_anything_starts(tmp_path, monkeypatch):

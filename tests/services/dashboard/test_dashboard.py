@@ -53,7 +53,7 @@ FOLDER = PROJECT.parent / "services" / "dashboard"
         (["--tls-cert", "nowhere.pem"], "--tls-key"),
         (["--origin", "robot.example"], "--origin"),
         (["--truth", "no topic"], "no topic"),
-        (["--port", "{taken}"], "--port"),
+        (["--port", "{taken}"], "--page-port"),
         (["-d", "nowhere"], "nowhere"),
     ],
 )
@@ -408,10 +408,11 @@ async def test_a_page_from_the_first_result_to_the_last(stage):
 
 def test_a_master_starts_it_for_its_own_results(boat, tmp_path):
     settings = Settings(uri="ws://robot:9090", ca=tmp_path / "ca.pem")
-    command = dashboard_command(settings, boat, tmp_path)
+    command = dashboard_command(settings, boat, tmp_path, 8081)
     flags = dict(zip(command[1::2], command[2::2], strict=True))
     assert flags["--deployment"] == str(boat.directory)
     assert (flags["--uri"], flags["--run-directory"]) == ("ws://robot:9090", str(tmp_path))
+    assert flags["--page-port"] == "8081"
     assert flags["--ca"] == str(tmp_path / "ca.pem")
     ended = invoke(master, ["--once", "--dashboard", "-d", boat.directory])
     assert ended.exit_code == 2
