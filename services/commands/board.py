@@ -1,7 +1,6 @@
 """The command `board`."""
 
 import os
-import sys
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +11,6 @@ import typer
 from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.credentials import read_key
 from pcie_shim.endpoint import Endpoint
-from services.boards.deployed import images_of
 from services.boards.hardware import Engine, SimulatedHardware
 from services.boards.processes import BoardProcesses, serve_one
 from services.child import RESTARTS
@@ -123,6 +121,8 @@ def _simulated(
         raise SettingsError(
             f"--engine {engine} needs --hardware DIR, a folder into which the hardware is compiled"
         )
+    from services.boards.deployed import images_of
+
     images = images_of(deployment_for(settings)) if settings.deployment is not None else []
     return SimulatedHardware(engine, folder, {at: image for at, image in enumerate(images) if at in boards})
 
@@ -138,13 +138,3 @@ def _endpoint(listen: str, key_file: Path | None, *, insecure: bool) -> Endpoint
             "hosts, or --insecure if that is intended"
         )
     return endpoint
-
-
-def main() -> None:
-    """Run the command and exit at once, because unloading the kernels in the regular way takes half a second."""
-    try:
-        app()
-    except SystemExit as end:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(end.code if isinstance(end.code, int) else int(end.code is not None))
