@@ -1,16 +1,23 @@
 """Boards whose hardware is simulated, for `board --engine`."""
 
-from collections.abc import Mapping
-from enum import StrEnum
-from pathlib import Path
+from __future__ import annotations
 
-from pcie_shim.board.rtl_board import RtlBoard
-from pcie_shim.board.simulation import Simulation
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
 from pcie_shim.errors import SimulationError
-from pcie_shim.programming_file import Image
 from services.errors import SettingsError
 from terminal.output import say, warn
-from toolchain.hardware import Compiled, HardwareToolError, Simulator, check_tools, compiled, missing
+
+# emulated boards would wait for these imports
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from pcie_shim.board.rtl_board import RtlBoard
+    from pcie_shim.board.simulation import Simulation
+    from pcie_shim.programming_file import Image
+    from toolchain.hardware import Compiled
 
 
 class Engine(StrEnum):
@@ -32,6 +39,8 @@ class SimulatedHardware:
             SettingsError: The simulator is not installed, or the VHDL is missing.
             SimulationError: An image cannot be compiled.
         """
+        from toolchain.hardware import HardwareToolError, Simulator, check_tools, missing
+
         self._images = images
         self._folder = folder
 
@@ -51,16 +60,22 @@ class SimulatedHardware:
 
     def board(self, index: int) -> RtlBoard:
         """Return a blank board, with the hardware of its image running if that is known, or raise a SimulationError."""
+        from pcie_shim.board.rtl_board import RtlBoard
+
         board = RtlBoard(self._simulate)
         if (image := self._images.get(index)) is not None:
             board.prepare(image)
         return board
 
     def _simulate(self, image: Image) -> Simulation:
+        from pcie_shim.board.simulation import Simulation
+
         found = self._compiled(image)
         return Simulation(found.command, found.folder)
 
     def _compiled(self, image: Image) -> Compiled:
+        from toolchain.hardware import HardwareToolError, Simulator, compiled
+
         if not image.kind.has_hardware:
             raise SimulationError(
                 f"A {image.kind.name} exists only in emulation, not as hardware: use emulated boards (--engine emulated)"

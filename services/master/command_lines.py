@@ -20,12 +20,12 @@ def _metrics(settings: Settings, role: str) -> list[str]:
     return ["--metrics", shifted(settings.metrics, METRICS_PORTS[role]), "--insecure"]
 
 
-def boards_command(boards: int, directory: Path, settings: Settings, *, once: bool) -> list[str]:
-    """Return the command that starts the emulated boards; with `once` it does not restart them."""
+def boards_arguments(boards: int, directory: Path, settings: Settings, *, once: bool) -> list[str]:
+    """Return the arguments of the `board` that runs all emulated boards; with `once` it does not restart them."""
     restarts = "0" if once else str(RESTARTS)
     return [
         # one process for all of them, which loads the kernels once
-        *(*own_command("board"), "--boards", str(boards)),
+        *("--boards", str(boards)),
         *("--directory", str(directory), "--restarts", restarts),
         *_metrics(settings, "board"),
     ]
@@ -60,15 +60,15 @@ _SETTINGS = {
 """Settings of one service beyond those that all services have. They become flags, so that `ps` shows them."""
 
 
-def service_command(role: str, endpoint: Endpoint, settings: Settings, *, reprogram: bool) -> list[str]:
-    """Return the command of a service."""
-    command = [*own_command(role), "--listen", str(endpoint), *_metrics(settings, role)]
+def service_arguments(role: str, endpoint: Endpoint, settings: Settings, *, reprogram: bool) -> list[str]:
+    """Return the arguments of a service's command."""
+    arguments = ["--listen", str(endpoint), *_metrics(settings, role)]
     for name in ("deployment", "log_level", *_SETTINGS[role]):
         value = getattr(settings, name)
         # without a value, the child takes that of the deployment as this process does
         if value is True:
-            command.append(f"--{name.replace('_', '-')}")
+            arguments.append(f"--{name.replace('_', '-')}")
         elif value not in (None, (), False):
             text = ",".join(value) if isinstance(value, tuple) else str(value)
-            command += [f"--{name.replace('_', '-')}", text]
-    return [*command, "--reprogram"] if reprogram else command
+            arguments += [f"--{name.replace('_', '-')}", text]
+    return [*arguments, "--reprogram"] if reprogram else arguments

@@ -10,8 +10,6 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from services.child import RESTARTS
 from services.errors import (
     BoardFailedError,
@@ -89,8 +87,8 @@ class Latencies:
     """Quantiles over the last published frames, and counts over all of them."""
 
     def __init__(self) -> None:
-        # A ring with a row for each of the last frames and a column for each stage, in ns.
-        self._times = np.zeros((REMEMBERED, len(_STAGES)), np.int64)
+        # A row for each of the last frames, with a column for each stage, in ns.
+        self._times: deque[list[int]] = deque(maxlen=REMEMBERED)
         # Over all frames: their number, and for each stage the sum and the counts of the buckets.
         self._frames = 0
         self._sums_ns = [0] * len(_STAGES)
@@ -106,7 +104,7 @@ class Latencies:
             published.out_ns,
         )
         times = [max(0, spent) for spent in (*stages, total - sum(stages), total)]
-        self._times[self._frames % REMEMBERED] = times
+        self._times.append(times)
         self._frames += 1
         for at, spent in enumerate(times):
             self._sums_ns[at] += spent
@@ -114,10 +112,11 @@ class Latencies:
 
     def summary(self) -> list[StageLatency]:
         """Return the latencies of each stage; none before the first frame."""
-        known = min(self._frames, REMEMBERED)
-        if not known:
+        if not self._frames:
             return []
-        p50, p99 = np.percentile(self._times[:known], (50, 99), axis=0, method="nearest") / 1e6
+        import numpy as np  # not before the boards have started, which takes longest
+
+        p50, p99 = np.percentile(np.array(self._times), (50, 99), axis=0, method="nearest") / 1e6
         return [
             StageLatency(
                 stage=stage,

@@ -14,11 +14,12 @@ import contextlib
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pcie_shim.endpoint import Endpoint
-from services.child import RESTARTS, Child, end_all
+from services.child import RESTARTS, Child, ForkedCommand, end_all, module_of
 from services.errors import (
     BoardFailedError,
     ChildDiedError,
@@ -27,7 +28,7 @@ from services.errors import (
     SettingsError,
     StackError,
 )
-from services.master.command_lines import boards_command, service_command
+from services.master.command_lines import boards_arguments, service_arguments
 from services.settings import Settings, endpoint_in
 from services.sockets.local_socket import RecordProtocol, check_hello, open_connection, own_hello
 from services.sockets.records import AnyRecord, Begin, Notice, Ready, Rosbridge, Trouble
@@ -214,8 +215,8 @@ class Peers:
             self.board_endpoints = tuple(
                 str(endpoint_in(directory, f"board{at}")) for at in range(len(endpoints))
             )
-            command = boards_command(len(endpoints), directory, settings, once=self._once)
-            self._boards = Child("the boards' process", command, directory=self._run)
+            arguments = boards_arguments(len(endpoints), directory, settings, once=self._once)
+            self._boards = ForkedCommand("the boards' process", "board", arguments, directory=self._run)
         for role, text in given.items():
             self._by_role[role] = Peer(role, None, None) if settings.fused else self._peer(role, text)
 
@@ -226,8 +227,8 @@ class Peers:
         endpoint = endpoint_in(self.directory, role)
         # only this run can have programmed its own boards
         reprogram = role == "pcie-app" and self._boards is not None
-        command = service_command(role, endpoint, self._service_settings, reprogram=reprogram)
-        return Peer(role, endpoint, Child(role, command, directory=self._run))
+        arguments = service_arguments(role, endpoint, self._service_settings, reprogram=reprogram)
+        return Peer(role, endpoint, ForkedCommand(role, role, arguments, directory=self._run))
 
     @property
     def _service_settings(self) -> Settings:
@@ -248,6 +249,10 @@ class Peers:
         if self._boards is not None:
             await self._boards.start()
             self._begin_task(self._keep_boards(self._boards))
+        # once for all of them, while the boards load their kernels
+        for peer in self:
+            if peer.child is not None:
+                import_module(module_of(peer.role))
         for peer in self:
             if peer.child is not None:
                 await peer.child.start()

@@ -6,17 +6,15 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Coroutine, Iterable
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from posteriors.axes import deployment_axes
 from services.child import Child, end_all
 from services.errors import NoDataError, StackError
 from services.master.command_lines import dashboard_command
 from services.master.flow import FrameFlow
 from services.master.peers import ROLE, Peer, Peers
-from services.output.master_output import posterior_of, print_json, sentence
-from services.output.posterior_output import Show, drawing
 from services.settings import Settings
 from services.sockets.records import LossReason, Publish, Published
 from services.sockets.reporting import STUCK_S, serve_status
@@ -27,6 +25,9 @@ from terminal.logs import get_logger
 from terminal.output import say, show_progress
 from terminal.run_directory import OccupiedError
 from toolchain.deployment import Deployment
+
+if TYPE_CHECKING:
+    from services.output.posterior_output import Show
 
 ASK_EVERY = 5.0
 """Seconds between two checks whether all children make progress."""
@@ -106,10 +107,12 @@ class Master:
                 command = dashboard_command(settings, self._deployment, run_directory, self._page_port)
                 self._page = Child("dashboard", command)
                 self._begin_task(self._keep_page(self._page))
-            with drawing() if self._plot else contextlib.nullcontext() as show:
+            with self._drawing() as show:
                 if show is not None:
                     self._begin_task(self._keep_drawing(show))
                 await peers.start(self._flow)
+                # only now, because it takes long, and the processes are starting meanwhile
+                import_module("services.output.master_output")
                 await self._flow.end
                 # a run of few frames may be over before it is known whether anybody can receive them
                 if self._flow.published and not self._once:
@@ -195,6 +198,8 @@ class Master:
 
     def _show(self, record: Published) -> None:
         """Print a published result if requested."""
+        from services.output.master_output import print_json, sentence
+
         self._newest = record
         if self._json:
             print_json(record, self._deployment)
@@ -216,6 +221,8 @@ class Master:
             self._flow.fail(NoDataError(f"no reading came from {topics} within {limit:g} s"))
 
     async def _show_progress(self) -> None:
+        from services.output.master_output import sentence
+
         # as of the last line: its time, and the results published until then
         before, count = time.monotonic(), 0
         while True:
@@ -229,13 +236,23 @@ class Master:
                 show_progress(f"{ROLE}: {published}{of} results, {rate:.0f} a second{newest}")
             before, count = now, published
 
-    async def _keep_drawing(self, show: Show) -> None:
+    def _drawing(self) -> contextlib.AbstractContextManager["Show | None"]:
+        if not self._plot:
+            return contextlib.nullcontext()
+        from services.output.posterior_output import drawing
+
+        return drawing()
+
+    async def _keep_drawing(self, show: "Show") -> None:
         while True:
             await asyncio.sleep(_DRAWN_EVERY)
             self._draw(show)
 
-    def _draw(self, show: Show) -> None:
+    def _draw(self, show: "Show") -> None:
         """Draw the newest posterior, unless it is drawn already."""
+        from posteriors.axes import deployment_axes
+        from services.output.master_output import posterior_of
+
         newest = self._flow.newest
         if newest is None or newest is self._drawn:
             return

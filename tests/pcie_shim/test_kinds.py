@@ -463,7 +463,7 @@ def test_a_host_refuses_a_board_with_the_image_of_the_other_kind(start_board, is
 
 
 def test_simulated_hardware_of_the_other_kind_refuses_it(monkeypatch, tmp_path):
-    monkeypatch.setattr("services.boards.hardware.check_tools", lambda _: None)
+    monkeypatch.setattr("toolchain.hardware.check_tools", lambda _: None)
     hardware = SimulatedHardware(Engine.GHDL, tmp_path, {})
     board = RtlBoard(hardware._simulate)
     with pytest.raises(RefusedError, match="BM2") as refused:

@@ -5,7 +5,7 @@ import pytest
 from pcie_shim.endpoint import parse_endpoint
 from services.commands import hub, pcie_app, publisher, subscriber
 from services.errors import SettingsError
-from services.master.command_lines import service_command
+from services.master.command_lines import service_arguments
 from services.settings import Settings, endpoint_in, load_settings
 from tests.command_runner import invoke
 
@@ -83,8 +83,8 @@ def test_every_flag_is_one_of_the_command(command, tmp_path):
         use_sim_time=True,
         **given,
     )
-    line = service_command(role, parse_endpoint("unix:/s.sock"), settings, reprogram=role == "pcie-app")
-    ended = invoke(command.app, line[1:])
+    line = service_arguments(role, parse_endpoint("unix:/s.sock"), settings, reprogram=role == "pcie-app")
+    ended = invoke(command.app, line)
     assert (ended.exit_code, "deployment.toml" in ended.stderr) == (2, True), (
         ended.stderr
     )  # the folder is empty
@@ -96,7 +96,7 @@ def test_every_flag_is_one_of_the_command(command, tmp_path):
 
 
 def test_a_setting_without_a_value_is_no_flag(tmp_path):
-    line = service_command(
+    line = service_arguments(
         "subscriber", parse_endpoint("unix:/s.sock"), Settings(deployment=tmp_path), reprogram=False
     )
     assert not {"--uri", "--ca", "--topic-bytes", "--queue", "--boards", "--metrics", "--use-sim-time"} & set(
