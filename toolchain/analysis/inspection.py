@@ -146,7 +146,8 @@ def _readings(
     source = "the model" if model is not None else "the codes"
     if model is None:
         model = model_of_codes(deployment.name, deployment.searched, deployment.variables, whole)
-        model = model if own is None else replace(model, prior=None, transition=own.transition)
+    if own is not None:
+        model = replace(model, prior=None, transition=own.transition)
     of_each = f" of readings for {replicas} replicas," if replicas > 1 else ""
     drawn = sample_readings(
         model,

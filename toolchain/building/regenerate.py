@@ -188,6 +188,15 @@ def _plan(
                 f"the model {what} {_listed(new)}, but the deployment {_listed(old)}: this is another machine, so "
                 "build it again with 'toolchain build'"
             )
+    if isinstance(model, Model) and (model.transition is None) is not (deployment.filter is None):
+        found = (
+            "no filter, but the deployment one"
+            if model.transition is None
+            else "a filter, but the deployment none"
+        )
+        raise BuildError(
+            f"the model has {found}: give the same --previous as for the build, or build it again"
+        )
     if isinstance(model, Model):
         return plan_machine(_with_widths(model, deployment), options)
     plan = plan_bm2(model, options, why)

@@ -21,7 +21,7 @@ from toolchain.bounded_files import read_bounded
 from toolchain.errors import DamagedDeploymentError, DeploymentError, ModelError
 
 _SUM_TOLERANCE: Final = 1e-6
-_MOST_WORK: Final = 2**28
+_MOST_WORK: Final = 2**27
 """Maximum number of multiplications of a prediction, which take about 0.2 s."""
 _HEADER_BYTES: Final = 4096
 

@@ -316,7 +316,13 @@ def test_a_build_and_a_regeneration_replace_the_file(tmp_path):
     after = load_deployment(tmp_path)
     assert after.new_filter().transition.table[0, 0] == 0.8
     assert after.hash != before.hash
+    with pytest.raises(
+        BuildError, match="the model has no filter, but the deployment one: give the same --previous"
+    ):
+        regenerate_memories(tmp_path, replace(sticky(), transition=None))
     build_model(replace(sticky(), transition=None), tmp_path)
+    with pytest.raises(BuildError, match="the model has a filter, but the deployment none"):
+        regenerate_memories(tmp_path, sticky())
     assert not (tmp_path / "filter.npy").exists()
     assert load_deployment(tmp_path).new_filter() is None
 
@@ -338,4 +344,10 @@ def test_inspect_compares_sequences_with_the_exact_filter(umbrella, tmp_path):
     assert "20 of 20 rows of walk.csv, without 5 that do not fit" in said
     assert "the machine against the exact filter" not in said
     assert "machine against the exact filter" in said
+    without = done(
+        toolchain(
+            "inspect", "built", "--model", umbrella, "--searched", "rain", "--known", "umbrella", "--json"
+        )
+    )
+    assert json.loads(without.stdout)["accuracy"] == found  # the transition is the deployment's
     assert "drawn from the codes" in done(toolchain("inspect", "built", "--frames", "5")).stdout
