@@ -1,10 +1,10 @@
 """The posterior of a deployment for given readings, computed in this process: for notebooks and tests of models."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from posteriors.errors import LabelError, PosteriorError
 from posteriors.posterior import Posterior
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from machines.bm1 import BM1Machine
     from toolchain.models import Model, Question
 
 
@@ -42,29 +43,32 @@ class EmulatedPosterior(Posterior):
             PosteriorError: The deployment is that of a BM2, and there is no model.
             ToolchainError: The model has an error, or the deployment was not built from it.
         """
-        what = "codes" if model is None else "model"
-        values = self._of_codes() if model is None else self._of_model(model, settings)
+        from toolchain.analysis.emulation import joined
+        from toolchain.building.build import read_images
+
+        machines = [image.machine for image in read_images(self.deployment)]
+        if model is not None:
+            values = self._of_model(model, settings, machines)
+        elif self.deployment.machine.is_divided:
+            values = self._of_codes(joined(machines))
+        else:
+            raise PosteriorError(
+                "the codes of a BM2 are odds of single bits, which have no exact posterior: name the model, such as "
+                "exact('clinic.bif')"
+            )
         return Posterior(
             probabilities=tuple(values.tolist()),
             labels=self.labels,
             sizes=self.sizes,
             dimensions=self.dimensions,
             heard_ns=self.heard_ns,
-            details={"exact": what},
+            details={"exact": "codes" if model is None else "model"},
         )
 
-    def _of_codes(self) -> "NDArray[np.float64]":
+    def _of_codes(self, whole: "BM1Machine") -> "NDArray[np.float64]":
         from machines.encode import decode_code
-        from toolchain.analysis.emulation import joined
-        from toolchain.building.build import read_images
         from toolchain.models.model import fuse
 
-        if not self.deployment.machine.is_divided:
-            raise PosteriorError(
-                "the codes of a BM2 are odds of single bits, which have no exact posterior: name the model, such as "
-                "exact('clinic.bif')"
-            )
-        whole = joined([image.machine for image in read_images(self.deployment)])
         addresses, row = self.deployment.machine_addresses(self.addresses)
         codes = [whole.prior[row]]
         codes += [table[at] for table, at in zip(whole.tables, addresses, strict=True) if at is not None]
@@ -72,29 +76,25 @@ class EmulatedPosterior(Posterior):
         return fuse(prior, likelihoods)
 
     def _of_model(
-        self, model: "Path | str | Model | Question", settings: Mapping[str, object]
+        self, source: "Path | str | Model | Question", settings: Mapping[str, object], machines: Sequence[Any]
     ) -> "NDArray[np.float64]":
         from toolchain.analysis.chain_inspection import check_same
         from toolchain.analysis.emulation import joined
         from toolchain.analysis.inspection import losses_of
-        from toolchain.building.build import read_images
         from toolchain.building.choice import network_for
         from toolchain.models.case_study import load_question
         from toolchain.models.joint import Question
         from toolchain.models.model import exact_posterior
         from toolchain.networks import is_network, read_network
 
-        deployment, machines = self.deployment, [image.machine for image in read_images(self.deployment)]
-        select = deployment.prior_select
-        source = model
+        deployment, select = self.deployment, self.deployment.prior_select
         if isinstance(source, str | Path):
-            if is_network(Path(source)):
-                known = [variable.name for variable in deployment.sensors]
-                source = read_network(Path(source)).ask(
-                    self.labels, known, prior_select=None if select is None else select.name
-                )
+            path, known = Path(source), [variable.name for variable in deployment.sensors]
+            if is_network(path):
+                selecting = None if select is None else select.name
+                source = read_network(path).ask(self.labels, known, prior_select=selecting)
             else:
-                source = load_question(Path(source), {key: str(value) for key, value in settings.items()})
+                source = load_question(path, {key: str(value) for key, value in settings.items()})
         if not deployment.machine.is_divided:
             network = network_for(source)
             check_same(deployment, machines[0], network)
@@ -109,15 +109,13 @@ class EmulatedPosterior(Posterior):
 
 
 def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int = 0) -> EmulatedPosterior:
-    """Run the machines of a deployment, without boards, processes or a rosbridge server.
+    """Run the machines of a deployment, without boards, processes or a rosbridge server; those of a filter for its first frame.
 
     Args:
         folder: The folder that `toolchain build` wrote.
         readings: The readings by the names of their variables, as in messages: numbers in their units, or names of
             states. A variable that is not named, or is None, has no reading, whatever its `on_missing` says of messages.
         bank: Set of seeds; each gives another draw of the same distribution.
-
-    The posterior of a filter is that of its first frame.
 
     Returns:
         The posterior in the shape of the model, with its labels and units; `report` is None.

@@ -211,7 +211,7 @@ class Posterior:
         import numpy as np
 
         likely = self.values[self.values > 0] / self.values.sum()
-        return float(-(likely * np.log2(likely)).sum()) + 0.0  # without it, certainty is -0.0
+        return abs(float((likely * np.log2(likely)).sum()))
 
     def total_variation(self, other: "Posterior") -> float:
         """Return half the sum of the absolute differences, 0 to 1; a LabelError if the dimensions differ."""

@@ -1,15 +1,17 @@
 """The posterior of a deployment in a notebook: its shape, its labels, and the readings that it takes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from posteriors import LabelError, Posterior, PosteriorError, posterior
 from toolchain.building.bm2_machine import plan_bm2
 from toolchain.building.build import build_deployment
-from toolchain.building.machine import plan_machine
+from toolchain.building.machine import plan_machine, with_bits
 from toolchain.building.options import BuildOptions
 from toolchain.errors import BuildError, ReadingMissingError
-from toolchain.models import Known, Model, dimension
+from toolchain.models import Known, Model, PriorSelect, dimension
 from toolchain.models.model import exact_posterior
 from toolchain.networks import read_network
 
@@ -79,6 +81,18 @@ def test_the_exact_posterior_is_that_of_the_model_or_of_the_codes(build):
     other = Model(name="rooms", searched=model().searched, known=model().known[::-1])
     with pytest.raises(BuildError, match="not built from"):
         found.exact(other)
+
+
+def test_the_exact_posterior_of_a_selected_prior_and_of_wider_columns(tmp_path):
+    rows = np.array([[0.5, 0.1, 0.1, 0.1, 0.1, 0.1], [0.1, 0.1, 0.1, 0.1, 0.1, 0.5]])
+    plain = replace(model(), prior_select=PriorSelect(name="hour", table=rows))
+    build_deployment(plan_machine(with_bits(plain, ["seen=4"]), BuildOptions(**TARGET)), tmp_path)
+    for hour in (1, None):
+        found = posterior(tmp_path, {"seen": "light", "hour": hour})
+        exact = exact_posterior(plain, [1, None], prior_address=hour)
+        np.testing.assert_allclose(found.exact(plain).probabilities, exact)
+        np.testing.assert_allclose(found.exact().probabilities, exact, atol=0.01)
+        assert found.total_variation(found.exact(plain)) < 0.2
 
 
 NETWORK = """network rain { }
