@@ -50,6 +50,8 @@ def reduced(term: Term, values: Mapping[str, int]) -> Term:
 def product(terms: Sequence[Term], scope: Sequence[str], sizes: Mapping[str, int]) -> NDArray[np.float64]:
     """Return the product of terms over all their names, float64[size of each]; a ModelError above the limit."""
     _check_size(scope, sizes, "the answer")
+    if len(terms) == 1 and terms[0].scope == tuple(scope):  # not copied: it may be large
+        return terms[0].table
     found = np.ones(tuple(sizes[name] for name in scope))
     for term in terms:
         order = sorted(range(len(term.scope)), key=lambda axis: scope.index(term.scope[axis]))
