@@ -4,8 +4,7 @@ Labels, states and details come from files and networks: they are shortened, esc
 """
 
 import base64
-import struct
-import zlib
+import io
 from collections.abc import Iterable, Sequence
 from html import escape
 from typing import Any, Final
@@ -14,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from posteriors.axes import Axis, printable, reading_order
-from terminal.pictures import VIRIDIS
 
 _MOST_BARS: Final = 24
 """Maximum number of cells that have a row of their own."""
@@ -94,22 +92,13 @@ def _sentence(facts: Iterable[str]) -> str:
 
 
 def _image(shades: NDArray[Any]) -> str:
-    """Return shades from 0 to 255 as an enlarged PNG in the colours of `VIRIDIS`."""
+    """Return shades from 0 to 255 as an enlarged PNG."""
+    from matplotlib.image import imsave
+
     each = max(1, _SIDE // max(shades.shape))
-    pixels = shades.round().astype(np.uint8).repeat(each, axis=0).repeat(each, axis=1)
-    steps, levels = np.linspace(0, 255, len(VIRIDIS)), np.arange(256)
-    palette = np.column_stack([np.interp(levels, steps, colour) for colour in zip(*VIRIDIS, strict=True)])
-    height, width = pixels.shape
-    rows = np.column_stack([np.zeros(height, np.uint8), pixels])  # each row begins with its filter, none
-    png = b"\x89PNG\r\n\x1a\n"
-    for kind, data in (
-        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
-        (b"PLTE", palette.round().astype(np.uint8).tobytes()),
-        (b"IDAT", zlib.compress(rows.tobytes(), 9)),
-        (b"IEND", b""),
-    ):
-        png += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-    return f'<img alt="posterior" src="data:image/png;base64,{base64.b64encode(png).decode()}"/>'
+    pixels, file = shades.repeat(each, axis=0).repeat(each, axis=1), io.BytesIO()
+    imsave(file, pixels, vmin=0, vmax=255, cmap="viridis", format="png")
+    return f'<img alt="posterior" src="data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"/>'
 
 
 # matplotlib
