@@ -89,6 +89,13 @@ async def report_unpublished(ros: Ros, topic: str, report: Callable[[str], None]
     report(f"{topic} has no publisher at {ros.uri} yet{perhaps}")
 
 
+async def report_unused_clock(ros: Ros, topic: str, report: Callable[[str], None]) -> None:
+    """Report `AFTER` seconds from now that a simulation publishes its time, which nobody here follows."""
+    await asyncio.sleep(AFTER)
+    if await ros.publishers(topic):
+        report(f"{topic} is published at {ros.uri}: if it is a simulation, pass --use-sim-time")
+
+
 async def check_types(topics: Iterable[tuple[Ros, str, str]]) -> None:
     """Raise a NotReceivableError if a topic is published with another type than ours, according to rosapi."""
     asked = list(topics)

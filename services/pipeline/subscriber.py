@@ -17,7 +17,13 @@ from bridge.client import Message, Ros, State, Subscription
 from bridge.errors import NoMessageError, TopicLeftOutError
 from services.errors import RosbridgeLostError, VariableError
 from services.pipeline.clock import CLOCK_TOPIC, Clock
-from services.pipeline.connections import check_types, connect_all, reconnect_now, report_unpublished
+from services.pipeline.connections import (
+    check_types,
+    connect_all,
+    reconnect_now,
+    report_unpublished,
+    report_unused_clock,
+)
 from services.pipeline.frames import FrameAssembler
 from services.settings import Settings
 from services.sockets.local_socket import MAX_RECORD
@@ -175,9 +181,10 @@ class Subscriber(Service):
                 asyncio.ensure_future(self._follow(rosbridges[at], at, source, hints[at]))
                 for at, source in enumerate(sources)
             ]
+            clock_hint = report_unpublished if self._clock.simulated else report_unused_clock
+            hints.append(asyncio.ensure_future(clock_hint(rosbridges[0], CLOCK_TOPIC, warn)))
+            stack.callback(hints[-1].cancel)
             if self._clock.simulated:
-                hints.append(asyncio.ensure_future(report_unpublished(rosbridges[0], CLOCK_TOPIC, warn)))
-                stack.callback(hints[-1].cancel)
                 tasks.append(asyncio.ensure_future(self._clock.follow(rosbridges[0], self._wake_if_due)))
             for task in tasks:
                 stack.callback(task.cancel)

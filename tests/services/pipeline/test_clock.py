@@ -153,3 +153,14 @@ async def test_what_is_published_ages_by_simulated_time(boat):
             await simulation.at(simulation.ms + 20)
             assert {each["level"] for each in standard._health()["status"]} == {3}
             following.cancel()
+
+
+async def test_the_time_of_a_simulation_that_is_not_followed_is_reported(link, tmp_path, monkeypatch):
+    monkeypatch.setattr("services.pipeline.connections.AFTER", 0.05)
+    async with FakeRosbridge(rosapi=True) as fake, connect(fake.uri) as simulator:
+        await simulator.advertise("/clock", "rosgraph_msgs/Clock")
+        await fake.wait_for_op("advertise", topic="/clock")
+        deployment = load_deployment(build_corridor(tmp_path, KNOWN, SOURCES.format(uri=fake.uri)))
+        async with running(Subscriber(Settings(), deployment, link.make), link):
+            link.take(Begin(once=False))
+            await link.until(lambda: any("--use-sim-time" in each.sentence for each in link.of(Notice)))
