@@ -6,12 +6,14 @@ import socket
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
+from casestudies import DEFAULT_URI
 from terminal.command_line import CommandLine
 from terminal.errors import OutputError
 from terminal.output import check_writable
@@ -79,7 +81,7 @@ async def build(
     Raises:
         ProcessError: The toolchain failed.
     """
-    toolchain = Process("toolchain", deployment.with_name(deployment.name + ".log"))
+    toolchain = Process("toolchain", deployment.with_name(deployment.name + ".log"), forks=True)
     await toolchain.start(
         *("toolchain", "build", str(Path(__file__).with_name(case_study)), "-o", str(deployment)),
         *("--partitions", str(boards), "--uri", uri, "--topic", topic, "--type", type_, *options),
@@ -153,12 +155,13 @@ async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, pag
     # the page shows what the viewer prints, whose lines would hide the page's address
     shown = {case.viewer, "master"} if page_port is None else {"master"}
     processes = {
-        name: Process(name, out / f"{name}.log", show=screen.show if name in shown else None)
+        name: Process(name, out / f"{name}.log", show=screen.show if name in shown else None, forks=True)
         for name in ("hub", case.viewer, "master", *case.publishers, "dashboard")
     }
     hub, viewer, master, *_ = processes.values()
     deployment = out / "deployment"
     saying = asyncio.create_task(screen.say_what_it_waits_for())
+    building = None
     try:
         screen.waits_for = "building the deployment"
         if uri is None:
@@ -166,19 +169,24 @@ async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, pag
                 f"starting the hub (the embedded rosbridge server), building the {case.name}'s deployment ..."
             )
             await hub.start("hub", "--port", PORT if count is None else "0")
-            uri = (await hub.line(r"ws://\S+"))[0]
         else:
             from bridge.discovery import announced_uri
 
             uri = await announced_uri(uri)  # once, instead of in each process
             screen.show(f"using the rosbridge server at {uri}, building the {case.name}'s deployment ...")
+        # the port of this hub, which ends with the demo, is not for the deployment
+        source = DEFAULT_URI if uri is None else uri
+        building = asyncio.create_task(
+            build(case.name, deployment, source, case.topic, case.type, *case.options, boards=case.boards)
+        )
+        await asyncio.sleep(0)
+        # once, for viewer, master and the robot's side, which are forked from this process
+        import_module("posteriors")
+        uri = (await hub.line(r"ws://\S+"))[0] if uri is None else uri
         counted = () if count is None else ("--count", str(count))
         await viewer.start(
             *(case.viewer, "--uri", uri, *counted, "--out", str(out)),
             *("--first-timeout", str(FIRST_TIMEOUT)),
-        )
-        building = asyncio.create_task(
-            build(case.name, deployment, uri, case.topic, case.type, *case.options, boards=case.boards)
         )
         await asyncio.gather(building, viewer.line("listening"))
         screen.waits_for = "waiting for results; a first start compiles kernels"
@@ -200,5 +208,7 @@ async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, pag
         screen.show("to watch it live in a browser, and to drag the boat: the same command with --dashboard")
     finally:
         saying.cancel()
+        if building is not None:
+            building.cancel()
         await asyncio.gather(*(process.end() for process in reversed(processes.values())))
     return 0

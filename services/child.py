@@ -6,25 +6,20 @@ parent ◀─ standard error ──────── child   lines for the user
 
 import asyncio
 import contextlib
-import ctypes
-import gc
 import os
 import signal
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from importlib import import_module
-from pathlib import Path
 from typing import Final, NoReturn
 
 import msgspec
 
 from services.errors import ReportedError, StackError
 from terminal.errors import ExitCode, StoppedError, exit_code_of
-from terminal.logs import PARENT_VARIABLE, name_process
+from terminal.logs import PARENT_VARIABLE
 from terminal.output import ERROR_DESCRIPTOR, relay, say_error
-from terminal.processes import ask_for_end_with_parent, own_command
+from terminal.processes import Forked, ask_for_end_with_parent, fork_command, own_command
 from terminal.run_directory import LockedRunDirectory
 from terminal.signals import ENDING_SIGNALS, raise_on_signals, stopped_error
 
@@ -123,7 +118,7 @@ class Child:
         # The run directory, whose lock the child holds too, so that the next run waits for its end.
         self._directory = directory
         # Of the last start: the process, its pipes (standard error and error reports), and its last report.
-        self._process: asyncio.subprocess.Process | _Forked | None = None
+        self._process: asyncio.subprocess.Process | Forked | None = None
         self._pipes: list[_Pipe] = []
         self._error = ""
         # Times of the last exits (monotonic, s), whose number within a window is limited, and the number of restarts.
@@ -158,7 +153,7 @@ class Child:
         with contextlib.suppress(msgspec.MsgspecError):
             self._error = _decoder.decode(line).error
 
-    async def _spawn(self, environment: dict[str, str], lines: int) -> "asyncio.subprocess.Process | _Forked":
+    async def _spawn(self, environment: dict[str, str], lines: int) -> asyncio.subprocess.Process | Forked:
         inherited = [int(environment[ERROR_DESCRIPTOR])]
         if self._directory is not None:
             inherited.append(self._directory.lock)
@@ -237,20 +232,40 @@ class ForkedChild(Child):
         super().__init__(name, [name], ends=ends)
         self._run = run
 
-    async def _spawn(self, environment: dict[str, str], lines: int) -> "_Forked":
-        return _fork(self.name, self._run, environment, lines)
+    async def _spawn(self, environment: dict[str, str], lines: int) -> Forked:
+        # Until the child has handlers of its own, a signal would reach the event loop of this process instead.
+        signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
+        pid = os.fork()
+        if not pid:
+            self._run_forked(environment, lines)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
+        return Forked(pid)
 
-
-def module_of(role: str) -> str:
-    """Return the module with the command line of a process of a run."""
-    return f"services.commands.{role.replace('-', '_')}"
+    def _run_forked(self, environment: dict[str, str], lines: int) -> NoReturn:
+        """Run the function in the child, which must never continue in the code of its parent."""
+        code: int = ExitCode.BUG
+        try:
+            os.setsid()
+            os.dup2(lines, 2)
+            os.environ.update(environment)
+            signal.set_wakeup_fd(-1)
+            raise_on_signals()
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
+            end_with_parent()
+            code = self._run()
+        except StoppedError as stopped:
+            code = stopped.exit_code
+        except BaseException as error:
+            code = exit_code_of(error)
+            say_error(f"{self.name}: {error}")
+        finally:
+            os._exit(code)
 
 
 class ForkedCommand(Child):
     """One of our commands. Its first start is a fork, which saves the imports; a restart executes it.
 
-    A fork takes a few milliseconds, and a new interpreter 0.3 s. Later, this process has connections, which a fork
-    would have to leave alone.
+    A fork takes a few milliseconds, and a new interpreter 0.3 s. But a later fork would copy a state that has grown.
     """
 
     def __init__(
@@ -261,98 +276,15 @@ class ForkedCommand(Child):
         self._role = role
         self._arguments = arguments
 
-    async def _spawn(self, environment: dict[str, str], lines: int) -> "asyncio.subprocess.Process | _Forked":
+    async def _spawn(self, environment: dict[str, str], lines: int) -> asyncio.subprocess.Process | Forked:
         if self._process is not None:
             return await super()._spawn(environment, lines)
-        kept = {int(environment[ERROR_DESCRIPTOR])}
+        kept = [int(environment[ERROR_DESCRIPTOR])]
         if self._directory is not None:
-            kept.add(self._directory.lock)
-        return _fork(self.name, lambda: self._run_command(kept), environment, lines)
-
-    def _run_command(self, kept: set[int]) -> int:
-        """Run the command line in the child, with no descriptors but the standard ones and `kept`."""
-        gc.freeze()  # objects of the parent must not close descriptors that have other owners here
-        null = os.open(os.devnull, os.O_RDWR)
-        os.dup2(null, 0)
-        os.dup2(null, 1)
-        for number in map(int, [each.name for each in Path("/proc/self/fd").iterdir()]):
-            if number > 2 and number not in kept:
-                with contextlib.suppress(OSError):  # that of the listing itself
-                    os.close(number)
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # the handler writes to a descriptor of the parent
-        name_process("")
-        sys.argv = [self._role, *self._arguments]
-        _show_command([sys.executable, *(word for word in self._command if word != sys.executable)])
-        import_module(module_of(self._role)).app(self._arguments)
-        return 0
-
-
-def _fork(name: str, run: Callable[[], int], environment: dict[str, str], lines: int) -> "_Forked":
-    """Fork a child that runs a function with these variables, and with `lines` as standard error."""
-    # Until the child has handlers of its own, a signal would reach the event loop of this process instead.
-    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
-    pid = os.fork()
-    if not pid:
-        _run_forked(name, run, environment, lines)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
-    return _Forked(pid)
-
-
-def _run_forked(name: str, run: Callable[[], int], environment: dict[str, str], lines: int) -> NoReturn:
-    """Run the function in the child, which must never continue in the code of its parent."""
-    code: int = ExitCode.BUG
-    try:
-        os.setsid()
-        os.dup2(lines, 2)
-        os.environ.update(environment)
-        signal.set_wakeup_fd(-1)
-        raise_on_signals()
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
-        end_with_parent()
-        code = run()
-    except StoppedError as stopped:
-        code = stopped.exit_code
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else ExitCode.DONE
-    except BaseException as error:
-        code = exit_code_of(error)
-        say_error(f"{name}: {error}")
-    finally:
-        os._exit(code)
-
-
-def _show_command(words: list[str]) -> None:
-    """Show this command line in `ps` for a forked process, cut to the length of its parent's."""
-    start, end = map(int, Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()[45:47])
-    size = end - start  # 0 where the system does not say
-    if size > 0:
-        text = "\0".join(words).encode("utf-8", "surrogateescape")[: size - 1]
-        ctypes.memmove(start, text.ljust(size, b"\0"), size)
-
-
-class _Forked:
-    """A forked process, with the part of the interface of `asyncio.subprocess.Process` that `Child` uses."""
-
-    def __init__(self, pid: int) -> None:
-        self.pid = pid
-        self.returncode: int | None = None
-        self._ended = asyncio.Event()
-        self._descriptor = os.pidfd_open(pid)
-        asyncio.get_running_loop().add_reader(self._descriptor, self._take_exit)
-
-    def _take_exit(self) -> None:
-        asyncio.get_running_loop().remove_reader(self._descriptor)
-        os.close(self._descriptor)
-        _, status = os.waitpid(self.pid, 0)
-        self.returncode = os.waitstatus_to_exitcode(status)
-        self._ended.set()
-
-    async def wait(self) -> None:
-        await self._ended.wait()
-
-    def send_signal(self, number: signal.Signals) -> None:
-        # the number cannot be another process's, because this one was not waited for
-        os.kill(self.pid, number)
+            kept.append(self._directory.lock)
+        return fork_command(
+            self._role, self._arguments, output=None, errors=lines, kept=kept, variables=environment
+        )
 
 
 async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:

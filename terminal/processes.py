@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
 import ctypes
+import gc
+import os
 import re
 import signal
 import sys
 import time
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Collection, Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 from terminal.errors import ExitCode, ProcessError
+from terminal.logs import name_process
+from terminal.signals import ENDING_SIGNALS
 
 SILENCE: Final = 1.5
 """Seconds without a line after which a `Screen` shows that the work continues."""
@@ -36,20 +43,139 @@ def ask_for_end_with_parent() -> None:
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
-class Process:
-    """A process with its lines: they go to a log, and also to `show` if they are meant for the screen."""
+class Forked:
+    """A forked process, with the part of the interface of `asyncio.subprocess.Process` that is used here."""
 
-    def __init__(self, name: str, log: Path, *, show: Callable[[str], None] | None = None) -> None:
+    def __init__(self, pid: int) -> None:
+        self.pid = pid
+        self.returncode: int | None = None
+        self._ended = asyncio.Event()
+        self._descriptor = os.pidfd_open(pid)
+        asyncio.get_running_loop().add_reader(self._descriptor, self._take_exit)
+
+    def _take_exit(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._descriptor)
+        os.close(self._descriptor)
+        _, status = os.waitpid(self.pid, 0)
+        self.returncode = os.waitstatus_to_exitcode(status)
+        self._ended.set()
+
+    async def wait(self) -> int | None:
+        """Wait for the end."""
+        await self._ended.wait()
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal; the number cannot be another process's, because this one was not waited for."""
+        os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """Kill it."""
+        self.send_signal(signal.SIGKILL)
+
+
+def fork_command(
+    name: str,
+    arguments: Sequence[str],
+    *,
+    output: int | None,
+    errors: int,
+    kept: Collection[int] = (),
+    variables: Mapping[str, str] | None = None,
+) -> Forked:
+    """Run one of our commands in a fork of this process, which has most of its modules already.
+
+    It is as if it had been executed: in its own session, without standard input, and with no descriptors but its
+    output (None: /dev/null), its errors and those `kept`.
+    """
+    # Until the child has handlers of its own, a signal would reach the event loop of this process instead.
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
+    pid = os.fork()
+    if not pid:
+        _run_command(name, arguments, output, errors, kept, variables or {})
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
+    return Forked(pid)
+
+
+def _run_command(
+    name: str,
+    arguments: Sequence[str],
+    output: int | None,
+    errors: int,
+    kept: Collection[int],
+    variables: Mapping[str, str],
+) -> NoReturn:
+    """Become a command in a forked child, which must never continue in the code of its parent."""
+    try:
+        # Nothing of the parent's may end here: neither its open files, nor what it does at its exit.
+        gc.freeze()
+        atexit._clear()  # noqa: SLF001 - it has no public name
+        os.setsid()
+        null = os.open(os.devnull, os.O_RDWR)
+        for number, source in enumerate((null, null if output is None else output, errors)):
+            os.dup2(source, number)
+        for number in [int(each.name) for each in Path("/proc/self/fd").iterdir()]:
+            if number > 2 and number not in kept:
+                with contextlib.suppress(OSError):  # that of the listing itself
+                    os.close(number)
+        os.environ.update(variables)
+        # the event loop's handlers write to descriptors that were just closed
+        signal.set_wakeup_fd(-1)
+        for each in (*ENDING_SIGNALS, signal.SIGCHLD):
+            signal.signal(each, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
+        ask_for_end_with_parent()
+        name_process("")
+        sys.argv = [name, *arguments]
+        command = own_command(name)
+        _show_command([sys.executable, *(word for word in command if word != sys.executable), *arguments])
+        # by its name, as its script does: only the entry point knows all commands
+        getattr(import_module("rosbayes.start"), name.replace("-", "_"))()
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(ExitCode.BUG)
+
+
+def _show_command(words: Sequence[str]) -> None:
+    """Show this command line in `ps` for a forked process, cut to the length of its parent's."""
+    start, end = map(int, Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()[45:47])
+    size = end - start  # 0 where the system does not say
+    if size > 0:
+        text = "\0".join(words).encode("utf-8", "surrogateescape")[: size - 1]
+        ctypes.memmove(start, text.ljust(size, b"\0"), size)
+
+
+class Process:
+    """A process with its lines: they go to a log, and also to `show` if they are meant for the screen.
+
+    With `forks`, it is forked from this process, which is faster (see `fork_command`).
+    """
+
+    def __init__(
+        self, name: str, log: Path, *, show: Callable[[str], None] | None = None, forks: bool = False
+    ) -> None:
         self.name = name
         self._log = log
         self._show = show
-        self._process: asyncio.subprocess.Process | None = None
+        self._forks = forks
+        self._process: asyncio.subprocess.Process | Forked | None = None
         self._reader: asyncio.Task[None] | None = None
         self._lines: list[str] = []
         self._news = asyncio.Event()
 
     async def start(self, *command: str) -> None:
         """Start the process in its own session, so that Ctrl-C reaches only the script."""
+        if self._forks:
+            reading, writing = os.pipe()
+            self._process = fork_command(command[0], command[1:], output=writing, errors=writing)
+            os.close(writing)
+            lines = asyncio.StreamReader()
+            await asyncio.get_running_loop().connect_read_pipe(
+                lambda: asyncio.StreamReaderProtocol(lines), os.fdopen(reading, "rb")
+            )
+            self._reader = asyncio.create_task(self._read(lines))
+            return
         self._process = await asyncio.create_subprocess_exec(
             *own_command(command[0]),
             *command[1:],
@@ -108,7 +234,8 @@ class Process:
         """Wait until the process has ended and all its lines are read, and return its exit code."""
         if self._reader is not None:
             await self._reader
-        return await self._process.wait() if self._process else 0
+        code = await self._process.wait() if self._process else 0
+        return code or 0
 
     async def succeed(self) -> None:
         """Wait for the successful end of the process.

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pcie_shim.endpoint import Endpoint
-from services.child import RESTARTS, Child, ForkedCommand, end_all, module_of
+from services.child import RESTARTS, Child, ForkedCommand, end_all
 from services.errors import (
     BoardFailedError,
     ChildDiedError,
@@ -252,7 +252,7 @@ class Peers:
         # once for all of them, while the boards load their kernels
         for peer in self:
             if peer.child is not None:
-                import_module(module_of(peer.role))
+                import_module(f"services.commands.{peer.role.replace('-', '_')}")
         for peer in self:
             if peer.child is not None:
                 await peer.child.start()
