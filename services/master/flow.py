@@ -9,6 +9,7 @@ from bisect import bisect_left
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from services.child import RESTARTS
 from services.errors import (
@@ -19,7 +20,6 @@ from services.errors import (
     VariableError,
 )
 from services.master.peers import ANSWER_TIME, Awaited, Peer, Peers
-from services.pipeline.inference import infer
 from services.settings import Settings
 from services.sockets.records import (
     AnyRecord,
@@ -39,7 +39,10 @@ from services.sockets.records import (
 from services.sockets.status import BUCKETS_S, FrameCounts, StageLatency
 from terminal.logs import Logger
 from toolchain.deployment import Deployment
-from toolchain.deployment.filter import Filter
+
+# the boards, whose start takes longest, must not wait for NumPy
+if TYPE_CHECKING:
+    from toolchain.deployment.filter import Filter
 
 QUEUE_ALL_DEPTH = 256
 """Maximum number of frames that wait with `queue = all` before the run ends with an error."""
@@ -325,7 +328,7 @@ class FrameFlow:
         if self._follows:
             self._follow(number, bank, waiting)
 
-    def _predict(self, own: Filter, steps: int) -> bytes:
+    def _predict(self, own: "Filter", steps: int) -> bytes:
         """Move the belief to the frame that is sent next, and return it as the codes of its prior."""
         if self._number == 1:
             self._log.info("the filter begins with its start distribution")
@@ -352,6 +355,8 @@ class FrameFlow:
             return
         self._computing = None
         if self._filter is not None:
+            from services.pipeline.inference import infer
+
             self._filter.update(infer(result, self._deployment).posterior)
         reading = computing.waiting.reading
         publisher = self._peers.publisher.protocol

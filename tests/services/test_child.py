@@ -190,3 +190,13 @@ asyncio.run(main())
         assert select.select([child], [], [], PROCESS_PATIENCE)[0], "the child outlived its parent"
     finally:
         os.close(child)
+
+
+@pytest.mark.process
+def test_the_boards_of_a_run_do_not_wait_for_the_imports_of_its_master():
+    slow = "{'bridge.client', 'numba', 'numpy', 'posteriors', 'rich'}"
+    code = f"import sys, services.commands.master; print(*(set(sys.modules) & {slow}))"
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, check=True, timeout=PROCESS_PATIENCE
+    )
+    assert found.stdout == b"\n"

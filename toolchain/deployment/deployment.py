@@ -187,11 +187,11 @@ class Deployment(DeploymentFile):
 
     def new_filter(self) -> "Filter | None":
         """Return a filter that begins, from the file of `[filter]`, or raise a DeploymentError; None without this section."""
+        if self.filter is None:
+            return None
         # here, because a subscriber loads a deployment without NumPy
         from toolchain.deployment.filter import Filter, Transition
 
-        if self.filter is None:
-            return None
         path, machine = self.directory / self.filter.file, self.machine
         return Filter(Transition.read(path, machine.lines, self.filter.hash), machine.prob_bits)
 
