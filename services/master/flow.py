@@ -174,8 +174,9 @@ class FrameFlow:
         # The belief of a deployment with [filter]: that of the last frame sent to the boards, predicted when it is sent,
         # then its posterior. It outlives boards and pcie-app; a lost frame leaves the prediction.
         self._filter = deployment.new_filter()
-        # Readings since the last one in `_readings` that were lost: steps of the filter without an update.
-        self._skipped = 0
+        # Readings since the last one in `_readings` that were lost: steps of the filter without an update. The subscriber
+        # counts messages, of which each topic brings one for a reading; `_messages` is the rest, less than a reading.
+        self._skipped = self._messages = 0
         self.losses: Counter[LossReason] = Counter()
         """Readings and results lost so far, by reason."""
         # Causes of unusable messages, and of frames without a posterior or with a biased one: the user is warned once
@@ -269,8 +270,8 @@ class FrameFlow:
             self.first_reading_at = time.monotonic()
         self.losses[LossReason.PASSED_OVER] += reading.passed_over
         self.losses[LossReason.UNPAIRED] += reading.unpaired
-        # the subscriber counts messages, of which each topic brings one for a reading
-        self._skipped += reading.passed_over // len(self._deployment.sources)
+        steps, self._messages = divmod(self._messages + reading.passed_over, len(self._deployment.sources))
+        self._skipped += steps
         if self._peers.publisher.away and not self._once:
             # computing it would only delay a later one, whose result can be received
             self.losses[LossReason.ROSBRIDGE_AWAY] += 1

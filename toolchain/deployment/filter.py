@@ -9,6 +9,7 @@ A frame without a posterior leaves the prediction as the belief.
 
 import hashlib
 import io
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -59,10 +60,10 @@ class Transition:
 
     def content(self) -> bytes:
         """Return the content of the file: a NumPy array of float64[1 + lines, lines], the start and then the table."""
-        file = io.BytesIO()
-        rows = np.vstack([self.start, self.table]).astype("<f8")
-        np.lib.format.write_array(file, rows, version=(1, 0), allow_pickle=False)
-        return file.getvalue()
+        return (
+            _header((len(self.table) + 1, len(self.table)))
+            + np.vstack([self.start, self.table]).astype("<f8").tobytes()
+        )
 
     @classmethod
     def read(cls, path: Path, lines: int, sha256: str) -> "Transition":
@@ -76,19 +77,25 @@ class Transition:
             raise DamagedDeploymentError(
                 f"{path} is of another build, or damaged: its hash is {found[:16]}, deployment.toml names {sha256[:16]}"
             )
-        file, shape = io.BytesIO(data), (lines + 1, lines)
-        try:
-            version = np.lib.format.read_magic(file)
-            found_shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-            rows = np.frombuffer(data, "<f8", offset=file.tell()).reshape(shape)
-            if (version, found_shape, fortran, dtype) == ((1, 0), shape, False, rows.dtype):
+        shape = (lines + 1, lines)
+        header = _header(shape)
+        why = f"it does not have its {len(header) + 8 * math.prod(shape)} bytes, or another header"
+        if data.startswith(header) and len(data) == len(header) + 8 * math.prod(shape):
+            rows = np.frombuffer(data, "<f8", offset=len(header)).reshape(shape)
+            try:
                 return cls(rows[0], rows[1:])
-            why = f"it has {dtype}{list(found_shape)}"
-        except (ValueError, ModelError) as reason:
-            why = str(reason)
+            except ModelError as reason:
+                why = str(reason)
         raise DamagedDeploymentError(
             f"{path} is not float64{list(shape)}, the filter's start and transition: {why}"
         )
+
+
+def _header(shape: tuple[int, int]) -> bytes:
+    """Return the beginning of a NumPy file. It is compared, because NumPy's reading of a hostile one fails in many ways."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    return file.getvalue()
 
 
 def prediction_codes(prediction: NDArray[np.float64], prob_bits: int) -> NDArray[np.uint16]:

@@ -440,6 +440,18 @@ async def test_every_lost_reading_is_a_step_of_the_filter(filtered):
     run.flow.end.cancel()
 
 
+async def test_lost_messages_of_several_topics_are_fewer_steps(filtered):
+    run = Run(filtered.model_copy(update={"sources": [filtered.sources[0]] * 2}))
+    run.read()
+    counted(run, 0, 1, 0)
+    for lost, steps in ((3, 2), (2, 2), (1, 2), (1, 1), (3, 3)):  # each two messages are a reading
+        run.read(passed_over=lost)
+        expected = codes_of(np.linalg.matrix_power(MOVES, steps)[1])
+        assert prior_of(run.app.records[-1]) == expected
+        counted(run, 0, 1, 0)
+    run.flow.end.cancel()
+
+
 async def test_a_prediction_that_would_take_too_long_is_shortened_and_reported(filtered):
     run = Run(filtered)
     run.flow._filter.most_steps = 4

@@ -296,11 +296,22 @@ def test_the_file_of_the_filter_is_guarded(tmp_path):
             load_deployment(tmp_path, edited=True)
 
 
-@pytest.mark.parametrize("content", [np.zeros((2, 2)), np.zeros((3, 2), "<f4"), np.full((3, 2), 0.4), None])
+@pytest.mark.parametrize(
+    "content",
+    [
+        *(
+            np.zeros((2, 2)),
+            np.zeros((3, 2), "<f4"),
+            np.full((3, 2), 0.4),
+            np.asfortranarray(np.full((3, 2), 0.5)),
+        ),
+        *(b"\x93NUMPY\x01\x00", b"\x93NUMPY\x01\x00\xd0\x07" + b"(" * 2000),
+    ],
+)
 def test_a_file_with_the_right_hash_is_read_with_care(tmp_path, content):
     path = tmp_path / "filter.npy"
-    if content is None:
-        path.write_bytes(b"\x93NUMPY\x01\x00")
+    if isinstance(content, bytes):
+        path.write_bytes(content)
     else:
         np.save(path, content)
     with pytest.raises(DamagedDeploymentError, match=r"is not float64\[3, 2\]"):
