@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from typing import Any, Final, Literal
 
 _NS: Final = 1_000_000_000
+# Seconds are uint32 in ROS 1 and int32 in ROS 2, nanoseconds uint32 in both.
+_WORD: Final = 1 << 32
 _KEYS: Final = (("sec", "nanosec", 2), ("secs", "nsecs", 1))
 
 
@@ -31,7 +33,10 @@ def stamp_ns(time: object) -> int | None:
     for second, nanosecond, _version in _KEYS:
         if second in time:
             seconds, nanoseconds = time[second], time.get(nanosecond, 0)
-            if type(seconds) is int and type(nanoseconds) is int:
+            # A time beyond the ranges of both versions would not fit into 64 bits of nanoseconds.
+            if type(seconds) is not int or type(nanoseconds) is not int:
+                break
+            if -_WORD // 2 <= seconds < _WORD and 0 <= nanoseconds < _WORD:
                 return seconds * _NS + nanoseconds
             break
     return None

@@ -25,6 +25,7 @@ from terminal.signals import ENDING_SIGNALS
 SILENCE: Final = 1.5
 """Seconds without a line after which a `Screen` shows that the work continues."""
 _PR_SET_PDEATHSIG: Final = 1
+_PR_SET_NAME: Final = 15
 
 
 def own_command(name: str) -> list[str]:
@@ -128,7 +129,9 @@ def _run_command(
         name_process("")
         sys.argv = [name, *arguments]
         command = own_command(name)
-        _show_command([sys.executable, *(word for word in command if word != sys.executable), *arguments])
+        _show_command(
+            name, [sys.executable, *(word for word in command if word != sys.executable), *arguments]
+        )
         # by its name, as its script does: only the entry point knows all commands
         getattr(import_module("rosbayes.start"), name.replace("-", "_"))()
     except BaseException:
@@ -137,8 +140,9 @@ def _run_command(
         os._exit(ExitCode.BUG)
 
 
-def _show_command(words: Sequence[str]) -> None:
-    """Show this command line in `ps` for a forked process, cut to the length of its parent's."""
+def _show_command(name: str, words: Sequence[str]) -> None:
+    """Show a name in `top` and a command line in `ps` for a forked process, the latter cut to the length of its parent's."""
+    ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
     start, end = map(int, Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()[45:47])
     size = end - start  # 0 where the system does not say
     if size > 0:

@@ -108,7 +108,9 @@ def test_what_is_built_is_read(time, version):
 @pytest.mark.parametrize(
     ("time", "nanoseconds"),
     [(time, None) for time in (None, 5, "now", [], {}, {"sec": "5"}, {"sec": 5, "nanosec": None})]
-    + [({"secs": 1.5}, None), ({"sec": True}, None), ({"sec": 3}, 3_000_000_000)],
+    + [({"secs": 1.5}, None), ({"sec": True}, None), ({"sec": 3}, 3_000_000_000)]
+    + [(time, None) for time in ({"sec": 1 << 32}, {"sec": -(1 << 31) - 1}, {"sec": 1, "nanosec": 1 << 32})]
+    + [({"sec": 1, "nanosec": -1}, None), ({"sec": -(1 << 31)}, -(10**9 << 31))],
 )
 def test_what_is_a_time(time, nanoseconds):
     assert stamp_ns(time) == nanoseconds

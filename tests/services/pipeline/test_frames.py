@@ -6,6 +6,7 @@ from contextlib import nullcontext
 
 import pytest
 
+from bridge.stamps import stamp
 from services.errors import VariableError
 from services.pipeline.frames import UNPAIRED_WARNING, FrameAssembler, StampGap
 from toolchain.deployment import BM1Section, BoardSection, Deployment, Dimension, Source, Variable
@@ -36,7 +37,7 @@ def two_topics(*, tolerance_s=0.05, **second):
 
 
 def stamped(ms, **values):
-    return {"header": {"stamp": {"sec": 100, "nanosec": int(ms * 1e6)}}, **values}
+    return {"header": {"stamp": stamp(100 * 10**9 + int(ms * 1e6), 2)}, **values}
 
 
 def test_one_topic_every_message_is_a_frame_with_its_stamp():
