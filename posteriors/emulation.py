@@ -122,7 +122,8 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
 
     Raises:
         LabelError: The deployment has no variable of this name.
-        PosteriorError: The machine has replicas or readings for each line; use `machines.posterior`.
+        PosteriorError: The readings have no names, or the machine has replicas or readings for each line; for these,
+            use `machines.posterior`.
         ToolchainError: The deployment is damaged, or a reading cannot be used.
         NoPosteriorError: All counts are 0 for these readings.
     """
@@ -132,6 +133,8 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
     from pcie_shim.programming_file import read_image
     from toolchain.deployment.address import to_address
 
+    if not isinstance(readings, Mapping):
+        raise PosteriorError(f"the readings are {readings!r}, expected values by name, such as {{'D1': 42}}")
     deployment = load_deployment(Path(folder))
     names = [variable.name for variable in deployment.variables]
     for name in readings:

@@ -126,6 +126,8 @@ def test_what_it_refuses(build):
     folder = build()
     with pytest.raises(LabelError, match="did you mean 'seen'"):
         posterior(folder, {"sen": 1})
+    with pytest.raises(PosteriorError, match="expected values by name"):
+        posterior(folder, [1, 2])
     with pytest.raises(ReadingMissingError):
         posterior(folder, {"felt": float("nan")})
     with pytest.raises(PosteriorError):
