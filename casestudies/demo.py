@@ -1,6 +1,7 @@
 """The command `demo`: a case study from end to end, whose processes are started in order and ended together."""
 
 import asyncio
+import contextlib
 import os
 import socket
 import time
@@ -9,11 +10,13 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Thread
 from typing import Annotated, Final
 
 import typer
 
 from casestudies import DEFAULT_URI
+from machines import warm_up
 from terminal.command_line import CommandLine
 from terminal.errors import OutputError
 from terminal.output import check_writable
@@ -148,6 +151,22 @@ def demo(
     return run_async(_run(case, uri, None if stay else count, out.resolve(), page_port=port))
 
 
+async def _load_kernels() -> None:
+    """Load the boards' kernels while the deployment is built; master and boards inherit them from this process."""
+    loop, loaded = asyncio.get_running_loop(), asyncio.Event()
+
+    def load() -> None:
+        try:
+            warm_up()  # boards report its errors
+        finally:
+            with contextlib.suppress(RuntimeError):  # the demo was ended meanwhile
+                loop.call_soon_threadsafe(loaded.set)
+
+    # unlike that of an executor, this thread does not delay Ctrl-C
+    Thread(target=load, daemon=True).start()
+    await loaded.wait()
+
+
 async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, page_port: int | None) -> int:
     """Build, start everything, wait for the viewer's last picture, and end everything; no count: run until Ctrl-C."""
     started = time.monotonic()
@@ -163,7 +182,7 @@ async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, pag
     saying = asyncio.create_task(screen.say_what_it_waits_for())
     building = None
     try:
-        screen.waits_for = "building the deployment"
+        screen.waits_for = "building the deployment, loading the kernels, which a first start compiles"
         if uri is None:
             screen.show(
                 f"starting the hub (the embedded rosbridge server), building the {case.name}'s deployment ..."
@@ -188,8 +207,9 @@ async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, pag
             *(case.viewer, "--uri", uri, *counted, "--out", str(out)),
             *("--first-timeout", str(FIRST_TIMEOUT)),
         )
-        await asyncio.gather(building, viewer.line("listening"))
-        screen.waits_for = "waiting for results; a first start compiles kernels"
+        # nothing is forked before the kernels are loaded, because a fork would inherit the locks of their thread
+        await asyncio.gather(building, viewer.line("listening"), _load_kernels())
+        screen.waits_for = "waiting for results"
         await master.start("master", "--loop", *counted, "-d", str(deployment), "--uri", uri)
         for name, options in case.publishers.items():
             await processes[name].start(name, "--uri", uri, *options)
