@@ -1,11 +1,13 @@
 """Processes that a command starts: where its commands are looked for, their lines, and their end."""
 
+import subprocess
 import sys
 
 import pytest
 
 from terminal.errors import ProcessError
 from terminal.processes import Process, own_command
+from tests.patience import PROCESS_PATIENCE
 
 SHELL = "/bin/sh"
 
@@ -46,3 +48,38 @@ async def test_a_process_that_is_ended_is_not_shown_any_more(tmp_path):
     await process.end()
     assert (shown, await process.wait()) == (["ready"], 143)
     assert "terminated" in (tmp_path / "log").read_text()
+
+
+FORKING = """
+import asyncio, os, socket, sys, tempfile
+from pathlib import Path
+from terminal.processes import Process
+
+async def main():
+    folder = tempfile.TemporaryDirectory()
+    ours, theirs = socket.socketpair()
+    hub = Process("hub", Path(folder.name, "hub.log"), forks=True)
+    await hub.start("hub", "--port", "0")
+    await hub.line(r"ws://\\S+")
+    words = Path(f"/proc/{hub.pid}/cmdline").read_bytes().split(b"\\0")
+    theirs.close()
+    ours.setblocking(False)
+    assert ours.recv(1) == b"", "the fork has kept a descriptor"
+    await hub.end()
+    assert Path(folder.name).exists(), "the fork has done what this process does at its exit"
+    print(Path(os.fsdecode(words[1])).name, hub._process.returncode)
+
+asyncio.run(main())
+"""
+
+
+@pytest.mark.process
+def test_a_forked_command_is_as_if_it_had_been_executed():
+    done = subprocess.run(
+        [sys.executable, "-c", FORKING, *("x" for _ in range(200))],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PROCESS_PATIENCE,
+    )
+    assert (done.stdout, done.stderr) == ("hub 143\n", "")
