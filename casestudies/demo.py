@@ -43,6 +43,8 @@ class Case:
     boards: int
     options: Sequence[str] = ()
     """Options of the build."""
+    pointer: str = ""
+    """What to do on the page."""
     viewer: str
     publishers: Mapping[str, Sequence[str]]
     """The commands on the robot's side with their options, in the order of their start."""
@@ -57,6 +59,7 @@ def boat(rates: Sequence[str], *, array: bool) -> Case:
         type="std_msgs/Float64MultiArray" if array else "boat_msgs/Sensors",
         boards=4,
         options=("--set", "array=true") if array else (),
+        pointer="; on the page, drag the boat",
         viewer="boat-viewer",
         publishers={"boat-normaliser": flags, "boat-simulator": [*rates, *flags]},
     )
@@ -220,12 +223,12 @@ async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, pag
             )
             address = await processes["dashboard"].line(r"http://\S+")
             saying.cancel()
-            screen.show(f"open {address[0]} in a browser; on the page, drag the boat")
+            screen.show(f"open {address[0]} in a browser{case.pointer}")
         await master.succeed()
         screen.waits_for = "drawing the pictures"
         await viewer.succeed()
         screen.show(f"done in {time.monotonic() - started:.1f} s; pictures are in {out}")
-        screen.show("to watch it live in a browser, and to drag the boat: the same command with --dashboard")
+        screen.show("to watch it live in a browser: the same command with --dashboard")
     finally:
         saying.cancel()
         if building is not None:

@@ -1,7 +1,7 @@
 """The posterior of a deployment for given readings, computed in this process: for notebooks and tests of models."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,8 @@ class EmulatedPosterior(Posterior):
     """A posterior of `posterior`, which can be compared with the exact one for the same readings."""
 
     deployment: Deployment = field(compare=False)
+    machines: tuple[Any, ...] = field(compare=False)
+    """Those of its boards, which the folder may not have any more."""
     addresses: tuple[int | None, ...]
     """The reading of each variable of the deployment; None without one."""
 
@@ -40,17 +42,19 @@ class EmulatedPosterior(Posterior):
             The posterior, whose `details` say of what it is: `exact` is `model` or `codes`.
 
         Raises:
-            PosteriorError: The deployment is that of a BM2, and there is no model.
+            PosteriorError: The deployment is that of a BM2 and there is no model, or there are settings that nothing takes.
             ToolchainError: The model has an error, or the deployment was not built from it.
         """
         from toolchain.analysis.emulation import joined
-        from toolchain.building.build import read_images
 
-        machines = [image.machine for image in read_images(self.deployment)]
         if model is not None:
-            values = self._of_model(model, settings, machines)
+            values = self._of_model(model, settings)
+        elif settings:
+            raise PosteriorError(
+                f"{', '.join(settings)}: only a model has parameters, so name it first, as in exact('boat')"
+            )
         elif self.deployment.machine.is_divided:
-            values = self._of_codes(joined(machines))
+            values = self._of_codes(joined(self.machines))
         else:
             raise PosteriorError(
                 "the codes of a BM2 are odds of single bits, which have no exact posterior: name the model, such as "
@@ -76,7 +80,7 @@ class EmulatedPosterior(Posterior):
         return fuse(prior, likelihoods)
 
     def _of_model(
-        self, source: "Path | str | Model | Question", settings: Mapping[str, object], machines: Sequence[Any]
+        self, source: "Path | str | Model | Question", settings: Mapping[str, object]
     ) -> "NDArray[np.float64]":
         from toolchain.analysis.chain_inspection import check_same
         from toolchain.analysis.emulation import joined
@@ -90,19 +94,21 @@ class EmulatedPosterior(Posterior):
         deployment, select = self.deployment, self.deployment.prior_select
         if isinstance(source, str | Path):
             path, known = Path(source), [variable.name for variable in deployment.sensors]
-            if is_network(path):
+            if not is_network(path):
+                source = load_question(path, {key: str(value) for key, value in settings.items()})
+            elif settings:
+                raise PosteriorError(f"{', '.join(settings)}: a network file has no parameters")
+            else:
                 selecting = None if select is None else select.name
                 source = read_network(path).ask(self.labels, known, prior_select=selecting)
-            else:
-                source = load_question(path, {key: str(value) for key, value in settings.items()})
         if not deployment.machine.is_divided:
             network = network_for(source)
-            check_same(deployment, machines[0], network)
+            check_same(deployment, self.machines[0], network)
             return network.exact(self.addresses)
         fusion = source.model() if isinstance(source, Question) else source
         bits = {variable.name: variable.bits for variable in deployment.variables}
         known_bits = [replace(known, bits=bits.get(known.name, known.bits)) for known in fusion.known]
-        losses_of(deployment, joined(machines), replace(fusion, known=tuple(known_bits)))
+        losses_of(deployment, joined(self.machines), replace(fusion, known=tuple(known_bits)))
         addresses, _ = deployment.machine_addresses(self.addresses)
         row = None if select is None else self.addresses[deployment.variables.index(select)]
         return exact_posterior(fusion, addresses, prior_address=row)
@@ -173,5 +179,6 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
         heard_ns=time.time_ns(),
         details=details,
         deployment=deployment,
+        machines=tuple(machines),
         addresses=addresses,
     )

@@ -95,8 +95,10 @@ def _image(shades: NDArray[Any]) -> str:
     """Return shades from 0 to 255 as an enlarged PNG."""
     from matplotlib.image import imsave
 
-    each = max(1, _SIDE // max(shades.shape))
-    pixels, file = shades.repeat(each, axis=0).repeat(each, axis=1), io.BytesIO()
+    long = max(shades.shape)
+    sides = shades.shape if long > _LONGEST * min(shades.shape) else (long, long)
+    down, across = (max(1, _SIDE // side) for side in sides)
+    pixels, file = shades.repeat(down, axis=0).repeat(across, axis=1), io.BytesIO()
     imsave(file, pixels, vmin=0, vmax=255, cmap="viridis", format="png")
     return f'<img alt="posterior" src="data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"/>'
 

@@ -122,8 +122,21 @@ def test_the_exact_posterior_of_a_network(tmp_path):
         found.exact(str(file))
 
 
-def test_what_it_refuses(build):
+def test_a_posterior_keeps_its_machine(build):
     folder = build()
+    found = posterior(folder, {"seen": 1})
+    before = found.exact()
+    for image in folder.rglob("*.bm"):
+        image.unlink()
+    assert found.exact() == before
+
+
+def test_what_it_refuses(build, tmp_path):
+    folder = build()
+    with pytest.raises(PosteriorError, match="cells: only a model has parameters"):
+        posterior(folder, {"seen": 1}).exact(cells=3)
+    with pytest.raises(PosteriorError, match="cells: a network file has no parameters"):
+        posterior(folder, {"seen": 1}).exact(tmp_path / "a.bif", cells=3)
     with pytest.raises(LabelError, match="did you mean 'seen'"):
         posterior(folder, {"sen": 1})
     with pytest.raises(PosteriorError, match="expected values by name"):
