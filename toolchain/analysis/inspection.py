@@ -147,6 +147,10 @@ def _readings(
     if model is None:
         model = model_of_codes(deployment.name, deployment.searched, deployment.variables, whole)
     if own is not None:
+        if model.transition is not None and model.transition.content() != own.transition.content():
+            raise BuildError(
+                f"{deployment.directory} was not built from the model {model.name}: its transition differs; build it again"
+            )
         model = replace(model, prior=None, transition=own.transition)
     of_each = f" of readings for {replicas} replicas," if replicas > 1 else ""
     drawn = sample_readings(

@@ -362,3 +362,8 @@ def test_inspect_compares_sequences_with_the_exact_filter(umbrella, tmp_path):
     )
     assert json.loads(without.stdout)["accuracy"] == found  # the transition is the deployment's
     assert "drawn from the codes" in done(toolchain("inspect", "built", "--frames", "5")).stdout
+    other = UMBRELLA.replace(
+        "0.7, 0.3; (no) 0.3, 0.7", "0.6, 0.4; (no) 0.4, 0.6"
+    )  # with the same first prior
+    (tmp_path / umbrella).write_text(other)
+    assert_refused(toolchain("inspect", "built", *model), "its transition differs")
