@@ -136,22 +136,29 @@ def demo(
         raise OutputError(
             "--dashboard needs NiceGUI, which is not installed: pip install 'rosbayes[dashboard]', or leave it out"
         )
+    stay |= dashboard
+    if stay and uri is None:
+        _check_port("hub", int(PORT), f"use that server with --uri ws://127.0.0.1:{PORT}")
     if dashboard:
         # the page is started last, when it is late to say that its port is taken
-        try:
-            socket.create_server(("127.0.0.1", page_port)).close()
-        except OSError as error:
-            raise OutputError(
-                f"the page cannot listen on port {page_port} ({os.strerror(error.errno or 0)}): end the process that listens "
-                "there, or choose another --page-port"
-            ) from None
+        _check_port("page", page_port, "choose another --page-port")
     check_writable(out)
     rates = ["--rate", str(rate), *(() if seed is None else ("--seed", str(seed)))]
     # a real server accepts only installed message types
     case = sprinkler(rates, count) if is_sprinkler else boat(rates, array=uri is not None)
-    stay |= dashboard
     port = page_port if dashboard else None
     return run_async(_run(case, uri, None if stay else count, out.resolve(), page_port=port))
+
+
+def _check_port(whose: str, port: int, otherwise: str) -> None:
+    """Raise an OutputError if a port cannot be listened on."""
+    try:
+        socket.create_server(("127.0.0.1", port)).close()
+    except OSError as error:
+        raise OutputError(
+            f"the {whose} cannot listen on port {port} ({os.strerror(error.errno or 0)}): end the process that listens there, "
+            f"or {otherwise}"
+        ) from None
 
 
 async def _load_kernels() -> None:

@@ -218,7 +218,8 @@ class Master:
         await asyncio.sleep(limit + _GRACE_PERIOD)
         if not self._flow.has_data:
             topics = ", ".join(source.topic for source in self._deployment.sources)
-            self._flow.fail(NoDataError(f"no reading came from {topics} within {limit:g} s"))
+            clock = "; with --use-sim-time, /clock is needed too" if self._settings.use_sim_time else ""
+            self._flow.fail(NoDataError(f"no reading came from {topics} within {limit:g} s{clock}"))
 
     async def _show_progress(self) -> None:
         from services.output.master_output import sentence

@@ -24,6 +24,8 @@ class Clock:
         # The last time on /clock, and by how much it has advanced in all, both in ns.
         self._time: int | None = None
         self._tick = 0
+        self.heard = time.monotonic()
+        """When the last message came, at first when this began (monotonic seconds)."""
 
     def time_ns(self) -> int:
         """Return the time as in stamps; that of a simulation is 0 before the first message."""
@@ -42,6 +44,6 @@ class Clock:
             if (now := stamp_ns(message.msg.get("clock"))) is None:
                 continue
             self._tick += max(now - (now if self._time is None else self._time), 0)
-            self._time = now
+            self._time, self.heard = now, time.monotonic()
             if moved is not None:
                 moved()

@@ -103,9 +103,7 @@ async def check_types(topics: Iterable[tuple[Ros, str, str]]) -> None:
     for known, (ros, topic, own) in zip(types, asked, strict=True):
         # without a publisher it may still get our type
         if known and not same_type(known, own) and await ros.publishers(topic) != []:
-            raise NotReceivableError(
-                f"{topic} is {shown(known[:80])} at {ros.uri}, not {own}; build with that type"
-            )
+            raise NotReceivableError(f"{topic} is {shown(known[:80])} at {ros.uri}, not {own}; use that type")
 
 
 # --- topics of results ---------------------------------------------------------------------

@@ -113,6 +113,9 @@ class Subscriber(Service):
             topics = " and ".join(source.topic for source in self._deployment.sources)
             since = "yet" if age is None else f"for {age:.0f} s"
             why = f"no complete reading {since}: {self._assembler.stamp_gap() or f'waiting for messages on {topics}'}"
+        silence = time.monotonic() - self._clock.heard
+        if not why and self._clock.simulated and self._assembler.deadline is not None and silence > limit:
+            why = f"a message waits for another topic, and {CLOCK_TOPIC} has brought nothing for {silence:.0f} s"
         return ProcessStatus(
             ready=not why,
             why=why or f"connected to {', '.join(self._rosbridges)}",

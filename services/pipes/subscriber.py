@@ -6,7 +6,7 @@ import time
 
 from bridge.client import Message
 from bridge.fields import Field, all_missing
-from services.pipeline.connections import connect_all, report_unpublished
+from services.pipeline.connections import check_types, connect_all, report_unpublished
 from services.pipeline.frames import FrameAssembler
 from services.pipeline.subscriber import RECEIVED_QUEUE
 from services.settings import Settings
@@ -22,13 +22,14 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
 
     Raises:
         NoMessageError: No message came in time.
-        BridgeError: A message does not have a variable, or the server is unreachable.
+        BridgeError: A message does not have a variable, the topic has another type, or the server is unreachable.
     """
     fields = [Field(name) for name in names]
     size, report = settings.message_bytes, report_waits()
     async with contextlib.AsyncExitStack() as stack:
         by_uri = await connect_all(stack, settings, [source.uri], on_state=report, max_size=size)
         ros = by_uri[source.uri]
+        await check_types([(ros, source.topic, source.type)])
         subscription = ros.subscribe(
             source.topic, source.type, queue_size=RECEIVED_QUEUE, max_bytes=settings.topic_bytes
         )
@@ -58,6 +59,7 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
 
     Raises:
         NoMessageError: No message came in time.
+        BridgeError: A topic has another type, or a server is unreachable.
         VariableError: A variable is missing or unusable.
     """
     frames = FrameAssembler(deployment)
@@ -111,6 +113,8 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
                 await arrived.put((at, await subscription.next(timeout=settings.first_data_timeout)))
                 hint.cancel()
 
+        needed = [source for at, source in enumerate(deployment.sources) if frames.needs(at)]
+        await check_types((by_uri[settings.uri or each.uri], each.topic, each.type) for each in needed)
         for source in deployment.sources:
             say(f"listening on {source.topic} at {settings.uri or source.uri}")
         # the printing ends, or one of them fails

@@ -24,13 +24,16 @@ def test_a_robot_is_looked_up_before_anything_starts(tmp_path, monkeypatch):
     assert "no robot called Adam" in ended.stderr
 
 
-def test_a_port_that_is_taken_is_named_before_anything_starts(tmp_path):
+@pytest.mark.parametrize("flags", [["--stay"], ["--dashboard", "--uri", "ws://127.0.0.1:1", "--page-port"]])
+def test_a_port_that_is_taken_is_named_before_anything_starts(tmp_path, monkeypatch, flags):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
-        ended = invoke(demo.app, ["--dashboard", "--page-port", port, "--out", str(tmp_path / "out")])
+        monkeypatch.setattr(demo, "PORT", port)
+        given = [*flags, port] if "--page-port" in flags else flags
+        ended = invoke(demo.app, [*given, "--out", str(tmp_path / "out")])
     assert ended.exit_code == 2
     assert f"port {port}" in ended.stderr
-    assert "--page-port" in ended.stderr
+    assert ("--page-port" if "--page-port" in flags else f"--uri ws://127.0.0.1:{port}") in ended.stderr
     assert not (tmp_path / "out").exists()
 
 

@@ -91,7 +91,7 @@ async def test_ticks_go_on_when_the_clock_begins_again(ros_version):
 @pytest.mark.parametrize("real_s", [0.0, 0.05], ids=["faster", "at a fifth of the rate"])
 async def test_a_topic_is_waited_for_as_long_as_simulated_time_says(link, tmp_path, real_s):
     """The tolerance is 50 ms, in which a slow simulation takes a quarter of a second; without a header, it stamps."""
-    async with simulated(link, tmp_path, real_s=real_s) as (simulation, _):
+    async with simulated(link, tmp_path, real_s=real_s) as (simulation, subscriber):
         for turn in range(1, 4):
             await simulation.at(100 * turn)
             await simulation.range(turn)
@@ -109,6 +109,7 @@ async def test_a_topic_is_waited_for_as_long_as_simulated_time_says(link, tmp_pa
         await simulation.range(4)
         await simulation.at(440)
         assert len(link.of(Reading)) == 3
+        await until(lambda: "and /clock has brought nothing for" in subscriber.status().why)
         await simulation.at(460)
         await link.until(lambda: len(link.of(Reading)) == 4)
         assert link.of(Reading)[-1].addresses == [4, None]

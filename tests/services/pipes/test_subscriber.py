@@ -7,6 +7,8 @@ import socket
 
 import pytest
 
+from bridge.client import connect
+from services.pipeline.connections import NotReceivableError
 from services.pipes.subscriber import print_addresses, print_variables
 from services.settings import Settings
 from tests.fake_rosbridge import FakeRosbridge
@@ -35,6 +37,19 @@ async def test_a_mistyped_topic_is_named_with_similar_ones(boat, capsys, monkeyp
             await printing
     (warning,) = (line for line in said.splitlines() if "/boat/sensors2" in line)
     assert warning.startswith("warning: ")
+
+
+@pytest.mark.parametrize("of_deployment", [False, True])
+async def test_a_topic_of_another_type_is_named_at_once(boat, of_deployment):
+    async with FakeRosbridge(rosapi=True) as fake, connect(fake.uri) as robot:
+        await robot.advertise("/boat/sensors", "std_msgs/String")
+        settings = Settings(uri=fake.uri, first_data_timeout=100 * PATIENCE)
+        source = Source(uri=fake.uri, topic="/boat/sensors", type="boat_msgs/Sensors")
+        printing = (
+            print_addresses(settings, boat, 1) if of_deployment else print_variables(settings, source, [], 1)
+        )
+        with pytest.raises(NotReceivableError, match=r"is std_msgs/String at .*, not boat_msgs/Sensors; use"):
+            await printing
 
 
 async def test_a_server_that_comes_later_is_waited_for_aloud(capsys):
