@@ -47,10 +47,11 @@ _TURN_FRAMES: Final = 128
 _TURN_BYTES: Final = 64 * 1024
 _SLICE_BYTES: Final = 4 * 1024
 _TURN_MESSAGES: Final = 32
-# Seconds for which the hub polls its sockets after a prompt response, and for which it does not after polling was in
-# vain, at first and at most (see `_Hub.stay_awake`).
+# Seconds for which the hub polls its sockets after a prompt response; in which a response comes that waited for the end
+# of that; and for which the hub does not poll then, at first and at most (see `_Hub.stay_awake`).
 _AWAKE: Final = 200e-6
-_PAUSES: Final = (1e-3, 1.0)
+_AT_ONCE: Final = 60e-6
+_PAUSES: Final = (1e-3, 0.1)
 # Seconds between two checks for silent and stuck clients.
 _SWEEP: Final = 1.0
 # Seconds that a client has to end a connection which the hub closed.
@@ -248,7 +249,9 @@ class _Hub:
         is_prompt, self._prompt_until = now < self._prompt_until, now + _AWAKE
         if self._is_polling:
             self._pause = _PAUSES[0]
-        elif now < self._in_vain + _AWAKE:  # a client on the same core had to wait for the end of the polling
+        elif (
+            now < self._in_vain + _AT_ONCE
+        ):  # a client on the same core had to wait for the end of the polling
             self._in_vain, self._poll_from = -inf, now + self._pause
             self._pause = min(2 * self._pause, _PAUSES[1])
         elif is_prompt and now >= self._poll_from:

@@ -179,17 +179,20 @@ async def test_polling_in_vain_is_not_repeated_at_once(monkeypatch):
     assert not await polls_after(0)
     assert await polls_after(100)
     await nothing_until(400)  # but as soon as the core is free
-    assert not await polls_after(500, 600, 1300, 1400)
+    assert not await polls_after(450, 600, 1300, 1400)
     assert await polls_after(1550)
     await nothing_until(1900)
-    assert not await polls_after(2000, 3000, 3100, 3900)  # twice as long
+    assert not await polls_after(1950, 3000, 3100, 3900)  # twice as long
     assert await polls_after(4050, 4100)  # not in vain
     await nothing_until(4500)
-    assert not await polls_after(4600, 5500)
+    assert not await polls_after(4550, 5500)
     assert await polls_after(5650)
     await nothing_until(6000)
     assert not await polls_after(100_000)
     assert await polls_after(100_100)  # a pause of the client is not held against polling
+    await nothing_until(100_500)
+    assert not await polls_after(100_600)
+    assert await polls_after(100_700)  # nor a slow response
 
 
 def test_every_limit_must_be_positive():
