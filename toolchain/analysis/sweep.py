@@ -4,10 +4,10 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal, cast
+from typing import Any, Final, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -227,10 +227,6 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
             alpha=0.6,
             label=f"{rng}, scale {scale}",
         )
-        for point in of_kind:
-            words = f"{point.prob_bits}, {point.target_count}" + f", {point.steps_per_clock}" * is_stepped
-            at_point = {"xytext": (8, -2), "textcoords": "offset points", "fontsize": 6.5}
-            axes.annotate(words, (point.cycles_median, point.total_variation), **at_point)
     axes.scatter(
         [point.cycles_median for point in front],
         [point.total_variation for point in front],
@@ -248,12 +244,41 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
         title=f"{name}: accuracy against cycles; the larger, the more ALMs\n"
         f"(numbers: bits of a code, target count{', steps' * is_stepped})",
     )
+    axes.margins(x=0.15)  # room for the names beside the last points
+    axes.tick_params(which="minor", labelsize=6)
     axes.grid(alpha=0.3, which="both")
+    steps = [f", {point.steps_per_clock}" * is_stepped for point in points]
+    names = [
+        f"{point.prob_bits}, {point.target_count}{more}" for point, more in zip(points, steps, strict=True)
+    ]
+    places = [(point.cycles_median, point.total_variation) for point in points]
+    _name_points(axes, sorted(zip(places, names, strict=True), key=lambda each: -each[0][1]))
     if beside:
         figure.legend(loc="outside right center", fontsize="small", frameon=False)
     else:
         axes.legend(fontsize="small", frameon=False)
     save_figure(figure, path, dpi=120)
+
+
+def _name_points(axes: Any, names: Iterable[tuple[tuple[float, float], str]]) -> None:
+    """Write names beside points, the highest first; one that would cover another goes below it, with a line to its point."""
+    line = 9.5
+    dots = axes.figure.dpi / 72
+    axes.get_xlim()  # sets the limits, on which the places depend
+    taken: list[tuple[float, float, str]] = []
+    for place, name in names:
+        x, y = axes.transData.transform(place) / dots
+        if any(
+            name == other and abs(x - left) < line and abs(y - high) < line for left, high, other in taken
+        ):
+            continue  # the same, but for the generator
+        low = y
+        while any(abs(x - left) < 5 * line and abs(low - high) < line for left, high, _ in taken):
+            low -= 1
+        taken.append((x, low, name))
+        to_point = None if low == y else {"arrowstyle": "-", "linewidth": 0.3, "relpos": (0, 0.5)}
+        at_point = {"xytext": (8, low - y - 2), "textcoords": "offset points", "fontsize": 6.5}
+        axes.annotate(name, place, arrowprops=to_point, **at_point)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,6 @@
 """Sweeps: every point is saved before the next begins, a sweep resumes where it stopped, and the front is right."""
 
+import itertools
 import signal
 from pathlib import Path
 
@@ -7,12 +8,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from terminal.pictures import new_figure
 from tests.toolchain.builders import corridor, posts
 from tests.toolchain.running import assert_refused, done, toolchain
 from toolchain.analysis import Sweep
 from toolchain.analysis.logic import DEVICES
 from toolchain.analysis.readings import sample_readings
-from toolchain.analysis.sweep import Point, Results, draw_sweep, pareto, run_sweep, run_task, table, tasks
+from toolchain.analysis.sweep import (
+    Point,
+    Results,
+    _name_points,
+    draw_sweep,
+    pareto,
+    run_sweep,
+    run_task,
+    table,
+    tasks,
+)
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 
@@ -246,3 +258,15 @@ def test_a_file_of_results_that_does_not_end_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("toolchain.analysis.sweep.MAX_FILE_BYTES", 1000)
     with pytest.raises(BuildError, match="not a regular file"):
         Results(Path("/dev/zero"))
+
+
+def test_no_name_of_a_point_covers_another():
+    axes = new_figure(7, 5).subplots()
+    axes.set(xscale="log", yscale="log")
+    places = [(1000, 0.1), (1000, 0.1), (1010, 0.099), (1000, 0.1), (9000, 0.01)]
+    axes.scatter(*zip(*places, strict=True))
+    _name_points(axes, zip(places, ["8, 63", "8, 63", "6, 63", "4, 63", "8, 255"], strict=True))
+    assert [text.get_text() for text in axes.texts] == ["8, 63", "6, 63", "4, 63", "8, 255"]
+    points = 72 / axes.figure.dpi
+    heights = [axes.transData.transform(text.xy)[1] * points + text.xyann[1] for text in axes.texts]
+    assert all(above - below > 9 for above, below in itertools.pairwise(heights))
