@@ -16,6 +16,7 @@ from typing import Annotated, Final
 import typer
 
 from casestudies import DEFAULT_URI
+from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
 from machines import warm_up
 from terminal.command_line import CommandLine
 from terminal.errors import OutputError
@@ -44,7 +45,7 @@ class Case:
     options: Sequence[str] = ()
     """Options of the build."""
     pointer: str = ""
-    """What to do on the page."""
+    """The end of the line with the page's address: advice, if there is any."""
     viewer: str
     publishers: Mapping[str, Sequence[str]]
     """The commands on the robot's side with their options, in the order of their start."""
@@ -55,8 +56,8 @@ def boat(rates: Sequence[str], *, array: bool) -> Case:
     flags = ["--array"] if array else []
     return Case(
         name="boat",
-        topic="/boat/sensors",
-        type="std_msgs/Float64MultiArray" if array else "boat_msgs/Sensors",
+        topic=SENSORS_TOPIC,
+        type="std_msgs/Float64MultiArray" if array else SENSORS_TYPE,
         boards=4,
         options=("--set", "array=true") if array else (),
         pointer="; on the page, drag the boat",

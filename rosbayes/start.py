@@ -1,4 +1,4 @@
-"""The start of every command: Ctrl-C during the imports ends it with 130, without a traceback."""
+"""The start and the end of every command: Ctrl-C during the imports ends it with 130, without a traceback."""
 
 # nothing that takes long to import, because Ctrl-C still shows a traceback meanwhile
 import atexit

@@ -28,7 +28,7 @@ from rich.table import Table
 
 from scripts.benches.bare import advertise, bare, publish, settled, soon, subscribe
 from scripts.running.flags import ScriptParser
-from scripts.running.processes import run_script
+from scripts.running.script import run_script
 from scripts.verifications.installation import install_roslibpy
 from services.errors import StackError
 from terminal.processes import Process

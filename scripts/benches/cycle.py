@@ -24,9 +24,10 @@ from rich.table import Table
 
 from bridge.client import Publication, Ros, Subscription, connect
 from bridge.stamps import header, header_stamp_ns
+from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
 from casestudies.demo import build
 from scripts.running.flags import ScriptParser
-from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, run_script
+from scripts.running.script import run_script
 from terminal.processes import Process
 
 STAGES = (
@@ -40,7 +41,7 @@ WINDOW = 4
 """Number of readings in flight when frames per second are measured."""
 TURN = 50
 """Number of readings in a turn, after which another alternative is measured."""
-FLOOR, STACKS = "floor (echo)", {"processes": BOAT_TOPIC, "fused": BOAT_TOPIC + "_fused"}
+FLOOR, STACKS = "floor (echo)", {"processes": SENSORS_TOPIC, "fused": SENSORS_TOPIC + "_fused"}
 BOAT_FLAGS = ("--loop", "--queue", "all")
 
 Times = defaultdict[str, list[float]]
@@ -159,9 +160,9 @@ async def measure(ros: Ros, masters: dict[str, Process], some: list[dict[str, in
     kind = "std_msgs/Float64MultiArray"
     results = ros.subscribe("/BMresults", kind)
     echoes = ros.subscribe("/bench/echo", kind)
-    all_ = {FLOOR: Measured(await ros.advertise("/bench/reading", BOAT_TYPE), echoes, 0)}
+    all_ = {FLOOR: Measured(await ros.advertise("/bench/reading", SENSORS_TYPE), echoes, 0)}
     for name, topic in STACKS.items():
-        all_[name] = Measured(await ros.advertise(topic, BOAT_TYPE), results, masters[name].pid)
+        all_[name] = Measured(await ros.advertise(topic, SENSORS_TYPE), results, masters[name].pid)
     for topic in ("/bench/reading", *STACKS.values()):
         await until_read(ros, topic)
     for each in all_.values():
@@ -190,7 +191,7 @@ async def bench(arguments: argparse.Namespace) -> int:
             uri = (await hub.line(r"ws://\S+"))[0]
             await echo.start(sys.executable, "-P", "-m", "scripts.benches.echo", uri, str(LINES))
             for name, topic in STACKS.items():
-                await build("boat", where / f"boat-{name}", uri, topic, BOAT_TYPE)
+                await build("boat", where / f"boat-{name}", uri, topic, SENSORS_TYPE)
                 flags = [*BOAT_FLAGS, *(["--fused"] if name == "fused" else [])]
                 (run := where / f"run-{name}").mkdir(mode=0o700)
                 flags += ["--run-directory", str(run)]

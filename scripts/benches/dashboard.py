@@ -27,6 +27,7 @@ from rich.table import Table
 from websockets.sync.client import connect as connect_plainly
 
 from bridge.client import Ros, connect
+from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
 from posteriors import BoardReport, FrameReport, StageTimes
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, VariableReading, write_frame_report
 from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
@@ -34,7 +35,7 @@ from scripts.benches.cycle import cpu_us, message, quantile, readings, until_rea
 from scripts.benches.load import mib_of
 from scripts.running.browser import Browser, Stand, Visit, browser
 from scripts.running.flags import ScriptParser
-from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, run_script
+from scripts.running.script import run_script
 
 HZ: Final = 50
 SIDE: Final = 64
@@ -172,11 +173,11 @@ async def cycles(plain: Stand, beside: Stand, frames: int, seed: int) -> Rows:
         reader = multiprocessing.get_context("spawn").Process(target=read, args=(beside.url,), daemon=True)
         reader.start()
         sides = [
-            (await ros.advertise(BOAT_TOPIC, BOAT_TYPE), ros.subscribe(RESULTS_TOPIC, RESULTS_TYPE))
+            (await ros.advertise(SENSORS_TOPIC, SENSORS_TYPE), ros.subscribe(RESULTS_TOPIC, RESULTS_TYPE))
             for ros in (one, other)
         ]
         for ros in (one, other):
-            await until_read(ros, BOAT_TOPIC)
+            await until_read(ros, SENSORS_TOPIC)
         some = readings(seed, frames + WARM_UP_TURNS * TURN)
         for at in range(0, len(some), TURN):
             for taken, (publication, results) in zip(medians, sides, strict=True):

@@ -25,11 +25,12 @@ from rich.console import Console
 from rich.table import Table
 
 from bridge.client import connect
+from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
 from casestudies.demo import build
 from scripts.benches.bare import Bare, advertise, bare, frame, publish, settled, subscribe
 from scripts.benches.cycle import BOAT_FLAGS, WINDOW, message, processes_of, quantile, readings
 from scripts.running.flags import ScriptParser
-from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, run_script
+from scripts.running.script import run_script
 from terminal.processes import Process
 
 TOPICS, PUBLISHERS, SLOW = 200, 50, 50
@@ -217,7 +218,7 @@ async def minutes_of(uri: str, hub: int, master: int, count: int) -> list[Row]:
     some, rows = readings(1, 1000), []
     async with connect(uri) as ros:
         results = ros.subscribe("/BMresults", "std_msgs/Float64MultiArray")
-        publication = await ros.advertise(BOAT_TOPIC, BOAT_TYPE)
+        publication = await ros.advertise(SENSORS_TOPIC, SENSORS_TYPE)
         sent: deque[float] = deque()
         for minute in range(count + 1):
             row = Row("master --loop", f"minute {minute}")
@@ -245,7 +246,7 @@ async def bench(arguments: argparse.Namespace) -> int:
             rows = await crowd(uri, hub.pid, arguments.clients, arguments.seconds)
             rows += [await attacked(uri, hub.pid, name, arguments.seconds) for name in ATTACKS]
             if arguments.minutes:
-                await build("boat", where / "boat", uri, BOAT_TOPIC, BOAT_TYPE)
+                await build("boat", where / "boat", uri, SENSORS_TOPIC, SENSORS_TYPE)
                 await master.start(
                     "master", "-d", str(where / "boat"), "--uri", uri, *BOAT_FLAGS, "--run-directory", folder
                 )

@@ -24,7 +24,7 @@ from casestudies.demo import build
 from casestudies.mrclam.model import BEARING_SIGMA, FLOOR, RANGE_SIGMA, Landmark, model, read_landmarks
 from casestudies.mrclam.player import RecordedFrame, area_grid, median_distance, play, read_recording
 from scripts.running.flags import ScriptParser
-from scripts.running.processes import ROOT, run_script
+from scripts.running.script import ROOT, run_script
 from terminal.processes import Process
 from toolchain.deployment.address import to_address
 from toolchain.models import Model, exact_posterior

@@ -21,9 +21,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
 from casestudies.demo import build
 from scripts.running.flags import ScriptParser
-from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, run_script
+from scripts.running.script import run_script
 from terminal.errors import ProcessError
 from terminal.processes import Process, own_command
 
@@ -119,7 +120,7 @@ async def bench(arguments: argparse.Namespace) -> int:
         try:
             await processes[0].start("hub", "--port", "0")
             uri = (await processes[0].line(r"ws://\S+"))[0]
-            await build("boat", folder / "deployment", uri, BOAT_TOPIC, BOAT_TYPE)
+            await build("boat", folder / "deployment", uri, SENSORS_TOPIC, SENSORS_TYPE)
             for each in processes[1:]:
                 await each.start(each.name, "--uri", uri)
             await processes[2].line("seed")

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Final
 
 from bridge.client import connect
+from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
 from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
 from scripts.benches.cycle import TURN, Measured, readings, until_read
 from scripts.running.browser import Stand
 from scripts.running.flags import ScriptParser
-from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE, run_script
+from scripts.running.script import run_script
 from toolchain.deployment import Topics
 
 OFF: Final = "\n[topics]\n" + "".join(f"{key} = false\n" for key in Topics.model_fields)
@@ -34,8 +35,8 @@ async def measure(folder: Path, some: list[dict[str, int]]) -> float:
             await stand.start_master(extra)
             tool, robot = [await stack.enter_async_context(connect(stand.uri)) for _ in range(2)]
             results = robot.subscribe(RESULTS_TOPIC, RESULTS_TYPE)
-            sides.append(Measured(await robot.advertise(BOAT_TOPIC, BOAT_TYPE), results, 0))
-            await until_read(robot, BOAT_TOPIC)
+            sides.append(Measured(await robot.advertise(SENSORS_TOPIC, SENSORS_TYPE), results, 0))
+            await until_read(robot, SENSORS_TOPIC)
             heard = [tool.subscribe(topic) for topic in TOPICS if not extra]
             await tool.call("/rosapi/get_time")  # so that the hub knows the subscriptions
             await sides[-1].one_by_one(some[:TURN])

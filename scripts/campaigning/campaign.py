@@ -19,7 +19,7 @@ from scripts.campaigning.observer import Finding, Flaw
 from scripts.campaigning.round import Round, RoundResult
 from scripts.campaigning.stack import Topology
 from scripts.running.flags import ScriptParser
-from scripts.running.processes import ROOT, run_script
+from scripts.running.script import ROOT, run_script
 from terminal.processes import Process
 
 STEPS, CALM = 10, 200

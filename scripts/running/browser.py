@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
+from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
 from casestudies.demo import build
 from scripts.running.patience import FACTOR
-from scripts.running.processes import BOAT_TOPIC, BOAT_TYPE
 from scripts.verifications.installation import install_programs, use_packages
 from terminal.processes import Process
 
@@ -253,7 +253,7 @@ class Stand:
 
     async def start_master(self, extra: str = "") -> None:
         """Build the boat's deployment, add lines to its deployment.toml, and start its master."""
-        await build("boat", deployment := self._folder / "boat", self.uri, BOAT_TOPIC, BOAT_TYPE)
+        await build("boat", deployment := self._folder / "boat", self.uri, SENSORS_TOPIC, SENSORS_TYPE)
         with (deployment / "deployment.toml").open("a") as file:
             file.write(extra)
         flags = ("-d", str(deployment), "--loop", *self._where)

@@ -8,7 +8,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from scripts.running.processes import ROOT
+from scripts.running.script import ROOT
 
 FLAKY_MOST = 2
 """Maximum number of tests with processes that may fail once, and pass when they are run again alone."""

@@ -39,7 +39,7 @@ from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
 from scripts.running.browser import PATIENCE, Browser, Place, Stand, Visit, browser
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
-from scripts.running.processes import ROOT, run_script
+from scripts.running.script import ROOT, run_script
 from scripts.verifications.checks import CheckError, Tally, expect
 
 LIMIT: Final = 1200.0 * FACTOR

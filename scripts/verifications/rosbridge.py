@@ -35,10 +35,11 @@ from bridge.client.protocol import Compression
 from bridge.codecs.serialised import MessageTypes
 from bridge.errors import BridgeError, EncodeError, GoalError, NoMessageError, ServiceError
 from casestudies.boat import sensors
+from casestudies.boat.sensors import SENSORS_TOPIC
 from casestudies.demo import build
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR
-from scripts.running.processes import BOAT_TOPIC, ROOT, run_script
+from scripts.running.script import ROOT, run_script
 from scripts.verifications import real_rosbridge
 from scripts.verifications.checks import CheckError, Tally, expect
 from services.errors import SettingsError, StackError
@@ -532,7 +533,7 @@ async def robot(stand: Stand, received: Received, sent: list[Sent]) -> AsyncIter
             reading = Sent(5 + 7 * number % 23, 5 + 11 * number % 23, time.time_ns())
             sent.append(reading)
             msg = {"data": readings_of(reading.column, reading.row)}
-            await client.send(op="publish", topic=BOAT_TOPIC, msg=msg)
+            await client.send(op="publish", topic=SENSORS_TOPIC, msg=msg)
             await asyncio.sleep(EVERY)
 
     async with plain_client(stand.uri) as listener, plain_client(stand.uri) as publisher:
@@ -540,7 +541,7 @@ async def robot(stand: Stand, received: Received, sent: list[Sent]) -> AsyncIter
         for topic, type_ in types.items():
             # without a given queue length, a server over DDS keeps ten messages
             await listener.send(op="subscribe", topic=topic, type=type_, queue_length=1000)
-        await publisher.send(op="advertise", topic=BOAT_TOPIC, type=ARRAY)
+        await publisher.send(op="advertise", topic=SENSORS_TOPIC, type=ARRAY)
         publishing = asyncio.create_task(publish(publisher))
         try:
             yield listener
@@ -657,7 +658,7 @@ async def check_silence(stand: Stand) -> None:
         output = await stand.ended(master, 3)
     errors = [line for line in output.splitlines() if line.startswith("error: ")]
     expect(len(errors) == 1, f"the master says {len(errors)} errors, not one")
-    expect(BOAT_TOPIC in errors[0], f"the error does not name {BOAT_TOPIC}: {errors[0]}")
+    expect(SENSORS_TOPIC in errors[0], f"the error does not name {SENSORS_TOPIC}: {errors[0]}")
 
 
 # All of them
@@ -706,7 +707,7 @@ async def verify(kinds: list[str], only: str) -> int:
     deployments = {form: OUT / f"deployment-{form}" for form in ARRAY_TYPES}
     for form, folder in deployments.items():
         uri = f"ws://127.0.0.1:{port}"
-        await build("boat", folder, uri, BOAT_TOPIC, ARRAY_TYPES[form], "--set", "array=true")
+        await build("boat", folder, uri, SENSORS_TOPIC, ARRAY_TYPES[form], "--set", "array=true")
     before = bytes_of(list(deployments.values()))
     tally = Tally()
     for kind in kinds:

@@ -15,7 +15,7 @@ from typing import Final
 
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
-from scripts.running.processes import ROOT
+from scripts.running.script import ROOT
 from scripts.verifications.checks import CheckError, Tally, expect
 from scripts.verifications.installation import pip, run
 from services.errors import SettingsError

@@ -20,7 +20,7 @@ from typing import Any, Final
 from bridge.client import GoalRequest, connect
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR
-from scripts.running.processes import run_script
+from scripts.running.script import run_script
 from scripts.verifications.checks import Tally
 from scripts.verifications.installation import install_node_packages, install_roslibpy
 from terminal.processes import Process

@@ -20,7 +20,7 @@ from typing import Final
 
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR
-from scripts.running.processes import ROOT
+from scripts.running.script import ROOT
 from scripts.verifications.checks import CheckError, DownloadError, Tally, expect
 from scripts.verifications.containers.project import STOP_GRACE, copy_project, fetch_wheels, home
 from scripts.verifications.containers.stack import (

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
-from scripts.running.processes import ROOT
+from scripts.running.script import ROOT
 from scripts.verifications.checks import DownloadError
 
 FETCH_LIMIT: Final = 600.0 * FACTOR

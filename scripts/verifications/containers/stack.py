@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from scripts.running.patience import FACTOR
-from scripts.running.processes import ROOT
+from scripts.running.script import ROOT
 from scripts.verifications.checks import CheckError, expect
 
 OUT: Final = ROOT / "out" / "verify-containers"

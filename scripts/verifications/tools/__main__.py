@@ -31,7 +31,7 @@ from posteriors.standard_messages import Level
 from scripts.running.browser import PATIENCE, Place, Stand
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
-from scripts.running.processes import ROOT, run_script
+from scripts.running.script import ROOT, run_script
 from scripts.verifications.checks import CheckError, Tally
 from scripts.verifications.installation import install_node_packages, install_programs
 from services.errors import StackError

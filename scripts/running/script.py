@@ -1,4 +1,4 @@
-"""What scripts that run processes share: the boat's topic, the time limit, and the report of an error."""
+"""The main function of a script: its coroutine within a time limit, and an error in one sentence."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from terminal.signals import run_async
 from toolchain.errors import ToolchainError
 
 ROOT = Path(__file__).resolve().parents[2]
-BOAT_TOPIC, BOAT_TYPE = "/boat/sensors", "boat_msgs/Sensors"
 
 
 def run_script(work: Callable[[], Awaitable[int]], limit: float) -> int:
