@@ -11,6 +11,7 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Final, NoReturn
 
 import msgspec
@@ -19,7 +20,7 @@ from services.errors import ReportedError, StackError
 from terminal.errors import ExitCode, StoppedError, exit_code_of
 from terminal.logs import PARENT_VARIABLE
 from terminal.output import ERROR_DESCRIPTOR, relay, say_error
-from terminal.processes import Forked, ask_for_end_with_parent, fork_command, own_command
+from terminal.processes import Forked, ask_for_end_with_parent, fork, fork_command, own_command
 from terminal.run_directory import LockedRunDirectory
 from terminal.signals import ENDING_SIGNALS, raise_on_signals, stopped_error
 
@@ -233,13 +234,7 @@ class ForkedChild(Child):
         self._run = run
 
     async def _spawn(self, environment: dict[str, str], lines: int) -> Forked:
-        # Until the child has handlers of its own, a signal would reach the event loop of this process instead.
-        signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
-        pid = os.fork()
-        if not pid:
-            self._run_forked(environment, lines)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
-        return Forked(pid)
+        return fork(partial(self._run_forked, environment, lines))
 
     def _run_forked(self, environment: dict[str, str], lines: int) -> NoReturn:
         """Run the function in the child, which must never continue in the code of its parent."""

@@ -14,6 +14,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Final, NoReturn
@@ -75,6 +76,17 @@ class Forked:
         self.send_signal(signal.SIGKILL)
 
 
+def fork(run: Callable[[], NoReturn]) -> Forked:
+    """Run a function in a forked process. It begins with the ending signals blocked, and must end the process."""
+    # until the child has handlers of its own, a signal would reach the event loop of this process instead
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
+    pid = os.fork()
+    if not pid:
+        run()
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
+    return Forked(pid)
+
+
 def fork_command(
     name: str,
     arguments: Sequence[str],
@@ -89,13 +101,7 @@ def fork_command(
     It is as if it had been executed: in its own session, without standard input, and with no descriptors but its
     output (None: /dev/null), its errors and those `kept`.
     """
-    # Until the child has handlers of its own, a signal would reach the event loop of this process instead.
-    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
-    pid = os.fork()
-    if not pid:
-        _run_command(name, arguments, output, errors, kept, variables or {})
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
-    return Forked(pid)
+    return fork(partial(_run_command, name, arguments, output, errors, kept, variables or {}))
 
 
 def _run_command(
