@@ -33,16 +33,16 @@ class EmulatedPosterior(Posterior):
         """Return the exact posterior for the same readings, by inference in float64.
 
         Args:
-            model: The model from which the deployment was built: a folder with `model.py`, a network file, or what these
-                give. Without it, the result is that of the rounded probabilities in the machine's memories, which differ
-                from the model by what quantising lost; only a BM1 has these.
+            model: The model from which the deployment was built: a folder with `model.py`, a network file, or what
+                these give. Without it, the result is that of the rounded probabilities in the machine's memories, which
+                differ from the model by what quantising lost; only a BM1 has these.
             settings: Parameters of `model()`, as `--set` gave them to the build.
 
         Returns:
             The posterior, whose `details` say of what it is: `exact` is `model` or `codes`.
 
         Raises:
-            PosteriorError: The deployment is that of a BM2 and there is no model, or there are settings that nothing takes.
+            PosteriorError: There is no model for a BM2, or there are settings that nothing takes.
             ToolchainError: The model has an error, or the deployment was not built from it.
         """
         from toolchain.analysis.emulation import joined
@@ -115,7 +115,9 @@ class EmulatedPosterior(Posterior):
 
 
 def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int = 0) -> EmulatedPosterior:
-    """Run the machines of a deployment, without boards, processes or a rosbridge server; those of a filter for its first frame.
+    """Run the machines of a deployment, without boards, processes or a rosbridge server.
+
+    Those of a filter run for its first frame.
 
     Args:
         folder: The folder that `toolchain build` wrote.

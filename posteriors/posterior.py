@@ -201,7 +201,8 @@ class Posterior:
     def _known_axes(self) -> list[Axis]:
         if not self.dimensions:
             raise LabelError(
-                "the units of this posterior are not known: use best() and mean(), which are indices, or with_units(FOLDER) with the folder of its deployment"
+                "the units of this posterior are not known: use best() and mean(), which are indices, or "
+                "with_units(FOLDER) with the folder of its deployment"
             )
         return self.axes
 

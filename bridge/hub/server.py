@@ -158,8 +158,8 @@ class _Hub:
         # The next `sweep`, and when the last one was: a hub that was late must not blame its clients.
         self._sweeper: asyncio.TimerHandle | None = None
         self._swept = time.monotonic()
-        # Monotonic seconds: until when a response is prompt, from when on sockets may be polled for it, and when polling
-        # was last in vain.
+        # Monotonic seconds: until when a response is prompt, from when on sockets may be polled for it, and when
+        # polling was last in vain.
         self._prompt_until = self._poll_from = self._in_vain = -inf
         # Seconds without polling after the next one in vain, and True while `_poll` is scheduled.
         self._pause = _PAUSES[0]
@@ -244,7 +244,7 @@ class _Hub:
         """Poll the sockets for a moment after a response at `now`, if responses are prompt.
 
         Otherwise client and hub sleep in turn while one message is on its way, and waking up takes longer than all the
-        rest. A publisher that waits for nothing gets its core.
+        rest. The hub does not poll for a publisher that waits for nothing, since that may need the core.
         """
         is_prompt, self._prompt_until = now < self._prompt_until, now + _AWAKE
         if self._is_polling:

@@ -108,7 +108,7 @@ class Boat:
         self.switch("sail", on=False)
 
     def drive(self, forward: float, turn: float) -> None:
-        """Move at this velocity, no faster than the boat can, for `DRIVE_TIMEOUT` seconds; `turn` is radians a second."""
+        """Move at this velocity for `DRIVE_TIMEOUT` seconds, no faster than the boat can; `turn` is in radians a second."""
         self._forward, self._turn = min(max(forward, -self._speed), self._speed), turn
         self._driven = DRIVE_TIMEOUT
         self.switches["sail"] = False

@@ -261,7 +261,7 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
 
 
 def _name_points(axes: Any, names: Iterable[tuple[tuple[float, float], str]]) -> None:
-    """Write names beside points, the highest first; one that would cover another goes below it, with a line to its point."""
+    """Write names beside points, the highest first; one that would cover another goes below it, with a line."""
     line = 9.5
     dots = axes.figure.dpi / 72
     axes.get_xlim()  # sets the limits, on which the places depend
