@@ -248,7 +248,7 @@ class CommonOptions:
     steps_per_clock: Annotated[
         int,
         typer.Option(
-            help="Steps of a generator per cycle; 1 as in the thesis; 0: as many as are needed for fresh bits."
+            help="Steps of a generator per cycle; 0: as many as are needed for fresh bits."
         ),
     ] = 0
 
