@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Thread
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import typer
 
@@ -124,6 +124,10 @@ def demo(
     page_port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port of the page; 0 selects a free one.")
     ] = 8080,
+    link_rate: Annotated[
+        Literal["none", "pcie-gen2", "jtag"] | None,
+        typer.Option(help="Link to the boards (see `board`).", show_default="BM_LINK_RATE, or none"),
+    ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings per second.")] = 10.0,
     seed: Annotated[
         int | None, typer.Option(min=0, help="Seed of what is simulated.", show_default="a new one each time")
@@ -148,7 +152,8 @@ def demo(
     # a real server accepts only installed message types
     case = sprinkler(rates, count) if is_sprinkler else boat(rates, array=uri is not None)
     port = page_port if dashboard else None
-    return run_async(_run(case, uri, None if stay else count, out.resolve(), page_port=port))
+    link = () if link_rate is None else ("--link-rate", link_rate)
+    return run_async(_run(case, uri, None if stay else count, out.resolve(), page_port=port, options=link))
 
 
 def _check_port(whose: str, port: int, otherwise: str) -> None:
@@ -178,8 +183,19 @@ async def _load_kernels() -> None:
     await loaded.wait()
 
 
-async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, page_port: int | None) -> int:
-    """Build, start everything, wait for the viewer's last picture, and end everything; no count: run until Ctrl-C."""
+async def _run(
+    case: Case,
+    uri: str | None,
+    count: int | None,
+    out: Path,
+    *,
+    page_port: int | None,
+    options: Sequence[str],
+) -> int:
+    """Build, start everything, wait for the viewer's last picture, and end everything; no count: run until Ctrl-C.
+
+    The options are the master's.
+    """
     started = time.monotonic()
     screen = Screen()
     # the page shows what the viewer prints, whose lines would hide the page's address
@@ -221,9 +237,9 @@ async def _run(case: Case, uri: str | None, count: int | None, out: Path, *, pag
         # nothing is forked before the kernels are loaded, because a fork would inherit the locks of their thread
         await asyncio.gather(building, viewer.line("listening"), _load_kernels())
         screen.waits_for = "waiting for results"
-        await master.start("master", "--loop", *counted, "-d", str(deployment), "--uri", uri)
-        for name, options in case.publishers.items():
-            await processes[name].start(name, "--uri", uri, *options)
+        await master.start("master", "--loop", *counted, "-d", str(deployment), "--uri", uri, *options)
+        for name, flags in case.publishers.items():
+            await processes[name].start(name, "--uri", uri, *flags)
         if page_port is not None:
             await viewer.line(FIRST_RESULT)
             await processes["dashboard"].start(

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationIn
 from bridge.discovery import ROBOT, find_uri
 from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import PcieShimError
+from pcie_shim.link_rate import LinkRate
 from services.errors import SettingsError
 from terminal.flags import Flag
 from terminal.logs import LogFormat, use_log_format
@@ -73,6 +74,11 @@ class Settings(BaseModel):
     )
     key_file: Annotated[Path | None, Flag(metavar="FILE")] = Field(
         default=None, description="File with the key that boards over TCP and their hosts share."
+    )
+
+    link_rate: LinkRate = Field(
+        default=LinkRate.NONE,
+        description="Delay the frames of the boards started here as PCIe (20,800 Mbps) or USB/JTAG (24 Mbps) would.",
     )
 
     # --- the processes of a run ---

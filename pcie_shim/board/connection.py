@@ -15,7 +15,8 @@ from pcie_shim import credentials, framing
 from pcie_shim.board.emulated_board import RefusedError
 from pcie_shim.endpoint import no_delay
 from pcie_shim.errors import FramingError
-from pcie_shim.framing import Frame, ProgramBegin
+from pcie_shim.framing import HEADER_BYTES, Frame, ProgramBegin
+from pcie_shim.link_rate import LinkModel
 from pcie_shim.register_layout import ALL_ONES
 from pcie_shim.register_map import ErrorCode
 
@@ -28,8 +29,10 @@ KEEPALIVE_S: Final = 5
 class Connection:
     """A connection of a host or loader, which begins with the board's challenge or greeting."""
 
-    def __init__(self, connection: socket.socket, key: bytes, greeting: bytes) -> None:
-        """Send the greeting, or if the board has a key, first a challenge."""
+    def __init__(
+        self, connection: socket.socket, key: bytes, greeting: bytes, link: LinkModel | None = None
+    ) -> None:
+        """Send the greeting, or if the board has a key, first a challenge; `link` delays the frames."""
         no_delay(connection)
         if connection.family != socket.AF_UNIX:
             # a host whose machine or cable failed must not hold the board forever
@@ -41,6 +44,10 @@ class Connection:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", int(SEND_S), 0))
         self.socket = connection
         self.decoder = framing.FrameDecoder()
+
+        # The model of a slower link, and the monotonic time at which the host sent the frames of the last receive.
+        self._link = link
+        self._sent_ns = 0
 
         # Sequence number of the last request. Every request has the next one, so a lost or repeated one is noticed.
         self.sequence = 0
@@ -67,6 +74,7 @@ class Connection:
         except OSError:
             count = 0
         self.decoder.received(count)
+        self._sent_ns = time.monotonic_ns() if self._link else 0
         self.open = count > 0
         return self.open
 
@@ -78,7 +86,9 @@ class Connection:
                 frame = self.decoder.next_frame()
                 if frame is None:
                     return
-                _, _, sequence, address, _, _ = frame
+                _, _, sequence, address, _, payload = frame
+                if self._link is not None:
+                    self._link.carry(HEADER_BYTES + len(payload), self._sent_ns)
                 self.sequence = due = (self.sequence + 1) & ALL_ONES
                 if sequence == due:
                     (self._authenticate if self._nonce else handle)(frame)
@@ -109,6 +119,8 @@ class Connection:
 
     def send(self, data: bytes) -> None:
         """Send all bytes; a connection that accepts none for SEND_S is closed."""
+        if self._link is not None:
+            self._link.carry(len(data), time.monotonic_ns())
         try:
             self.socket.sendall(data)
         except OSError:
@@ -119,10 +131,16 @@ class HostConnection(Connection):
     """A link to a host, which holds the board from its first request on."""
 
     def __init__(
-        self, connection: socket.socket, key: bytes, greeting: bytes, token: bytes, programmed: int
+        self,
+        connection: socket.socket,
+        key: bytes,
+        greeting: bytes,
+        token: bytes,
+        programmed: int,
+        link: LinkModel | None,
     ) -> None:
         """Store the token of the greeting, and the number of images loaded so far."""
-        super().__init__(connection, key, greeting)
+        super().__init__(connection, key, greeting, link)
 
         # A loader that shows this token may program the board although this host holds it: it is the same host.
         self.token = token

@@ -26,6 +26,7 @@ from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.endpoint import Endpoint, listen, parse_endpoint, remove_listener
 from pcie_shim.errors import FramingError
 from pcie_shim.framing import Frame, ProgramBegin
+from pcie_shim.link_rate import LinkModel
 from pcie_shim.programming_file import MAX_IMAGE_BYTES
 from pcie_shim.register_layout import ALL_ONES
 from pcie_shim.register_map import ErrorCode
@@ -117,6 +118,7 @@ def serve_board(
     index: int,
     stop: StopSignal,
     board: Board | None = None,
+    link: LinkModel | None = None,
     pin: bool = True,
     on_ready: Callable[[Board], None] | None = None,
 ) -> None:
@@ -125,7 +127,7 @@ def serve_board(
     With `pin`, this thread is pinned to one of its allowed cores, number `index` modulo their number. Boards compute
     for tenths of a millisecond, too short for Linux to distribute the threads woken by one host over the cores:
     without pinning, the boards of a mini-cluster would compute one after the other. The thread also gets the policy
-    SCHED_BATCH, so that it does not preempt others when it wakes. `on_ready` is called when both sockets are listening.
+    SCHED_BATCH, so that it does not preempt others when it wakes. `link` delays the frames of hosts. `on_ready` is called when both sockets are listening.
 
     Raises:
         EndpointError: The endpoint is invalid or in use.
@@ -137,7 +139,7 @@ def serve_board(
         # a board that wakes must not preempt the host, which has other boards to start; some sandboxes refuse this
         with suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-    with closing(BoardServer(where, index, stop, board or EmulatedBoard())) as server:
+    with closing(BoardServer(where, index, stop, board or EmulatedBoard(), link)) as server:
         if on_ready is not None:
             on_ready(server.board)
         server.run()
@@ -146,9 +148,12 @@ def serve_board(
 class BoardServer:
     """The loop over the stop signal, two listening sockets, a host and a loader."""
 
-    def __init__(self, endpoint: Endpoint, index: int, stop: StopSignal, board: Board) -> None:
+    def __init__(
+        self, endpoint: Endpoint, index: int, stop: StopSignal, board: Board, link: LinkModel | None = None
+    ) -> None:
         """Listen at both ports, or raise an EndpointError."""
         self.board = board
+        self._link = link
         self._index = index
         self._stop = stop
         self._endpoint = endpoint
@@ -244,7 +249,9 @@ class BoardServer:
             self._drop_host(next(iter(self._silent_hosts.values())))
         # unpredictable, because it permits programming
         token = os.urandom(8)
-        host = HostConnection(connection, self._key, self._greeting(token), token, self.board.programmed)
+        host = HostConnection(
+            connection, self._key, self._greeting(token), token, self.board.programmed, self._link
+        )
         self._silent_hosts[host.socket.fileno()] = host
         self._epoll.register(host.socket.fileno(), _READABLE)
 

@@ -15,6 +15,7 @@ from typing import Final, NoReturn
 from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.board.server import Board, StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint, is_served
+from pcie_shim.link_rate import LinkModel, link_model
 from services.boards.hardware import SimulatedHardware
 from services.child import ForkedChild, end_all
 from services.errors import BoardFailedError, SettingsError
@@ -40,6 +41,7 @@ def serve_one(
     directory: Path | None,
     *,
     board: Board,
+    link: LinkModel | None,
     metrics: str = "",
     restarts: int = 0,
     on_ready: Callable[[], None],
@@ -82,7 +84,7 @@ def serve_one(
 
     name = f"board{index}"
     with closing(board), serve_status_in_thread(directory, name, status, metrics=metrics, is_alive=is_alive):
-        serve_board(endpoint, index=index, stop=stop, board=board, on_ready=ready)
+        serve_board(endpoint, index=index, stop=stop, board=board, link=link, on_ready=ready)
     raise stopped_error(ended_by[0])
 
 
@@ -114,6 +116,9 @@ class BoardProcesses:
         self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
         self._settings = settings
         self._hardware = hardware
+
+        # before the forks, because a cable is shared by all boards
+        self._link = link_model(settings.link_rate)
 
         # one for all boards: the limit of restarts concerns them together
         self._ends: deque[float] = deque(maxlen=restarts + 1)
@@ -186,6 +191,7 @@ class BoardProcesses:
             at,
             self._settings.run_directory,
             board=EmulatedBoard() if self._hardware is None else self._hardware.board(at),
+            link=self._link,
             metrics=shifted(self._settings.metrics, at),
             restarts=self._children[at].restarts,
             on_ready=lambda: self._sign(_LISTENS + at),

@@ -11,6 +11,7 @@ import typer
 from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.credentials import read_key
 from pcie_shim.endpoint import Endpoint
+from pcie_shim.link_rate import link_model
 from services.boards.hardware import Engine, SimulatedHardware
 from services.boards.processes import BoardProcesses, serve_one
 from services.child import RESTARTS
@@ -32,7 +33,7 @@ app = CommandLine(
 
 
 @app.command(help=app.info.help)
-@options.with_settings("deployment", "key_file", "metrics", "log_format")
+@options.with_settings("deployment", "link_rate", "key_file", "metrics", "log_format")
 def board(
     settings: Settings,
     listen: options.Listen = None,
@@ -108,7 +109,15 @@ def board(
             say(f"board {index} listens at {endpoint}")
 
     served = EmulatedBoard() if simulated is None else simulated.board(index)
-    serve_one(endpoint, index, run_directory, board=served, metrics=settings.metrics, on_ready=on_ready)
+    serve_one(
+        endpoint,
+        index,
+        run_directory,
+        board=served,
+        link=link_model(settings.link_rate),
+        metrics=settings.metrics,
+        on_ready=on_ready,
+    )
 
 
 def _simulated(

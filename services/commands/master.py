@@ -29,7 +29,7 @@ app = CommandLine(
 @options.with_settings(
     *("deployment", "uri", "ca", "boards", "queue", "stop", "ros_version", "message_bytes", "topic_bytes"),
     *("connect_timeout", "first_data_timeout", "peer_timeout", "board_timeout", "stop_timeout", "key_file"),
-    *("use_sim_time", "fused", "run_directory", "metrics", "log_level", "log_format"),
+    *("link_rate", "use_sim_time", "fused", "run_directory", "metrics", "log_level", "log_format"),
 )
 def master(
     settings: Settings,

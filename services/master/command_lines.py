@@ -27,6 +27,7 @@ def boards_arguments(boards: int, directory: Path, settings: Settings, *, once: 
         # one process for all of them, which loads the kernels once
         *("--boards", str(boards)),
         *("--directory", str(directory), "--restarts", restarts),
+        *("--link-rate", settings.link_rate),
         *_metrics(settings, "board"),
     ]
 

@@ -14,7 +14,10 @@ from pathlib import Path
 import psutil
 import pytest
 
+from machines.kind import FrameInput
 from pcie_shim.endpoint import Endpoint
+from pcie_shim.host.mini_cluster import MiniCluster
+from pcie_shim.link_rate import LinkRate
 from services.boards import processes
 from services.boards.processes import BoardProcesses
 from services.child import ForkedChild
@@ -22,6 +25,7 @@ from services.errors import BoardFailedError, SettingsError
 from services.settings import Settings
 from services.sockets.reporting import STUCK_S
 from tests.patience import PROCESS_PATIENCE, PRODUCT_LIMITS
+from tests.pcie_shim.boards import images
 
 BOARD = str(Path(sys.executable).parent / "board")
 
@@ -108,6 +112,22 @@ def test_a_second_signal_close_behind_the_first_changes_nothing(start, tmp_path)
         _, rest = boards.communicate(timeout=PROCESS_PATIENCE)
         assert boards.returncode in {130, 143}
         assert rest.count("\n") == 1
+
+
+@pytest.mark.process
+def test_a_slower_link_changes_no_counts(start, tmp_path):
+    parts = images(5, [4, 4, 3])
+    frame = FrameInput(addresses=(3, 4), target_count=200, max_cycles=1 << 14, bank=0, stop="slices")
+    found = {}
+    for rate in LinkRate:
+        places = [f"unix:{tmp_path}/{rate}/board{at}.sock" for at in range(len(parts))]
+        boards = start("--boards", "3", "--directory", str(tmp_path / rate), BM_LINK_RATE=rate)
+        assert boards.stderr.readline().startswith("3 boards listen")
+        with MiniCluster.open(places, parts, timeout=PROCESS_PATIENCE, slack=PROCESS_PATIENCE) as cluster:
+            output = cluster.run(frame)
+        assert output.slices > 1
+        found[rate] = [(each.words, each.cycles, each.reason) for each in output.boards]
+    assert found[LinkRate.JTAG] == found[LinkRate.PCIE_GEN2] == found[LinkRate.NONE]
 
 
 @pytest.mark.process

@@ -1,0 +1,93 @@
+"""A link with a rate: frames between host and emulated board take the time that they would take on PCIe or USB/JTAG.
+
+    frame ──▶ waits until the wire is free ──▶ occupies it for bits / rate ──▶ latency ──▶ arrives
+
+The board's side delays both what it receives and what it sends. The time is real and comes on top of what the socket
+takes; it changes no counts, and COMPUTE_NS does not contain it. Programming has its own port, which is not delayed.
+"""
+
+import fcntl
+import mmap
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """Figures of a kind of link.
+
+    Attributes:
+        mbps: Rate in 10^6 bits per second.
+        latency_us: Microseconds of a transfer in one direction, besides its bits.
+        shared: True if one wire connects all boards, so that their transfers queue.
+    """
+
+    mbps: float
+    latency_us: float
+    shared: bool
+
+    def seconds(self, size: int, transfers: int = 1) -> float:
+        """Return the time of so many bytes in so many transfers, one after another."""
+        return 8e-6 * size / self.mbps + 1e-6 * transfers * self.latency_us
+
+
+class LinkRate(StrEnum):
+    """The kinds of links whose time can be modelled."""
+
+    NONE = "none"
+    PCIE_GEN2 = "pcie-gen2"
+    JTAG = "jtag"
+
+
+WIRES: Final = {
+    # Thesis 2.3: 20,800 Mbps, measured with the vendor's diagnostics. A read of a device takes about 1 us there and back
+    # (Neugebauer et al., "Understanding PCIe performance for end host networking", SIGCOMM 2018). Each board has lanes
+    # of its own.
+    LinkRate.PCIE_GEN2: Wire(20_800, 0.5, shared=False),
+    # Thesis 2.3: at most 24 Mbps. A transfer waits for the next micro-frame of high-speed USB, 125 us (USB 2.0
+    # specification, 8.4.3). JTAG is a chain: one cable for all boards, and one transfer at a time.
+    LinkRate.JTAG: Wire(24, 125, shared=True),
+}
+
+_SPIN_NS: Final = 150_000
+"""The last nanoseconds of a wait, which are not slept, because Linux wakes a process some 60 us late."""
+
+
+def wait_until(tick_ns: int) -> None:
+    """Return at this time of the monotonic clock, to a few microseconds; sleep if it is far away."""
+    while (left := tick_ns - time.monotonic_ns()) > 0:
+        if left > _SPIN_NS:
+            time.sleep((left - _SPIN_NS) / 1e9)
+
+
+class LinkModel:
+    """The wire to a board or, if it is shared, to all boards that are forked after its creation."""
+
+    def __init__(self, wire: Wire, wait: Callable[[int], None] = wait_until) -> None:
+        self._wire = wire
+        self._wait = wait
+
+        # Monotonic time at which the last transfer leaves the wire; a shared one has it in memory that forks share,
+        # under a lock, which the kernel takes from a process that is killed.
+        self._free_ns = memoryview(mmap.mmap(-1, 8) if wire.shared else bytearray(8)).cast("q")
+        self._lock = os.memfd_create("wire") if wire.shared else None
+
+    def carry(self, size: int, sent_ns: int) -> None:
+        """Return when `size` bytes that were sent at this monotonic time have arrived."""
+        if self._lock is not None:
+            fcntl.lockf(self._lock, fcntl.LOCK_EX)
+        leaves_ns = max(sent_ns, self._free_ns[0]) + round(8e3 * size / self._wire.mbps)
+        self._free_ns[0] = leaves_ns
+        if self._lock is not None:
+            fcntl.lockf(self._lock, fcntl.LOCK_UN)
+        # the next transfer may begin meanwhile: latency does not occupy the wire
+        self._wait(leaves_ns + round(1e3 * self._wire.latency_us))
+
+
+def link_model(rate: LinkRate) -> LinkModel | None:
+    """Return a model of this kind of link; None for no delay."""
+    return None if rate is LinkRate.NONE else LinkModel(WIRES[rate])
