@@ -1,14 +1,17 @@
 """Flags of the commands: those of settings, made from `Settings`, and others that several commands share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
 import typer
+from pydantic import ValidationError
 
 from services.child import end_with_parent
+from services.errors import SettingsError
 from services.settings import ENV_PREFIX, Settings, load_settings
 from terminal.flags import Group, expanded, flags_of
+from toolchain.deployment import Source
 
 
 def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
@@ -23,6 +26,27 @@ def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., i
         return expanded(command, {"settings": Group(flags_of(Settings, names, prefix=ENV_PREFIX), load)})
 
     return decorate
+
+
+def refuse_with_deployment(settings: Settings, flags: Mapping[str, str | None]) -> None:
+    """Raise a SettingsError for a flag that describes a topic, if there is a deployment, which has its own."""
+    given = [f"{flag} {value}" for flag, value in flags.items() if value]
+    # if it were ignored, the command would use another topic than the user named
+    if settings.deployment is not None and given:
+        raise SettingsError(
+            f"{given[0]} cannot be combined with a deployment; {settings.deployment} has its own: omit one of them"
+        )
+
+
+def source_of(uri: str, topic: str, type_: str) -> Source:
+    """Return a topic, checked like one of a deployment, so that the same mistakes have the same errors."""
+    try:
+        return Source(uri=uri, topic=topic, type=type_)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise SettingsError(
+            f"--{first['loc'][0]}: {str(first['msg']).removeprefix('Value error, ')}"
+        ) from error
 
 
 Listen: TypeAlias = Annotated[

@@ -3,7 +3,6 @@
 from typing import Annotated
 
 import typer
-from pydantic import ValidationError
 
 from services.commands import flags as options
 from services.errors import SettingsError
@@ -13,7 +12,6 @@ from services.settings import Settings
 from services.sockets.serving import deployment_for, listening
 from terminal.command_line import CommandLine
 from terminal.signals import run_async
-from toolchain.deployment import Source
 
 app = CommandLine(
     help="Extract variables from a ROS topic over rosbridge.\n\n"
@@ -45,12 +43,8 @@ def subscriber(
     insecure: options.Insecure = False,
 ) -> int:
     """Extract variables from a ROS topic over rosbridge."""
-    # a deployment defines all of these, so with an ignored flag it would read something other than the user named
-    if settings.deployment is not None and (value := topic or type_ or variables):
-        flag = "--topic" if topic else "--type" if type_ else "--variables"
-        raise SettingsError(
-            f"{flag} {value} cannot be combined with a deployment; {settings.deployment} has its own: omit one of them"
-        )
+    flags = {"--topic": topic, "--type": type_, "--variables": variables}
+    options.refuse_with_deployment(settings, flags)
     if listen is not None:
         loaded = deployment_for(settings)
         link = listening(listen, ROLE, settings, loaded, insecure=insecure)
@@ -64,13 +58,6 @@ def subscriber(
         raise SettingsError(
             "give --uri, --topic and --type, or --deployment DIR (subscriber --help shows examples)"
         )
-    # checked like a source of a deployment, so that the same mistakes have the same errors
     names = [name.strip() for name in variables.split(",") if name.strip()]
-    try:
-        source = Source(uri=settings.uri, topic=topic, type=type_)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise SettingsError(
-            f"--{first['loc'][0]}: {str(first['msg']).removeprefix('Value error, ')}"
-        ) from error
+    source = options.source_of(settings.uri, topic, type_)
     return run_async(print_variables(settings, source, names, count))

@@ -170,4 +170,4 @@ def _way_out(topic: AdvertisedTopic) -> str:
     """Return what to do about a topic that cannot be received."""
     if topic.key:
         return f"set {topic.key} = false under [topics] in deployment.toml"
-    return "build with another output topic"
+    return "choose another topic for the results"

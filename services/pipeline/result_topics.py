@@ -28,13 +28,13 @@ RESULTS_DEPTH = 64
 """Maximum number of results that wait for the rosbridge server; the master has fewer in flight."""
 
 
-def same_numbers(received: Any, sent: list[float]) -> bool:
+def same_numbers(received: Any, sent: list[float], *, rel_tol: float = 1e-12, abs_tol: float = 0.0) -> bool:
     """Return whether an array equals the sent one, except for the last bit, which some servers lose."""
     return (
         isinstance(received, list)
         and len(received) == len(sent)
         and all(
-            isinstance(one, int | float) and math.isclose(one, other, rel_tol=1e-12)
+            isinstance(one, int | float) and math.isclose(one, other, rel_tol=rel_tol, abs_tol=abs_tol)
             for one, other in zip(received, sent, strict=True)
         )
     )

@@ -14,7 +14,7 @@ from machines.bm1_kind import BM1
 from machines.kind import BoardResult
 from pcie_shim.host.mini_cluster import FrameOutput
 from services.boards.frames import decode_boards
-from services.commands import master, subscriber
+from services.commands import master, publisher, subscriber
 from services.errors import InputLineError
 from services.pipes import lines, pcie_app
 from services.pipes.pcie_app import reading_from_line
@@ -107,6 +107,8 @@ def test_a_line_that_is_not_a_result_is_refused(line, results, replicas):
     [
         (subscriber, ("--topic", "/t")),
         (subscriber, ("--variables", "A")),
+        (publisher, ("--topic", "/t")),
+        (publisher, ("--field", "data")),
         (master, ("--once", "--connect", "/nowhere")),
     ],
 )

@@ -1,0 +1,204 @@
+"""`publisher` without a deployment: numbers of standard input as messages with an array (thesis 3.1, Publisher.jar)."""
+
+import asyncio
+import base64
+import contextlib
+import re
+import sys
+from dataclasses import dataclass
+from typing import Any, Final
+
+from bridge.client import Ros, Subscription
+from bridge.codecs.message_check import SCALAR, Definitions, FieldType, bundled_definitions
+from bridge.errors import NoMessageError
+from bridge.fields import Field, Place, format_place
+from bridge.names import ros1_type, ros_version_of_type
+from services.errors import InputLineError, SettingsError
+from services.pipeline.connections import (
+    AdvertisedTopic,
+    NotReceivableError,
+    check_types,
+    connect_all,
+    refusals,
+    reported_refusals,
+)
+from services.pipeline.result_topics import RESULTS_DEPTH, same_numbers
+from services.pipes.lines import LINE_LIMIT, decoded, lines
+from services.settings import Settings
+from terminal.connection import report_waits
+from terminal.output import say
+from toolchain.deployment import Source
+
+_EXPECTED: Final = "numbers: a JSON array such as [0.1, 0.9], or 0.1 0.9, or 0.1,0.9"
+_NUMBER: Final = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
+_INTEGER: Final = re.compile(rb"[+-]?\d{1,20}")
+_MULTI_ARRAY: Final = re.compile(r"std_msgs/((?:Float(?:32|64)|U?Int(?:8|16|32|64)))MultiArray")
+_SHOWN: Final = 40
+_MAX_FIELDS: Final = 10_000
+
+_FLOAT32_MAX: Final = float.fromhex("0x1.fffffep127")
+_RANGES: Final[dict[str, tuple[float, float]]] = {
+    **{f"int{bits}": (-(1 << bits - 1), (1 << bits - 1) - 1) for bits in (8, 16, 32, 64)},
+    **{f"uint{bits}": (0, (1 << bits) - 1) for bits in (8, 16, 32, 64)},
+    "char": (0, 255),
+    **dict.fromkeys(("float32", "float"), (-_FLOAT32_MAX, _FLOAT32_MAX)),
+    **dict.fromkeys(("float64", "double"), (-sys.float_info.max, sys.float_info.max)),
+}
+"""Lowest and highest number of each numeric type; rosapi of ROS 2 writes `float` and `double`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayField:
+    """A field that is an array of numbers, in messages of one type."""
+
+    message_type: str
+    place: Place
+    kind: FieldType
+
+    @property
+    def path(self) -> str:
+        """Path of the field in a message."""
+        return format_place(self.place)
+
+    def numbers(self, line: bytes, number: int) -> list[float]:
+        """Return the numbers of a line of standard input, or raise an InputLineError; integers for an array of integers."""
+        where = f"line {number} of standard input"
+        text = line.strip()
+        found: list[float]
+        if text.startswith(b"["):
+            found = decoded(text, number, list[int | float], _EXPECTED)
+        else:
+            found = []
+            # not both separators, because "0,5 0,5" are two numbers where the decimal point is a comma
+            for token in re.split(rb"\s*,\s*", text) if b"," in text else text.split():
+                if not _NUMBER.fullmatch(token):
+                    shown = token[:_SHOWN].decode(errors="replace")
+                    raise InputLineError(
+                        f"{where} has {shown!r}, which is not a number; expected {_EXPECTED}"
+                    )
+                found.append(int(token) if _INTEGER.fullmatch(token) else float(token))
+        if self.kind.length not in (0, len(found)) or not found:
+            some = self.kind.length or "one or more"
+            raise InputLineError(
+                f"{where} has {len(found)} numbers, but {self.path} of {self.message_type} has {some}"
+            )
+        return [self._fitting(value, where) for value in found]
+
+    def _fitting(self, value: float, where: str) -> float:
+        low, high = _RANGES[self.kind.element]
+        is_whole = isinstance(low, int)
+        if not low <= value <= high or (is_whole and value != int(value)):
+            expected = f"an integer from {low} to {high}" if is_whole else f"a number up to {high:.3g}"
+            raise InputLineError(
+                f"{where} has {repr(value)[:_SHOWN]}, but {self.path} of {self.message_type} is {self.kind}: "
+                f"expected {expected}"
+            )
+        return int(value) if is_whole else float(value)
+
+    def message(self, numbers: list[float]) -> dict[str, Any]:
+        """Return a message with these numbers; the server fills the other fields."""
+        octets = self.kind.element in {"uint8", "char"}
+        value: Any = bytes(map(int, numbers)) if octets else numbers
+        for step in reversed(self.place):
+            value = {step: value}
+        message: dict[str, Any] = value
+        return message
+
+    def holds(self, message: dict[str, Any], numbers: list[float]) -> bool:
+        """Return whether a received message has these numbers, apart from the rounding of a float32."""
+        _, received = Field(self.path).value(message)
+        if isinstance(received, str):  # uint8[]
+            with contextlib.suppress(ValueError):
+                received = list(base64.b64decode(received))
+        return same_numbers(received, numbers, rel_tol=1e-6, abs_tol=1e-37)
+
+
+def array_field(definitions: Definitions, message_type: str, path: str | None) -> ArrayField:
+    """Return the array of numbers at a path in a message type, or its only one.
+
+    Raises:
+        SettingsError: There is none there, or without a path there are several.
+    """
+    arrays: dict[str, ArrayField] = {}
+    waiting: list[tuple[Place, str]] = [((), ros1_type(message_type))]
+    # bounded, because a server could answer with a type that contains itself
+    for _ in range(_MAX_FIELDS):
+        if not waiting:
+            break
+        outer, name = waiting.pop(0)
+        for field, kind in definitions.get(name, {}).items():
+            place = (*outer, field)
+            if kind.length == SCALAR:
+                waiting.append((place, kind.element))
+            elif kind.element in _RANGES:
+                arrays[format_place(place)] = ArrayField(message_type, place, kind)
+    if path is None and len(arrays) == 1:
+        (path,) = arrays
+    if path not in arrays:
+        there = ", ".join(f"{found} ({array.kind})" for found, array in arrays.items())
+        wanted = "one array of numbers" if path is None else f"array of numbers {path}"
+        raise SettingsError(
+            f"{message_type} has no {wanted}; "
+            + (f"choose with --field from: {there}" if there else "--type needs one with an array")
+        )
+    return arrays[path]
+
+
+async def _definitions(ros: Ros, message_type: str) -> Definitions:
+    """Return the fields of a type from its name, from rosapi or from rosbags; empty if none of them knows it."""
+    name = ros1_type(message_type)
+    if match := _MULTI_ARRAY.fullmatch(name):
+        return {name: {"data": FieldType(match[1].lower(), 0)}}
+    # before rosapi, which compares the names of types literally
+    version = await ros.detect_ros_version() or ros_version_of_type(message_type) or 1
+    if name in (known := await ros.message_details(message_type)):
+        return known
+    # in a thread, because loading rosbags would block the event loop for too long
+    return await asyncio.to_thread(bundled_definitions, message_type, version)
+
+
+async def publish_arrays(settings: Settings, source: Source, path: str | None) -> int:
+    """Publish each line of standard input as one message of a topic, and wait until the last one is seen.
+
+    Raises:
+        InputLineError: A line cannot be a message of the type, or there is no line.
+        SettingsError: The type does not have this field.
+        BridgeError: The topic has another type, or the server is unreachable.
+    """
+    async with contextlib.AsyncExitStack() as stack:
+        uris, report = [source.uri], report_waits()
+        ros = (await connect_all(stack, settings, uris, on_state=report, max_size=LINE_LIMIT))[source.uri]
+        await check_types([(ros, source.topic, source.type)])
+        if not (definitions := await _definitions(ros, source.type)):
+            raise SettingsError(
+                f"the fields of {source.type} are not known at {source.uri}: is the type right, and does rosapi run there?"
+            )
+        field = array_field(definitions, source.type, path)
+        publication = await ros.advertise(source.topic, source.type)
+        watched = ros.subscribe(source.topic, source.type, queue_size=RESULTS_DEPTH)
+        say(f"publishing on {source.topic} at {source.uri}")
+        count, last = 0, []
+        async for number, line in lines():
+            last = field.numbers(line, number)
+            await publication.publish(field.message(last))
+            count += 1
+        if not count:
+            raise InputLineError(f"standard input is empty; expected {_EXPECTED} on each line")
+        topic = AdvertisedTopic(ros, source.uri, source.topic, source.type)
+        unseen = not await _seen(watched, field, last, settings.seen_timeout)
+        if unseen and (refused := await refusals([topic], settled=True) | reported_refusals([topic])):
+            raise NotReceivableError(refused[source.topic])
+    lost = f", but the last was not seen on the wire within {settings.seen_timeout:g} s" if unseen else ""
+    say(f"{count} published{lost}")
+    return 0
+
+
+async def _seen(watched: Subscription, field: ArrayField, numbers: list[float], limit: float) -> bool:
+    """Return whether a message with these numbers comes back in time."""
+    # of earlier messages and other publishers, any number may come before
+    with contextlib.suppress(TimeoutError, NoMessageError):
+        async with asyncio.timeout(limit):
+            while not field.holds((await watched.next(limit)).msg, numbers):
+                pass
+            return True
+    return False
