@@ -246,10 +246,7 @@ class CommonOptions:
         typer.Option(help="bank: each frame restarts the generators; free: never, as in the thesis."),
     ] = RngReset.BANK
     steps_per_clock: Annotated[
-        int,
-        typer.Option(
-            help="Steps of a generator per cycle; 0: as many as are needed for fresh bits."
-        ),
+        int, typer.Option(help="Steps of a generator per cycle; 0: as many as are needed for fresh bits.")
     ] = 0
 
 
