@@ -23,7 +23,7 @@ from toolchain.analysis.readings import (
 from toolchain.analysis.resources import ASSUMPTIONS, Energy, Estimate, energy, estimate
 from toolchain.building.build import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
-from toolchain.building.report import loss_heading, many_sentence
+from toolchain.building.report import edited_sentence, loss_heading, many_sentence
 from toolchain.deployment import Deployment, Scale
 from toolchain.errors import BuildError
 from toolchain.models.model import Model
@@ -95,8 +95,11 @@ def inspect_deployment(
     )
 
 
-def losses_of(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[ColumnLoss, ...]:
-    """Return the quantisation loss of the model, or raise a BuildError if its codes are not those of the deployment."""
+def losses_of(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[ColumnLoss, ...] | None:
+    """Return the quantisation loss of the model, or None if the codes were edited since the build.
+
+    A BuildError if the codes are those of another model.
+    """
     if model.lines == deployment.machine.lines and len(model.known) == whole.parameters.sensors:
         quantised = quantise(
             model,
@@ -107,6 +110,8 @@ def losses_of(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[
         pairs = zip((quantised.prior, *quantised.tables), (whole.prior, *whole.tables), strict=True)
         if all(np.array_equal(ours, theirs) for ours, theirs in pairs):
             return quantised.losses
+        if deployment.edited_boards:
+            return None
     raise BuildError(
         f"{deployment.directory} was not built from the model {model.name} with these settings: its codes differ; give "
         "the same --set and --bits as for the build, or build it again"
@@ -225,6 +230,8 @@ def _machine_part(found: Inspection) -> str:
 
 
 def _loss_part(found: Inspection) -> str:
+    if found.deployment.edited_boards and found.losses is None:
+        return edited_sentence(found.deployment)
     if found.losses is None:
         return "Lost by quantising: as report.txt says, which the build wrote; give the model with --model to compare."
     width = max(6, *(len(loss.name) for loss in found.losses))
@@ -355,6 +362,7 @@ def as_json(found: Inspection) -> str:
         "lines": found.machine.parameters.lines,
         "columns": found.machine.parameters.columns,
         "boards": len(found.deployment.boards),
+        "edited_boards": found.deployment.edited_boards,
         "replicas": found.deployment.machine.replicas,
         "readings": found.readings.source,
         "clock_hz": found.clock_hz,

@@ -136,6 +136,15 @@ def many_sentence(machine: MachineSection) -> str:
     return sentence
 
 
+def edited_sentence(deployment: Deployment) -> str:
+    """Say that the codes are not only the model's, and what a comparison with the model then means."""
+    boards = ", ".join(map(str, deployment.edited_boards))
+    return (
+        f"Edited since the build: the image of board {boards}. Its codes may not be the model's, so a difference from the "
+        "model includes the edit."
+    )
+
+
 def _topics_sentence(deployment: Deployment) -> str:
     """Name the sources of readings (with their variables, if there are several) and the topic of the posteriors."""
     output = deployment.outputs[0]

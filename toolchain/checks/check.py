@@ -76,7 +76,21 @@ def check_deployment(directory: Path) -> list[Finding]:
         check_agreement(deployment, images)
     except (ToolchainError, PcieShimError) as reason:
         return [refusal(reason, "the deployment")]
-    return _sorted([*_files(directory, deployment, images), *_check(deployment, images, None)])
+    edited = [
+        note(
+            Check.EDITED,
+            ", ".join(f"board {board}" for board in deployment.edited_boards),
+            "the image was made from memories or parameters that were edited since the build, so it may not be the model's",
+            "'toolchain regenerate memories --model' returns to the model",
+        )
+    ]
+    return _sorted(
+        [
+            *_files(directory, deployment, images),
+            *(edited if deployment.edited_boards else ()),
+            *_check(deployment, images, None),
+        ]
+    )
 
 
 def refusal(reason: Exception, about: str) -> Finding:

@@ -46,6 +46,7 @@ class Check(StrEnum):
     VANISHED_FLOOR = "vanished-floor"
     LOST_MASS = "lost-mass"
     FILES = "files"
+    EDITED = "edited"
     RNG = "rng"
     RNG_BANKS = "rng-banks"
     RNG_STEPS = "rng-steps"

@@ -79,6 +79,21 @@ def memories(
         _print_changes(regenerate_memories(directory), verbose=verbose)
 
 
+def images(directory: Directory, verbose: Verbose = False) -> None:
+    """Write the images again from edited memories and parameters, and report the edits.
+
+    For example, after an edit of build/boat/bm_arch/Memory_MIFs/board0_prior.mif: `toolchain regenerate images
+    build/boat`. Then program the boards again.
+    """
+    from toolchain.building.edited_sources import regenerate_images
+
+    before = _lines(directory)
+    edits, changes = regenerate_images(directory)
+    for edit in edits:
+        typer.echo(f"edited     {edit}")
+    _print_changes(changes, before, _lines(directory), verbose=verbose)
+
+
 def project(directory: Directory, verbose: Verbose = False) -> None:
     """Write the Quartus project again.
 
@@ -212,5 +227,5 @@ Then change model.py, build it again, and point --uri at the robot.
 """
 
 
-add_commands(regeneration, memories, project, deployment)
+add_commands(regeneration, memories, images, project, deployment)
 add_commands(app, build, check, inspect, advise, explore, query, show, fit, new)

@@ -195,6 +195,11 @@ class Deployment(DeploymentFile):
         path, machine = self.directory / self.filter.file, self.machine
         return Filter(Transition.read(path, machine.lines, self.filter.hash), machine.prob_bits)
 
+    @property
+    def edited_boards(self) -> tuple[int, ...]:
+        """The boards whose images were made from edited sources, so that they may not be the model's."""
+        return tuple(index for index, board in enumerate(self.boards) if board.built_hash)
+
     def output_uri(self, output: Output) -> str:
         """Return the rosbridge server on which an output is published."""
         return output.uri or self.sources[0].uri

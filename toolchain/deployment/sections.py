@@ -408,6 +408,8 @@ class BoardSection(Section):
 
     image: OwnPath
     image_hash: Sha256
+    # the image of the build, if another was made from sources that a person has edited
+    built_hash: Sha256 | None = Field(default=None, exclude_if=lambda built: built is None)
     line_offset: int = Field(ge=0)
     lines: int = Field(ge=1)
     endpoint: str = ""

@@ -42,6 +42,10 @@ class Memory:
     """A function that returns every word, from address 0."""
     comments: tuple[str, ...]
     """Comment lines for the beginning of the file."""
+    board: int | None = None
+    """The board that has it, or None if all have the same."""
+    section: str = ""
+    """The section of the programming file with its codes; none for seeds, which follow from the parameters."""
 
     def lines(self) -> Iterator[str]:
         """Yield the MIF, in canonical form."""
@@ -112,6 +116,19 @@ def packed_words(codes: NDArray[np.uint16], prob_bits: int) -> Iterator[int]:
             yield int.from_bytes(row.tobytes(), "big")
 
 
+def unpacked_codes(words: Sequence[int], prob_bits: int, count: int) -> NDArray[np.uint32]:
+    """Return the codes of words, uint32[words, count], the inverse of `packed_words`."""
+    size = -(-count * prob_bits // 8)
+    data = np.frombuffer(b"".join(word.to_bytes(size, "little") for word in words), np.uint8)
+    found = np.empty((len(words), count), np.uint32)
+    weights = np.uint32(1) << np.arange(prob_bits, dtype=np.uint32)
+    for start in range(0, len(words), _ROWS_AT_ONCE):
+        rows = data.reshape(len(words), size)[start : start + _ROWS_AT_ONCE]
+        bits = np.unpackbits(rows, axis=1, count=count * prob_bits, bitorder="little")
+        found[start : start + _ROWS_AT_ONCE] = bits.reshape(len(rows), count, prob_bits) @ weights
+    return found
+
+
 def _prior(deployment: Deployment, board: int, image: Image) -> Memory:
     name, part, select = f"board{board}_prior.mif", image.partition, deployment.prior_select
     parameters = image.machine.parameters
@@ -127,13 +144,15 @@ def _prior(deployment: Deployment, board: int, image: Image) -> Memory:
                 "prior elements, P(S), until the host writes another",
                 f"address = the line of the board, from line {part.line_offset} of the model on",
             ),
+            board=board,
+            section="prior",
         )
     what = "P(S)"
     if select is not None:
         what = (
             f"P(S | {select.name}): address = the value of {select.name}; the top one is the prior without it"
         )
-    return _codes(name, f"prior elements, {what}", image, image.machine.prior)
+    return _codes(name, f"prior elements, {what}", image, image.machine.prior, "prior")
 
 
 def _columns(deployment: Deployment, board: int, image: Image) -> Iterator[Memory]:
@@ -149,10 +168,10 @@ def _columns(deployment: Deployment, board: int, image: Image) -> Iterator[Memor
             f"column {column}, tiles, P({variable.name} | S): address = {whose}value of {variable.name}, {variable.values} "
             "are served; the top one is a missing reading"
         )
-        yield _codes(column_name(board, column, sensors), what, image, table)
+        yield _codes(column_name(board, column, sensors), what, image, table, f"column {column}")
 
 
-def _codes(name: str, what: str, image: Image, codes: NDArray[np.uint16]) -> Memory:
+def _codes(name: str, what: str, image: Image, codes: NDArray[np.uint16], section: str) -> Memory:
     bits, part = image.machine.parameters.prob_bits, image.partition
     lines = codes.shape[1]
     return Memory(
@@ -167,6 +186,8 @@ def _codes(name: str, what: str, image: Image, codes: NDArray[np.uint16]) -> Mem
                 "the first in the lowest bits"
             ),
         ),
+        board=part.index,
+        section=section,
     )
 
 
@@ -205,6 +226,7 @@ def _cdes(machine: BM2Machine) -> Iterator[Memory]:
                 f"CDE {at}, of the variables {_listed(factor)}, which are the bits {_listed(bits)} of the state",
                 f"address = j * {1 << len(bits) - 1} + the other bits, for the pointed bit number j of these",
             ),
+            section=f"cde {at}",
         )
 
 
@@ -235,4 +257,5 @@ def _rng_table(table: NDArray[np.uint32], prob_bits: int) -> Memory:
         depth=table.size,
         words=lambda: (int(number) & mask for number in table),
         comments=("the random numbers that all generators play in a ring",),
+        section="rng",
     )

@@ -68,22 +68,26 @@ def printable(text: str) -> str:
     return text.encode("unicode_escape").decode("ascii")
 
 
-def read_mif(path: Path) -> Mif:
-    """Read the contents of a memory from any form of MIF; a MifError contains the line."""
+def read_mif(path: Path, due: tuple[int, int] | None = None) -> Mif:
+    """Read the contents of a memory from any form of MIF; a MifError contains the line.
+
+    With `due`, the width and depth of the memory for which it is, another size is refused, and so is a missing address.
+    """
     data = read_bounded(path, MOST_BYTES, MifError)
-    return parse_mif(data.decode("latin-1"), str(path))
+    return parse_mif(data.decode("latin-1"), str(path), due)
 
 
-def parse_mif(text: str, name: str = "the MIF") -> Mif:
+def parse_mif(text: str, name: str = "the MIF", due: tuple[int, int] | None = None) -> Mif:
     """Return the contents of a memory from the text of a MIF; a MifError contains the line and the expected token."""
-    return _Reader(text, name).read()
+    return _Reader(text, name, due).read()
 
 
 class _Reader:
     """A token reader; `_kind` and `_word` are the current token, `_line` is its line."""
 
-    def __init__(self, text: str, name: str) -> None:
+    def __init__(self, text: str, name: str, due: tuple[int, int] | None) -> None:
         self._name = name
+        self._due = {} if due is None else {"WIDTH": due[0], "DEPTH": due[1]}
         self._line = 1
         self._tokens = self._tokenise(text)
         self._kind = self._word = ""
@@ -99,6 +103,8 @@ class _Reader:
             self._expect(";")
         if self._kind:
             self._refuse("the end of the file after END;")
+        if self._due and None in words:
+            self._fail(f"address {words.index(None)} is missing; expected 0 to {depth - 1}")
         return Mif(width, tuple(word or 0 for word in words))
 
     def _header(self) -> tuple[int, int, str, str]:
@@ -123,6 +129,8 @@ class _Reader:
                 most = MOST_WIDTH if key == "WIDTH" else MOST_WORDS
                 if not 1 <= sizes[key] <= most:
                     self._fail(f"{key} is {sizes[key]}, expected 1 to {most}")
+                if sizes[key] != self._due.get(key, sizes[key]):
+                    self._fail(f"{key} is {sizes[key]}, but this machine's memory has {self._due[key]}")
             self._next()
             self._expect(";")
         for key in ("WIDTH", "DEPTH"):

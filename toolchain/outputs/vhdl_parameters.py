@@ -1,12 +1,18 @@
 """`bm1_parameters.vhd`: all parameters for the VHDL of the machine, in one package (thesis 3.2)."""
 
+import re
 from collections.abc import Iterable, Sequence
-from typing import Final
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Final, Self
 
 from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
 from machines.rng import POLYNOMIALS
 from pcie_shim.programming_file import Image
+from toolchain.bounded_files import read_bounded
 from toolchain.deployment import Deployment
+from toolchain.errors import BuildError
 from toolchain.outputs.memories import column_name, generators, seed_width, seed_words
 from toolchain.outputs.mif import printable
 
@@ -39,7 +45,7 @@ def parameters_vhd(deployment: Deployment, images: Sequence[Image]) -> str:
         [
             f"-- Parameters of the Bayesian machine of the model {printable(deployment.name)}, VHDL-2008.\n",
             f"-- It searches {printable(searched)}; the first is the slowest in the lines' order.\n",
-            "-- Written by 'toolchain build', and again by 'toolchain regenerate memories'; not to be edited.\n\n",
+            "-- Written by 'toolchain build'; after an edit, 'toolchain regenerate images' makes images of it.\n\n",
             "library ieee;\nuse ieee.std_logic_1164.all;\n\npackage bm1_parameters is\n\n",
             _TYPES,
             _section("The matrix: column 0 is the prior, columns 1 to SENSORS the known variables"),
@@ -200,3 +206,61 @@ def _memory_files(images: Sequence[Image]) -> str:
     return (
         f"\n  -- Contents of the memories, in Memory_MIFs: board<b>_prior.mif{columns} and so on, {seeds}.\n"
     )
+
+
+_TOKEN: Final = re.compile(r'\n|--[^\n]*|\w*"[^"\n]*"|[\w.]+|:=|=>|[^\s]')
+_MOST_BYTES: Final = 4 << 20
+_IMAGE_HASH: Final = re.compile(r'(image_hash\s*=>\s*)x"[0-9a-f]{64}"')
+
+
+@dataclass(frozen=True, slots=True)
+class PackageTokens:
+    """The package as tokens without comments, in lower case like VHDL's names, and the line of each.
+
+    Hashes of images are left out, because they follow from the rest.
+    """
+
+    name: str
+    """The file, for errors."""
+    tokens: tuple[tuple[str, int], ...]
+
+    @classmethod
+    def of(cls, text: str, name: str = PARAMETERS_FILE) -> Self:
+        """Return the tokens of a text."""
+        found, line = [], 1
+        for word in _TOKEN.findall(_IMAGE_HASH.sub(r"\1hash", text.lower())):
+            if word == "\n":
+                line += 1
+            elif not word.startswith("--"):
+                found.append((word, line))
+        return cls(name, tuple(found))
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Return the tokens of a file."""
+        return cls.of(read_bounded(path, _MOST_BYTES, BuildError).decode("latin-1"), str(path))
+
+    def value(self, constant: str) -> tuple[str, int]:
+        """Return the value of a constant, one token, and its line, or raise a BuildError."""
+        words = [token for token, _ in self.tokens]
+        for at in range(len(words) - 1):
+            if words[at : at + 2] == ["constant", constant.lower()] and ":=" in words[at:]:
+                return self.tokens[min(words.index(":=", at) + 1, len(words) - 1)]
+        raise BuildError(
+            f"there is no constant {constant}; expected the package of the build", path=self.name
+        )
+
+    def check_same(self, expected: Self) -> None:
+        """Raise a BuildError for the first token that is not the expected one."""
+        constant, before = "the package", ""
+        for found, due in zip_longest(self.tokens, expected.tokens, fillvalue=("the end", None)):
+            if found[0] != due[0]:
+                line = found[1] or self.tokens[-1][1]
+                raise BuildError(
+                    f"expected {due[0]} in {constant}, as memories and images have it, found {found[0]}; set it back, or "
+                    "build again with 'toolchain build'",
+                    path=self.name,
+                    line=line,
+                )
+            constant = found[0].upper() if before == "constant" else constant
+            before = found[0]

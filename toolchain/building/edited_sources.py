@@ -1,0 +1,182 @@
+"""Programming files from edited sources: the MIFs and `bm1_parameters.vhd` of a deployment (thesis 3.2, 3.4).
+
+An edit is taken if the files that it gives are the sources again: what the new images would write is compared with
+what the person has written, so sources that contradict each other are refused.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from machines.errors import MachineError
+from machines.parameters import RngReset
+from pcie_shim.errors import PcieShimError
+from pcie_shim.programming_file import Image
+from toolchain.building.build import check_agreement, read_images
+from toolchain.building.machine import MACHINE_KEYS
+from toolchain.deployment import FILE_NAME, Deployment, deployment_text, load_deployment
+from toolchain.deployment.deployment import with_hash
+from toolchain.errors import BuildError
+from toolchain.outputs.memories import MEMORIES_FOLDER, Memory, memories, unpacked_codes
+from toolchain.outputs.mif import read_mif
+from toolchain.outputs.output_files import (
+    Change,
+    image_files,
+    memory_files,
+    quartus_files,
+    text_file,
+    write_files,
+)
+from toolchain.outputs.vhdl_parameters import PARAMETERS_FILE, PackageTokens, parameters_vhd
+
+_PARAMETERS: Final = {
+    "COUNTER_BITS": "counter_bits",
+    "RNG_KIND": "rng",
+    "RNG_SHARED": "shared",
+    "STEPS_PER_CLOCK": "steps_per_clock",
+    "RNG_RESET_BANK": "rng_reset",
+    "RNG_BANKS": "rng_banks",
+    "TARGET_COUNT": "target_count",
+    "MAX_CYCLES": "max_cycles",
+}
+"""The constants that may be edited, and their keys in `[machine]`; the others are the sizes of memories and boards."""
+_SHOWN: Final = 3
+"""Number of codes of a memory that are listed."""
+
+
+def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Change]]]:
+    """Write the images again from the memories and parameters; return the edits, as sentences, and the files.
+
+    Edited sources are written in canonical form, and `deployment.toml` gets the hashes and parameters.
+
+    Raises:
+        BuildError: The sources contradict each other, or need another machine.
+        MifError: A memory is not that of this machine.
+        DeploymentError: The deployment is missing or damaged.
+    """
+    deployment = load_deployment(directory)
+    images = read_images(deployment)
+    check_agreement(deployment, images)
+    changed, new = deployment, images
+    edits: list[str] = []
+    if deployment.machine.type == "BM1":
+        changed, new, edits = _with_parameters(directory, deployment, images)
+    for memory in memories(changed, new):
+        new, edit = _with_memory(directory / MEMORIES_FOLDER / memory.name, memory, new)
+        edits += edit
+    boards = []
+    for board, image in zip(changed.boards, new, strict=True):
+        built = board.built_hash or board.image_hash
+        edited = image.image_hash != built
+        boards.append(board.replace(image_hash=image.image_hash, built_hash=built if edited else None))
+    changed = with_hash(changed.replace(boards=tuple(boards)))
+    if deployment.machine.type == "BM1":
+        due = PackageTokens.of(parameters_vhd(changed, new))
+        PackageTokens.read(directory / PARAMETERS_FILE).check_same(due)
+    parts = [image_files(changed, new), memory_files(changed, new), quartus_files(changed, new)]
+    if changed != deployment:  # last, so that a partially written folder has the old hashes
+        parts.append(text_file(FILE_NAME, deployment_text(changed)))
+    return edits, sorted(change for part in parts for change in write_files(directory, part))
+
+
+def _with_parameters(
+    directory: Path, deployment: Deployment, images: Sequence[Image]
+) -> tuple[Deployment, list[Image], list[str]]:
+    """Return deployment and images with the parameters of the VHDL package, and its edits."""
+    found = PackageTokens.read(directory / PARAMETERS_FILE)
+    built = PackageTokens.of(parameters_vhd(deployment, images))
+    values: dict[str, Any] = {}
+    edits = []
+    for constant, key in _PARAMETERS.items():
+        (old, _), (new, line) = built.value(constant), found.value(constant)
+        if new != old:
+            values[key] = _value(found.name, constant, new, line)
+            edits.append(f"{PARAMETERS_FILE}, line {line}: {constant} {old} -> {new}")
+    own = {key: value for key, value in values.items() if key in MACHINE_KEYS}
+    try:
+        machines = [
+            replace(image.machine, parameters=replace(image.machine.parameters, **own)) for image in images
+        ]
+        same = {key: getattr(machines[0].parameters, key) for key in own}
+        machine = deployment.machine.replace(**values | same)
+        changed = deployment.replace(machine=machine)
+        new_images = [replace(image, machine=each) for image, each in zip(images, machines, strict=True)]
+    except ValidationError as reason:
+        what = reason.errors()[0]["msg"].removeprefix("Value error, ")
+        raise BuildError(what, path=found.name) from None
+    except (MachineError, PcieShimError) as reason:
+        raise BuildError(str(reason), path=found.name) from None
+    return changed, new_images, edits
+
+
+def _value(name: str, constant: str, text: str, line: int) -> int | str | bool | RngReset:
+    """Return the value of a token of VHDL."""
+    truth = {"true": True, "false": False}.get(text)
+    if constant == "RNG_RESET_BANK" and truth is not None:
+        return RngReset.BANK if truth else RngReset.FREE
+    if constant == "RNG_SHARED" and truth is not None:
+        return truth
+    if constant == "RNG_KIND" and text.startswith("rng_"):
+        return text.removeprefix("rng_")
+    if constant not in {"RNG_RESET_BANK", "RNG_SHARED", "RNG_KIND"}:
+        if found := re.fullmatch(r'x"([0-9a-f]{1,16})"', text):
+            return int(found[1], 16)
+        if re.fullmatch(r"[0-9]{1,10}", text, re.ASCII):
+            return int(text)
+    raise BuildError(f"{constant} is {text}, expected a value like that of the build", path=name, line=line)
+
+
+def _with_memory(path: Path, memory: Memory, images: Sequence[Image]) -> tuple[list[Image], list[str]]:
+    """Return the images with the codes of a memory's file, and the edits in it."""
+    words = read_mif(path, (memory.width, memory.depth)).words
+    if not memory.section:
+        for address, (seed, due) in enumerate(zip(words, memory.words(), strict=True)):
+            if seed != due:
+                raise BuildError(
+                    f"address {address:#x} has {seed:#x}, expected {due:#x}: seeds follow from RNG_KIND and RNG_BANKS; set it "
+                    "back, or run 'toolchain regenerate memories'",
+                    path=path,
+                )
+        return list(images), []
+    first = images[memory.board or 0]
+    bits = first.machine.parameters.prob_bits
+    before = dict(first.kind.sections(first.machine))[memory.section]
+    found = unpacked_codes(words, bits, memory.width // bits)
+    old = before.reshape(found.shape) & (1 << bits) - 1
+    if (found == old).all():
+        return list(images), []
+    # where a code is as before, so are the bits of a random number above it
+    codes = np.where(found == old, before.reshape(found.shape), found).astype(before.dtype)
+    new = [
+        _with_section(path, image, memory.section, codes.reshape(before.shape))
+        if memory.board in {None, board}
+        else image
+        for board, image in enumerate(images)
+    ]
+    return new, [_sentence(path, old, found, first.partition.line_offset)]
+
+
+def _with_section(path: Path, image: Image, section: str, codes: NDArray[Any]) -> Image:
+    sections = dict(image.kind.sections(image.machine)) | {section: codes}
+    try:
+        return replace(image, machine=image.kind.machine(image.machine.parameters, sections))
+    except MachineError as reason:
+        raise BuildError(str(reason).rstrip("."), path=path) from None
+
+
+def _sentence(path: Path, old: NDArray[Any], new: NDArray[Any], offset: int) -> str:
+    """Return which codes of a memory have changed, and the first ones with their values."""
+    places = np.argwhere(old != new)
+    shown = []
+    for address, line in places[:_SHOWN].tolist():
+        where = f"address {address:#x}" + (f", line {offset + line}" if old.shape[1] > 1 else "")
+        shown.append(f"{where}: {old[address, line]:#x} -> {new[address, line]:#x}")
+    more = f"; and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
+    count = f"{len(places)} code{'s' if len(places) > 1 else ''}"
+    return f"{MEMORIES_FOLDER}/{path.name}: {count}: {'; '.join(shown)}{more}"
