@@ -433,6 +433,7 @@ begin
                            & std_logic_vector(to_unsigned(INTERFACE_INPUTS, 16)),
       cap_speed_i       => word(CLOCK_HZ),
       cap_steps_i       => word(STEPS),
+      cap_link_i        => (others => '0'),
       cap_sensor_bits_i => sensor_widths,
       control_o         => control,
       target_count_o    => target,

@@ -38,6 +38,7 @@ entity bm_register_block is
     cap_interface_i   : in    std_logic_vector(31 downto 0);  -- Interface, as read
     cap_speed_i       : in    std_logic_vector(31 downto 0);  -- Speed, as read
     cap_steps_i       : in    std_logic_vector(31 downto 0);  -- Steps of the RNGs, as read
+    cap_link_i        : in    std_logic_vector(31 downto 0);  -- Link, as read
     cap_sensor_bits_i : in    std_logic_vector(511 downto 0); -- Widths of the sensors' addresses, as read
     control_o         : out   std_logic_vector(31 downto 0);  -- Control, as written
     target_count_o    : out   std_logic_vector(31 downto 0);  -- Target count, as written
@@ -200,7 +201,7 @@ begin
           found := found or x"31304D42";
         end if;
         if (unsigned(word_i) = MAP_VERSION_ADDRESS / 4) then
-          found := found or x"00010002";
+          found := found or x"00010003";
         end if;
         if (unsigned(word_i) = LIVENESS_ADDRESS / 4) then
           found := found or liveness_i(31 downto 0);
@@ -291,6 +292,9 @@ begin
         end if;
         if (unsigned(word_i) = CAP_STEPS_ADDRESS / 4) then
           found := found or cap_steps_i(31 downto 0);
+        end if;
+        if (unsigned(word_i) = CAP_LINK_ADDRESS / 4) then
+          found := found or cap_link_i(31 downto 0);
         end if;
         if (unsigned(word_i) = CAP_SENSOR_BITS_ADDRESS / 4) then
           found := found or cap_sensor_bits_i(31 downto 0);

@@ -20,7 +20,7 @@ extern "C" {
 #define BM_REGISTERS__MAP_VERSION__MINOR_bm 0xffff
 #define BM_REGISTERS__MAP_VERSION__MINOR_bp 0
 #define BM_REGISTERS__MAP_VERSION__MINOR_bw 16
-#define BM_REGISTERS__MAP_VERSION__MINOR_reset 0x2
+#define BM_REGISTERS__MAP_VERSION__MINOR_reset 0x3
 #define BM_REGISTERS__MAP_VERSION__MAJOR_bm 0xffff0000
 #define BM_REGISTERS__MAP_VERSION__MAJOR_bp 16
 #define BM_REGISTERS__MAP_VERSION__MAJOR_bw 16
@@ -141,6 +141,11 @@ extern "C" {
 #define BM_REGISTERS__CAP_STEPS__PER_CLOCK_bm 0xffffffff
 #define BM_REGISTERS__CAP_STEPS__PER_CLOCK_bp 0
 #define BM_REGISTERS__CAP_STEPS__PER_CLOCK_bw 32
+
+// reg - bm_registers::CAP_LINK
+#define BM_REGISTERS__CAP_LINK__SENDS_RESULTS_bm 0x1
+#define BM_REGISTERS__CAP_LINK__SENDS_RESULTS_bp 0
+#define BM_REGISTERS__CAP_LINK__SENDS_RESULTS_bw 1
 
 // reg - bm_registers::CAP_SENSOR_BITS
 #define BM_REGISTERS__CAP_SENSOR_BITS__FIRST_bm 0xff
@@ -335,7 +340,8 @@ typedef struct __attribute__ ((__packed__)) {
     uint32_t CAP_INTERFACE;
     uint32_t CAP_SPEED;
     uint32_t CAP_STEPS;
-    uint8_t RESERVED_b0_bf[0x10];
+    uint32_t CAP_LINK;
+    uint8_t RESERVED_b4_bf[0xc];
     uint32_t CAP_SENSOR_BITS[16];
     uint32_t CONTROL;
     uint32_t TARGET_COUNT;

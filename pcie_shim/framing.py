@@ -23,7 +23,7 @@ READ: Final = 2
 WRITE: Final = 3
 """Host to board: write the payload from `address` on; acknowledged, unless posted."""
 IRQ: Final = 4
-"""Board to host: the machine has stopped; the payload is the block from DONE on, and the blocks that the image names."""
+"""Board to host: the machine has stopped; the payload is the block from DONE on, and with CAP_LINK.SENDS_RESULTS the answer."""
 ERROR: Final = 5
 """Board to host: the request of this sequence number was refused (`encode_error`)."""
 PROGRAM: Final = 6

@@ -7,7 +7,7 @@ each register means is in docs/reference/registers.md.
 from enum import IntEnum
 from typing import Final
 
-MAP_SHA256: Final = "3e1197271f18778cf35434fbe02dfebc8031433857203d65ac2c3a91a1ef4854"
+MAP_SHA256: Final = "ce45436af122e6ea95d04bad0f45b2e80adba8b53c02569f00118801536ee5b9"
 BAR_SIZE: Final = 0x20000
 
 
@@ -53,7 +53,7 @@ class Block(int):
 ID: Final = Block(0x0000, 1, writable=False)
 ID_VALUE: Final = 0x31304d42
 MAP_VERSION: Final = Block(0x0004, 1, writable=False)
-MAP_VERSION_VALUE: Final = 0x10002
+MAP_VERSION_VALUE: Final = 0x10003
 MAP_VERSION_MINOR_MASK: Final = 0xffff
 MAP_VERSION_MAJOR_MASK: Final = 0xffff0000
 LIVENESS: Final = Block(0x0008, 1, writable=True)
@@ -88,6 +88,8 @@ CAP_INTERFACE_SENSORS_MASK: Final = 0xffff
 CAP_INTERFACE_RESULTS_MASK: Final = 0xffff0000
 CAP_SPEED: Final = Block(0x00a8, 1, writable=False)
 CAP_STEPS: Final = Block(0x00ac, 1, writable=False)
+CAP_LINK: Final = Block(0x00b0, 1, writable=False)
+CAP_LINK_SENDS_RESULTS_MASK: Final = 0x1
 CAP_SENSOR_BITS: Final = Block(0x00c0, 16, writable=False)
 CAP_SENSOR_BITS_FIRST_MASK: Final = 0xff
 CAP_SENSOR_BITS_SECOND_MASK: Final = 0xff00

@@ -189,8 +189,9 @@ def module_text(register_map: RegisterMap) -> str:
         lines.append(f"{block.name}: Final = Block({arguments})")
         if default := block.value():
             lines.append(f"{block.name}_VALUE: Final = {default:#x}")
-        for field in block.fields if len(block.fields) > 1 else ():
-            lines.append(f"{block.name}_{field.name}_MASK: Final = {field.mask:#x}")
+        for field in block.fields:
+            if field.mask != (1 << block.width) - 1:
+                lines.append(f"{block.name}_{field.name}_MASK: Final = {field.mask:#x}")
     return "\n".join([*lines, "", *_BLOCKS, ""])
 
 

@@ -81,6 +81,11 @@ class Settings(BaseModel):
         description="Delay the frames of the boards started here as PCIe (20,800 Mbps) or USB/JTAG (24 Mbps) would.",
     )
 
+    read_results: bool = Field(
+        default=False,
+        description="Read the results of the boards started here from their registers, as on hardware, not with their interrupts.",
+    )
+
     # --- the processes of a run ---
     subscriber: str = Field(
         default="", description="Endpoint of a running subscriber (see `master --connect`)."

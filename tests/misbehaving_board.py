@@ -19,7 +19,7 @@ from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.board.server import BoardServer, StopSignal
 from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.framing import Frame
-from pcie_shim.register_layout import ALL_ONES
+from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK
 from pcie_shim.register_map import BoardState
 
 
@@ -38,6 +38,11 @@ class Kind(StrEnum):
     DONE_TWICE = "done-twice"  # an interrupt is sent twice, with the same doorbell number
     DONE_EARLY = "done-early"  # an interrupt is sent before the machine has run
     STALE_RESULT = "stale-result"  # an interrupt has the doorbell number and results of the previous one
+    NO_RESULTS = "no-results"  # an interrupt lacks the results that the board says it sends
+    MORE_RESULTS = "more-results"  # an interrupt has results that the board does not say it sends
+    RESET_AFTER_DONE = (
+        "reset-after-done"  # the board is reset between an interrupt and the reading of the results
+    )
 
 
 @dataclass(slots=True)
@@ -66,8 +71,8 @@ class Fault:
 class MisbehavingBoard(EmulatedBoard):
     """A board that counts its starts, and may run forever without a cycle."""
 
-    def __init__(self, fault: Fault) -> None:
-        super().__init__()
+    def __init__(self, fault: Fault, *, sends_results: bool) -> None:
+        super().__init__(sends_results=sends_results)
         self.fault = fault
         self.starts = 0
         self.stuck = False
@@ -97,8 +102,10 @@ class MisbehavingServer(BoardServer):
 
     board: MisbehavingBoard
 
-    def __init__(self, endpoint: Endpoint, index: int, stop: StopSignal, fault: Fault) -> None:
-        super().__init__(endpoint, index, stop, MisbehavingBoard(fault))
+    def __init__(
+        self, endpoint: Endpoint, index: int, stop: StopSignal, fault: Fault, *, sends_results: bool
+    ) -> None:
+        super().__init__(endpoint, index, stop, MisbehavingBoard(fault, sends_results=sends_results))
         self._fault = fault
         self._last_results = b""
         self._stalled: set[HostConnection] = set()
@@ -149,6 +156,12 @@ class MisbehavingServer(BoardServer):
         if operation == framing.IRQ:
             last, self._last_results = self._last_results, words
             words = last if last and self._now(Kind.STALE_RESULT) else words
+            if self._now(Kind.NO_RESULTS):
+                words = words[: DONE_BLOCK.size]
+            if self._now(Kind.MORE_RESULTS):
+                words += bytes(4)
+            if self._now(Kind.RESET_AFTER_DONE):
+                self.board.reset()
         if words and self._now(Kind.SHORT_READ):
             words = words[:-4]
         if words and self._now(Kind.ALL_ONES):
@@ -172,10 +185,11 @@ def rings(address: int, octets: int) -> bool:
     return address <= rm.RESUME and address + octets > rm.START
 
 
-def serve_misbehaving(endpoint, *, index, stop, fault, on_ready):
+def serve_misbehaving(endpoint, *, index, stop, fault, on_ready, sends_results=True):
     """Serve a board with this fault until `stop` is set."""
     where = parse_endpoint(endpoint) if isinstance(endpoint, str) else endpoint
-    with closing(MisbehavingServer(where, index, stop, Fault.parse(fault))) as server:
+    fault = Fault.parse(fault)
+    with closing(MisbehavingServer(where, index, stop, fault, sends_results=sends_results)) as server:
         on_ready(server.board)
         server.run()
 

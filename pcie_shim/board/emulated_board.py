@@ -52,9 +52,13 @@ class RefusedError(PcieShimError):
 class EmulatedBoard:
     """A board: blank until an image is loaded, then a machine with registers (docs/reference/registers.md)."""
 
-    def __init__(self, make: Callable[[Any], Any] | None = None) -> None:
-        """Create a blank board; `make` returns the kernel of a machine instead of its kind."""
+    def __init__(self, make: Callable[[Any], Any] | None = None, *, sends_results: bool = True) -> None:
+        """Create a blank board; `make` returns the kernel of a machine instead of its kind.
+
+        Without `sends_results`, its interrupts announce results that the host has to read, as on hardware.
+        """
         self._make = make
+        self._sends_results = sends_results
         self.turned = 0.0
         """Monotonic time at which its server last polled for requests; 0 before the first time."""
         self.programmed = 0
@@ -70,7 +74,7 @@ class EmulatedBoard:
         self._access = bytearray(rm.BAR_SIZE // 4)
 
         # The machine of the loaded image, None while blank, which reads and writes the blocks of the map; and the
-        # words that an interrupt carries: from DONE on, and those that the image names.
+        # words that an interrupt carries: from DONE on, and if it sends results, those that the image names.
         self._machine: BoardMachine | None = None
         self._blocks = {
             name: self._view[block : block + 4 * block.words] for name, block in rm.BLOCKS.items()
@@ -112,6 +116,7 @@ class EmulatedBoard:
         self._put(rm.MAP_VERSION, rm.MAP_VERSION_VALUE)
         self._put(rm.LIVENESS, ALL_ONES)
         self._put(rm.PROGRAMMED, self.programmed)
+        self._put(rm.CAP_LINK, self._sends_results)
         self._view[rm.MAP_HASH : rm.MAP_HASH + 32] = bytes.fromhex(rm.MAP_SHA256)
         self._latched.clear()
         self.done = 0
@@ -166,7 +171,8 @@ class EmulatedBoard:
             self._put(address, value)
         for name, words in image.kind.contents(image.machine).items():
             self._blocks[name][: len(words)] = words
-        self._answer[1:] = [self._blocks[name][: 4 * words] for name, words in registers.answer.items()]
+        if self._sends_results:
+            self._answer[1:] = [self._blocks[name][: 4 * words] for name, words in registers.answer.items()]
         self._allow(rm.BLOCKS[registers.inputs], image.interface_sensors, _READ_WRITE)
         for name, count in {**registers.answer, "RESULTS": image.interface_results}.items():
             self._allow(rm.BLOCKS[name], count, _READ)
@@ -368,7 +374,7 @@ class EmulatedBoard:
         DONE_BLOCK.pack_into(self._memory, rm.DONE, self.done, status, cycles, self._compute_ns)
 
     def interrupt_words(self) -> bytes:
-        """Return the payload of an interrupt: DONE to COMPUTE_NS, and the blocks that the image names."""
+        """Return the payload of an interrupt, as `Board.interrupt_words`."""
         return b"".join(self._answer)
 
     # ---- memory ---------------------------------------------------------------------------------------

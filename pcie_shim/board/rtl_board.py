@@ -40,11 +40,10 @@ class RtlBoard:
         self._simulate = simulate
 
         # While there is no simulation, this one answers.
-        self._blank = EmulatedBoard()
+        self._blank = EmulatedBoard(sends_results=False)
 
-        # The simulated hardware and its image, which are replaced together when the board is programmed again.
+        # The simulated hardware and the hash of its image, which are replaced together when the board is programmed again.
         self._simulation: Simulation | None = None
-        self._image: Image | None = None
         self._image_hash = self._blank.image_hash
 
         # Hardware that is being compiled, or is ready for `load` to take.
@@ -99,7 +98,6 @@ class RtlBoard:
         if self._simulation is not None:
             self._simulation.close()
         self._simulation = simulation
-        self._image = image
         self._image_hash = image.image_hash
         self._chunk = max(int(simulation.speed * CHUNK_S), _SHORTEST_CHUNK)
         self.programmed += 1
@@ -214,12 +212,8 @@ class RtlBoard:
         self.running = field_of(rm.STATUS_STATE_MASK, status) == BoardState.RUNNING
 
     def interrupt_words(self) -> bytes:
-        """Return the payload of an interrupt: DONE to COMPUTE_NS, and the blocks that the image names."""
-        words = self.read(rm.DONE, DONE_BLOCK.size // 4)
-        if self._image is None:
-            return words
-        blocks = self._image.registers.answer.items()
-        return words + b"".join(self.read(rm.BLOCKS[name], count) for name, count in blocks)
+        """Return the payload of an interrupt: DONE to COMPUTE_NS; the host reads the results from the hardware."""
+        return self.read(rm.DONE, DONE_BLOCK.size // 4)
 
     def release(self) -> None:
         """Stop a running machine and disable interrupts, because the host has disconnected."""

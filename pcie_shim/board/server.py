@@ -81,7 +81,7 @@ class Board(Protocol):
         """Run the machine for one more chunk; then `running` tells whether it must continue."""
 
     def interrupt_words(self) -> bytes:
-        """Return the payload of an interrupt: DONE to COMPUTE_NS, the results, replicas' outcomes."""
+        """Return the payload of an interrupt: DONE to COMPUTE_NS, and with CAP_LINK.SENDS_RESULTS the blocks of the answer."""
 
     def release(self) -> None:
         """Stop a running machine and disable interrupts, because the host has disconnected."""

@@ -23,7 +23,7 @@ from pcie_shim.errors import (
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import Done, RegisterWrite, SocketLink
 from pcie_shim.programming_file import Image
-from pcie_shim.register_layout import ALL_ONES, SETTINGS, next_doorbell, register_values
+from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, SETTINGS, next_doorbell, register_values
 from pcie_shim.register_map import BoardState
 
 _ASSUMED_SPEED: Final = 1e4  # cycles per second of a board that does not report its speed
@@ -31,7 +31,7 @@ _START: Final = struct.Struct("<QI")  # RUN_UNTIL, START
 _RESUME: Final = struct.Struct("<QII")  # RUN_UNTIL, START (0: no effect), RESUME
 _BANK_AT: Final = rm.BANK - rm.TARGET_COUNT
 _PRIOR_AT: Final = rm.PRIOR_SELECT - rm.TARGET_COUNT
-_CAPABILITIES: Final = range(rm.CAP_MACHINE, rm.CAP_STEPS + 4, 4)
+_CAPABILITIES: Final = range(rm.CAP_MACHINE, rm.CAP_LINK + 4, 4)
 
 
 class DrivenBoard:
@@ -44,19 +44,20 @@ class DrivenBoard:
         self.image = image
         self._reprogram = reprogram
 
-        # What follows from the image: the extent of an answer, which begins with the results, and its reasons.
+        # What follows from the image: the blocks of an answer, which begins with the results, and its reasons.
         self._kind = image.kind
         self._reasons = frozenset(image.kind.reasons) - {0}
         self.replicas = image.registers.replicas
         self._results_bytes = 4 * image.registers.result_words
-        self._answer_bytes = 4 * sum(image.registers.answer.values())
+        self._answer_blocks = [(rm.BLOCKS[name], words) for name, words in image.registers.answer.items()]
 
         # Either an open link, or None and the reason why.
         self.link: SocketLink | None = None
         self.broken = "it has not been opened"
 
-        # Cycles per second, as the board reports them when it is opened.
+        # As the board reports when it is opened: its cycles per second, and whether its interrupts carry the answer.
         self.speed = _ASSUMED_SPEED
+        self.sends_results = False
         self._forget()
 
     def _forget(self) -> None:
@@ -70,7 +71,7 @@ class DrivenBoard:
         self.waiting = False
         self.done: Done | None = None
 
-        # Of the last answer: its words, the stop reason of each replica, and with several their cycles.
+        # Of the last answer: its words (set by `fetch`), the stop reason of each replica, and with several their cycles.
         self.answer = memoryview(b"")
         self.reasons: tuple[int, ...] = (0,) * self.replicas
         self._replica_cycles: tuple[int, ...] = ()
@@ -115,20 +116,25 @@ class DrivenBoard:
 
     def _check_identity(self, link: SocketLink) -> None:
         identity = link.read32(rm.ID)
-        # a device that is gone reads all ones, and memory that is no board reads what was written
-        pattern = time.monotonic_ns() & ALL_ONES
-        link.write32(rm.LIVENESS, pattern)
-        alive = link.read32(rm.LIVENESS) == pattern ^ ALL_ONES
-        if identity != rm.ID_VALUE or not alive:
+        if identity != rm.ID_VALUE:
             raise GreetingMismatchError(
-                f"The device at {self.endpoint} is not a board: its ID is {identity:#010x} instead of {rm.ID_VALUE:#010x}, "
-                f"and its LIVENESS register is {'alive' if alive else 'dead'}"
+                f"The device at {self.endpoint} is not a board: its ID is {identity:#010x} instead of {rm.ID_VALUE:#010x}"
             )
         map_hash = link.read_block(rm.MAP_HASH, rm.MAP_HASH.words).hex()
         if map_hash != rm.MAP_SHA256:
             raise GreetingMismatchError(
                 f"The board at {self.endpoint} has register map {map_hash}, this software has "
                 f"{rm.MAP_SHA256}: use a board and a host of the same version"
+            )
+        # a machine that another host left running would refuse every other write
+        link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK)
+        # memory that is no board reads what was written
+        pattern = time.monotonic_ns() & ALL_ONES
+        link.write32(rm.LIVENESS, pattern)
+        if link.read32(rm.LIVENESS) != pattern ^ ALL_ONES:
+            raise GreetingMismatchError(
+                f"The device at {self.endpoint} is not a board: its LIVENESS register does not read the complement of "
+                "what was written"
             )
 
     def _check_image(self, link: SocketLink) -> None:
@@ -144,6 +150,7 @@ class DrivenBoard:
         """Check that the registers used by the host exist, independently of the image hash."""
         words = struct.iter_unpack("<I", link.read_block(_CAPABILITIES.start, len(_CAPABILITIES)))
         theirs = dict(zip(_CAPABILITIES, (word for (word,) in words), strict=True))
+        self.sends_results = bool(theirs[rm.CAP_LINK] & rm.CAP_LINK_SENDS_RESULTS_MASK)
         registers = self.image.registers
         # these decide how long a result is, and where its parts are
         for address, value in register_values(registers.capabilities).items():
@@ -233,22 +240,46 @@ class DrivenBoard:
         return is_done
 
     def _take(self, done: Done) -> None:
-        """Check the answer of the board, and store it."""
+        """Check what an interrupt says, and store it."""
         if not self.waiting or done.number != self.number:
             raise SequenceError(
                 f"The board at {self.endpoint} answered doorbell {done.number} where {self.number} was due once"
             )
-        if len(done.results) != self._answer_bytes:
+        due = sum(words for _, words in self._answer_blocks) if self.sends_results else 0
+        if len(done.results) != 4 * due:
             raise ShortReadError(
-                f"The board at {self.endpoint} sent {len(done.results) // 4} results where "
-                f"{self._answer_bytes // 4} were due"
+                f"The board at {self.endpoint} sent {len(done.results) // 4} results with its interrupt where "
+                f"{due} were due according to its CAP_LINK"
             )
         if done.state != BoardState.DONE or done.reason not in self._reasons:
             raise FramingError(
                 f"The board at {self.endpoint} stopped with an impossible status, {done.status:#010x}"
             )
+        self.waiting = False
+        self.done = done
+
+    def fetch(self) -> None:
+        """Store the answer of a board that is done, after reading its blocks if the interrupt did not carry them.
+
+        This host holds the board, so nobody else starts it; but a reset, or a power cycle, between the interrupt and
+        the reads would clear the results. DONE to COMPUTE_NS is therefore read last: if it is still what the interrupt
+        announced, the machine has stood still since, and the blocks are those of the frame.
+        """
+        done = self._answered()
+        words = done.results
+        if not self.sends_results:
+            link = self.open_link
+            words = memoryview(b"".join([link.read_block(*block) for block in self._answer_blocks]))
+            number, status, cycles, _ = DONE_BLOCK.unpack(link.read_block(rm.DONE, DONE_BLOCK.size // 4))
+            if (number, status, cycles) != done[:3]:
+                raise SequenceError(
+                    f"The board at {self.endpoint} changed while its results were read: DONE is {number} and STATUS "
+                    f"{status:#010x} after {cycles} cycles, the interrupt said {done.number}, {done.status:#010x} and {done.cycles}"
+                )
+            if (second := link.take_done()) is not None:
+                self._take(second)
         if self.replicas > 1:
-            outcomes = np.frombuffer(done.results, OUTCOME, self.replicas, self._results_bytes)
+            outcomes = np.frombuffer(words, OUTCOME, self.replicas, self._results_bytes)
             reasons = tuple(outcomes["reason"].tolist())
             if not self._reasons.issuperset(reasons):
                 raise FramingError(f"The board at {self.endpoint} stopped a replica with an unknown reason")
@@ -256,19 +287,21 @@ class DrivenBoard:
             self._replica_cycles = tuple(outcomes["cycles"].tolist())
         else:
             self.reasons = (done.reason,)
-        self.waiting = False
-        self.answer = done.results
-        self.done = done
+        self.answer = words
+
+    def _answered(self) -> Done:
+        if self.done is None:
+            raise SequenceError(f"The board at {self.endpoint} has not answered doorbell {self.number}")
+        return self.done
 
     def result(self) -> BoardResult:
         """Return the result of the frame; the words are copied from the buffer of the link."""
-        if self.done is None:
-            raise SequenceError(f"The board at {self.endpoint} has not answered doorbell {self.number}")
-        words = bytes(self.done.results[: self._results_bytes])
+        done = self._answered()
+        words = bytes(self.answer[: self._results_bytes])
         if self.replicas == 1:
-            return BoardResult(words, self.done.cycles, self.done.reason)
+            return BoardResult(words, done.cycles, done.reason)
         joint = self._kind.joint_reason(self.reasons)
-        return BoardResult(words, self.done.cycles, joint, self._replica_cycles, self.reasons)
+        return BoardResult(words, done.cycles, joint, self._replica_cycles, self.reasons)
 
 
 def board_error(board: DrivenBoard, error: PcieShimError) -> BoardError:

@@ -5,8 +5,8 @@
              resume to those that ◀────┘                                      │
              have not stopped      ◀──────────────── no ──────────────────────┘
 
-The sensors and the start of a frame are posted to every board before waiting for the first one; then results
-are received as the boards stop. Boards stop together (`slices`) or independently (`own`, as in the thesis).
+The sensors and the start of a frame are posted to every board before waiting for the first one; when all have
+stopped, their results are read. Boards stop together (`slices`) or independently (`own`, as in the thesis).
 """
 
 import select
@@ -48,7 +48,7 @@ class FrameOutput:
         boards: One result per board, in the order of the partition.
         register_writes_ns: Time for posting settings, sensors, starts and resumes.
         compute_ns: Time of waiting for the boards: their computing, and the transport.
-        reads_ns: Time for copying the results.
+        reads_ns: Time for reading the results, or for copying those that came with the interrupts.
         boards_compute_ns: Computing time of the slowest board, summed over the slices. The rest of
             `compute_ns` is transport, or other boards on the same core.
         slices: Number of slices.
@@ -80,7 +80,7 @@ class _Progress:
 
         # For the output: finished slices, and nanoseconds of each stage since the last look at the clock.
         self.slices = 0
-        self.writes_ns = self.waits_ns = self.computing_ns = 0
+        self.writes_ns = self.waits_ns = self.reads_ns = self.computing_ns = 0
         self.clock_ns = time.perf_counter_ns()
 
 
@@ -280,6 +280,14 @@ class MiniCluster:
         progress.computing_ns += max(
             board.done.compute_ns for board in progress.running if board.done is not None
         )
+        for board in progress.running:
+            try:
+                board.fetch()
+            except LinkError as error:
+                self._fail(board, error)
+        now = time.perf_counter_ns()
+        progress.reads_ns += now - progress.clock_ns
+        progress.clock_ns = now
         course = progress.course
         numbers, blocks = course.proceed(
             [board.reasons for board in self._boards], [board.answer for board in self._boards]
@@ -298,7 +306,7 @@ class MiniCluster:
             boards=tuple(results),
             register_writes_ns=progress.writes_ns,
             compute_ns=progress.waits_ns,
-            reads_ns=time.perf_counter_ns() - progress.clock_ns,
+            reads_ns=progress.reads_ns + time.perf_counter_ns() - progress.clock_ns,
             boards_compute_ns=progress.computing_ns,
             slices=progress.slices,
         )

@@ -6,7 +6,7 @@
       │◀─ reply 1 ──────────────────────────────────────│
       │── WRITE 2, POSTED: settings and sensors ───────▶│   no reply
       │── WRITE 3, POSTED: RUN_UNTIL and the doorbell ─▶│
-      │◀─ IRQ 1: DONE, STATUS, CYCLES, counts ──────────│   numbered apart from the requests
+      │◀─ IRQ 1: DONE, STATUS, CYCLES, COMPUTE_NS ──────│   numbered apart from the requests; results may follow
       │◀─ ERROR 3 ──────────────────────────────────────│   instead of the IRQ, if write 3 was refused
 
 A host with one board reads, writes and waits. A host with many boards posts to each of them, polls their
@@ -58,8 +58,8 @@ class Done(NamedTuple):
         status: The STATUS register.
         cycles: Cycles run in this frame.
         compute_ns: Computing time since that start or resume, in nanoseconds.
-        results: The result words of the machine, replica after replica, followed by OUTCOMES if there are replicas;
-            as bytes, valid until the link receives again.
+        results: The words of the blocks that the image names, RESULTS first, from a board that sends them; as bytes,
+            valid until the link receives again.
     """
 
     number: int

@@ -35,6 +35,13 @@ _LISTENS: Final = 128
 """Added to a board's number in the sign that it listens; the number alone is a sign of life."""
 
 
+def blank_board(index: int, settings: Settings, hardware: SimulatedHardware | None) -> Board:
+    """Return an emulated board, or one of the simulated hardware if there is any."""
+    return (
+        EmulatedBoard(sends_results=not settings.read_results) if hardware is None else hardware.board(index)
+    )
+
+
 def serve_one(
     endpoint: Endpoint,
     index: int,
@@ -190,7 +197,7 @@ class BoardProcesses:
             self._endpoints[at],
             at,
             self._settings.run_directory,
-            board=EmulatedBoard() if self._hardware is None else self._hardware.board(at),
+            board=blank_board(at, self._settings, self._hardware),
             link=self._link,
             metrics=shifted(self._settings.metrics, at),
             restarts=self._children[at].restarts,

@@ -8,12 +8,11 @@ from typing import Annotated
 
 import typer
 
-from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.credentials import read_key
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.link_rate import link_model
 from services.boards.hardware import Engine, SimulatedHardware
-from services.boards.processes import BoardProcesses, serve_one
+from services.boards.processes import BoardProcesses, blank_board, serve_one
 from services.child import RESTARTS
 from services.commands import flags as options
 from services.errors import SettingsError
@@ -33,7 +32,7 @@ app = CommandLine(
 
 
 @app.command(help=app.info.help)
-@options.with_settings("deployment", "link_rate", "key_file", "metrics", "log_format")
+@options.with_settings("deployment", "link_rate", "read_results", "key_file", "metrics", "log_format")
 def board(
     settings: Settings,
     listen: options.Listen = None,
@@ -108,12 +107,11 @@ def board(
         if PARENT_VARIABLE not in os.environ:
             say(f"board {index} listens at {endpoint}")
 
-    served = EmulatedBoard() if simulated is None else simulated.board(index)
     serve_one(
         endpoint,
         index,
         run_directory,
-        board=served,
+        board=blank_board(index, settings, simulated),
         link=link_model(settings.link_rate),
         metrics=settings.metrics,
         on_ready=on_ready,

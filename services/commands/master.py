@@ -29,7 +29,16 @@ app = CommandLine(
 @options.with_settings(
     *("deployment", "uri", "ca", "boards", "queue", "stop", "ros_version", "message_bytes", "topic_bytes"),
     *("connect_timeout", "first_data_timeout", "peer_timeout", "board_timeout", "stop_timeout", "key_file"),
-    *("link_rate", "use_sim_time", "fused", "run_directory", "metrics", "log_level", "log_format"),
+    *(
+        "link_rate",
+        "read_results",
+        "use_sim_time",
+        "fused",
+        "run_directory",
+        "metrics",
+        "log_level",
+        "log_format",
+    ),
 )
 def master(
     settings: Settings,

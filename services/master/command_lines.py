@@ -28,6 +28,7 @@ def boards_arguments(boards: int, directory: Path, settings: Settings, *, once: 
         *("--boards", str(boards)),
         *("--directory", str(directory), "--restarts", restarts),
         *("--link-rate", settings.link_rate),
+        *(["--read-results"] if settings.read_results else []),
         *_metrics(settings, "board"),
     ]
 

@@ -17,6 +17,7 @@ from machines.bm1 import BM1Machine, Start, StopReason
 from machines.bm1_kind import BM1
 from machines.kind import FrameInput
 from machines.parameters import BM1Parameters, RngKind, SensorMode
+from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.board.server import StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import BoardError, PcieShimError
@@ -88,10 +89,13 @@ def images(seed: int, lines: Sequence[int], **parameters) -> list[Image]:
 
 
 class ServedBoard:
-    """An emulated board in a thread of the test's process."""
+    """An emulated board in a thread of the test's process; the host may have to read its results."""
 
-    def __init__(self, endpoint: Endpoint | str, *, index: int = 0, misbehave: str = "") -> None:
+    def __init__(
+        self, endpoint: Endpoint | str, *, index: int = 0, misbehave: str = "", sends_results: bool = True
+    ) -> None:
         self.endpoint = endpoint
+        self._sends_results = sends_results
         self._stop = StopSignal()
         self._listens = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(index, misbehave), name="board", daemon=True)
@@ -100,9 +104,11 @@ class ServedBoard:
 
     def _run(self, index: int, misbehave: str) -> None:
         try:
-            serve = (
-                partial(serve_misbehaving, fault=misbehave) if misbehave else partial(serve_board, pin=False)
-            )
+            if misbehave:
+                serve = partial(serve_misbehaving, fault=misbehave, sends_results=self._sends_results)
+            else:
+                board = EmulatedBoard(sends_results=self._sends_results)
+                serve = partial(serve_board, pin=False, board=board)
             serve(self.endpoint, index=index, stop=self._stop, on_ready=lambda _board: self._listens.set())
         finally:
             self._stop.close()
@@ -129,11 +135,15 @@ def endpoints_of(boards: Sequence[ServedBoard]) -> list[str]:
 
 
 @contextlib.contextmanager
-def opened(parts: Sequence[Image], *, tcp: bool = False) -> Iterator[MiniCluster]:
+def opened(parts: Sequence[Image], *, tcp: bool = False, sends_results: bool = True) -> Iterator[MiniCluster]:
     """A mini-cluster of well-behaved boards that hold these parts; they end in order."""
     with tempfile.TemporaryDirectory(prefix="bm") as base:
         boards = [
-            ServedBoard(tcp_endpoint() if tcp else f"unix:{base}/board{at}.sock", index=at)
+            ServedBoard(
+                tcp_endpoint() if tcp else f"unix:{base}/board{at}.sock",
+                index=at,
+                sends_results=sends_results,
+            )
             for at in range(len(parts))
         ]
         try:

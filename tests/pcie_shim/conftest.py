@@ -31,8 +31,8 @@ def start_board(folder):
     """Serves boards in threads of this process, and ends them after the test."""
     started: list[ServedBoard] = []
 
-    def start(endpoint="", *, index=0, misbehave=""):
-        board = ServedBoard(endpoint or f"unix:{folder}/board{index}.sock", index=index, misbehave=misbehave)
+    def start(endpoint="", *, index=0, **how):
+        board = ServedBoard(endpoint or f"unix:{folder}/board{index}.sock", index=index, **how)
         started.append(board)
         return board
 

@@ -94,10 +94,12 @@ frames = st.builds(
 # ---- to the bit ----
 
 
-@pytest.fixture(scope="module", params=["unix", "tcp"])
+@pytest.fixture(scope="module", params=["unix", "tcp", "unix, results read"])
 def cluster(request):
     """Four boards that misbehave in nothing, opened once for many frames."""
-    with opened(PARTS, tcp=request.param == "tcp") as cluster:
+    sends_results = "read" not in request.param
+    with opened(PARTS, tcp=request.param == "tcp", sends_results=sends_results) as cluster:
+        assert all(board.sends_results is sends_results for board in cluster._boards)
         yield cluster
 
 
@@ -141,7 +143,7 @@ def test_an_output_says_how_each_board_ended_and_where_the_time_went(cluster, mo
     assert ends == {512 << output.slices - 1}
     assert 0 < max(stopped) <= min(ends)
     spent = output.register_writes_ns, output.compute_ns, output.reads_ns
-    assert spent == (output.slices, output.slices, 1)
+    assert spent == (output.slices, output.slices, output.slices + 1)
     assert output.boards_compute_ns > 0
     cluster.run(frame(3, 4))  # the results are the caller's own
     assert outcome(output) == kept
@@ -353,11 +355,14 @@ OWN = {"stop": "own"}
         ("short-read", FramingError, True), ("wrong-sequence", FramingError, True),
         ("wrong-crc", FramingError, True), ("done-twice", FramingError, False),
         ("done-early", FramingError, False), ("stale-result", FramingError, False),
-        ("all-ones", DeviceGoneError, True),
+        ("all-ones", DeviceGoneError, True), ("no-results", ShortReadError, False),
+        ("more-results", ShortReadError, False), ("reset-after-done", SequenceError, False),
     ],
 )  # fmt: skip
 def test_a_misbehaving_board_fails_the_frame_and_comes_back(start_board, clock, kind, error, on_opening):
-    boards = [start_board(index=0), start_board(index=1, misbehave=f"{kind}:1:1"), start_board(index=2)]
+    sends_results = kind not in {"more-results", "reset-after-done"}
+    boards = [start_board(index=0), start_board(index=2)]
+    boards.insert(1, start_board(index=1, misbehave=f"{kind}:1:1", sends_results=sends_results))
     parts = images(70, (3, 2, 2))
     with MiniCluster.open(endpoints_of(boards), parts, timeout=PATIENCE) as cluster:
         assert outcome(cluster.run(frame(**OWN))) == expected(parts, frame(**OWN))
@@ -391,7 +396,7 @@ def test_a_board_of_another_register_map_is_refused(start_board):
 @pytest.mark.parametrize("words", [-1, 0, 1])
 def test_an_interrupt_has_exactly_the_results_of_its_board(words):
     board = DrivenBoard(0, parse_endpoint("unix:/nowhere"), images(1, (3,))[0])
-    board.waiting = True
+    board.waiting = board.sends_results = True
     status = in_field(rm.STATUS_STATE_MASK, BoardState.DONE)
     status |= in_field(rm.STATUS_STOP_REASON_MASK, StopReason.OVERFLOW)
     done = Done(board.number, status, 9, 100, memoryview(bytes(4 * (3 + words))))

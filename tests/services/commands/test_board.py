@@ -4,6 +4,8 @@ import shutil
 
 import pytest
 
+from pcie_shim import register_map as rm
+from services.boards.processes import blank_board
 from services.commands.board import app as board
 from services.commands.loader import app as loader
 from services.commands.master import app as master
@@ -55,20 +57,22 @@ def test_a_service_serves_no_master_on_the_network(service, boat):
 
 def test_as_many_boards_as_the_deployment_has(boat, tmp_path, monkeypatch):
     class Counted:
-        def __init__(self, directory, count, *_):
+        def __init__(self, directory, count, _restarts, settings, hardware):
             assert directory == tmp_path / "boards"
             counted.append(count)
+            sending.append(blank_board(0, settings, hardware).read(rm.CAP_LINK, 1)[0])
 
         def run(self):
             raise SettingsError("counted")
 
-    counted = []
+    counted, sending = [], []
     monkeypatch.setattr("services.commands.board.BoardProcesses", Counted)
     ended = invoke(board, ["-d", boat.directory, "--directory", tmp_path / "boards"])
     assert (ended.exit_code, counted) == (2, [len(boat.boards)])
     monkeypatch.setenv("BM_DEPLOYMENT", str(boat.directory))
-    invoke(board, ["--boards", "2", "--directory", tmp_path / "boards"])
+    invoke(board, ["--boards", "2", "--directory", tmp_path / "boards", "--read-results"])
     assert counted.pop() == 2, "a number that is given counts"
+    assert sending == [1, 0]
 
 
 def test_a_folder_stands_for_all_boards_in_it(boat):
