@@ -237,9 +237,9 @@ def test_accesses_are_answered_and_refused_alike(parameters, compiled_into):
                     while board.running:
                         board.step()
             assert simulated.done == emulated.done
-            for address, words in [(rm.DONE, simulated.interrupt_words()), *answer_blocks(of, simulated)]:
-                wanted = emulated.read(address, len(words) // 4)
-                assert compared(words, address) == compared(wanted, address)
+            for address, found in [(rm.DONE, simulated.interrupt_words()), *answer_blocks(of, simulated)]:
+                wanted = emulated.read(address, len(found) // 4)
+                assert compared(found, address) == compared(wanted, address)
     assert emulated.done == 10
     assert {ErrorCode.OUTSIDE, ErrorCode.TOO_LONG, ErrorCode.READ_ONLY, ErrorCode.MISALIGNED} <= refused
 
