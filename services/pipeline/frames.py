@@ -17,7 +17,7 @@ from services.pipeline.synchroniser import Synchroniser
 from services.sockets.records import Addresses, Reading, Values
 from toolchain.deployment import Deployment, Variable
 from toolchain.deployment.address import to_address
-from toolchain.errors import ReadingError
+from toolchain.errors import ReadingError, ReadingMissingError
 
 UNPAIRED_WARNING = 8
 """If every needed topic has this many unpaired messages, a gap between their stamps is reported."""
@@ -60,10 +60,9 @@ class _SourceReader:
         self, variable: Variable, field: Field, message: dict[str, Any]
     ) -> tuple[int | list[int] | None, object]:
         """Return the address of a variable, and its value as received."""
-        present, value = field.value(message)
-        if not present and variable.on_missing == "error":
-            # one error for all of them, because a message without one variable often lacks others too
-            raise all_missing(self._missing(message), message)
+        value = field.value(message)[1]
+        if value is None and variable.on_missing == "error":
+            self._require_all(message)
         if variable.name not in self._arrays:
             return to_address(variable, value), value
         # imported here, because a subscriber of single numbers does not need NumPy
@@ -71,12 +70,21 @@ class _SourceReader:
 
         return to_addresses(self._deployment, variable, value), None
 
-    def _missing(self, message: dict[str, Any]) -> list[Field]:
-        return [
-            field
-            for variable, field in self._fields
-            if variable.on_missing == "error" and not field.value(message)[0]
-        ]
+    def _require_all(self, message: dict[str, Any]) -> None:
+        """Raise one error for everything that a message lacks, unless that is a single null."""
+        # often several are missing, such as all of one sensor
+        needed = [field for variable, field in self._fields if variable.on_missing == "error"]
+        if self._prior is not None and not self._prior_optional:
+            needed.append(self._prior)
+        found = [(field, *field.value(message)) for field in needed]
+        missing = {field: present for field, present, value in found if value is None}
+        if not any(missing.values()):
+            raise all_missing(list(missing), message)
+        if len(missing) > 1:
+            names = ", ".join(field.name for field in missing)
+            raise ReadingMissingError(
+                f"{names} are absent or null (NaN is null in JSON), and this deployment needs them (on_missing = error)"
+            )
 
     def _prior_codes(self, message: dict[str, Any]) -> bytes:
         if self._prior is None:
@@ -85,6 +93,7 @@ class _SourceReader:
         if not present or value is None:
             if self._prior_optional:
                 return b""
+            self._require_all(message)
             raise self._prior.missing(message)
         from toolchain.deployment.address_array import written_prior
 

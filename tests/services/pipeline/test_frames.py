@@ -58,6 +58,20 @@ def test_all_missing_variables_are_named():
         frames.take(0, {"D2": 1}, 0, 0)
     assert ["D1" in str(caught.value), "'D3'" in str(caught.value)] == [True, True]
     assert "'D4'" not in str(caught.value)
+    # a null is missing too, and so is a prior that the deployment needs
+    prior = WrittenPrior(source=0, path="belief", on_missing="error")
+    needs_prior = deployment(variable("D1"), variable("D2")).model_copy(update={"prior": prior})
+    for message, names in (
+        ({"D2": None}, ("D1", "D2", "belief")),
+        ({"D1": 1}, ("D2", "belief")),
+        ({"D1": None, "D2": 1, "belief": [1.0] * 4}, ("D1",)),
+        ({"D1": 1, "D2": 1}, ("belief",)),
+        ({"D1": 1, "D2": 1, "belief": None}, ("belief",)),
+    ):
+        with pytest.raises(VariableError) as caught:
+            FrameAssembler(needs_prior).take(0, message, 0, 0)
+        said = str(caught.value).partition("; it has")[0]
+        assert [name for name in ("D1", "D2", "belief") if name in said] == list(names)
 
 
 @pytest.mark.parametrize("message", [{}, {"D1": None}, {"D1": float("nan")}, {"D1": []}])

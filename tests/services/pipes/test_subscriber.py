@@ -8,6 +8,7 @@ import socket
 import pytest
 
 from bridge.client import connect
+from bridge.errors import FieldMissingError
 from services.pipeline.connections import NotReceivableError
 from services.pipes.subscriber import print_addresses, print_variables
 from services.settings import Settings
@@ -50,6 +51,17 @@ async def test_a_topic_of_another_type_is_named_at_once(boat, of_deployment):
         )
         with pytest.raises(NotReceivableError, match=r"is std_msgs/String at .*, not boat_msgs/Sensors; use"):
             await printing
+
+
+async def test_all_variables_that_are_not_found_are_named(capsys):
+    async with FakeRosbridge() as fake:
+        source, names = Source(uri=fake.uri, topic="/t", type="p/T"), ["D7", "pose.x", "B9"]
+        printing = asyncio.create_task(print_variables(Settings(), source, names, 1))
+        await fake.wait_for_op("subscribe", topic="/t")
+        await fake.publish("/t", {"pose": {"x": 1}})
+        with pytest.raises(FieldMissingError, match=r"no fields 'D7', 'B9'; it has pose\.x"):
+            await printing
+    assert capsys.readouterr().out == ""
 
 
 async def test_a_server_that_comes_later_is_waited_for_aloud(capsys):
