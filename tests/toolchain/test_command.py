@@ -60,6 +60,7 @@ def test_mistakes(case, arguments, named):
 
 MACHINE = {
     "machine": MachineChoice.BM1,
+    "thesis": True,
     "sequencer": Sequencer.RANDOM,
     "literal": True,
     "sample_every": SampleEvery.MOVE,

@@ -14,8 +14,8 @@ from typing import Annotated, Final, TypeAlias, TypeVar
 
 import typer
 
-from machines.parameters import RngKind
-from toolchain.building.options import BuildOptions
+from machines.parameters import RngKind, RngReset
+from toolchain.building.options import BuildOptions, Thesis
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
 from toolchain.flags import MaxCycles, Partitions, ReadingColumns, StopWhen
@@ -104,6 +104,7 @@ class Sweep:
     steps: Annotated[
         str, typer.Option(help="Steps of a generator per cycle; 0: fresh bits.", metavar="LIST")
     ] = "0"
+    thesis: Thesis = False
     partitions: Partitions = 1
     stop: StopWhen = Stop.SLICES
     max_cycles: MaxCycles = 2**17
@@ -145,6 +146,7 @@ class Sweep:
                 max_cycles=self.max_cycles,
                 stop=self.stop,
                 rng=rng,
+                rng_reset=RngReset.FREE if self.thesis else RngReset.BANK,
                 steps_per_clock=steps,
             )
 

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import typer
 from pydantic import Field, ValidationError
@@ -206,6 +206,39 @@ class DeploymentEdits:
     tolerance_s: Annotated[float | None, TOLERANCE] = None
 
 
+THESIS: Final = {
+    "stop": "own",
+    "rng_reset": "free",
+    "steps_per_clock": 1,
+    "interface": "20x1200",
+    "partitions": 4,
+    "sequencer": "linear",
+    "literal": True,
+    # `toolchain explore` has a list of steps
+    "steps": "1",
+}
+"""The defaults of `--thesis`: the machine of the thesis, as a value for each flag that a command may have."""
+
+
+def _use_thesis(context: typer.Context, value: bool) -> bool:
+    """Replace the defaults of the other flags, which are read later; a flag of the command line still wins."""
+    if value:
+        context.default_map = {**THESIS, **(context.default_map or {})}
+    return value
+
+
+Thesis: TypeAlias = Annotated[
+    bool,
+    typer.Option(
+        "--thesis",
+        help="The machine of the thesis: --stop own, --rng-reset free, one step per clock, --interface 20x1200, "
+        "--partitions 4; BM2: --literal, --sequencer linear. A flag given beside it wins.",
+        is_eager=True,
+        callback=_use_thesis,
+    ),
+]
+
+
 class MachineChoice(StrEnum):
     """The machine for a model."""
 
@@ -225,6 +258,7 @@ class CommonOptions:
             help="auto: a BM1 if the known variables are independent given the searched ones, or a BM2."
         ),
     ] = MachineChoice.AUTO
+    thesis: Thesis = False
     partitions: Partitions = 1
     prob_bits: Annotated[
         int | None, typer.Option(help="Bits of a code.", min=1, max=16, show_default="8; BM2, filter: 16")
@@ -289,7 +323,10 @@ class BM2Options:
         Sequencer.LINEAR
     )
     literal: Annotated[
-        bool, typer.Option("--literal", help="All CDEs of a BM2 must agree, also those without the bit.")
+        bool,
+        typer.Option(
+            "--literal/--no-literal", help="All CDEs of a BM2 must agree, also those without the bit."
+        ),
     ] = False
     sample_every: Annotated[SampleEvery, typer.Option(help="A sample of a BM2 after each sweep or move.")] = (
         SampleEvery.SWEEP
@@ -301,10 +338,14 @@ class BM2Options:
     ] = 0
 
 
-def given_flags(options: object, group: type[BM1Options | BM2Options]) -> list[str]:
-    """Return the flags of a group that do not have their defaults."""
-    names = [each.name for each in fields(group) if getattr(options, each.name) != each.default]
-    return [_flag(name) for name in names]
+def given_flags(options: CommonOptions, group: type[BM1Options | BM2Options]) -> list[str]:
+    """Return the flags of a group that do not have their defaults; `--thesis` has some for both machines."""
+    preset = THESIS if options.thesis else {}
+    return [
+        _flag(each.name)
+        for each in fields(group)
+        if getattr(options, each.name) not in (each.default, preset.get(each.name, each.default))
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,6 +4,7 @@ It has no dates or paths, so the same input gives the same bytes.
 """
 
 from collections.abc import Sequence
+from typing import Final
 
 from machines.bm2 import BM2Machine
 from machines.parameters import PriorMode, SensorMode
@@ -13,6 +14,12 @@ from toolchain.building.quantise import Quantised
 from toolchain.deployment import Deployment, MachineSection
 from toolchain.models.model import Model
 from toolchain.models.network import NetworkModel
+
+SHARED_BITS: Final = {
+    "BM1": "means are correct, but counts vary up to 2.6 times as much",
+    "BM2": "this biases all samples",
+}
+"""What it does to a machine that random numbers share bits with those of the next cycle, as a clause."""
 
 
 def build_report(model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str) -> str:
@@ -97,10 +104,13 @@ def _report(
 
 
 def _generators(machine: MachineSection) -> str:
-    return (
-        f"{machine.rng} with {machine.rng_banks} banks, rng_reset = {machine.rng_reset}, {machine.steps_per_clock} steps "
-        "per clock."
+    steps = f"{machine.steps_per_clock} step{'' if machine.steps_per_clock == 1 else 's'}"
+    text = (
+        f"{machine.rng} with {machine.rng_banks} banks, rng_reset = {machine.rng_reset}, {steps} per clock."
     )
+    if machine.rng.lfsr_bits is not None and machine.steps_per_clock < machine.prob_bits:
+        text += f" With so few steps, consecutive random numbers share bits: {SHARED_BITS[machine.type]}."
+    return text
 
 
 def _boards(deployment: Deployment, what: str, places: Sequence[str]) -> str:

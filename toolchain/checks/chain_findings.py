@@ -19,6 +19,7 @@ from machines.rng import LFSR
 from toolchain.analysis.chain import ChainError, agreement, chain_error
 from toolchain.analysis.logic import BLOCK_SHAPES, blocks_of, device_named
 from toolchain.building.bm2_machine import clipped
+from toolchain.building.report import SHARED_BITS
 from toolchain.checks.findings import Check, Finding, Severity, error, note, reading, warning
 from toolchain.checks.generators import fresh_numbers, relations
 from toolchain.deployment import Deployment
@@ -285,7 +286,7 @@ def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]
     p, about = chain.machine.parameters, f"rng = {chain.machine.parameters.rng}"
     width, boards, sets = p.rng.lfsr_bits, p.chains, p.rng_banks * p.chains
     wider = "" if p.rng is RngKind.LFSR32 else "--rng lfsr32, or "
-    yield from fresh_numbers(p, "this biases all samples")
+    yield from fresh_numbers(p, SHARED_BITS["BM2"])
     if width is None:
         return
     seeds = LFSR(p.rng).seeds(np.arange(sets * p.cdes, dtype=np.uint64))

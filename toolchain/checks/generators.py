@@ -18,6 +18,7 @@ from machines.bm1 import BM1Machine
 from machines.bm2 import BM2Parameters
 from machines.parameters import BM1Parameters, RngKind, RngReset
 from machines.rng import LFSR
+from toolchain.building.report import SHARED_BITS
 from toolchain.checks.findings import Check, CheckedMachine, Finding, Severity, error, note, warning
 from toolchain.outputs.memories import seed_words
 
@@ -35,7 +36,7 @@ def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
             "use an LFSR for a board",
         )
         return
-    yield from fresh_numbers(parameters, "means are correct, but counts vary up to 2.6 times as much")
+    yield from fresh_numbers(parameters, SHARED_BITS["BM1"])
     width = parameters.rng.lfsr_bits
     length = 2**width - 1 if width is not None else len(_table(machine.board))
     yield from _period(machine, length)
@@ -52,9 +53,11 @@ def fresh_numbers(p: BM1Parameters | BM2Parameters, effect: str) -> Iterator[Fin
             "every frame uses the same random numbers, so averaging over frames does not remove their error"
         )
         yield warning(Check.RNG_BANKS, "rng_banks = 1", what, "use --rng-banks 16, or --rng-reset free")
-    if p.rng.lfsr_bits is not None and p.steps_per_clock < p.prob_bits:
+    # both together are the generators of `--thesis`, which are meant; the report of the build says what they do
+    thesis = p.rng_reset is RngReset.FREE and p.steps_per_clock == 1
+    if p.rng.lfsr_bits is not None and p.steps_per_clock < p.prob_bits and not thesis:
         what = f"numbers of {p.prob_bits} bits share {p.prob_bits - p.steps_per_clock} bits with those of the next cycle: {effect}"
-        advice = "omit --steps-per-clock, except for the thesis's machine"
+        advice = "omit --steps-per-clock, except for the thesis's machine (--thesis)"
         yield warning(Check.RNG_STEPS, f"steps_per_clock = {p.steps_per_clock}", what, advice)
 
 
