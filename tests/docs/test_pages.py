@@ -86,6 +86,27 @@ def test_the_commands_of_readme_and_its_doors_exist_with_their_flags():
     assert checked >= 20
 
 
+def every_flag(group):
+    """The flags of all subcommands, and of theirs."""
+    found = set()
+    for name in group.commands:
+        command = group.resolve_command(None, [name])[1]
+        found |= {name for each in command.params for name in (*each.opts, *each.secondary_opts)}
+        if hasattr(command, "commands"):
+            found |= every_flag(command)
+    return found
+
+
+def test_flags_and_files_on_the_page_about_the_thesis_exist():
+    page = PAGES["docs/explanation/thesis.md"]
+    flags = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", page))
+    assert len(flags) > 20
+    assert not flags - every_flag(get_command(app))
+    files = set(re.findall(r"`((?:scripts|machines|tests|hdl)/[\w./]*\w)", page))
+    assert len(files) > 5
+    assert not [file for file in files if not (ROOT / file).exists()]
+
+
 def test_units_and_settings_of_the_pages_about_operation_are_known():
     text = "".join(PAGES[f"docs/how-to/{name}.md"] for name in ("containers", "hosts", "operating"))
     units = re.findall(r"`/etc/systemd/system/[\w@.-]+`:\n\n```ini\n(.*?)```", text, re.DOTALL)
