@@ -84,7 +84,15 @@ MACHINE = {
     "replicas": 15,
 }
 TARGETED = TargetOptions(
-    uri="ws://a:1", topic="/b", type="c/D", output="/e", prior_path="f", queue=Queue.ALL, tolerance_s=0.7
+    uri="ws://a:1",
+    topic="/b",
+    type="c/D",
+    output="/e",
+    order="B,A",
+    path=["A=g"],
+    prior_path="f",
+    queue=Queue.ALL,
+    tolerance_s=0.7,
 )
 
 

@@ -33,7 +33,7 @@ from toolchain.building.machine import (
     split,
     whole_machine,
 )
-from toolchain.building.options import refused_option
+from toolchain.building.options import placed, refused_option
 from toolchain.building.quantise import Quantised, quantise
 from toolchain.building.report import bm2_report, build_report
 from toolchain.deployment import (
@@ -247,6 +247,7 @@ def _variables(plan: MachinePlan | BM2Plan) -> tuple[Variable, ...]:
     """Return the known variables; with `threshold`, the values of a sensor are the codes."""
     options, variables = plan.options, plan.model.variables
     variables = variables if options.sources is None else options.sources.place(variables)
+    variables = placed(variables, options.order, options.path)
     if options.sensor_mode is not SensorMode.THRESHOLD:
         return tuple(variables)
     bits = plan.parameters.prob_bits
@@ -255,6 +256,7 @@ def _variables(plan: MachinePlan | BM2Plan) -> tuple[Variable, ...]:
             name=variable.name,
             source=variable.source,
             path=variable.path,
+            table_of=variable.table_of,
             bits=bits,
             values=2**bits - 1,
             on_missing=variable.on_missing,

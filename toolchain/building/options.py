@@ -17,7 +17,7 @@ from toolchain.bounded_files import TomlFile, nearest_name
 from toolchain.deployment import Output, Queue, Scale, Source, Stop, Variable, WrittenPrior
 from toolchain.deployment.sections import MessagePath, Name, Section, Sequence
 from toolchain.errors import BuildError, ToolchainError
-from toolchain.flags import MAX_CYCLES, STOP, Partitions, StopWhen
+from toolchain.flags import MAX_CYCLES, STOP, Partitions, StopWhen, key_values, names_in
 
 if TYPE_CHECKING:
     import numpy as np
@@ -138,6 +138,43 @@ def read_sources(path: Path, uri: str | None) -> SourcesFile:
     return file
 
 
+def placed(
+    variables: tuple[Variable, ...], order: str | None, path: list[str] | None
+) -> tuple[Variable, ...]:
+    """Return variables with `--order` and `--path`, or raise a BuildError.
+
+    With an order, a column keeps its table and its conversion to addresses; its name, source and path change.
+    """
+    columns = {variable.name: variable for variable in variables if variable.kind == "sensor"}
+    names = names_in("--order", order or "") or list(columns)
+    if unknown := next((name for name in names if name not in columns), None):
+        raise BuildError(
+            f"--order {order}: there is no sensor '{unknown}'; {nearest_name(unknown, list(columns))}"
+        )
+    if sorted(names) != sorted(columns):
+        raise BuildError(
+            f"--order {order}: expected each of {', '.join(columns)} once, in the order of the columns"
+        )
+    readings = dict(zip(columns, (columns[name] for name in names), strict=True))
+    paths, known = key_values(path or (), "--path", "range=data[0]"), [each.name for each in variables]
+    if unknown := next((name for name in paths if name not in known), None):
+        raise BuildError(
+            f"--path {unknown}={paths[unknown]}: there is no variable '{unknown}'; {nearest_name(unknown, known)}"
+        )
+    found = []
+    for variable in variables:
+        reading, table = readings.get(variable.name, variable), variable.table_of or variable.name
+        found.append(
+            variable.replace(
+                name=reading.name,
+                source=reading.source,
+                path=paths.get(reading.name, reading.path),
+                table_of=None if table == reading.name else table,
+            )
+        )
+    return tuple(found)
+
+
 _FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path", "shared": "--per-cell"}
 """Flags with other names than their fields."""
 
@@ -155,6 +192,8 @@ URI: Final = typer.Option(help="rosbridge server of the readings.", metavar="ws:
 TOPIC: Final = typer.Option(help="Topic of the readings.", metavar="TOPIC")
 TYPE: Final = typer.Option(help="Type of the topic.", metavar="PACKAGE/NAME")
 OUTPUT: Final = typer.Option(help="Topic of the posteriors.", metavar="TOPIC")
+ORDER: Final = typer.Option(help="The sensors that columns 1 to N read, in this order.", metavar="A,B,C")
+PATH: Final = typer.Option(help="Path of a variable in the message; repeatable.", metavar="NAME=PATH")
 QUEUE: Final = typer.Option(help="If readings arrive too fast: keep only the latest, or all in order.")
 TOLERANCE: Final = typer.Option(
     "--tolerance",
@@ -177,6 +216,8 @@ class TargetOptions:
     topic: Annotated[str, TOPIC] = ""
     type: Annotated[str, TYPE] = ""
     output: Annotated[str, OUTPUT] = "/BMresults"
+    order: Annotated[str | None, ORDER] = None
+    path: Annotated[list[str] | None, PATH] = None
     prior_path: Annotated[
         str | None, typer.Option(help="Path of a written prior in the message.", metavar="PATH")
     ] = None
@@ -192,13 +233,8 @@ class DeploymentEdits:
     topic: Annotated[str | None, TOPIC] = None
     type: Annotated[str | None, TYPE] = None
     output: Annotated[str | None, OUTPUT] = None
-    order: Annotated[
-        str | None, typer.Option(help="The sensors in the order of columns 1 to N.", metavar="A,B,C")
-    ] = None
-    path: Annotated[
-        list[str] | None,
-        typer.Option(help="Path of a variable in the message; repeatable.", metavar="NAME=PATH"),
-    ] = None
+    order: Annotated[str | None, ORDER] = None
+    path: Annotated[list[str] | None, PATH] = None
     target_count: Annotated[int | None, TARGET_COUNT] = None
     max_cycles: Annotated[int | None, MAX_CYCLES] = None
     stop: Annotated[Stop | None, STOP] = None
@@ -410,9 +446,11 @@ def refused_option(reason: ValidationError) -> BuildError:
     """Return the error for an option that pydantic refuses, with the flag of the field."""
     detail = reason.errors(include_url=False)[0]
     key = str(detail["loc"][0]) if detail["loc"] else ""
-    flag = {"Output": "--output", "BM2Section": _flag(key).replace("--target-count", "--samples")}.get(
-        reason.title, _flag(key)
-    )
+    flag = {
+        "Output": "--output",
+        "Variable": "--path",
+        "BM2Section": _flag(key).replace("--target-count", "--samples"),
+    }.get(reason.title, _flag(key))
     if detail["type"] == "value_error":
         sentence = str(detail["ctx"]["error"])
         return BuildError(f"{flag}: {sentence}" if key else sentence)

@@ -13,11 +13,10 @@ from toolchain.building.bm2_machine import BM2_KEYS, BM2Plan, chain_layout, plan
 from toolchain.building.build import REPORT_NAME, assemble, check_agreement, read_images
 from toolchain.building.choice import model_for
 from toolchain.building.machine import MACHINE_KEYS, MachinePlan, board_layout, machine_options, plan_machine
-from toolchain.building.options import BuildOptions, DeploymentEdits, MachineChoice, refused_option
-from toolchain.deployment import FILE_NAME, BM2Section, Deployment, Variable, deployment_text, load_deployment
+from toolchain.building.options import BuildOptions, DeploymentEdits, MachineChoice, placed, refused_option
+from toolchain.deployment import FILE_NAME, BM2Section, Deployment, deployment_text, load_deployment
 from toolchain.deployment.deployment import with_hash
 from toolchain.errors import BuildError, ModelError
-from toolchain.flags import key_values, names_in
 from toolchain.models.joint import Question
 from toolchain.models.model import Model
 from toolchain.outputs.output_files import (
@@ -48,7 +47,7 @@ def edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
         changed = deployment.replace(
             sources=(first_source.replace(**target), *sources),
             outputs=(first_output.replace(**_defined(topic=edits.output)), *outputs),
-            variables=_with_paths(_in_order(deployment.variables, edits.order), edits.path or ()),
+            variables=placed(deployment.variables, edits.order, edits.path),
             machine=deployment.machine.replace(**machine),
             **_defined(queue=edits.queue, tolerance_s=edits.tolerance_s),
         )
@@ -59,40 +58,6 @@ def edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
 
 def _defined(**values: object) -> dict[str, object]:
     return {key: value for key, value in values.items() if value is not None}
-
-
-def _in_order(variables: tuple[Variable, ...], given: str | None) -> tuple[Variable, ...]:
-    """Return the variables in a new order of columns.
-
-    A column keeps its table and its conversion to addresses; its name, source and path change.
-    """
-    if given is None:
-        return variables
-    order = names_in("--order", given)
-    columns = {variable.name: variable for variable in variables if variable.kind == "sensor"}
-    if sorted(order) != sorted(columns):
-        raise BuildError(
-            f"--order {','.join(order)}: expected each of {', '.join(columns) or 'no sensors'} once, in the order of "
-            "the columns"
-        )
-    readings = dict(zip(columns, (columns[name] for name in order), strict=True))
-    return tuple(
-        variable.replace(name=reading.name, source=reading.source, path=reading.path)
-        if (reading := readings.get(variable.name))
-        else variable
-        for variable in variables
-    )
-
-
-def _with_paths(variables: tuple[Variable, ...], given: Sequence[str]) -> tuple[Variable, ...]:
-    paths = key_values(given, "--path", "range=data[0]")
-    names = [variable.name for variable in variables]
-    for name, path in paths.items():
-        if name not in names:
-            raise BuildError(
-                f"--path {name}={path}: there is no such variable; there are {', '.join(names) or 'none'}"
-            )
-    return tuple(variable.replace(path=paths.get(variable.name, variable.path)) for variable in variables)
 
 
 Changes = list[tuple[str, Change]]
@@ -211,10 +176,11 @@ def _plan(
 def _with_widths(model: Model, deployment: Deployment) -> Model:
     """Return the model with the address widths of the deployment, or raise a BuildError if it needs another machine."""
     kinds = {variable.name: variable.kind for variable in model.variables}
-    built_kinds = {variable.name: variable.kind for variable in deployment.variables}
+    built = {variable.table_of or variable.name: variable for variable in deployment.variables}
+    built_kinds = {name: variable.kind for name, variable in built.items()}
     if kinds != built_kinds:
         raise BuildError("another variable now selects the prior: build it again with 'toolchain build'")
-    bits = {variable.name: variable.bits for variable in deployment.variables}
+    bits = {name: variable.bits for name, variable in built.items()}
     select = model.prior_select
     if (
         deployment.machine.sensor_mode is SensorMode.THRESHOLD
@@ -239,13 +205,19 @@ def _listed(values: Sequence[object]) -> str:
 
 
 def _with_places(new: Deployment, old: Deployment) -> Deployment:
-    """Return the new deployment with the servers, topics, paths and endpoints of the old one."""
-    before = {variable.name: variable for variable in old.variables}
+    """Return the new deployment with the servers, topics, order, paths and endpoints of the old one."""
+    before = {variable.table_of or variable.name: variable for variable in old.variables}
     kept = ("sources", "outputs", "topics", "queue", "tolerance_s", "prior", "directory")
     deployment = new.replace(
         **{key: getattr(old, key) for key in kept},
         variables=tuple(
-            variable.replace(source=own.source, path=own.path, unit=variable.unit or own.unit)
+            variable.replace(
+                name=own.name,
+                source=own.source,
+                path=own.path,
+                table_of=own.table_of,
+                unit=variable.unit or own.unit,
+            )
             for variable in new.variables
             for own in (before[variable.name],)
         ),

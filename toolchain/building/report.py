@@ -26,7 +26,9 @@ def build_report(model: Model, deployment: Deployment, quantised: Quantised, int
     """Return the report of a BM1."""
     machine = deployment.machine
     grid = " x ".join(f"{d.label} {d.size}" for d in model.searched)
-    names = ", ".join(known.name for known in model.known)
+    names = ", ".join(
+        each.name + (f" (table of {each.table_of})" if each.table_of else "") for each in deployment.sensors
+    )
     count = f"{len(model.known)} known variable{'s' if len(model.known) != 1 else ''}"
     if names:
         names = f", in the order of the columns: {names}" if len(model.known) > 1 else f", {names}"

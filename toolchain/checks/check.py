@@ -159,7 +159,7 @@ def _same_readings(deployment: Deployment) -> Iterator[Finding]:
                 Check.SAME_READING,
                 " and ".join(names),
                 f"they all have the path {path}",
-                "give each its own path, in the model or with 'toolchain regenerate deployment --path'",
+                "give each its own path, in the model or with --path",
             )
 
 

@@ -92,7 +92,7 @@ def build(
 
 def check(
     context: typer.Context,
-    path: Annotated[
+    checked: Annotated[
         Path,
         typer.Argument(
             help="Folder with model.py, a network file, or the folder of a deployment.", metavar="MODEL|DIR"
@@ -118,15 +118,17 @@ def check(
     from toolchain.deployment import FILE_NAME
     from toolchain.models import case_study
 
-    if (path / FILE_NAME).is_file() and not (path / case_study.FILE_NAME).is_file():
+    if (checked / FILE_NAME).is_file() and not (checked / case_study.FILE_NAME).is_file():
         for flag in _model_flags(context):
-            raise BuildError(f"{flag} is for a model; {path} is a deployment, which was built with its own")
-        findings = check_deployment(path)
-    elif is_network(path) or case_study.model_path(path).is_file():
-        findings = _of_model(path, flags, target, sources)
+            raise BuildError(
+                f"{flag} is for a model; {checked} is a deployment, which was built with its own"
+            )
+        findings = check_deployment(checked)
+    elif is_network(checked) or case_study.model_path(checked).is_file():
+        findings = _of_model(checked, flags, target, sources)
     else:
         raise BuildError(
-            f"{path} contains neither a model ({case_study.FILE_NAME}) nor a deployment ({FILE_NAME}), and is not a "
+            f"{checked} contains neither a model ({case_study.FILE_NAME}) nor a deployment ({FILE_NAME}), and is not a "
             "network's file"
         )
     for finding in findings:
@@ -136,7 +138,7 @@ def check(
         summary = ", ".join(
             f"{counts[severity]} {severity}{'' if counts[severity] == 1 else 's'}" for severity in Severity
         )
-        typer.echo(f"{path}: {summary}", err=True)
+        typer.echo(f"{checked}: {summary}", err=True)
     raise typer.Exit(ToolchainError.exit_code if counts[Severity.ERROR] else 0)
 
 
@@ -144,7 +146,7 @@ def _model_flags(context: typer.Context) -> list[str]:
     given = []
     for each in context.command.params:
         source = context.get_parameter_source(each.name or "")
-        if source is not None and source.name == "COMMANDLINE" and each.name not in {"path", "json"}:
+        if source is not None and source.name == "COMMANDLINE" and each.name not in {"checked", "json"}:
             given.append(max(each.opts, key=len))
     return given
 

@@ -214,6 +214,8 @@ class Variable(Section):
     name: Name
     source: int = Field(default=0, ge=0)
     path: PathOrName = ""
+    # the model's variable whose table the column has, if --order gave the column the readings of another
+    table_of: Name | None = Field(default=None, exclude_if=lambda table: table is None)
     kind: Literal["sensor", "prior_select"] = "sensor"
     bits: int = Field(ge=1, le=16)
     offset: float = 0.0

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.toolchain.running import TARGET, contents, done, toolchain
+from tests.toolchain.running import TARGET, assert_refused, contents, done, toolchain
 from toolchain.building.options import DeploymentEdits
 from toolchain.building.regenerate import edited
 from toolchain.deployment import load_deployment
@@ -117,6 +117,35 @@ def test_a_wrong_order_of_readings_is_mended_without_touching_the_rest(built):
     assert {name for name in before if before[name] != after[name]} == {"deployment.toml"}
     regenerate("deployment", built, "--order", "D1,D2")
     assert contents(built) == before
+
+
+PLACES = ("--order", "D2,D1", "--path", "D1=data[7]")
+
+
+def test_what_a_build_was_told_about_places_is_not_asked_again(case, built):
+    """The flags mean the same in both commands, and new tables keep the order and paths, as readings go by them."""
+    once = build(case, "once", *OPTIONS, *PLACES)
+    regenerate("deployment", built, *PLACES)
+    assert (once / "deployment.toml").read_bytes() == (built / "deployment.toml").read_bytes()
+    assert "D2 (table of D1), D1 (table of D2)" in (once / "report.txt").read_text()
+    before = contents(once)
+    regenerate("memories", once, "--model", case)
+    assert contents(once) == before
+    regenerate("memories", once, "--model", case, "--set", "sigma=0.5")
+    found = [(each.name, each.path, each.bits, each.table_of) for each in load_deployment(once).variables]
+    assert found == [("D2", "data[1]", 6, "D1"), ("D1", "data[7]", 4, "D2")]
+    regenerate("deployment", once, "--order", "D1,D2")
+    assert [each.table_of for each in load_deployment(once).variables] == [None, None]
+
+
+@pytest.mark.parametrize("wrong", [("--order", "D1,D22"), ("--path", "D22=data[1]")])
+def test_a_misspelt_variable_is_named_with_the_nearest_one(case, built, wrong):
+    for result in (
+        toolchain("build", case, "-o", case.parent / "new", *TARGET, *wrong),
+        regenerate("deployment", built, *wrong, code=2),
+    ):
+        assert_refused(result, wrong[0], "did you mean 'D2'?")
+    assert not (case.parent / "new").exists()
 
 
 def test_every_edit_of_the_deployment(built):
