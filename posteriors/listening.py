@@ -295,8 +295,8 @@ def listen(
     connection. A lost connection is restored. Ctrl-C ends the loop normally.
 
     Args:
-        server: The URI of a rosbridge server, or an unopened `connect(...)` with further options (a token, a
-            proxy).
+        server: The URI of a rosbridge server or `robot:NAME`, or an unopened `connect(...)` with further options
+            (a token, a proxy).
         function: Called with each `Posterior`. Its exceptions end the loop and propagate; returning False
             also ends the loop.
         count: Number of posteriors after which to return; None for no limit.

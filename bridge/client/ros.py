@@ -14,17 +14,20 @@ from dataclasses import replace
 from ssl import SSLContext
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
+from websockets.uri import WebSocketURI
+
 from bridge.client.actions import ActionServer, Goal, GoalHandler
 from bridge.client.handles import PUBLISH_QUEUE_SIZE, QUEUE_SIZE, Handler, Publication, Service, Subscription
 from bridge.client.protocol import ClientCore, Compression, Delivery, RosVersion
 from bridge.client.protocol.events import StatusReceived
 from bridge.client.rosapi import NodeDetails, Params, TypeChecks
-from bridge.client.route import Path, make_route, shown
+from bridge.client.route import Path, Route, make_route, shown
 from bridge.client.session import Session, State, StateCallback
 from bridge.client.websocket import Limits, check_uri
 from bridge.codecs.cbor_codec import Arrays
 from bridge.codecs.json_codec import MAX_SIZE
 from bridge.codecs.message_check import Definitions, definitions_from_rosapi
+from bridge.discovery import ROBOT, announced_uri
 from bridge.errors import ActionlibError, OptionError
 from bridge.names import ros2_type, ros_version_of_type
 from bridge.qos import Qos
@@ -477,7 +480,8 @@ def connect(
     advertisements, subscriptions and services.
 
     Args:
-        uri: `ws://host:port`, or `wss://` for TLS; the certificate is always verified.
+        uri: `ws://host:port`, or `wss://` for TLS, whose certificate is always verified; or `robot:NAME`, which is
+            looked up when the client is opened (`bridge.discovery`).
         connect_timeout: Timeout of the first connection in seconds.
         retry: Whether to repeat the first attempt until `connect_timeout` is over, while nothing answers at the URI;
             `on_state` is then called with `CONNECTING` and the reason, once.
@@ -502,7 +506,8 @@ def connect(
 
     Raises:
         UriError: The URI is not a WebSocket URI.
-        OptionError: An option is out of its range, or a file cannot be read.
+        OptionError: An option is out of its range, or a file cannot be read. For `robot:NAME`, errors about
+            the route are raised when the client is opened.
     """
     if ros_version not in {"auto", "1", "2"}:
         raise OptionError(f"ros_version must be auto, 1 or 2, not {ros_version!r}")
@@ -513,18 +518,27 @@ def connect(
         ping_timeout=ping_timeout,
     )
     configured_version: RosVersion | None = None if ros_version == "auto" else 1 if ros_version == "1" else 2
-    parsed = check_uri(uri)
-    route = make_route(
-        parsed,
-        token=token,
-        headers=headers,
-        ca_file=ca_file,
-        client_certificate=client_certificate,
-        tls=tls,
-        proxy=proxy,
-    )
+
+    def server(uri: str) -> tuple[WebSocketURI, str, Route]:
+        parsed = check_uri(uri)
+        route = make_route(
+            parsed,
+            token=token,
+            headers=headers,
+            ca_file=ca_file,
+            client_certificate=client_certificate,
+            tls=tls,
+            proxy=proxy,
+        )
+        # The credentials are in the route, whose repr hides them.
+        return replace(parsed, username=None, password=None), shown(uri), route
+
+    # At once where that is possible, so that mistakes are found here and not when the client is opened.
+    known = None if uri.startswith(ROBOT) else server(uri)
+
+    async def locate() -> tuple[WebSocketURI, str, Route]:
+        return known or server(await announced_uri(uri))
+
     core = ClientCore(ros_version=configured_version, max_size=max_size, fragment_size=fragment_size)
-    # The credentials are in the route, whose repr hides them.
-    parsed = replace(parsed, username=None, password=None)
-    session = Session(parsed, shown(uri), core, limits, on_state, route=route, retry=retry)
+    session = Session(shown(uri), locate, core, limits, on_state, retry=retry)
     return Ros(session, check_types=check_types)

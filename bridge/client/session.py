@@ -128,20 +128,19 @@ class Session:
 
     def __init__(
         self,
-        uri: WebSocketURI,
         shown_uri: str,
+        locate: Callable[[], Coroutine[Any, Any, tuple[WebSocketURI, str, Route]]],
         core: ClientCore,
         limits: Limits,
         on_state: StateCallback | None,
         *,
-        route: Route,
         retry: bool = False,
     ) -> None:
-        # URI of the server, without secrets.
+        # URI of the server, without secrets; that of a named robot from the first attempt to connect on.
         self.uri = shown_uri
-        # What each attempt to connect needs.
-        self._parsed_uri = uri
-        self._route = route
+        # What each attempt to connect needs: the URI and the route, which the first one gets from `_locate`.
+        self._locate = locate
+        self._located: tuple[WebSocketURI, Route] | None = None
         self._limits = limits
         self._retry = retry
         # The protocol state: what the program wants, and what waits for an answer.
@@ -269,10 +268,14 @@ class Session:
             await asyncio.wait(ending, timeout=CLOSE_TIMEOUT)
 
     async def _connect(self, seconds: float) -> None:
+        if self._located is None:
+            uri, self.uri, route = await self._locate()
+            self._located = uri, route
+        uri, route = self._located
         websocket = await open_websocket(
-            self._parsed_uri,
+            uri,
             self.uri,
-            route=self._route,
+            route=route,
             timeout=seconds,
             limits=self._limits,
             on_messages=self._take,

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from bridge.client import Publication, Ros, connect
-from bridge.discovery import announced_uri
 from bridge.errors import BridgeError, NotRosbridgeError, TopicLeftOutError, UnreachableError
 from bridge.stamps import header
 from posteriors.axes import Axis, deployment_axes, state_in_words
@@ -123,7 +122,7 @@ class Robot:
         while True:
             try:
                 async with connect(
-                    await announced_uri(self._uri),
+                    self._uri,
                     connect_timeout=self._settings.connect_timeout,
                     ca_file=self._settings.ca,
                     ros_version=self._settings.ros_version,

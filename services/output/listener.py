@@ -3,7 +3,6 @@
 from typing import Final
 
 from bridge.client import connect
-from bridge.discovery import announced_uri
 from posteriors.axes import Axis
 from posteriors.errors import BadResultError, LabelError, NoResultError
 from posteriors.listening import posteriors
@@ -47,7 +46,7 @@ async def show_frames(
     limit: float = settings.first_data_timeout
     async with (
         connect(
-            await announced_uri(uri),
+            uri,
             connect_timeout=settings.connect_timeout,
             retry=True,
             ca_file=settings.ca,

@@ -13,7 +13,6 @@ from functools import partial
 from typing import Any, Final
 
 from bridge.client import Ros, State, connect
-from bridge.discovery import announced_uri
 from bridge.errors import BridgeError
 from bridge.names import absolute, same_type
 from services.settings import Settings
@@ -52,7 +51,7 @@ async def connect_all(
     for uri in uris:
         if (used := settings.uri or uri) not in by_uri:
             by_uri[used] = connect(
-                await announced_uri(used),
+                used,
                 connect_timeout=settings.connect_timeout,
                 retry=True,
                 ca_file=settings.ca,

@@ -13,6 +13,7 @@ import threading
 import pytest
 
 from bridge.client import State, connect
+from bridge.discovery import UnknownRobotError
 from bridge.errors import ConcurrentReadError, DisconnectedError, OptionError, UnreachableError
 from posteriors import BadResultError, NoResultError, listen, posteriors
 from posteriors.frame_report import FrameReport
@@ -277,6 +278,15 @@ def test_a_thread_without_a_loop_raises_in_the_caller(monkeypatch):
     monkeypatch.setattr(asyncio, "new_event_loop", new_event_loop)
     with pytest.raises(OSError, match="Too many"):
         listen("ws://127.0.0.1:1", print)
+
+
+def test_a_robots_name_is_a_server(monkeypatch):
+    async def resolve(name):
+        raise UnknownRobotError(f"no robot called {name}")
+
+    monkeypatch.setattr("bridge.discovery.resolve", resolve)
+    with pytest.raises(UnknownRobotError, match="Zoë"):
+        listen("robot:Zoë", print)
 
 
 async def test_silence_on_a_topic_of_another_type_names_the_type():

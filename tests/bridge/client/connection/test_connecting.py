@@ -14,6 +14,7 @@ from websockets.utils import accept_key
 
 from bridge.client import State, connect
 from bridge.client.websocket import WebSocket
+from bridge.discovery import UnknownRobotError
 from bridge.errors import (
     AccessRefusedError,
     BridgeError,
@@ -55,6 +56,33 @@ async def test_a_uri_that_is_none():
     wrong = ("127.0.0.1:9090", "http://robot:9090", "ws://:9090", "", "ws://robot:70000", "ws://[::1")
     for uri in (*wrong, "ws://" + "a" * 100 + ".local"):
         assert repr(uri) in await fails(uri, UriError)
+
+
+async def test_a_robots_name_is_looked_up_once(fake, monkeypatch):
+    asked = []
+
+    async def resolve(name):
+        asked.append(name)
+        if name == "Adam":
+            raise UnknownRobotError("no robot called Adam")
+        return fake.uri if name == "Zoë" else "http://robot:9090"
+
+    monkeypatch.setattr("bridge.discovery.resolve", resolve)
+    ros = connect("robot:Zoë")
+    assert (ros.uri, asked) == ("robot:Zoë", [])
+    async with ros:
+        assert ros.uri == fake.uri
+        await fake.cut()
+        await fake.wait_for_connections(2)
+    assert asked == ["Zoë"]
+    for name, error in (("Adam", UnknownRobotError), ("Eve", UriError)):
+        ros = connect(f"robot:{name}")
+        with pytest.raises(error):
+            await ros.__aenter__()
+        assert ros.state is State.CLOSED
+    # an option that does not suit the server
+    with pytest.raises(OptionError, match="requires wss://"):
+        await connect("robot:Zoë", ca_file="ca.pem").__aenter__()
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,7 @@ async def test_a_token_and_headers_are_shown_at_the_door_and_nowhere_else(caplog
     async with access(wants=f"Bearer {TOKEN}") as server:
         uri = f"ws://127.0.0.1:{server.port}"
         async with connect(uri, token=TOKEN, headers={"X-Robot": "boat-s3cret"}) as ros:
-            said = [repr(each) for each in (ros, vars(ros), vars(ros._session), ros._session._route)]
+            said = [repr(each) for each in (ros, vars(ros), vars(ros._session), ros._session._located)]
             ros._session._websocket.abort()
             await ros.wait_for_state(State.RECONNECTING, PATIENCE)
             await ros.wait_for_state(State.CONNECTED, PATIENCE)
@@ -274,7 +274,7 @@ async def test_through_a_proxy(certificates, secure, kind):
         uri = f"{'wss' if secure else 'ws'}://localhost:{server.port}"
         async with connect(uri, proxy=proxy.uri, token=TOKEN, **options) as ros:
             assert ros.state is State.CONNECTED
-            assert "s3cret" not in repr(ros._session._route)
+            assert "s3cret" not in repr(ros._session._located)
         if kind is SocksProxy:
             wrong = proxy.uri.replace("s3cret", "wr0ng")
             assert "wr0ng" not in await refused(uri, UnreachableError, proxy=wrong)
