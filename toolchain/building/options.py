@@ -394,7 +394,7 @@ class BuildOptions(MachineOptions, TargetOptions):
     """The options of a build: the values of its flags, and the contents of files that flags name."""
 
     interface: tuple[int, int] | None = None
-    """Inputs and results of the boards' registers; None for the thesis's 20 x 1200, or the size of the model if larger."""
+    """Inputs and results of the boards' registers; None for those that the largest board needs."""
     rng_table: NDArray[np.uint32] | None = None
     """uint32[length], the random numbers for `rng = table`; None to generate them."""
     sources: SourcesFile | None = None

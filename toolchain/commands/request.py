@@ -83,7 +83,7 @@ class BuildFlags(MachineOptions, ModelFlags):
         str | None,
         typer.Option(
             help="Inputs x results of a board's registers.",
-            show_default="20x1200, or the model's size if larger",
+            show_default="what the largest board needs",
             metavar="INPUTSxRESULTS",
         ),
     ] = None

@@ -264,6 +264,7 @@ class CommonSection(Section):
 
     type: str
     lines: int = Field(ge=1)
+    # the default of former builds, whose files may lack the key; a build writes it
     interface: Annotated[str, _matching(_INTERFACE, _AN_INTERFACE)] = "20x1200"
     prob_bits: int = Field(ge=1, le=16)
 

@@ -87,12 +87,14 @@ def test_seeds_that_no_memory_holds(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_interface_grows_with_the_model_and_says_so(tmp_path):
+def test_the_interface_has_the_size_of_the_largest_board_and_says_so(tmp_path):
     built = build_model(model(sensors=21), tmp_path)
-    assert built.deployment.machine.interface == "21x1200"
-    assert "Interface: 21x1200, larger than the default 20x1200: " in built.report
-    default = build_model(model(), tmp_path)
-    assert "Interface: 20x1200.\n" in default.report
+    assert built.deployment.machine.interface == "21x25"
+    assert "Interface: 21x25, which is the size of the largest board.\n" in built.report
+    plan = plan_machine(model(), replace(OPTIONS, partitions=2, interface=(20, 1200)))
+    assert assemble(plan).deployment.machine.interface == "20x1200"
+    split = assemble(replace(plan, options=replace(plan.options, interface=None)))
+    assert split.deployment.machine.interface == "2x13"
     for interface in ((2, 25), (64, 4096)):  # exactly the machine's size, and the register map's
         assemble(plan_machine(model(), replace(OPTIONS, interface=interface)))
 

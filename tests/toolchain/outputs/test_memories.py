@@ -249,7 +249,8 @@ def test_the_package_has_every_parameter(tmp_path, changes):
         f"steps_per_clock={parameters.steps_per_clock} "
         f"rng_reset_bank={parameters.rng_reset is RngReset.BANK} rng_banks={parameters.rng_banks} {seeds} "
         f'target_count=x"{parameters.target_count_max:08x}" max_cycles=x"{131072:016x}" '
-        f'interface_sensors=20 interface_results=1200 map_hash=x"{image.map_hash}" '
+        f"interface_sensors={image.registers.input_words} interface_results={image.registers.result_words} "
+        f'map_hash=x"{image.map_hash}" '
         f'boards={len(images)} model_hash=x"{image.model_hash}" partitions=({partitions})'
     )
     assert constants(tmp_path) == expected.lower().split()
