@@ -16,7 +16,7 @@ import numpy as np
 from machines.bm1 import BM1Machine, Start, addressed_codes
 from machines.bm1_kind import BM1
 from machines.encode import decode_code
-from machines.parameters import BM1Parameters, SensorMode
+from machines.parameters import REPLICAS_MAX, BM1Parameters, SensorMode
 from pcie_shim.register_layout import interface_room
 from toolchain.analysis.emulation import one_replica
 from toolchain.analysis.logic import MLAB_ALMS, MLAB_SHARE, Device, Logic, Memories, logic_of, place_memories
@@ -78,6 +78,25 @@ def estimate(parameters: BM1Parameters, device: Device, *, table_length: int = L
     )
 
 
+def most_replicas(board: BM1Parameters, device: Device, *, table_length: int = LENGTH) -> tuple[int, str]:
+    """Return how many machines with the lines of a board fit it, 0 if none does, and why no more, as a clause."""
+
+    def why_not(replicas: int) -> str:
+        machines = replace(board, replicas=replicas)
+        used = BM1.registers(machines)
+        for what, needed, room in zip(
+            ("input", "result"), (used.input_words, used.result_words), interface_room(used), strict=True
+        ):
+            if needed > room:
+                return f"it takes {needed:,} {what} registers, and the map has {room:,}"
+        return estimate(machines, device, table_length=table_length).why_not
+
+    most = bisect_left(range(1, REPLICAS_MAX + 1), True, key=lambda replicas: why_not(replicas) != "")
+    if most == REPLICAS_MAX:
+        return most, "a board has at most that many"
+    return most, f"with {most + 1}, {why_not(most + 1)}"
+
+
 def boards_needed(
     parameters: BM1Parameters, device: Device, *, table_length: int = LENGTH
 ) -> tuple[int, str]:
@@ -93,9 +112,10 @@ def boards_needed(
     possible = range(1, min(parameters.lines, largest_lines) + 1)
     most = bisect_left(possible, True, key=lambda lines: not on(lines).fits)
     if most == 0 and largest_lines == 0:
+        fewer, _ = most_replicas(replace(parameters, lines=1), device, table_length=table_length)
         raise BuildError(
             f"not even one line of {parameters.replicas} replicas fits the register map: it has room for {room[0]} inputs "
-            f"and {room[1]} results; use fewer --replicas"
+            f"and {room[1]} results; use --replicas {fewer} or fewer"
         )
     if most == 0:
         raise BuildError(
@@ -112,10 +132,10 @@ def boards_needed(
     else:
         reason = f"on one {device.title} {on(parameters.lines).why_not}"
     boards = f"{count} boards" if count > 2 else "two boards"
-    return count, (
-        f"{parameters.lines} lines need {boards}: {reason}; {largest} lines per board take {share}. An estimate, not a "
-        "compilation."
-    )
+    why = f"{parameters.lines} lines need {boards}: {reason}; {largest} lines per board take {share}. An estimate, not a compilation."
+    if parameters.replicas > 1 and (whole := most_replicas(parameters, device, table_length=table_length)[0]):
+        why += f" With --replicas {whole} or fewer, all lines fit one board."
+    return count, why
 
 
 CORE_VOLTAGE: Final = 0.9

@@ -53,7 +53,7 @@ class MachinePlan:
     """The reason for a BM1, as a clause."""
     model: Model
     options: BuildOptions
-    """The options; only the number of boards may still change, because the parameters do not contain it."""
+    """The options; the number of boards may still change, and that of replicas, if they fill a device."""
     parameters: BM1Parameters
     """The parameters of the whole machine, with the lines of all boards."""
     target_count: int
@@ -110,7 +110,7 @@ def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
             lines=model.lines,
             sensor_bits=tuple(prob_bits if per_line_codes else known.bits for known in model.known),
             prior_bits=0 if model.prior_select is None else model.prior_select.bits,
-            **machine_options(options, MACHINE_KEYS),
+            **machine_options(options, MACHINE_KEYS) | {"replicas": options.replicas or 1},
         )
     except ParameterError as reason:
         raise refused_parameter(reason) from reason
@@ -132,8 +132,8 @@ def _filter_options(options: BuildOptions) -> BuildOptions:
     if options.written_prior is not None:
         flag = "--prior-path" if options.sources is None else f"the prior in {options.sources.toml.path}"
         raise BuildError(f"{flag} cannot be used with a filter, which writes the prior itself: leave it out")
-    if options.replicas > 1 or options.sensor_mode is not SensorMode.COLUMN:
-        flag = "--replicas" if options.replicas > 1 else f"--sensor-mode {options.sensor_mode}"
+    if options.replicas != 1 or options.sensor_mode is not SensorMode.COLUMN:
+        flag = "--replicas" if options.replicas != 1 else f"--sensor-mode {options.sensor_mode}"
         raise BuildError(
             f"{flag} cannot be used with a filter, which is one machine with one reading per variable: leave it out"
         )
@@ -224,7 +224,7 @@ def board_layout(
     what = f"{board.sensors} known variables and {board.lines} lines on it"
     if board.replicas > 1:
         what += f", {board.replicas} times"
-    return fitted_layout(blocks, used, interface, what, _advice(parameters, interface_room(used)))
+    return fitted_layout(blocks, used, interface, what, _advice(parameters, used))
 
 
 def fitted_layout(
@@ -263,15 +263,18 @@ def _is_within(needed: tuple[int, int], room: tuple[int, int]) -> bool:
     return needed[0] <= room[0] and needed[1] <= room[1]
 
 
-def _advice(parameters: BM1Parameters, room: tuple[int, int]) -> str:
+def _advice(parameters: BM1Parameters, used: UsedRegisters) -> str:
     """Return advice on fitting the register map, after a colon; empty if there is none."""
+    room = interface_room(used)
     lines = room[1] // parameters.replicas
     if parameters.sensor_mode is not SensorMode.COLUMN and parameters.sensors:
         lines = min(lines, room[0] // (parameters.replicas * parameters.sensors))
     elif parameters.sensors * parameters.replicas > room[0]:
         lines = 0
     ways = [f"--partitions {-(-parameters.lines // lines)} or more"] if lines else []
-    ways += ["fewer --replicas"] if parameters.replicas > 1 else []
+    words = zip((used.input_words, used.result_words), room, strict=True)
+    most = min(place * used.replicas // needed for needed, place in words if needed)
+    ways += [f"--replicas {most} or fewer"] if 0 < most < used.replicas else []
     return f": use {', or '.join(ways)}" if ways else ""
 
 

@@ -12,7 +12,7 @@ import typer
 from pydantic import Field, ValidationError
 
 from machines.errors import ParameterError
-from machines.parameters import PriorMode, RngKind, RngReset, SampleEvery, SensorMode, Sequencer
+from machines.parameters import REPLICAS_MAX, PriorMode, RngKind, RngReset, SampleEvery, SensorMode, Sequencer
 from toolchain.bounded_files import TomlFile, nearest_name
 from toolchain.deployment import Output, Queue, Scale, Source, Stop, Variable, WrittenPrior
 from toolchain.deployment.sections import MessagePath, Name, Section, Sequence
@@ -320,6 +320,19 @@ class CommonOptions:
     ] = 0
 
 
+FILL: Final = 0
+"""`--replicas fill`: the number of machines follows from the device of the boards."""
+
+
+def replica_count(text: str) -> int:
+    """Return the number of `--replicas`, or FILL; click also gives its default, a number."""
+    if text == "fill":
+        return FILL
+    if re.fullmatch(r"\d{1,3}", str(text), re.ASCII) and 1 <= int(text) <= REPLICAS_MAX:
+        return int(text)
+    raise typer.BadParameter(f"{text} is not in the range 1 to {REPLICAS_MAX}, nor fill")
+
+
 @dataclass(frozen=True, kw_only=True)
 class BM1Options:
     """The flags of a build about a BM1, except those that name a file or need parsing."""
@@ -347,7 +360,11 @@ class BM1Options:
     ] = SensorMode.COLUMN
     replicas: Annotated[
         int,
-        typer.Option(help="Number of machines on each board, which share the generators.", min=1, max=256),
+        typer.Option(
+            parser=replica_count,
+            help="Number of machines on each board, which share the generators; fill: as many as fit the --device.",
+            metavar="N|fill",
+        ),
     ] = 1
 
 

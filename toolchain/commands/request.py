@@ -9,9 +9,16 @@ import typer
 
 from machines.parameters import RngKind
 from toolchain.bounded_files import open_regular
-from toolchain.building.options import BuildOptions, MachineOptions, OnMissing, TargetOptions, read_sources
+from toolchain.building.options import (
+    FILL,
+    BuildOptions,
+    MachineOptions,
+    OnMissing,
+    TargetOptions,
+    read_sources,
+)
 from toolchain.deployment import parse_interface
-from toolchain.errors import BuildError, NetworkFileError
+from toolchain.errors import BuildError, NetworkFileError, counted
 from toolchain.flags import Bits, Settings, key_values, names_in
 from toolchain.networks import is_network, read_network
 
@@ -175,6 +182,8 @@ def build_options(flags: BuildFlags, target: TargetOptions, sources: Path | None
             options = replace(options, interface=parse_interface(flags.interface))
         except ValueError as reason:
             raise BuildError(f"--interface: {reason}") from None
+    if options.replicas == FILL and flags.device is None:
+        raise BuildError("--replicas fill needs the FPGA of the boards: add --device proce-v-d8")
     if flags.rng_table is not None:
         if options.rng is not RngKind.TABLE:
             raise BuildError(f"--rng-table requires --rng table, but this is --rng {options.rng}")
@@ -183,19 +192,28 @@ def build_options(flags: BuildFlags, target: TargetOptions, sources: Path | None
 
 
 def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
-    """Return the plan with as many boards as the lines need on a device, and why, as a sentence."""
+    """Return the plan with as many boards as the lines need on a device, and machines that fill them, and why."""
     if name is None:
         return plan, ""
     from toolchain.analysis.logic import device_named
-    from toolchain.analysis.resources import boards_needed
+    from toolchain.analysis.resources import boards_needed, estimate, most_replicas
+    from toolchain.building.machine import partition_lines
     from toolchain.outputs.mif import LENGTH
 
-    options = plan.options
-    count, why = boards_needed(
-        plan.parameters,
-        device_named(name),
-        table_length=LENGTH if options.rng_table is None else options.rng_table.size,
-    )
+    options, parameters, device = plan.options, plan.parameters, device_named(name)
+    length = LENGTH if options.rng_table is None else options.rng_table.size
+    count, why = boards_needed(parameters, device, table_length=length)
     if options.partitions > count:
         why += f" --partitions {options.partitions} asks for more."
-    return replace(plan, options=replace(options, partitions=max(count, options.partitions))), why
+    options = replace(options, partitions=max(count, options.partitions))
+    if options.replicas == FILL:
+        board = replace(parameters, lines=partition_lines(parameters.lines, options.partitions)[0].lines)
+        most, limit = most_replicas(board, device, table_length=length)
+        options = replace(options, replicas=max(most, 1))
+        parameters = replace(parameters, replicas=options.replicas)
+        took = estimate(replace(board, replicas=options.replicas), device, table_length=length)
+        why += (
+            f" {counted(options.replicas, 'machine')} fill a board, with {took.alms:,.0f} ALMs ({took.alm_share:.0%}) and "
+            f"{took.memories.blocks:,} memory blocks ({took.block_share:.0%}): {limit}."
+        )
+    return replace(plan, options=options, parameters=parameters), why

@@ -1,12 +1,13 @@
 """Resources: exact counts where possible, and the figures of the thesis."""
 
+import math
 from dataclasses import replace
 
 import pytest
 
-from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
+from machines.parameters import REPLICAS_MAX, BM1Parameters, PriorMode, RngKind, SensorMode
 from toolchain.analysis.logic import DEVICES, device_named, logic_of
-from toolchain.analysis.resources import boards_needed, estimate
+from toolchain.analysis.resources import boards_needed, estimate, most_replicas
 from toolchain.errors import BuildError
 
 D8 = DEVICES["proce-v-d8"]
@@ -100,6 +101,42 @@ def test_boards_for_more_lines_than_the_register_map_holds():
     count, why = boards_needed(many, D8)
     assert count == 3
     assert " 4096 lines " in why
+
+
+@pytest.mark.parametrize(
+    ("board", "limit"),
+    [
+        (replace(BOAT, lines=256), "ALMs"),
+        (BM1Parameters(lines=300, sensor_bits=(2,)), "4,200 result registers, and the map has 4,096"),
+        (
+            BM1Parameters(
+                lines=10, sensor_bits=(3, 3, 3, 3), sensor_mode=SensorMode.CELL, rng=RngKind.LFSR16
+            ),
+            "",
+        ),
+        (BM1Parameters(lines=40, sensor_bits=(3,) * 10, sensor_mode=SensorMode.CELL), "input registers"),
+    ],
+    ids=["logic", "results", "most", "inputs"],
+)
+def test_as_many_machines_as_fit_a_board(board, limit):
+    most, why = most_replicas(board, D8)
+    assert limit in why
+    room = [
+        replicas
+        for replicas in range(1, REPLICAS_MAX + 1)
+        if replicas * board.lines <= 4096
+        and replicas * math.prod(board.input_shape) <= 8192
+        and on_d8(replace(board, replicas=replicas)).fits
+    ]
+    assert room == list(range(1, most + 1))
+
+
+def test_replicas_that_divide_the_lines_are_told_how_many_would_not():
+    whole, _ = most_replicas(BOAT, D8)
+    assert boards_needed(replace(BOAT, replicas=whole), D8)[0] == 1
+    count, why = boards_needed(replace(BOAT, replicas=whole + 1), D8)
+    assert count > 1
+    assert f"--replicas {whole} or fewer" in why
 
 
 def test_what_has_no_estimate():

@@ -15,7 +15,7 @@ from machines.bm1 import Start
 from machines.encode import decode_code
 from machines.parameters import RngKind, SensorMode
 from pcie_shim.programming_file import read_image
-from tests.toolchain.running import OPTIONS
+from tests.toolchain.running import OPTIONS, TARGET, TINY, assert_refused, done, toolchain
 from toolchain.analysis.accuracy import measure
 from toolchain.analysis.emulation import EmulatedBoards, one_replica
 from toolchain.analysis.logic import DEVICES, logic_of
@@ -210,7 +210,12 @@ CALLED_REPLICA = replace(model(), searched=(dimension(REPLICA, size=6),))
         (model(), replace(THRESHOLD, scale=Scale.ADDRESS), {"scale": Scale.COLUMN}, "--scale"),
         (model(), replace(CELL, replicas=3, interface=(35, 18)), {"interface": (36, 18)}, "36x18"),
         (model(), replace(OPTIONS, replicas=3, interface=(9000, 18)), {"interface": (9, 18)}, "9000x18"),
-        (model(40), replace(CELL, replicas=200), {"partitions": 2}, "2 or more, or fewer --replicas"),
+        (
+            model(40),
+            replace(CELL, replicas=200),
+            {"partitions": 2},
+            "2 or more, or --replicas [0-9]+ or fewer",
+        ),
         (CALLED_REPLICA, replace(OPTIONS, replicas=2), {"replicas": 1}, "'replica'"),
     ],
 )
@@ -279,3 +284,24 @@ def test_a_frame_of_replicas_is_measured_as_a_board_runs_it(mode):
     assert measured.cycles.median.value == np.median(lengths)
     with pytest.raises(BuildError, match="20 replicas.* 12 "):
         measure(boards, readings, of, replicas=20)
+
+
+def test_boards_are_filled_with_machines(case):
+    """As many as fit on a board, and lines are divided only if one machine does not fit."""
+    (case / "model.py").write_text(TINY.replace("size: int = 4", "size: int = 100"))
+    out = case.parent / "out"
+    fill = ("build", case, "-o", out, *TARGET, "--replicas", "fill")
+    assert_refused(toolchain(*fill), "--replicas fill", "--device")
+    report = done(toolchain(*fill, "--device", "proce-v-d8")).stdout
+    assert "40 machines fill a board" in report
+    assert "with 41, it takes 4,100 result registers, and the map has 4,096." in report
+    deployment = load_deployment(out)
+    assert (deployment.machine.replicas, len(deployment.boards)) == (40, 1)
+    done(toolchain(*fill, "--device", "proce-v-d8", "--set", "size=5000"))
+    deployment = load_deployment(out)
+    assert (deployment.machine.replicas, len(deployment.boards)) == (1, 2)
+    over = ("build", case, "-o", out, *TARGET, "--replicas", "50")
+    assert_refused(toolchain(*over), "--partitions 2 or more", "--replicas 40 or fewer")
+    assert_refused(
+        toolchain("build", case, "-o", out, *TARGET, "--replicas", "0"), "--replicas", "256", "fill"
+    )
