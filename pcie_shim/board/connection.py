@@ -45,7 +45,8 @@ class Connection:
         self.socket = connection
         self.decoder = framing.FrameDecoder()
 
-        # The model of a slower link, and the monotonic time at which the host sent the frames of the last receive.
+        # The model of a slower link, and the monotonic time at which it gets the frames of the last receive: when the
+        # first one is decoded, so that its time comes on top of the socket's; 0 before that.
         self._link = link
         self._sent_ns = 0
 
@@ -74,7 +75,7 @@ class Connection:
         except OSError:
             count = 0
         self.decoder.received(count)
-        self._sent_ns = time.monotonic_ns() if self._link else 0
+        self._sent_ns = 0
         self.open = count > 0
         return self.open
 
@@ -88,6 +89,7 @@ class Connection:
                     return
                 _, _, sequence, address, _, payload = frame
                 if self._link is not None:
+                    self._sent_ns = self._sent_ns or time.monotonic_ns()
                     self._link.carry(HEADER_BYTES + len(payload), self._sent_ns)
                 self.sequence = due = (self.sequence + 1) & ALL_ONES
                 if sequence == due:

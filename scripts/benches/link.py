@@ -1,0 +1,376 @@
+"""The link to the boards by size of a transfer, boards and partitions, for each --link-rate (thesis 2.3, 4.3).
+
+bench ── blocks of 1 to 8,192 words ──▶ INPUTS of 1, 2 or 4 boards, and back
+bench ── frames of 4,096 results on 1, 2 or 4 boards, sent with the done message or read ──▶ the time besides computing
+
+What the socket takes (`none`) is part of every measurement. The rate and the latency of a modelled link are fitted to the
+difference from it, so that they come from the clock of the host and not from the model.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import itertools
+import os
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, asynccontextmanager, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from machines.bm1 import BM1Machine
+from machines.bm1_kind import BM1
+from machines.kind import FrameInput
+from machines.parameters import BM1Parameters
+from pcie_shim import register_map as rm
+from pcie_shim.endpoint import parse_endpoint
+from pcie_shim.host.loader import program
+from pcie_shim.host.mini_cluster import MiniCluster
+from pcie_shim.host.socket_link import SocketLink
+from pcie_shim.link_rate import WIRES, LinkRate
+from pcie_shim.programming_file import Image, Partition
+from scripts.running.flags import ScriptParser
+from scripts.running.script import run_script
+from terminal.output import write_json
+from terminal.pictures import new_figure, save_figure
+from terminal.processes import Process
+
+BOARDS = (1, 2, 4)
+WORDS = (1, 16, 256, 1024, 4096, 8192)
+RESULTS = 4096
+WAYS = {"sent": (), "read": ("--read-results",)}
+"""How the host gets the results: with the done message, or as the thesis's host from the registers; flags of `board`."""
+SLOWER = 20
+"""A measurement over JTAG for so many of the others, because each takes milliseconds."""
+TOLERANCE = 0.15
+"""Deviation of a fitted rate from the stated one that the bench accepts."""
+LIMIT_S = 30.0
+
+Move = Callable[[Sequence[SocketLink], int], None]
+
+
+class Transfer(NamedTuple):
+    """Blocks of `size` bytes to or from each of the boards: the time until all have moved."""
+
+    link: LinkRate
+    direction: str
+    boards: int
+    size: int
+    us: float
+
+    @property
+    def mbps(self) -> float:
+        """10^6 bits of payload per second, over all boards."""
+        return 8 * self.size * self.boards / self.us
+
+
+class FrameTime(NamedTuple):
+    """A frame of RESULTS results on so many boards: its time besides computing."""
+
+    link: LinkRate
+    way: str
+    boards: int
+    us: float
+
+
+class Fitted(NamedTuple):
+    """A rate and a latency that explain how much slower than the socket alone the transfers of a link are."""
+
+    link: LinkRate
+    direction: str
+    mbps: float
+    latency_us: float
+
+    @property
+    def is_right(self) -> bool:
+        """True if the rate is the stated one within the tolerance."""
+        return abs(self.mbps / WIRES[self.link].mbps - 1) <= TOLERANCE
+
+
+def image(lines: int, index: int, count: int, *, replicas: int = 1) -> Image:
+    """Return an image that counts to 1 in a few cycles; with replicas, its board has room for INPUTS."""
+    parameters = BM1Parameters(lines=lines, sensor_bits=(1,), replicas=replicas)
+    codes = np.full((2, lines), parameters.ones_code, np.uint16)
+    return Image(
+        machine=BM1Machine(parameters, codes[:1], (codes,)),
+        partition=Partition(index, count, index * lines, count * lines),
+        interface_sensors=rm.INPUTS.words if replicas > 1 else BM1.registers(parameters).input_words,
+        interface_results=lines * replicas,
+        model_hash="0" * 64,
+        build_date="",
+        tool_version="",
+    )
+
+
+def write(links: Sequence[SocketLink], words: int) -> None:
+    """Write a block to one board after the other, each acknowledged."""
+    block = bytes(4 * words)
+    for link in links:
+        link.write_block(rm.INPUTS, block)
+
+
+def post(links: Sequence[SocketLink], words: int) -> None:
+    """Post a block to every board, and then ask each for a word, which it answers when the block has arrived."""
+    block = bytes(4 * words)
+    for link in links:
+        link.post([(rm.INPUTS, block)])
+    for link in links:
+        link.read32(rm.DONE)
+
+
+def read(links: Sequence[SocketLink], words: int) -> None:
+    """Read a block from one board after the other."""
+    for link in links:
+        link.read_block(rm.INPUTS, words)
+
+
+MOVES: dict[str, Move] = {"write": write, "post": post, "read": read}
+
+
+def times(works: Mapping[LinkRate, Callable[[], float]], repeats: int) -> dict[LinkRate, float]:
+    """Return the time that a tenth of the measurements of each stay below; other processes only slow them down."""
+    found: dict[LinkRate, list[float]] = {link: [] for link in works}
+    for turn in range(-SLOWER, repeats):
+        for link, work in works.items():
+            if link is LinkRate.JTAG and turn % SLOWER:
+                continue
+            us = work()
+            if turn >= 0:  # the others warm up
+                found[link].append(us)
+    return {link: sorted(each)[len(each) // 10] for link, each in found.items()}
+
+
+def timed(move: Move, links: Sequence[SocketLink], words: int) -> float:
+    """Return how long this took, in microseconds."""
+    began = time.perf_counter_ns()
+    move(links, words)
+    return (time.perf_counter_ns() - began) / 1e3
+
+
+@contextmanager
+def opened(folder: Path, boards: int) -> Iterator[dict[LinkRate, list[SocketLink]]]:
+    """Open links to so many boards of each kind."""
+    with ExitStack() as stack:
+        yield {
+            link: [stack.enter_context(SocketLink.open(place, timeout=LIMIT_S)) for place in places]
+            for link in LinkRate
+            for places in [[parse_endpoint(each) for each in endpoints(folder, link, boards)]]
+        }
+
+
+def endpoints(folder: Path, link: LinkRate, boards: int) -> list[str]:
+    """Return where the boards of a kind listen."""
+    return [f"unix:{folder / link}/board{at}.sock" for at in range(boards)]
+
+
+def measure_transfers(folder: Path, boards: int, words: int, repeats: int) -> list[Transfer]:
+    """Measure blocks of one size, in both directions, over every kind of link."""
+    found = []
+    for place in (each for link in LinkRate for each in endpoints(folder, link, boards)):
+        program(parse_endpoint(place), image(1, 0, 1, replicas=2), timeout=LIMIT_S)
+    with opened(folder, boards) as links:
+        for direction, move in MOVES.items():
+            works = {link: partial(timed, move, those, words) for link, those in links.items()}
+            for link, us in times(works, repeats).items():
+                found.append(Transfer(link, direction, boards, 4 * words, us))
+    return found
+
+
+def measure_frames(folder: Path, way: str, boards: int, repeats: int) -> list[FrameTime]:
+    """Measure frames on so many boards."""
+    parts = [image(RESULTS // boards, index, boards) for index in range(boards)]
+    frame = FrameInput(addresses=(0,), target_count=1, max_cycles=1 << 12, bank=0, stop="own")
+    with ExitStack() as stack:
+        clusters = {
+            link: stack.enter_context(
+                MiniCluster.open(endpoints(folder, link, boards), parts, timeout=LIMIT_S, reprogram=True)
+            )
+            for link in LinkRate
+        }
+
+        def besides(link: LinkRate) -> float:
+            began = time.perf_counter_ns()
+            output = clusters[link].run(frame)
+            return (time.perf_counter_ns() - began - output.boards_compute_ns) / 1e3
+
+        found = times({link: partial(besides, link) for link in LinkRate}, repeats)
+    return [FrameTime(link, way, boards, us) for link, us in found.items()]
+
+
+def fits(transfers: Sequence[Transfer]) -> list[Fitted]:
+    """Fit a rate and the latency of one transfer to the times of one board, less those of the socket alone."""
+    alone = {
+        (each.direction, each.size): each.us
+        for each in transfers
+        if each.boards == 1 and each.link is LinkRate.NONE
+    }
+    found = []
+    for link in WIRES:
+        for direction in ("write", "read"):
+            those = [
+                each for each in transfers if (each.link, each.direction, each.boards) == (link, direction, 1)
+            ]
+            more = [each.us - alone[direction, each.size] for each in those]
+            us_a_byte, _ = np.polyfit([each.size for each in those], more, 1)
+            # those of a word are two transfers, of 44 bytes with their headers
+            found.append(Fitted(link, direction, 8 / us_a_byte, (more[0] - 44 * us_a_byte) / 2))
+    return found
+
+
+@asynccontextmanager
+async def served(folder: Path, flags: Sequence[str]) -> AsyncIterator[None]:
+    """Run boards of every kind."""
+    processes = [Process(f"boards ({link})", folder / f"{link}.log") for link in LinkRate]
+    try:
+        for link, process in zip(LinkRate, processes, strict=True):
+            own = ("--boards", str(max(BOARDS)), "--directory", str(folder / link), "--link-rate", link)
+            await process.start("board", *own, *flags)
+        for process in processes:
+            await process.line("boards listen")
+        yield
+    finally:
+        await asyncio.gather(*(process.end() for process in processes))
+
+
+async def bench(arguments: argparse.Namespace) -> int:
+    """Start boards of every kind, measure them, and print the tables."""
+    transfers: list[Transfer] = []
+    frames: list[FrameTime] = []
+    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as name:
+        for way, flags in WAYS.items():
+            folder = Path(name) / way
+            folder.mkdir()
+            async with served(folder, flags):
+                for boards in BOARDS:
+                    for words in WORDS if way == "sent" else ():
+                        await asyncio.sleep(0)  # for Ctrl-C
+                        transfers += measure_transfers(folder, boards, words, arguments.repeats)
+                    frames += measure_frames(folder, way, boards, arguments.repeats)
+    fitted = fits(transfers)
+    show(transfers, frames, fitted)
+    if arguments.json:
+        write_json(arguments.json, numbers(transfers, frames, fitted))
+    if arguments.picture:
+        draw(arguments.picture, transfers, frames)
+    return 0
+
+
+def show(transfers: Sequence[Transfer], frames: Sequence[FrameTime], fitted: Sequence[Fitted]) -> None:
+    """Print the tables on standard output."""
+    table = Table(title="a block to or from each board: microseconds, and Mbps of payload over all boards")
+    for column in (
+        "boards",
+        "",
+        "bytes",
+        *(f"{link}{unit}" if unit == " us" else unit for link in LinkRate for unit in (" us", "Mbps")),
+    ):
+        table.add_column(column, justify="right")
+    for boards in BOARDS:
+        for direction in MOVES:
+            for words in WORDS:
+                row = [
+                    next(each for each in transfers if each[:4] == (link, direction, boards, 4 * words))
+                    for link in LinkRate
+                ]
+                cells = [
+                    text
+                    for each in row
+                    for text in (f"{each.us:,.0f}", f"{each.mbps:,.{int(each.mbps < 100)}f}")
+                ]
+                table.add_row(str(boards), direction, f"{4 * words:,}", *cells)
+            table.add_section()
+    Console().print(table)
+    table = Table(title=f"a frame of {RESULTS} results: microseconds besides computing")
+    for column in ("results", "partitions", *LinkRate):
+        table.add_column(column, justify="right")
+    for way, boards in itertools.product(WAYS, BOARDS):
+        those = [next(each for each in frames if each[:3] == (link, way, boards)) for link in LinkRate]
+        table.add_row(way, str(boards), *(f"{each.us:,.0f}" for each in those))
+    Console().print(table)
+    for each in fitted:
+        wire = WIRES[each.link]
+        verdict = "right" if each.is_right else "WRONG"
+        print(
+            f"{each.link}, {each.direction}: {each.mbps:,.4g} Mbps and {each.latency_us:,.3g} us a transfer more than the "
+            f"socket alone; the model has {wire.mbps:,g} Mbps and {wire.latency_us:g} us: {verdict} within {TOLERANCE:.0%}"
+        )
+    by_link = {each.link: each.mbps for each in fitted if each.direction == "read"}
+    slow, fast = (
+        next(each.us for each in transfers if each[:4] == (link, "read", 1, 4 * WORDS[-1]))
+        for link in (LinkRate.JTAG, LinkRate.PCIE_GEN2)
+    )
+    print(
+        f"PCIe has {by_link[LinkRate.PCIE_GEN2] / by_link[LinkRate.JTAG]:.0f} times the rate of USB/JTAG (thesis 2.3: "
+        f"around 800); with the emulation's socket before it, {4 * WORDS[-1]:,} bytes are read {slow / fast:.0f} times as "
+        f"fast; {len(os.sched_getaffinity(0))} cores"
+    )
+
+
+def numbers(
+    transfers: Sequence[Transfer], frames: Sequence[FrameTime], fitted: Sequence[Fitted]
+) -> dict[str, Any]:
+    """Return everything as a JSON object."""
+    return {
+        "transfers": [{**each._asdict(), "mbps": each.mbps} for each in transfers],
+        "frames": [each._asdict() for each in frames],
+        "fitted": [
+            {
+                **each._asdict(),
+                "model_mbps": WIRES[each.link].mbps,
+                "model_latency_us": WIRES[each.link].latency_us,
+            }
+            for each in fitted
+        ],
+    }
+
+
+def draw(path: Path, transfers: Sequence[Transfer], frames: Sequence[FrameTime]) -> None:
+    """Draw the time of a read by its size, with the model's own time dotted, and that of a frame by partitions."""
+    figure = new_figure(9.6, 4.2)
+    by_size, by_boards = figure.subplots(1, 2)
+    for link, colour in zip(LinkRate, ("#bbbbbb", "#4477aa", "#ee6677"), strict=True):
+        those = [each for each in transfers if (each.link, each.direction, each.boards) == (link, "read", 1)]
+        sizes = [each.size for each in those]
+        by_size.loglog(sizes, [each.us for each in those], marker="o", color=colour, label=link)
+        if link in WIRES:
+            model = [1e6 * WIRES[link].seconds(size, 2) for size in sizes]
+            by_size.loglog(sizes, model, linestyle=":", color=colour, label=f"{link}, without the socket")
+        own = [each for each in frames if (each.link, each.way) == (link, "read")]
+        by_boards.semilogy([each.boards for each in own], [each.us for each in own], marker="o", color=colour)
+    by_size.set_xlabel("bytes read from one board")
+    by_size.set_ylabel("us")
+    by_size.legend(frameon=False)
+    by_boards.set_xlabel("boards (partitions)")
+    by_boards.set_xticks(BOARDS)
+    by_boards.set_title(f"a frame of {RESULTS} results that are read, besides computing", fontsize=10)
+    by_size.set_title("one block", fontsize=10)
+    save_figure(figure, path)
+
+
+def main() -> int:
+    """Parse the flags and measure."""
+    parser = ScriptParser(
+        prog="scripts/bench link",
+        description="Measure the link to the boards by size of a transfer and boards, for each --link-rate.",
+    )
+    parser.add_argument(
+        "--repeats", type=int, default=400, help=f"transfers of each size; over JTAG a {SLOWER}th"
+    )
+    parser.add_argument("--json", type=Path, help="write all numbers to this file")
+    parser.add_argument("--picture", type=Path, help="draw them into this PNG")
+    arguments = parser.parse_args()
+    if arguments.repeats < 1:
+        parser.error("--repeats must be 1 or more")
+    return run_script(lambda: bench(arguments), 600)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
