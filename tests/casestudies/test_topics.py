@@ -12,6 +12,8 @@ from casestudies.boat.normaliser import app as normaliser
 from casestudies.boat.simulator import app as simulator
 from casestudies.boat.viewer import app as viewer
 from casestudies.mrclam.player import app as player
+from casestudies.sprinkler.garden import app as garden
+from casestudies.sprinkler.viewer import app as sprinkler_viewer
 from casestudies.topics import Readiness, serve_readiness
 from terminal.health import is_ready, read_status, status_socket
 from tests.command_runner import invoke
@@ -88,7 +90,7 @@ def looked_up(monkeypatch):
     return names
 
 
-@pytest.mark.parametrize("command", [simulator, normaliser, viewer])
+@pytest.mark.parametrize("command", [simulator, normaliser, viewer, garden, sprinkler_viewer])
 def test_a_robots_name_stands_for_its_uri(command, looked_up, monkeypatch):
     found = invoke(command, ["--uri", "robot:Zoë"])
     assert (found.exit_code, looked_up) == (3, ["Zoë"])

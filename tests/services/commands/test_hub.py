@@ -9,7 +9,7 @@ import pytest
 from websockets.asyncio.client import connect
 
 from bridge.discovery import Robot, UnknownRobotError
-from services.commands import discover, hub
+from services.commands import dashboard, discover, hub, listen, master, publisher, subscriber
 from services.errors import SettingsError
 from services.settings import load_settings
 from terminal.processes import own_command
@@ -128,8 +128,9 @@ def test_a_network_without_robots_is_one_sentence():
     assert "within 0.2 s" in ended.stderr
 
 
-async def test_a_robots_name_stands_for_its_uri(monkeypatch):
-    """Also where a loop runs already, as here."""
+@pytest.fixture
+def _zoe(monkeypatch):
+    """Only this robot is announced."""
 
     async def resolve(name):
         await asyncio.sleep(0)
@@ -138,6 +139,18 @@ async def test_a_robots_name_stands_for_its_uri(monkeypatch):
         return "ws://192.0.2.7:9090"
 
     monkeypatch.setattr("bridge.discovery.resolve", resolve)
+
+
+@pytest.mark.usefixtures("_zoe")
+@pytest.mark.parametrize("command", [dashboard, listen, master, publisher, subscriber])
+def test_every_command_with_a_uri_looks_a_robot_up(command):
+    ended = invoke(command.app, ["--uri", "robot:Adam"])
+    assert (ended.exit_code, ended.stderr) == (3, "error: no robot called Adam\n")
+
+
+@pytest.mark.usefixtures("_zoe")
+async def test_a_robots_name_stands_for_its_uri(monkeypatch):
+    """Also where a loop runs already, as here."""
     assert load_settings(uri="robot:Zoë").uri == "ws://192.0.2.7:9090"
     with pytest.raises(UnknownRobotError):
         load_settings(uri="robot:Adam")

@@ -63,12 +63,12 @@ def test_a_build_from_several_topics(tmp_path, written):
     path = str(written(FILE))
     result = done(
         build(
-            tmp_path, "--sources", path, "--uri", "ws://one:9090", "--tolerance", "0.2", "--set", "path=a.b"
+            tmp_path, "--sources", path, "--uri", "robot:Robot 7", "--tolerance", "0.2", "--set", "path=a.b"
         )
     )
     deployment = load_deployment(tmp_path / "out")
     assert [(each.uri, each.topic, each.compression) for each in deployment.sources] == [
-        ("ws://one:9090", "/range", "none"),
+        ("robot:Robot 7", "/range", "none"),
         ("ws://two:9090", "/scan", "cbor"),
         ("ws://two:9090", "/imu", "none"),
     ]
