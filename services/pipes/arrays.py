@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from bridge.client import Ros, Subscription
 from bridge.codecs.message_check import SCALAR, Definitions, FieldType, bundled_definitions
-from bridge.errors import NoMessageError
+from bridge.errors import MessageTooLargeError, NoMessageError
 from bridge.fields import Field, Place, format_place
 from bridge.names import ros1_type, ros_version_of_type
 from services.errors import InputLineError, SettingsError
@@ -180,7 +180,10 @@ async def publish_arrays(settings: Settings, source: Source, path: str | None) -
         count, last = 0, []
         async for number, line in lines():
             last = field.numbers(line, number)
-            await publication.publish(field.message(last))
+            try:
+                await publication.publish(field.message(last))
+            except MessageTooLargeError as error:
+                raise InputLineError(f"line {number} of standard input: {error}") from error
             count += 1
         if not count:
             raise InputLineError(f"standard input is empty; expected {_EXPECTED} on each line")
