@@ -49,6 +49,8 @@ class Case:
     viewer: str
     publishers: Mapping[str, Sequence[str]]
     """The commands on the robot's side with their options, in the order of their start."""
+    is_frame: bool = True
+    """Whether a result of the viewer is a frame of the master, so that both end after the same number."""
 
 
 def boat(rates: Sequence[str], *, array: bool) -> Case:
@@ -80,6 +82,21 @@ def sprinkler(rates: Sequence[str], count: int) -> Case:
     )
 
 
+def disparity(rates: Sequence[str]) -> Case:
+    """Return binocular disparity on one board, with a machine for each of 160 pixels."""
+    options = {"sensor-mode": "threshold", "replicas": 160, "queue": "all", "max-cycles": 8192}
+    return Case(
+        name="disparity",
+        topic="/disparity/likelihoods",
+        type="disparity_msgs/Likelihoods",
+        boards=1,
+        options=[text for name, value in options.items() for text in (f"--{name}", str(value))],
+        viewer="disparity-matcher",
+        publishers={"disparity-cameras": rates},
+        is_frame=False,
+    )
+
+
 async def build(
     case_study: str, deployment: Path, uri: str, topic: str, type_: str, *options: str, boards: int = 4
 ) -> None:
@@ -100,6 +117,9 @@ async def build(
 def demo(
     is_sprinkler: Annotated[
         bool, typer.Option("--sprinkler", help="Run the sprinkler instead, on two BM2.")
+    ] = False,
+    is_disparity: Annotated[
+        bool, typer.Option("--disparity", help="Run binocular disparity instead, on a board of 160 BM1.")
     ] = False,
     uri: Annotated[
         str | None,
@@ -128,7 +148,10 @@ def demo(
         Literal["none", "pcie-gen2", "jtag"] | None,
         typer.Option(help="Link to the boards (see `board`).", show_default="BM_LINK_RATE, or none"),
     ] = None,
-    rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings per second.")] = 10.0,
+    rate: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=10_000, help="Readings per second.", show_default="10, or 2 stereo pairs"),
+    ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, help="Seed of what is simulated.", show_default="a new one each time")
     ] = None,
@@ -141,6 +164,8 @@ def demo(
         raise OutputError(
             "--dashboard needs NiceGUI, which is not installed: pip install 'rosbayes[dashboard]', or leave it out"
         )
+    if is_sprinkler and is_disparity:
+        raise typer.BadParameter("choose one of --sprinkler and --disparity")
     stay |= dashboard
     if stay and uri is None:
         _check_port("hub", int(PORT), f"use that server with --uri ws://127.0.0.1:{PORT}")
@@ -148,9 +173,14 @@ def demo(
         # the page is started last, when it is late to say that its port is taken
         _check_port("page", page_port, "choose another --page-port")
     check_writable(out)
+    rate = rate or (2.0 if is_disparity else 10.0)
     rates = ["--rate", str(rate), *(() if seed is None else ("--seed", str(seed)))]
     # a real server accepts only installed message types
-    case = sprinkler(rates, count) if is_sprinkler else boat(rates, array=uri is not None)
+    case = boat(rates, array=uri is not None)
+    if is_sprinkler:
+        case = sprinkler(rates, count)
+    elif is_disparity:
+        case = disparity(rates)
     port = page_port if dashboard else None
     link = () if link_rate is None else ("--link-rate", link_rate)
     return run_async(_run(case, uri, None if stay else count, out.resolve(), page_port=port, options=link))
@@ -208,6 +238,7 @@ async def _run(
     deployment = out / "deployment"
     saying = asyncio.create_task(screen.say_what_it_waits_for())
     building = None
+    ends: list[asyncio.Future[None]] = []
     try:
         screen.waits_for = "building the deployment, loading the kernels, which a first start compiles"
         if uri is None:
@@ -237,7 +268,8 @@ async def _run(
         # nothing is forked before the kernels are loaded, because a fork would inherit the locks of their thread
         await asyncio.gather(building, viewer.line("listening"), _load_kernels())
         screen.waits_for = "waiting for results"
-        await master.start("master", "--loop", *counted, "-d", str(deployment), "--uri", uri, *options)
+        frames = counted if case.is_frame else ()
+        await master.start("master", "--loop", *frames, "-d", str(deployment), "--uri", uri, *options)
         for name, flags in case.publishers.items():
             await processes[name].start(name, "--uri", uri, *flags)
         if page_port is not None:
@@ -248,7 +280,9 @@ async def _run(
             address = await processes["dashboard"].line(r"http://\S+")
             saying.cancel()
             screen.show(f"open {address[0]} in a browser{case.pointer}")
-        await master.succeed()
+        ends = [asyncio.ensure_future(each.succeed()) for each in (master, viewer)]
+        # a master without a count ends only by a failure, which need not wait for the viewer's timeout
+        await next(iter((await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED))[0]))
         screen.waits_for = "drawing the pictures"
         await viewer.succeed()
         screen.show(f"done in {time.monotonic() - started:.1f} s; pictures are in {out}")
@@ -258,4 +292,5 @@ async def _run(
         if building is not None:
             building.cancel()
         await asyncio.gather(*(process.end() for process in reversed(processes.values())))
+        await asyncio.gather(*ends, return_exceptions=True)
     return 0

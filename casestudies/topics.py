@@ -88,8 +88,10 @@ SETTLED_S: Final = 3.0
 """If a server does not list an advertised topic after this many seconds, it has refused it."""
 
 
-async def report_refused(ros: Ros, topic: str, type_: str) -> None:
-    """Warn if, according to rosapi, the server does not forward an advertised topic."""
+async def report_refused(
+    ros: Ros, topic: str, type_: str, otherwise: str = "publish arrays with --array"
+) -> None:
+    """Warn if, according to rosapi, the server does not forward an advertised topic; `otherwise` is what to do then."""
     await asyncio.sleep(SETTLED_S)
     known = await ros.topic_type(topic)
     if known is None or (known and same_type(known, type_)):
@@ -98,7 +100,7 @@ async def report_refused(ros: Ros, topic: str, type_: str) -> None:
     reason = f"it is {shown(known)} there" if known else f"does the server have {package}?"
     warn(
         f"the server rejects everything on {topic}, of type {type_}: {reason}; "
-        "install the package on the robot, or publish arrays with --array"
+        f"install the package on the robot, or {otherwise}"
     )
 
 

@@ -10,7 +10,7 @@ from functools import partial
 
 # each command line, that of a subcommand after a colon, and what it does in the list of `rosbayes --help`
 COMMANDS = {
-    "demo": ("casestudies.demo", "Run the boat or the sprinkler, without a robot."),
+    "demo": ("casestudies.demo", "Run a case study, without a robot."),
     "toolchain": ("toolchain.commands.main", "From a model to a deployment."),
     "new": ("toolchain.commands.main:new", "Create a model from a template."),
     "build": ("toolchain.commands.main:build", "Build a deployment from a model or a network."),
@@ -41,6 +41,8 @@ COMMANDS = {
         "Publish whether a simulated garden's grass is wet.",
     ),
     "sprinkler-viewer": ("casestudies.sprinkler.viewer", "Show how the estimate of rain converges."),
+    "disparity-cameras": ("casestudies.disparity.cameras", "Publish stereo pairs of a simulated scene."),
+    "disparity-matcher": ("casestudies.disparity.matcher", "Turn stereo pairs into disparity images."),
 }
 
 

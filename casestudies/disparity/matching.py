@@ -1,0 +1,93 @@
+"""The host's part: three filters for each image, matching costs, likelihoods, and their fusion in float64 (thesis 4.4).
+
+Everything is computed for all pixels and disparities at once. A cost volume is float32[disparities, height, width].
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+FILTERS: Final = ("gradient_x", "gradient_y", "surround")
+"""The sensors of the machine, one for each filter.
+
+The derivatives across and down, and the difference between a small and a large surround (a Laplacian). None of them
+sees the brightness that the cameras do not share, and their noise is nearly independent, as naive fusion assumes.
+"""
+SCALES: Final = (2.0, 2.0, 4.0)
+"""Mean matching cost of each filter at the true disparity, in grey levels."""
+OUTLIER: Final = 0.05
+"""Likelihood of any cost at the true disparity, relative to that of cost 0: occlusions, reflections."""
+WINDOW: Final = 2
+"""Pixels on each side of a pixel over which a cost is averaged."""
+
+Volume = NDArray[np.float32]
+
+
+def box_sum(values: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
+    """Return the sums over windows of 2 * reach + 1 in the last two dimensions, cut off at the borders."""
+    for axis in (-1, -2):
+        size = values.shape[axis]
+        zero = np.zeros_like(np.take(values, [0], axis))
+        # float64, because running sums of float32 would lose what windows far from the border hold
+        running = np.concatenate([zero, np.cumsum(values, axis, dtype=np.float64)], axis)
+        ends = np.minimum(np.arange(size) + reach + 1, size)
+        starts = np.maximum(np.arange(size) - reach, 0)
+        values = (np.take(running, ends, axis) - np.take(running, starts, axis)).astype(np.float32)
+    return values
+
+
+def filtered(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the outputs of the filters, float32[filters, height, width], of uint8[height, width]; borders are repeated."""
+    padded = np.pad(image.astype(np.float32), 1, mode="edge")
+    across = padded[:, 2:] - padded[:, :-2]
+    down = padded[2:] - padded[:-2]
+    ones = np.ones(image.shape, np.float32)
+    near, far = (box_sum(image.astype(np.float32), reach) / box_sum(ones, reach) for reach in (1, 4))
+    return np.stack(
+        [
+            (across[:-2] + 2 * across[1:-1] + across[2:]) / 4,
+            (down[:, :-2] + 2 * down[:, 1:-1] + down[:, 2:]) / 4,
+            near - far,
+        ]
+    )
+
+
+def matching_costs(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], disparities: int
+) -> NDArray[np.float32]:
+    """Return the cost of each filter, disparity and pixel of the left image, float32[filters, disparities, height, width].
+
+    It is the mean of |left(x, y) - right(x - d, y)| over a window. Where x - d lies beyond the border, it is NaN.
+    """
+    ours, theirs = filtered(left), filtered(right)
+    height, width = left.shape
+    costs = np.full((len(FILTERS), disparities, height, width), np.nan, np.float32)
+    for d in range(min(disparities, width)):
+        difference = np.abs(ours[:, :, d:] - theirs[:, :, : width - d])
+        count = box_sum(np.ones((height, width - d), np.float32), WINDOW)
+        costs[:, d, :, d:] = box_sum(difference, WINDOW) / count
+    return costs
+
+
+def likelihoods(costs: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return P(cost | disparity) relative to cost 0, in the shape of the costs.
+
+    A disparity beyond the border has no cost, and gets the mean likelihood of those that have one, so that it is
+    neither preferred nor excluded. In the first column of pixels, all likelihoods are therefore equal.
+    """
+    scales = np.array(SCALES, np.float32)[:, np.newaxis, np.newaxis, np.newaxis]
+    likely = (1 - OUTLIER) * np.exp(-costs / scales) + np.float32(OUTLIER)
+    return np.where(np.isnan(likely), np.float32(np.nanmean(likely, axis=1, keepdims=True)), likely)
+
+
+def as_bytes(likely: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return likelihoods as the machine gets them: relative to the likeliest disparity of their pixel, 255 for that."""
+    scaled = np.rint(likely * (255 / likely.max(axis=1, keepdims=True)))
+    return scaled.astype(np.uint8, copy=False)
+
+
+def fused(likely: NDArray[np.float32] | NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return the posterior in float64, float64[disparities, height, width]: the product over filters, normalised."""
+    product = likely.astype(np.float64).prod(axis=0)
+    return np.asarray(product / product.sum(axis=0))
