@@ -83,8 +83,8 @@ def likelihoods(costs: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def as_bytes(likely: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return likelihoods as the machine gets them: relative to the likeliest disparity of their pixel, 255 for that."""
-    scaled = np.rint(likely * (255 / likely.max(axis=1, keepdims=True)))
-    return scaled.astype(np.uint8, copy=False)
+    codes: NDArray[np.uint8] = np.rint(likely * (255 / likely.max(axis=1, keepdims=True))).astype(np.uint8)
+    return codes
 
 
 def fused(likely: NDArray[np.float32] | NDArray[np.uint8]) -> NDArray[np.float64]:

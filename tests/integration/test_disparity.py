@@ -35,8 +35,10 @@ async def test_the_demo_turns_images_into_the_disparities_of_its_machines(stage,
         *(sys.executable, "-m", "rosbayes", "demo", "--disparity"),
         *("--count", "2", "--seed", "7", "--out", str(tmp_path)),
     )
-    await until(lambda: "listening to ws://" in demo.out or demo.process.poll() is not None)
-    async with Robot(re.search(r"listening to (ws://\S+)", demo.out)[1], TOPICS) as robot:
+    listening = await until(
+        lambda: re.search(r"listening to (ws://\S+)\n", demo.out), lambda: demo.err + demo.out
+    )
+    async with Robot(listening[1], TOPICS) as robot:
         assert await demo.end() == 0, demo.err + demo.out
         await robot.lost()
     # what it printed: 160 x 120 pixels are 120 tiles
