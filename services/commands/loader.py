@@ -5,13 +5,14 @@ from typing import Annotated
 
 import typer
 
+from pcie_shim.errors import PcieShimError
 from pcie_shim.host.loader import program
 from services.commands import flags as options
 from services.errors import SettingsError
 from services.settings import Settings
 from services.sockets.serving import board_endpoint, board_endpoints, deployment_for
 from terminal.command_line import CommandLine
-from terminal.output import say, say_if_slow
+from terminal.output import say, say_error, say_if_slow, warn
 
 app = CommandLine(
     help="Program boards with images written by `toolchain build`.\n\n"
@@ -48,9 +49,19 @@ def loader(
         )
     else:
         images, endpoints = [image], [board_endpoint(endpoint, "ENDPOINT", settings)]
-    # one after the other: if one fails, those before it keep their new images
-    for path, board in zip(images, endpoints, strict=True):
-        with say_if_slow(f"waiting for the board at {board}"):
-            image_hash = program(board, path, timeout=settings.peer_timeout)
-        say(f"{board} holds image {image_hash[:16]} now")
+    failed: dict[int, PcieShimError] = {}
+    for at, (path, board) in enumerate(zip(images, endpoints, strict=True)):
+        try:
+            with say_if_slow(f"waiting for the board at {board}"):
+                image_hash = program(board, path, timeout=settings.peer_timeout)
+            say(f"{board} holds image {image_hash[:16]} now")
+        except PcieShimError as error:
+            if len(images) == 1:
+                raise
+            # the other boards are programmed nevertheless, so that a second run has only this one left
+            failed[at] = error
+            warn(f"{board} is not programmed: {error}")
+    if failed:
+        say_error(f"of {len(images)} boards, these are not programmed: {', '.join(map(str, failed))}")
+        return next(iter(failed.values())).exit_code
     return 0

@@ -5,6 +5,7 @@ import shutil
 import pytest
 
 from pcie_shim import register_map as rm
+from pcie_shim.errors import LinkError
 from services.boards.processes import blank_board
 from services.commands.board import app as board
 from services.commands.loader import app as loader
@@ -115,6 +116,22 @@ def test_all_boards_of_a_deployment_get_their_images(boat, programmed):
     ended = invoke(loader, ["-d", boat.directory, "--boards", "unix:/nowhere/"])
     assert ended.exit_code == 0
     assert programmed == [(f"unix:/nowhere/board{at}.sock", f"board{at}.bm") for at in range(4)]
+
+
+def test_boards_beside_one_that_is_not_there_are_programmed_and_named(boat, programmed, monkeypatch):
+    def program(endpoint, image, *, timeout):
+        if image.name in {"board1.bm", "board2.bm"}:
+            raise LinkError("held")
+        programmed.append(str(endpoint))
+        return "ab" * 32
+
+    monkeypatch.setattr("services.commands.loader.program", program)
+    ended = invoke(loader, ["-d", boat.directory, "--boards", "unix:/nowhere/"])
+    assert (ended.exit_code, programmed) == (5, [f"unix:/nowhere/board{at}.sock" for at in (0, 3)])
+    lines = ended.stderr.splitlines()
+    assert [f"board{at}.sock" in line for at, line in enumerate(lines[:4])] == [True] * 4
+    assert ["not programmed" in line for line in lines[:4]] == [False, True, True, False]
+    assert lines[4].endswith("1, 2")
 
 
 def test_one_board_gets_its_image(boat, programmed):
