@@ -116,9 +116,9 @@ async def test_each_line_is_a_message(monkeypatch, tmp_path, capsys, type_, path
 
 
 async def test_a_message_that_the_server_would_not_take(monkeypatch, tmp_path):
-    async with running_hub(limits=HubLimits(message_bytes=1000)) as port:
-        with pytest.raises(InputLineError, match="line 2 of standard input: .*1000"):
-            await published(monkeypatch, tmp_path, b"1\n" + b"1 " * 500, f"ws://127.0.0.1:{port}")
+    async with running_hub(limits=HubLimits(message_bytes=10_000)) as port:
+        with pytest.raises(InputLineError, match="line 2 of standard input: .*bytes"):
+            await published(monkeypatch, tmp_path, b"1\n" + b"1 " * 5000, f"ws://127.0.0.1:{port}")
 
 
 async def test_a_bad_line_ends_it_after_those_before(monkeypatch, tmp_path):
