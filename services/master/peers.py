@@ -355,17 +355,16 @@ class Peers:
         peer.reason = None
         peer.closed.clear()
         while True:
-            child = peer.child
-            if child is not None and not child.is_running:
-                await child.wait()
-                raise child.failure()
+            if peer.child is not None and not peer.child.is_running:
+                await self._restart(peer.child)
+                deadline = time.monotonic() + limit
             try:
                 await open_connection(peer.endpoint, make)
             except OSError as error:
                 if time.monotonic() > deadline:
                     hint = (
                         "is it running?"
-                        if child is None
+                        if peer.child is None
                         else "it was started but is not listening yet: is the computer overloaded?"
                     )
                     raise ChildDiedError(
@@ -427,7 +426,11 @@ class Peers:
             await asyncio.wait_for(child.wait(), self._settings.stop_timeout)
         if child.is_running:
             child.kill()
-            await child.wait()
+        await self._restart(child)
+
+    async def _restart(self, child: Child) -> None:
+        """Start a process again when it has exited, or raise the error that ends the run."""
+        await child.wait()
         failure = child.failure()
         if self._once or failure.exit_code != ExitCode.CHILD:
             raise failure

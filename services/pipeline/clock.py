@@ -11,6 +11,8 @@ CLOCK_TOPIC: Final = "/clock"
 _CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
 _INTERVAL_MS: Final = 10
 """Minimum time between two messages, of which simulators publish a thousand a second."""
+_MOST_NS: Final = 3600 * 10**9
+"""The most by which a message advances the ticks: jumps to and fro must not make them exceed the 64 bits of a record."""
 
 
 class Clock:
@@ -43,7 +45,7 @@ class Clock:
         async for message in messages:
             if (now := stamp_ns(message.msg.get("clock"))) is None:
                 continue
-            self._tick += max(now - (now if self._time is None else self._time), 0)
+            self._tick += min(max(now - (now if self._time is None else self._time), 0), _MOST_NS)
             self._time, self.heard = now, time.monotonic()
             if moved is not None:
                 moved()

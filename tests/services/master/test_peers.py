@@ -89,6 +89,32 @@ async def test_a_process_that_dies_is_restarted_three_times(boat, tmp_path):
     assert (tmp_path / "starts").read_text() == "\n" * (1 + RESTARTS)
 
 
+@pytest.mark.process
+@pytest.mark.parametrize("once", [True, False])
+async def test_a_process_that_dies_before_it_is_connected_is_restarted(boat, tmp_path, once):
+    place = tmp_path / "x.sock"
+    peers = Peers(Settings(), boat, get_logger("test"), once=once)
+    child = Child(
+        "subscriber",
+        ["/bin/sh", "-c", f"[ -e {tmp_path}/again ] && exec sleep 1000; >{tmp_path}/again; kill -KILL $$"],
+    )
+    await child.start()
+    await child.wait()
+    connecting = asyncio.ensure_future(
+        peers._connect(Peer("subscriber", endpoint_from(f"unix:{place}", "here"), child), PATIENCE)
+    )
+    if once:
+        with pytest.raises(ReportedError, match="SIGKILL"):
+            await connecting
+    else:
+        async with await asyncio.start_unix_server(lambda _, writer: writer.close(), place):
+            await asyncio.wait_for(connecting, PATIENCE)
+        assert child.is_running
+    child.kill()
+    await child.wait()
+    child.close()
+
+
 class Process:
     """A process of the master's own."""
 

@@ -79,13 +79,14 @@ async def test_ticks_go_on_when_the_clock_begins_again(ros_version):
             clock.follow(ros, lambda: heard.append((clock.time_ns(), clock.tick())))
         )
         await fake.wait_for_op("subscribe", topic="/clock")
-        times = [7_000_000_000, 7_000_000_005, 7_000_000_005, 3, 4]
+        times = [7_000_000_000, 7_000_000_005, 7_000_000_005, 3, 4, 2**31 * 10**9, 0, 2**31 * 10**9]
         for count, time_ns in enumerate(times, 1):
             await fake.publish("/clock", {"clock": "noon"})
             await fake.publish("/clock", {"clock": stamp(time_ns, ros_version)})
             await until(lambda count=count: len(heard) == count)
         following.cancel()
-    assert heard == list(zip(times, [0, 5, 5, 5, 6], strict=True))
+    hour = 3600 * 10**9
+    assert heard == list(zip(times, [0, 5, 5, 5, 6, 6 + hour, 6 + hour, 6 + 2 * hour], strict=True))
 
 
 @pytest.mark.parametrize("real_s", [0.0, 0.05], ids=["faster", "at a fifth of the rate"])
