@@ -143,7 +143,8 @@ class Child:
             self._process = await self._spawn(environment, lines.writer)
         except OSError as error:
             raise StackError(
-                f"cannot start {self.name} ({self._command[0]}): {error.strerror or error}; install rosbayes into this environment"
+                f"cannot start {self.name} ({self._command[0]}): {error.strerror or error}"
+                + ("; install rosbayes into this environment" if isinstance(error, FileNotFoundError) else "")
             ) from error
         finally:
             for pipe in self._pipes:
