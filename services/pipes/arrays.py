@@ -11,7 +11,7 @@ from typing import Any, Final
 from bridge.client import Ros, Subscription
 from bridge.codecs.message_check import SCALAR, Definitions, FieldType, bundled_definitions
 from bridge.errors import MessageTooLargeError, NoMessageError
-from bridge.fields import Field, Place, format_place
+from bridge.fields import Place, format_place
 from bridge.names import ros1_type, ros_version_of_type
 from services.errors import InputLineError, SettingsError
 from services.pipeline.connections import (
@@ -106,7 +106,9 @@ class ArrayField:
 
     def holds(self, message: dict[str, Any], numbers: list[float]) -> bool:
         """Return whether a received message has these numbers, apart from the rounding of a float32."""
-        _, received = Field(self.path).value(message)
+        received: Any = message
+        for step in self.place:
+            received = received.get(step) if isinstance(received, dict) else None
         if isinstance(received, str):  # uint8[]
             with contextlib.suppress(ValueError):
                 received = list(base64.b64decode(received))

@@ -72,6 +72,7 @@ def test_the_message_of_an_array():
     assert of("uint8").holds({"inner": {"data": "AQI="}}, [1, 2])
     assert of("float32").holds({"inner": {"data": [0.10000000149011612]}}, [0.1])
     assert not of("float32").holds({"inner": {"data": [0.1001]}}, [0.1])
+    assert not of("float32").holds({"inner": None, "data": [0.1]}, [0.1])
 
 
 def test_which_array_of_a_type_is_meant():
