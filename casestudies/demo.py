@@ -268,8 +268,10 @@ async def _run(
         # nothing is forked before the kernels are loaded, because a fork would inherit the locks of their thread
         await asyncio.gather(building, viewer.line("listening"), _load_kernels())
         screen.waits_for = "waiting for results"
-        frames = counted if case.is_frame else ()
-        await master.start("master", "--loop", *frames, "-d", str(deployment), "--uri", uri, *options)
+        await master.start(
+            *("master", "--loop", *(counted if case.is_frame else ())),
+            *("-d", str(deployment), "--uri", uri, *options),
+        )
         for name, flags in case.publishers.items():
             await processes[name].start(name, "--uri", uri, *flags)
         if page_port is not None:
@@ -281,12 +283,16 @@ async def _run(
             saying.cancel()
             screen.show(f"open {address[0]} in a browser{case.pointer}")
         ends = [asyncio.ensure_future(each.succeed()) for each in (master, viewer)]
-        # a master without a count ends only by a failure, which need not wait for the viewer's timeout
+        # a failure of one need not wait for the other's timeout; a master without a count ends only so
         await next(iter((await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED))[0]))
+        if case.is_frame:
+            await ends[0]
         screen.waits_for = "drawing the pictures"
-        await viewer.succeed()
-        screen.show(f"done in {time.monotonic() - started:.1f} s; pictures are in {out}")
-        screen.show("to watch it live in a browser: the same command with --dashboard")
+        await ends[1]
+        screen.show(
+            f"done in {time.monotonic() - started:.1f} s; pictures are in {out}\n"
+            "to watch it live in a browser: the same command with --dashboard"
+        )
     finally:
         saying.cancel()
         if building is not None:

@@ -301,7 +301,7 @@ def disparity_matcher(
         str | None,
         typer.Option(
             help="The server of the stack, if it is not that of the cameras.",
-            metavar="ws://HOST:PORT",
+            metavar="ws://HOST:PORT|robot:NAME",
             show_default="--uri",
         ),
     ] = None,

@@ -37,6 +37,12 @@ def test_a_port_that_is_taken_is_named_before_anything_starts(tmp_path, monkeypa
     assert not (tmp_path / "out").exists()
 
 
+def test_one_case_study_is_run_at_a_time(tmp_path):
+    ended = invoke(demo.app, ["--sprinkler", "--disparity", "--out", str(tmp_path / "out")])
+    assert ended.exit_code == 2
+    assert "--sprinkler and --disparity" in ended.stderr
+
+
 def test_a_missing_page_is_named_before_anything_starts(tmp_path, monkeypatch):
     monkeypatch.setattr(demo, "find_spec", lambda _name: None)
     ended = invoke(demo.app, ["--dashboard", "--out", str(tmp_path / "out")])
