@@ -236,6 +236,7 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
                 )
                 for index, (image, block) in enumerate(zip(images, layout.blocks, strict=True))
             ),
+            model=options.model_flags,
             outputs=(Output(topic=options.output),),
         )
     except ValidationError as reason:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError
 from machines.errors import ParameterError
 from machines.parameters import REPLICAS_MAX, PriorMode, RngKind, RngReset, SampleEvery, SensorMode, Sequencer
 from toolchain.bounded_files import TomlFile, nearest_name
-from toolchain.deployment import Output, Queue, Scale, Source, Stop, Variable, WrittenPrior
+from toolchain.deployment import ModelSection, Output, Queue, Scale, Source, Stop, Variable, WrittenPrior
 from toolchain.deployment.sections import MessagePath, Name, Section, Sequence
 from toolchain.errors import BuildError, ToolchainError
 from toolchain.flags import MAX_CYCLES, STOP, Partitions, StopWhen, key_values, names_in
@@ -416,6 +416,8 @@ class BuildOptions(MachineOptions, TargetOptions):
     """uint32[length], the random numbers for `rng = table`; None to generate them."""
     sources: SourcesFile | None = None
     """Several topics and their variables, in place of `uri`, `topic` and `type`; or None."""
+    model_flags: ModelSection = field(default_factory=ModelSection)
+    """The flags with which the model was read."""
     build_date: str = ""
     """The date of the build, ISO 8601: part of the images' manifests, but not of their hashes."""
 

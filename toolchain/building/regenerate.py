@@ -14,7 +14,14 @@ from toolchain.building.build import REPORT_NAME, assemble, check_agreement, rea
 from toolchain.building.choice import model_for
 from toolchain.building.machine import MACHINE_KEYS, MachinePlan, board_layout, machine_options, plan_machine
 from toolchain.building.options import BuildOptions, DeploymentEdits, MachineChoice, placed, refused_option
-from toolchain.deployment import FILE_NAME, BM2Section, Deployment, deployment_text, load_deployment
+from toolchain.deployment import (
+    FILE_NAME,
+    BM2Section,
+    Deployment,
+    ModelSection,
+    deployment_text,
+    load_deployment,
+)
 from toolchain.deployment.deployment import with_hash
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.joint import Question
@@ -64,11 +71,15 @@ Changes = list[tuple[str, Change]]
 
 
 def regenerate_memories(
-    directory: Path, model: Model | Question | None = None, *, build_date: str = ""
+    directory: Path,
+    model: Model | Question | None = None,
+    *,
+    flags: ModelSection | None = None,
+    build_date: str = "",
 ) -> Changes:
     """Write the memories, and a BM1's `bm1_parameters.vhd`, again, from the images, or with new tables from a model.
 
-    With a model, the images (with this date), the report and the hashes of `deployment.toml` are updated, and
+    With a model, read with these flags, the images (with this date), the report and the hashes of `deployment.toml` are updated, and
     the columns get the order of the model; sizes, widths and everything about topics do not change.
 
     Raises:
@@ -79,9 +90,10 @@ def regenerate_memories(
     images = read_images(deployment)
     if model is None:
         return write_files(directory, memory_files(deployment, images))
-    plan = _plan(
-        model, replace(_options(deployment, images[0]), build_date=build_date), deployment, images[0]
+    options = replace(
+        _options(deployment, images[0]), model_flags=flags or ModelSection(), build_date=build_date
     )
+    plan = _plan(model, options, deployment, images[0])
     built = assemble(plan, lambda new: _with_places(new, deployment))
     parts = [
         image_files(built.deployment, built.images),

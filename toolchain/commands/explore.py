@@ -58,6 +58,7 @@ def inspect(
     from toolchain.deployment import load_deployment
 
     deployment = load_deployment(directory)
+    flags = flags.over(deployment.model)
     if not deployment.machine.is_divided:
         from toolchain.analysis.chain_inspection import inspect_chain
         from toolchain.building.choice import network_for
@@ -66,7 +67,7 @@ def inspect(
         chain = inspect_chain(deployment, network, options, progress)
         typer.echo(chain.as_json() if json else chain.report(), nl=False)
         return
-    read = None if model is None else read_model(model, flags, bits)
+    read = None if model is None else read_model(model, flags, bits or deployment.model.bits)
     found = inspect_deployment(deployment, read, options, progress)
     typer.echo(as_json(found) if json else inspection_report(found), nl=False)
 

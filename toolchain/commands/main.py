@@ -67,11 +67,14 @@ def memories(
     """
     from toolchain.building.build import build_date
     from toolchain.building.regenerate import regenerate_memories
+    from toolchain.deployment import load_deployment
 
     if model is not None:
+        built = load_deployment(directory, images=False).model
+        flags = flags.over(built)
         source = read_source(model, flags)
-        before = _lines(directory)
-        changes = regenerate_memories(directory, source, build_date=build_date(model_file(model)))
+        before, date = _lines(directory), build_date(model_file(model))
+        changes = regenerate_memories(directory, source, flags=flags.section(built.bits), build_date=date)
         _print_changes(changes, before, _lines(directory), verbose=verbose)
     elif flags.settings or flags.question:
         raise BuildError(f"{'--set' if flags.settings else flags.question[0]} is for a model: add --model")

@@ -17,7 +17,7 @@ from toolchain.building.options import (
     TargetOptions,
     read_sources,
 )
-from toolchain.deployment import parse_interface
+from toolchain.deployment import ModelSection, parse_interface
 from toolchain.errors import BuildError, NetworkFileError, counted
 from toolchain.flags import Bits, Settings, key_values, names_in
 from toolchain.networks import is_network, read_network
@@ -59,6 +59,27 @@ class ModelFlags:
         ),
     ] = ""
     on_missing: Annotated[OnMissing, typer.Option(help="Meaning of an absent reading.")] = OnMissing.ERROR
+
+    def over(self, built: ModelSection) -> "ModelFlags":
+        """Return the flags of a build, and in their place those that are given here."""
+        found = {
+            each.name: getattr(self if getattr(self, each.name) != each.default else built, each.name)
+            for each in fields(ModelFlags)
+        }
+        settings = key_values(built.settings) | key_values(self.settings or ())
+        found["settings"] = [f"{key}={value}" for key, value in settings.items()]
+        found["on_missing"] = OnMissing(found["on_missing"])
+        return ModelFlags(**found)
+
+    def section(self, bits: Iterable[str] = ()) -> ModelSection:
+        """Return the flags as a deployment keeps them."""
+        flags = {each.name: getattr(self, each.name) for each in fields(ModelFlags)}
+        lists = {
+            "settings": tuple(self.settings or ()),
+            "given": tuple(self.given or ()),
+            "bits": tuple(bits),
+        }
+        return ModelSection(**flags | lists | {"on_missing": str(self.on_missing)})
 
     @property
     def question(self) -> list[str]:
@@ -173,6 +194,7 @@ def build_options(flags: BuildFlags, target: TargetOptions, sources: Path | None
                     f"{flag} {value}: the file of --sources sets that for each topic; omit the flag"
                 )
     options = BuildOptions(
+        model_flags=flags.section(flags.bits or ()),
         sources=None if sources is None else read_sources(sources, target.uri or None),
         **{each.name: getattr(target, each.name) for each in fields(TargetOptions)},
         **{each.name: getattr(flags, each.name) for each in fields(MachineOptions)},

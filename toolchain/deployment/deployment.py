@@ -18,6 +18,7 @@ from toolchain.deployment.sections import (
     Dimension,
     FilterSection,
     MachineSection,
+    ModelSection,
     Name,
     Output,
     Queue,
@@ -58,6 +59,7 @@ class DeploymentFile(Section):
     prior: WrittenPrior | None = Field(default=None, exclude_if=lambda prior: prior is None)
     filter: FilterSection | None = Field(default=None, exclude_if=lambda section: section is None)
     boards: Sequence[BoardSection] = Field(validation_alias="board", min_length=1)
+    model: ModelSection = Field(default=ModelSection(), exclude_if=lambda model: model == ModelSection())
     outputs: Sequence[Output] = Field(default=(Output(),), validation_alias="output")
     topics: Topics = Field(default=Topics(), exclude_if=lambda topics: topics == Topics())
 
@@ -220,6 +222,7 @@ def deployment_hash(deployment: DeploymentFile) -> str:
             "boards": {"__all__": {"endpoint"}},
             "outputs": {"__all__": {"uri"}},
             "topics": True,
+            "model": True,
         },
     )
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

@@ -193,6 +193,19 @@ class Section(BaseModel):
         return type(self)(**dict(self) | changes)
 
 
+class ModelSection(Section):
+    """`[model]`: the flags with which the build read the model, so that later commands with `--model` need none."""
+
+    settings: Sequence[str] = ()
+    bits: Sequence[str] = ()
+    searched: str = ""
+    known: str = ""
+    given: Sequence[str] = ()
+    prior_select: str = ""
+    previous: str = ""
+    on_missing: Literal["error", "missing"] = "error"
+
+
 class Source(Section):
     """`[[source]]`: a topic of readings on a rosbridge server."""
 

@@ -138,6 +138,34 @@ def test_what_a_build_was_told_about_places_is_not_asked_again(case, built):
     assert [each.table_of for each in load_deployment(once).variables] == [None, None]
 
 
+def test_how_the_model_was_read_is_not_asked_again(case, network):
+    """Neither new tables nor an inspection needs the flags of the build, and a given one replaces its own alone."""
+    out = build(case, "once", "--set", "sigma=0.5", "--set", "cells=6", "--bits", "D1=6")
+    before = contents(out)
+    regenerate("memories", out, "--model", case)
+    assert contents(out) == before
+    done(toolchain("inspect", out, "--model", case, "--frames", 2))
+    regenerate("memories", out, "--model", case, "--set", "sigma=2.0")
+    told = load_deployment(out).model
+    assert (told.settings, told.bits) == (("sigma=2.0", "cells=6"), ("D1=6",))
+    assert load_deployment(out).machine.lines == 6
+    asked = (
+        "--searched",
+        "rain",
+        "--known",
+        "grass,shoes",
+        "--given",
+        "sprinkler=on",
+        "--on-missing",
+        "missing",
+    )
+    out = build(network, "garden", *asked)
+    before = contents(out)
+    regenerate("memories", out, "--model", network)
+    assert contents(out) == before
+    done(toolchain("inspect", out, "--model", network, "--frames", 2))
+
+
 @pytest.mark.parametrize("wrong", [("--order", "D1,D22"), ("--path", "D22=data[1]")])
 def test_a_misspelt_variable_is_named_with_the_nearest_one(case, built, wrong):
     for result in (
