@@ -17,6 +17,7 @@ import typer
 
 from casestudies import DEFAULT_URI
 from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
+from casestudies.boat.viewer import CLOCK_HZ, Clock
 from machines import warm_up
 from terminal.command_line import CommandLine
 from terminal.errors import OutputError
@@ -47,13 +48,15 @@ class Case:
     pointer: str = ""
     """The end of the line with the page's address: advice, if there is any."""
     viewer: str
+    viewing: Sequence[str] = ()
+    """Options of the viewer."""
     publishers: Mapping[str, Sequence[str]]
     """The commands on the robot's side with their options, in the order of their start."""
     is_frame: bool = True
     """Whether a result of the viewer is a frame of the master, so that both end after the same number."""
 
 
-def boat(rates: Sequence[str], *, array: bool) -> Case:
+def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:
     """Return the boat on four boards; with `array`, its readings are plain arrays."""
     flags = ["--array"] if array else []
     return Case(
@@ -64,6 +67,7 @@ def boat(rates: Sequence[str], *, array: bool) -> Case:
         options=("--set", "array=true") if array else (),
         pointer="; on the page, drag the boat",
         viewer="boat-viewer",
+        viewing=("--clock", str(clock)),
         publishers={"boat-normaliser": flags, "boat-simulator": [*rates, *flags]},
     )
 
@@ -148,6 +152,7 @@ def demo(
         Literal["none", "pcie-gen2", "jtag"] | None,
         typer.Option(help="Link to the boards (see `board`).", show_default="BM_LINK_RATE, or none"),
     ] = None,
+    clock: Clock = CLOCK_HZ,
     rate: Annotated[
         float | None,
         typer.Option(min=0.01, max=10_000, help="Readings per second.", show_default="10, or 2 stereo pairs"),
@@ -176,7 +181,7 @@ def demo(
     rate = rate or (2.0 if is_disparity else 10.0)
     rates = ["--rate", str(rate), *(() if seed is None else ("--seed", str(seed)))]
     # a real server accepts only installed message types
-    case = boat(rates, array=uri is not None)
+    case = boat(rates, clock, array=uri is not None)
     if is_sprinkler:
         case = sprinkler(rates, count)
     elif is_disparity:
@@ -262,7 +267,7 @@ async def _run(
         uri = (await hub.line(r"ws://\S+"))[0] if uri is None else uri
         counted = () if count is None else ("--count", str(count))
         await viewer.start(
-            *(case.viewer, "--uri", uri, *counted, "--out", str(out)),
+            *(case.viewer, "--uri", uri, *counted, "--out", str(out), *case.viewing),
             *("--first-timeout", str(FIRST_TIMEOUT)),
         )
         # nothing is forked before the kernels are loaded, because a fork would inherit the locks of their thread

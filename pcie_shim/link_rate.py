@@ -10,7 +10,7 @@ import fcntl
 import mmap
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
@@ -43,7 +43,7 @@ class LinkRate(StrEnum):
     JTAG = "jtag"
 
 
-WIRES: Final = {
+WIRES: Final[Mapping[str, Wire]] = {
     # Thesis 2.3: 20,800 Mbps, measured with the vendor's diagnostics. A read of a device takes about 1 us there and back
     # (Neugebauer et al., "Understanding PCIe performance for end host networking", SIGCOMM 2018). Each board has lanes
     # of its own.

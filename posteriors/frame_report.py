@@ -11,6 +11,7 @@ import orjson
 from pydantic import BeforeValidator, Field, FiniteFloat, TypeAdapter
 
 from bridge.stamps import header, stamp_ns
+from pcie_shim.link_rate import WIRES
 from posteriors.messages import Part, validated
 
 FRAME_TOPIC: Final = "/bm/frame"
@@ -77,6 +78,9 @@ class FrameReport:
     number: int | None = None
     cycles: int | None = None
     counts_total: int | None = None
+    link_bytes: int | None = None
+    """Bytes between pcie-app and all boards, in both directions, and the number of transfers that they took."""
+    link_transfers: int | None = None
     received_ns: int | None = None
     """Receipt of the reading by the subscriber."""
     sent_ns: int | None = None
@@ -95,6 +99,12 @@ class FrameReport:
         """True if boards of a BM2 ended by their maximum number of cycles; `outcome` says which."""
         return "ended_early" in self.details
 
+    def link_us(self, rate: str) -> float | None:
+        """Return the microseconds of the frame's transfers, one after another, on a link of this --link-rate."""
+        if self.link_bytes is None or self.link_transfers is None:
+            return None
+        return 1e6 * WIRES[rate].seconds(self.link_bytes, self.link_transfers)
+
 
 # Keys of the message's values and their formats. The key of a number is the name of its field; that of a
 # stage has the suffix `_us`.
@@ -104,6 +114,8 @@ _FRAME_KEYS: Final = {
     "published": "%s",
     "cycles": "%d",
     "counts_total": "%d",
+    "link_bytes": "%d",
+    "link_transfers": "%d",
     "received_ns": "%d",
     "sent_ns": "%d",
     **{f"{stage}_us": "%.1f" for stage in _STAGES},
@@ -125,7 +137,9 @@ def _template(level: str, name: str, keys: Mapping[str, str]) -> str:
 _FRAME: Final = _template("%d", "frame", _FRAME_KEYS)
 _BOARD: Final = _template("0", "board %d", _BOARD_KEYS)
 _BOARD_OF_REPLICAS: Final = _template("0", "board %d", _BOARD_KEYS | _REPLICA_KEYS)
-_numbers: Final = attrgetter("cycles", "counts_total", "received_ns", "sent_ns")
+_numbers: Final = attrgetter(
+    "cycles", "counts_total", "link_bytes", "link_transfers", "received_ns", "sent_ns"
+)
 _times: Final = attrgetter(*_STAGES)
 
 

@@ -1,12 +1,13 @@
 """Pictures of posteriors next to the truth (thesis figure 4.4) and of a frame's time by stage (figure 4.5)."""
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Final
+from types import MappingProxyType
+from typing import Any, Final, TypeAlias
 
 from casestudies.boat.sensors import BEACONS, map_grid
 from casestudies.grid import Grid
@@ -25,6 +26,11 @@ class StageKind(StrEnum):
     COMPUTING = "computing on the boards"
 
 
+THESIS_SHARES: Final = {StageKind.ROSBRIDGE: 0.9874, StageKind.COMPUTING: 0.0124, StageKind.REGISTERS: 0.0001}
+"""Shares of a cycle's time in the thesis (4.3)."""
+PCIE: Final = "pcie-gen2"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageShare:
     """One stage of a frame: its mean over the frames that report it, and its share of all stages."""
@@ -39,7 +45,10 @@ def _reported(field: str) -> Callable[[Instance], float | None]:
     return lambda instance: getattr(instance.report.stages, field) if instance.report else None
 
 
-_STAGES: Final[tuple[tuple[str, StageKind, Callable[[Instance], float | None]], ...]] = (
+_Stage: TypeAlias = "tuple[str, StageKind, Callable[[Instance], float | None]]"
+"""A stage's name and part, and its time in microseconds in a frame, None if not known."""
+
+_STAGES: Final[tuple[_Stage, ...]] = (
     ("rosbridge in", StageKind.ROSBRIDGE, _reported("rosbridge_in")),
     ("local hops", StageKind.HOST, _reported("local_hops")),
     ("register writes", StageKind.REGISTERS, _reported("register_writes")),
@@ -59,9 +68,47 @@ def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
     `rosbridge out` is measured here, from the sending of a result to its arrival; the others come from
     `/bm/frame`.
     """
+    return _shares(instances, _STAGES)
+
+
+def projected_shares(instances: Iterable[Instance], clock_hz: float) -> tuple[StageShare, ...]:
+    """Return the stages with boards of hardware instead of emulated ones; empty if frames do not report what that needs.
+
+    Computing takes the cycles that the boards have counted, at this clock, and the link the modelled time of the
+    bytes that have moved, over PCIe. Host and rosbridge are those measured here.
+    """
+    stages = (
+        _STAGES[0],
+        _STAGES[1],
+        ("PCIe reads and writes", StageKind.REGISTERS, _link_us(PCIE)),
+        (f"BM1 at {clock_hz / 1e6:g} MHz", StageKind.COMPUTING, _compute_us(clock_hz)),
+        _STAGES[-1],
+    )
+    shares = _shares(instances, stages)
+    return shares if len(shares) == len(stages) else ()
+
+
+def mean_link_us(instances: Iterable[Instance], rate: str) -> float:
+    """Return the mean time of a frame's transfers on a link of this --link-rate; 0 if no frame reports them."""
+    return sum(share.mean_us for share in _shares(instances, (("", StageKind.REGISTERS, _link_us(rate)),)))
+
+
+def _link_us(rate: str) -> Callable[[Instance], float | None]:
+    return lambda instance: instance.report.link_us(rate) if instance.report else None
+
+
+def _compute_us(clock_hz: float) -> Callable[[Instance], float | None]:
+    def time_of(instance: Instance) -> float | None:
+        cycles = instance.report.cycles if instance.report else None
+        return None if cycles is None else 1e6 * cycles / clock_hz
+
+    return time_of
+
+
+def _shares(instances: Iterable[Instance], stages: Iterable[_Stage]) -> tuple[StageShare, ...]:
     published = [instance for instance in instances if instance.posterior is not None]
     means: list[tuple[str, StageKind, float]] = []
-    for name, part, time_of in _STAGES:
+    for name, part, time_of in stages:
         known = [time for time in map(time_of, published) if time is not None]
         if known:
             means.append((name, part, fmean(known)))
@@ -135,8 +182,19 @@ def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence
     save_figure(figure, path)
 
 
-def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> None:
-    """Draw figure 4.5, the mean time of each stage and its share of a frame's time, or raise an OutputError."""
+def draw_shares(
+    path: Path,
+    shares: Sequence[StageShare],
+    *,
+    frames: int,
+    title: str = "Time of a frame by stage",
+    note: str = "",
+    beside: Mapping[StageKind, float] = MappingProxyType({}),
+) -> None:
+    """Draw figure 4.5, the mean time of each stage and its share of a frame's time, or raise an OutputError.
+
+    The note is below the axis. The legend has the share of each part, and that in the thesis if it is in `beside`.
+    """
     figure = new_figure(8.4, 1.5 + 0.42 * max(len(shares), 1))
     axes = figure.subplots()
     names = [stage.name for stage in shares]
@@ -149,7 +207,7 @@ def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> Non
     )
     axes.invert_yaxis()
     axes.set_xlim(0, 1.32 * max(times, default=1.0))
-    axes.set_xlabel("mean time a frame, in ms")
+    axes.set_xlabel(f"mean time a frame, in ms{note}")
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(axis="y", length=0)
     parts = [part for part in StageKind if any(stage.part is part for stage in shares)]
@@ -157,13 +215,14 @@ def draw_shares(path: Path, shares: Sequence[StageShare], *, frames: int) -> Non
         [axes.barh([0], [0], color=_PART_COLOURS[part]) for part in parts],
         [
             f"{part}: {100 * sum(stage.share for stage in shares if stage.part is part):.1f} %"
+            + (f" (thesis {100 * beside[part]:.2f} %)" if part in beside else "")
             for part in parts
         ],
         loc="outside lower center",
         ncols=2,
         frameon=False,
     )
-    axes.set_title(f"Time of a frame by stage: {sum(times):.2f} ms, mean of {frames} frames")
+    axes.set_title(f"{title}: {sum(times):.2f} ms, mean of {frames} frames")
     save_figure(figure, path)
 
 

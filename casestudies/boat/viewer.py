@@ -5,7 +5,7 @@ from collections import deque
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
 import typer
 
@@ -17,10 +17,22 @@ from terminal.connection import report_connection
 from terminal.output import check_writable, say, warn, write_json
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from casestudies.boat.pictures import StageShare
     from casestudies.topics import Instance, Truth
 
 POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
+PROJECTED_PICTURE: Final = "figure-4.5-projected.png"
+CLOCK_HZ: Final = 100e6
+"""Clock of the boards in the projected figure, that of `toolchain inspect`; the thesis does not state its boards'."""
+Clock: TypeAlias = Annotated[
+    float,
+    typer.Option(
+        "--clock", min=1, max=1e12, help=f"Clock of the boards in {PROJECTED_PICTURE}.", metavar="HERTZ"
+    ),
+]
 HEADING: Final = "frame     true x, y     mean x, y  distance     cycles   time (ms)"
 
 
@@ -98,9 +110,10 @@ class Viewer:
         results: The number of frames with a posterior.
     """
 
-    def __init__(self, count: int | None) -> None:
+    def __init__(self, count: int | None, clock_hz: float = CLOCK_HZ) -> None:
         """Start without frames; `count` is the number of results to wait for, None to run until Ctrl-C."""
         self.count = count
+        self.clock_hz = clock_hz
         kept = KEPT if count is None else None
         self.instances: deque[Instance] = deque(maxlen=kept)
         self.route: tuple[Truth, ...] = ()
@@ -153,8 +166,17 @@ class Viewer:
                     warn(f"frames on /bm/frame without their result: {listener.announced_only}")
 
     def draw(self, folder: Path) -> tuple[Path, ...]:
-        """Write the two pictures and return their paths, or raise an OutputError."""
-        from casestudies.boat.pictures import draw_positions, draw_shares, far_apart, stage_shares
+        """Write the pictures and return their paths, or raise an OutputError."""
+        from casestudies.boat.pictures import (
+            PCIE,
+            THESIS_SHARES,
+            draw_positions,
+            draw_shares,
+            far_apart,
+            mean_link_us,
+            projected_shares,
+            stage_shares,
+        )
 
         written = []
         if chosen := far_apart(self.instances):
@@ -163,6 +185,17 @@ class Viewer:
         if shares := stage_shares(self.instances):
             written.append(folder / SHARES_PICTURE)
             draw_shares(written[-1], shares, frames=self.results)
+        if shares := projected_shares(self.instances, self.clock_hz):
+            written.append(folder / PROJECTED_PICTURE)
+            jtag = mean_link_us(self.instances, "jtag") - mean_link_us(self.instances, PCIE)
+            draw_shares(
+                written[-1],
+                shares,
+                frames=self.results,
+                title="Projected for hardware",
+                note=f"\nhost and rosbridge as measured, PCIe gen 2 as modelled (USB/JTAG: {jtag / 1000:+.2f} ms)",
+                beside=THESIS_SHARES,
+            )
         return tuple(written)
 
     def medians(self) -> tuple[float | None, float | None]:
@@ -175,7 +208,13 @@ class Viewer:
 
     def write_numbers(self, path: Path) -> None:
         """Write the frames and the times by stage as one JSON object, or raise an OutputError."""
-        from casestudies.boat.pictures import stage_shares
+        from casestudies.boat.pictures import projected_shares, stage_shares
+
+        def stages(shares: "Iterable[StageShare]") -> list[Numbers]:
+            return [
+                {"stage": each.name, "part": each.part.value, "mean_us": each.mean_us, "share": each.share}
+                for each in shares
+            ]
 
         distance, time = self.medians()
         numbers = {
@@ -183,10 +222,8 @@ class Viewer:
             "frames_without_posterior": self.frames - self.results,
             "median_distance_cells": distance,
             "median_time_ms": time,
-            "stages": [
-                {"stage": each.name, "part": each.part.value, "mean_us": each.mean_us, "share": each.share}
-                for each in stage_shares(self.instances)
-            ],
+            "stages": stages(stage_shares(self.instances)),
+            "projected_stages": stages(projected_shares(self.instances, self.clock_hz)),
             "frames": list(self.numbers),
         }
         write_json(path, numbers)
@@ -206,7 +243,8 @@ def boat_viewer(
     out: Annotated[
         Path | None,
         typer.Option(
-            help=f"Write {POSITIONS_PICTURE} and {SHARES_PICTURE} into this folder.", file_okay=False
+            help=f"Write {POSITIONS_PICTURE}, {SHARES_PICTURE} and {PROJECTED_PICTURE} into this folder.",
+            file_okay=False,
         ),
     ] = None,
     numbers: Annotated[
@@ -218,6 +256,7 @@ def boat_viewer(
     truth_tolerance: Annotated[
         float, typer.Option(min=0, help="Seconds by which a true pose may be older than the reading.")
     ] = 0.5,
+    clock: Clock = CLOCK_HZ,
     first_timeout: FirstTimeout = 60.0,
     timeout: Timeout = 30.0,
 ) -> None:
@@ -227,7 +266,7 @@ def boat_viewer(
     """
     from casestudies.topics import run_viewer
 
-    viewer = Viewer(count)
+    viewer = Viewer(count, clock)
     if out is not None:
         check_writable(out)
     if numbers is not None:

@@ -52,6 +52,8 @@ class FrameOutput:
         boards_compute_ns: Computing time of the slowest board, summed over the slices. The rest of
             `compute_ns` is transport, or other boards on the same core.
         slices: Number of slices.
+        link_bytes: Bytes between the host and all boards, in both directions, with the headers of the link.
+        link_transfers: Number of transfers that they were moved in.
     """
 
     boards: tuple[BoardResult, ...]
@@ -60,6 +62,8 @@ class FrameOutput:
     reads_ns: int
     boards_compute_ns: int
     slices: int
+    link_bytes: int
+    link_transfers: int
 
 
 class _Progress:
@@ -82,6 +86,9 @@ class _Progress:
         self.slices = 0
         self.writes_ns = self.waits_ns = self.reads_ns = self.computing_ns = 0
         self.clock_ns = time.perf_counter_ns()
+
+        # Bytes and transfers of the boards' links before this frame.
+        self.traffic = _traffic(boards)
 
 
 class MiniCluster:
@@ -302,6 +309,7 @@ class MiniCluster:
             self._expect_done(progress)
             return None
         results = course.conclude([board.result() for board in self._boards])
+        (size, transfers), (size_before, transfers_before) = _traffic(self._boards), progress.traffic
         return FrameOutput(
             boards=tuple(results),
             register_writes_ns=progress.writes_ns,
@@ -309,6 +317,8 @@ class MiniCluster:
             reads_ns=progress.reads_ns + time.perf_counter_ns() - progress.clock_ns,
             boards_compute_ns=progress.computing_ns,
             slices=progress.slices,
+            link_bytes=size - size_before,
+            link_transfers=transfers - transfers_before,
         )
 
     def _abandon(self) -> None:
@@ -385,6 +395,11 @@ class MiniCluster:
             self._poll.unregister(descriptor)
             del self._by_descriptor[descriptor]
         board.close(reason)
+
+
+def _traffic(boards: Sequence[DrivenBoard]) -> tuple[int, int]:
+    links = [board.open_link for board in boards]
+    return sum(link.bytes_moved for link in links), sum(link.transfers for link in links)
 
 
 def _check_images(boards: int, images: Sequence[Image]) -> None:

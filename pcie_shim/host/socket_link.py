@@ -105,6 +105,9 @@ class SocketLink:
         # The buffer of received bytes. Payloads are views of it, which the next receive overwrites.
         self._decoder = framing.FrameDecoder()
 
+        # Bytes of all frames in both directions, and transfers: frames that were sent together count once.
+        self.bytes_moved = self.transfers = 0
+
         # An interrupt that came while a request waited for its answer, with a copy of its results, until it is taken.
         self._done: Done | None = None
 
@@ -260,6 +263,7 @@ class SocketLink:
 
     def _send(self, frames: bytes) -> None:
         self._check_open()
+        self._count(len(frames))
         try:
             self._socket.sendall(frames)
         except OSError as error:
@@ -281,7 +285,7 @@ class SocketLink:
             return done
         self._check_open()
         try:
-            frame = self._decoder.next_frame()
+            frame = self._next_frame()
         except FramingError as error:
             self._give_up(error)
         if frame is None or frame.operation == framing.IRQ:
@@ -318,12 +322,22 @@ class SocketLink:
 
     def _receive(self, deadline: float, timeout: float, what: str) -> Frame:
         """Return the next frame of any kind; the timeout of the socket bounds each receive."""
-        while (frame := self._decoder.next_frame()) is None:
+        while (frame := self._next_frame()) is None:
             if time.monotonic() > deadline:
                 raise self.timeout_error(timeout, what)
             if not self._fill():
                 raise self.timeout_error(timeout, what)
         return frame
+
+    def _next_frame(self) -> Frame | None:
+        frame = self._decoder.next_frame()
+        if frame is not None:
+            self._count(framing.HEADER_BYTES + len(frame.payload))
+        return frame
+
+    def _count(self, size: int) -> None:
+        self.bytes_moved += size
+        self.transfers += 1
 
     def _fill(self) -> bool:
         """Receive once; return False if nothing came within the timeout of the socket."""

@@ -213,7 +213,7 @@ def fits(transfers: Sequence[Transfer]) -> list[Fitted]:
         if each.boards == 1 and each.link is LinkRate.NONE
     }
     found = []
-    for link in WIRES:
+    for link in (LinkRate.PCIE_GEN2, LinkRate.JTAG):
         for direction in ("write", "read"):
             those = [
                 each for each in transfers if (each.link, each.direction, each.boards) == (link, direction, 1)

@@ -72,7 +72,7 @@ def check_demo(installed: Installed) -> None:
     """Run the boat on four boards, and look for its pictures."""
     said = installed.run("rosbayes", "demo", "--count", "5")
     expect("5 results published" in said, f"it did not publish 5 results: {said}")
-    pictures(installed, "out", "figure-4.4.png", "figure-4.5.png")
+    pictures(installed, "out", "figure-4.4.png", "figure-4.5.png", "figure-4.5-projected.png")
 
 
 def check_sprinkler(installed: Installed) -> None:

@@ -120,6 +120,8 @@ def result_record(number: int, output: FrameOutput) -> FrameResult:
         compute_ns=output.compute_ns,
         reads_ns=output.reads_ns,
         boards_compute_ns=output.boards_compute_ns,
+        link_bytes=output.link_bytes,
+        link_transfers=output.link_transfers,
     )
 
 

@@ -43,6 +43,8 @@ def report_of(
         number=result.number,
         cycles=max((board.cycles for board in inference.boards), default=0),
         counts_total=sum(inference.totals),
+        link_bytes=result.link_bytes,
+        link_transfers=result.link_transfers,
         received_ns=publish.received_ns,
         sent_ns=sent_ns,
         stages=StageTimes(

@@ -177,7 +177,7 @@ class FrameRequest(Record, tag="frame", frozen=True):
 
 
 class FrameResult(Record, tag="result", frozen=True):
-    """pcie-app to master: the results of the boards, and durations.
+    """pcie-app to master: the results of the boards, durations, and what moved over the links.
 
     `boards` is a list of `machines.kind.BoardResult`, which only its sender and the publisher read.
     """
@@ -188,6 +188,8 @@ class FrameResult(Record, tag="result", frozen=True):
     compute_ns: int
     reads_ns: int
     boards_compute_ns: int
+    link_bytes: int = 0
+    link_transfers: int = 0
 
 
 class FrameFailed(Record, tag="failed", frozen=True):

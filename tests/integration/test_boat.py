@@ -270,7 +270,7 @@ async def test_one_command_draws_the_figures_of_the_thesis(stage, tmp_path):
     (command,) = re.findall(r"^    (rosbayes demo .*)$", page, re.MULTILINE)
     demo = stage.start(*shlex.split(command), "--count", "6", "--out", str(tmp_path))
     assert await demo.end() == 0, demo.err + demo.out
-    figures = [str(tmp_path / f"figure-4.{number}.png") for number in (4, 5)]
+    figures = [str(tmp_path / f"figure-4.{number}.png") for number in ("4", "5", "5-projected")]
     assert re.findall(r"^wrote (.*)$", demo.out, re.MULTILINE) == figures
     for figure in figures:
         assert imread(figure).shape[1] > 800

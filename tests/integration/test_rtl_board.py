@@ -24,12 +24,12 @@ MODEL = """
 
 
 def facts(status):
-    """Return the parts of a report that concern the machines, without times."""
+    """Return the parts of a report that concern the machines, without times and without the link."""
     return {
         # a reading ends with its age
         pair["key"]: pair["value"].rpartition(";")[0] if pair["key"].startswith("reading.") else pair["value"]
         for pair in status["values"]
-        if not pair["key"].endswith(("_ns", "_us"))
+        if not pair["key"].endswith(("_ns", "_us")) and not pair["key"].startswith("link_")
     }
 
 

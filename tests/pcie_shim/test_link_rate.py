@@ -70,3 +70,5 @@ def test_every_frame_of_a_host_is_carried_once_in_each_direction(start_board, mo
         assert output.boards[0].counts.max() == 10
         # sensors; settings with the doorbell; the answer from DONE on, with the counts
         assert carried == [HEADER_BYTES + 4 * words for words in (2, 8, 6 + 4)]
+        # both writes are one post
+        assert (output.link_bytes, output.link_transfers) == (sum(carried), 2)

@@ -26,6 +26,8 @@ REPORT = FrameReport(
     number=7,
     cycles=812,
     counts_total=900,
+    link_bytes=5200,
+    link_transfers=8,
     received_ns=1_700_000_000_000_000_001,
     sent_ns=1_700_000_000_002_000_001,
     stages=StageTimes(
@@ -70,7 +72,8 @@ def test_a_report_that_is_written_is_read_back_whole(ros_version):
     ]
     keys = [pair["key"] for pair in message["status"][0]["values"]]
     assert keys == [
-        *("number", "published", "cycles", "counts_total", "received_ns", "sent_ns"),
+        *("number", "published", "cycles", "counts_total", "link_bytes", "link_transfers"),
+        *("received_ns", "sent_ns"),
         *("rosbridge_in_us", "local_hops_us", "waited_us", "register_writes_us", "compute_us"),
         *("reads_us", "boards_compute_us", "rosbridge_out_us", "missing", "samples"),
         *('of "b"', "reading.D1", 'reading.of "a" %d', "reading.far"),

@@ -9,7 +9,9 @@ from casestudies.boat.pictures import (
     draw_positions,
     draw_shares,
     far_apart,
+    mean_link_us,
     posterior_grid,
+    projected_shares,
     stage_shares,
 )
 from casestudies.topics import Instance, Truth
@@ -21,14 +23,23 @@ VIRIDIS_LOW, VIRIDIS_HIGH = (0.267, 0.005, 0.329), (0.993, 0.906, 0.144)
 TRUTH_COLOUR = (1.0, 0.302, 0.302)
 
 
-def instance(number, x=0.0, y=0.0, *, cell=None, truth=True, width=32, height=32, **stages):
+def instance(number, x=0.0, y=0.0, *, cell=None, truth=True, width=32, height=32, moved=(), **stages):
     values = [0.0] * (width * height)
     if cell is not None:
         values[cell] = 1.0
     else:
         values = [1 / len(values)] * len(values)
+    cycles, size, transfers = moved or (None, None, None)
     report = FrameReport(
-        stamp_ns=number, heard_ns=number, outcome="", number=number, sent_ns=0, stages=StageTimes(**stages)
+        stamp_ns=number,
+        heard_ns=number,
+        outcome="",
+        number=number,
+        sent_ns=0,
+        stages=StageTimes(**stages),
+        cycles=cycles,
+        link_bytes=size,
+        link_transfers=transfers,
     )
     posterior = Posterior(
         probabilities=tuple(values), labels=("y", "x"), sizes=(height, width), heard_ns=500_000, report=report
@@ -113,6 +124,20 @@ def test_means_and_shares():
     some = stage_shares([instance(1, compute=500), instance(2)])  # the others were not told
     assert [(stage.name, stage.mean_us) for stage in some] == [("computing", 500), ("rosbridge out", 500)]
     assert stage_shares([]) == ()
+
+
+def test_the_projected_boards_compute_at_their_clock_and_move_what_has_moved():
+    instances = [instance(1, moved=(2000, 5200, 8), **STAGES), instance(2, moved=(4000, 5200, 8), **STAGES)]
+    shares = projected_shares(instances, 50e6)
+    assert [(stage.part, stage.mean_us) for stage in shares] == [
+        (StageKind.ROSBRIDGE, 100),
+        (StageKind.HOST, 200),
+        (StageKind.REGISTERS, pytest.approx(2 + 8 * 0.5)),
+        (StageKind.COMPUTING, pytest.approx(60)),
+        (StageKind.ROSBRIDGE, 500),
+    ]
+    assert mean_link_us(instances, "jtag") == pytest.approx(5200 * 8 / 24 + 8 * 125)
+    assert projected_shares([instance(1, **STAGES)], 50e6) == ()
 
 
 def test_the_bars_are_as_long_as_the_times(tmp_path):

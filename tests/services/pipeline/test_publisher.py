@@ -292,9 +292,14 @@ async def test_results_are_looked_for_until_one_is_seen(boat, link):
 
 def test_the_stages_of_a_report_are_the_whole_time_of_its_frame(boat):
     boards = result(boat, 1).result.boards
-    publish = Publish(FrameResult(1, boards, 3_000, 70_000, 5_000, 60_000), 8, 9, 100_000, 120_000, 11_000)
+    publish = Publish(
+        FrameResult(1, boards, 3_000, 70_000, 5_000, 60_000, 5_200, 8), 8, 9, 100_000, 120_000, 11_000
+    )
     inference = infer(publish.result, boat)
-    stages = report_of(publish, inference, boat, now=(1, 300_000), previous_out_ns=4_000).stages
+    report = report_of(publish, inference, boat, now=(1, 300_000), previous_out_ns=4_000)
+    stages = report.stages
+    assert (report.link_bytes, report.link_transfers) == (5_200, 8)
+    assert report.link_us("pcie-gen2") == pytest.approx(2 + 8 * 0.5)
     assert (stages.rosbridge_in, stages.waited, stages.rosbridge_out) == (20, 11, 4)
     assert (stages.register_writes, stages.compute, stages.reads, stages.boards_compute) == (3, 70, 5, 60)
     assert stages.local_hops == 300 - 120 - 11 - (3 + 70 + 5)  # what no process has measured

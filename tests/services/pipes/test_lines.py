@@ -159,7 +159,9 @@ def test_pcie_app_filters_its_lines(tmp_path, monkeypatch, capsys):
         priors.append(np.frombuffer(frame.prior_codes, "<u2").tolist())
         words = np.array([0, 5 if frame.number == 1 else 0], "<u4").tobytes()
         times = dict.fromkeys(("register_writes_ns", "compute_ns", "reads_ns", "boards_compute_ns"), 0)
-        return FrameOutput(boards=(BoardResult(words, 9, 1),), slices=1, **times)
+        return FrameOutput(
+            boards=(BoardResult(words, 9, 1),), slices=1, link_bytes=0, link_transfers=0, **times
+        )
 
     boards.run = run
     monkeypatch.setattr(pcie_app, "blocking_lines", lambda: [(at, b'{"addresses": [0]}') for at in (1, 2, 3)])
