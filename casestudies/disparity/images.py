@@ -71,20 +71,21 @@ def disparity_message(
     head: Mapping[str, Any],
     *,
     disparities: int,
-    focal_px: float,
+    focal_px: float | None,
     baseline_m: float,
     ros_version: Literal[1, 2] | None,
 ) -> dict[str, Any]:
     """Return disparities in pixels, float64[height, width], as a stereo_msgs/DisparityImage.
 
-    Negative disparities are unknown, as for stereo_image_proc. The baseline is `T` in ROS 1 and `t` in ROS 2.
+    Negative disparities are unknown, as for stereo_image_proc. Without a focal length it is the width of the image. The
+    baseline is `T` in ROS 1 and `t` in ROS 2.
     """
     height, width = disparity.shape
     window = {"x_offset": 0, "y_offset": 0, "height": height, "width": width, "do_rectify": False}
     return {
         "header": dict(head),
         "image": image_message(disparity, head, "32FC1"),
-        "f": focal_px,
+        "f": float(width) if focal_px is None else focal_px,
         "t" if ros_version == 2 else "T": baseline_m,
         "valid_window": window,
         "min_disparity": 0.0,

@@ -219,14 +219,15 @@ class Matcher:
         self,
         uri: str,
         stack_uri: str,
+        as_message: Callable[..., dict[str, Any]],
         *,
         count: int | None,
-        baseline: float,
-        focal: float | None,
         first_limit_s: float,
         limit_s: float,
     ) -> None:
         """Match pairs until `count` are done, or until cancelled, and print a line for each.
+
+        `as_message` is `disparity_message`, with what is known about the cameras.
 
         Raises:
             NoResultError: No pair of images, or no posterior, came in time.
@@ -259,14 +260,7 @@ class Matcher:
                     images = await self.next_pair(limit_s if self.pairs else first_limit_s)
                     self.matched = await self.match(images, stack)
                     self.pairs += 1
-                    message = disparity_message(
-                        self.matched.disparity,
-                        images.head,
-                        disparities=self._disparities,
-                        focal_px=images.left.shape[1] if focal is None else focal,
-                        baseline_m=baseline,
-                        ros_version=version,
-                    )
+                    message = as_message(self.matched.disparity, images.head, ros_version=version)
                     if await disparities.publish(message):
                         readiness.record()
                     print(self.matched.line(self.pairs), flush=True)
@@ -337,9 +331,8 @@ def disparity_matcher(
     watching = matcher.watch(
         uri,
         stack_uri or uri,
+        partial(disparity_message, disparities=disparities, focal_px=focal, baseline_m=baseline),
         count=count,
-        baseline=baseline,
-        focal=focal,
         first_limit_s=first_timeout,
         limit_s=timeout,
     )

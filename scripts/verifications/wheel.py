@@ -81,6 +81,12 @@ def check_sprinkler(installed: Installed) -> None:
     pictures(installed, "rain", "sprinkler.png")
 
 
+def check_disparity(installed: Installed) -> None:
+    """Run binocular disparity on a board of 160 machines."""
+    installed.run("rosbayes", "demo", "--disparity", "--count", "1", "--out", "depth")
+    pictures(installed, "depth", "disparity.png")
+
+
 def check_page(installed: Installed) -> None:
     """Ask for the page, without its packages: the demo says before its start what to install."""
     said = installed.run("rosbayes", "demo", "--dashboard", "--out", "page", code=2)
@@ -122,6 +128,7 @@ def check_commands(installed: Installed) -> None:
 CHECKS: Final[dict[str, Callable[[Installed], None]]] = {
     "rosbayes demo": check_demo,
     "rosbayes demo --sprinkler": check_sprinkler,
+    "rosbayes demo --disparity": check_disparity,
     "rosbayes demo --dashboard": check_page,
     "rosbayes build boat": check_toolchain,
     "files": check_files,

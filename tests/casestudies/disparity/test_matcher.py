@@ -6,6 +6,7 @@ images -> fake server -> Matcher -> /disparity/likelihoods -> pretend stack -> /
 import asyncio
 import base64
 import contextlib
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +16,7 @@ from matplotlib.image import imread
 from bridge.stamps import header, stamp_ns
 from casestudies.disparity import matcher as matcher_module
 from casestudies.disparity.comparison import UNKNOWN, Matched, bad_share
-from casestudies.disparity.images import image_message, read_image
+from casestudies.disparity.images import disparity_message, image_message, read_image
 from casestudies.disparity.matcher import Matcher
 from casestudies.disparity.matching import FILTERS
 from casestudies.disparity.model import LEFT_TOPIC, RIGHT_TOPIC, TILE_TOPIC, TRUTH_TOPIC
@@ -26,7 +27,8 @@ from tests.patience import PATIENCE
 from tests.posteriors.messages import report_message
 
 PAIR = Scene(2).pair(0, 30, 20)
-LIMITS = {"count": 1, "baseline": 0.1, "focal": None, "first_limit_s": PATIENCE, "limit_s": PATIENCE}
+LIMITS = {"count": 1, "first_limit_s": PATIENCE, "limit_s": PATIENCE}
+AS_MESSAGE = partial(disparity_message, disparities=16, focal_px=None, baseline_m=0.1)
 
 
 def exact(tile):
@@ -85,7 +87,7 @@ async def run(respond, *, pixels=160, stamps=(1_000_000_001,), **limits):
     """Run a matcher over pairs on a fake server, and return it with the disparity images that it published."""
     matcher = Matcher(disparities=16, pixels=pixels, clock=1e8)
     async with FakeRosbridge() as fake, serving(fake, lambda *given: respond(fake, *given)):
-        watching = asyncio.ensure_future(matcher.watch(fake.uri, fake.uri, **LIMITS | limits))
+        watching = asyncio.ensure_future(matcher.watch(fake.uri, fake.uri, AS_MESSAGE, **LIMITS | limits))
         try:
             for number, stamp in enumerate(stamps, 1):
                 await publish_pair(fake, stamp=stamp)
@@ -107,6 +109,7 @@ async def test_a_pair_becomes_a_disparity_image(tmp_path, capsys):
     matched = matcher.matched
     picture = read_image(images[1]["image"], "32FC1")
     assert picture.shape == (20, 30)
+    assert (images[1]["f"], images[1]["T" if "T" in images[1] else "t"]) == (30, 0.1)
     # bytes round the likelihoods, and two disparities may be equally probable
     assert (picture == matched.exact.argmax(axis=0)).mean() > 0.95
     assert (matched.truth[~PAIR.occluded] == PAIR.disparity.astype(np.float32)[~PAIR.occluded]).all()
