@@ -45,6 +45,13 @@ def master(
     once: Annotated[bool, typer.Option("--once", help="Compute the first complete frame and exit.")] = False,
     loop: Annotated[bool, typer.Option("--loop", help="Run until Ctrl-C, or --count.")] = False,
     count: options.Count = None,
+    start_each_message: Annotated[
+        bool,
+        typer.Option(
+            "--start-each-message",
+            help="Start subscriber and publisher for every message, as the thesis did, to see what that costs.",
+        ),
+    ] = False,
     connect: Annotated[
         Path | None,
         typer.Option(
@@ -92,6 +99,8 @@ def master(
         raise SettingsError("choose one of --once and --loop")
     if once and count is not None:
         raise SettingsError("--count requires --loop; --once computes one frame")
+    if once and start_each_message:
+        raise SettingsError("--start-each-message requires --loop; --once starts each service once anyway")
     if once and dashboard:
         raise SettingsError("--dashboard requires --loop; --once ends with the first frame")
     check_metrics(settings.metrics, insecure=insecure)
@@ -99,7 +108,16 @@ def master(
     loaded = deployment_for(settings)
     page = page_port if dashboard else None
     return run_async(
-        run_master(settings, loaded, once=once, count=count, json=json, plot=plot, page_port=page)
+        run_master(
+            settings,
+            loaded,
+            once=once,
+            count=count,
+            json=json,
+            plot=plot,
+            page_port=page,
+            start_each_message=start_each_message,
+        )
     )
 
 

@@ -210,6 +210,11 @@ class FrameFlow:
         """Return the counts for the status."""
         return FrameCounts.of(self._received, self.published, self.losses, self._last)
 
+    @property
+    def is_idle(self) -> bool:
+        """True while no frame is between its reading and its outcome."""
+        return not self._readings and self._computing is None and not self._at_publisher
+
     # --- events at the peers -------------------------------------------------------------------
 
     def ready(self, peer: Peer) -> None:

@@ -104,6 +104,10 @@ class Awaited:
 class PeerEvents(Protocol):
     """Receiver of the events of peers."""
 
+    @property
+    def is_idle(self) -> bool:
+        """True while no frame is between its reading and its outcome."""
+
     def ready(self, peer: Peer) -> None:
         """Handle a peer that has become ready."""
 
@@ -422,10 +426,7 @@ class Peers:
             peer.missed = True
             return
         # it closes its socket before it exits, and its exit code says whether another start would help
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(child.wait(), self._settings.stop_timeout)
-        if child.is_running:
-            child.kill()
+        await self._ended(child)
         await self._restart(child)
 
     async def _restart(self, child: Child) -> None:
@@ -439,6 +440,14 @@ class Peers:
             raise ChildDiedError(f"{failure}; it was restarted {RESTARTS} times within {window:g} s before")
         self._log.warning(f"{failure}; restarting it")
         await child.start()
+
+    async def _ended(self, child: Child) -> None:
+        """Wait for the end of a process that has closed its connection; kill it if it takes too long."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(child.wait(), self._settings.stop_timeout)
+        if child.is_running:
+            child.kill()
+            await child.wait()
 
     # --- records -------------------------------------------------------------------------------
 
@@ -478,7 +487,7 @@ class Peers:
 
     def _ready(self, peer: Peer, record: Ready) -> None:
         peer.ready = True
-        self._log.info(f"{peer.role}: {record.sentence}")
+        self._log_ready(peer, record)
         # the publisher must advertise before the subscriber subscribes, because results need a topic
         if self.begun.is_set():
             self._begin(peer)
@@ -487,6 +496,9 @@ class Peers:
             for each in self:
                 self._begin(each)
         self._events.ready(peer)
+
+    def _log_ready(self, peer: Peer, record: Ready) -> None:
+        self._log.info(f"{peer.role}: {record.sentence}")
 
     def _rosbridge(self, peer: Peer, record: Rosbridge) -> None:
         peer.away = not record.connected

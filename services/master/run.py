@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from services.child import Child, end_all
 from services.errors import NoDataError, StackError
 from services.master.command_lines import dashboard_command
+from services.master.each_message import EachMessagePeers
 from services.master.flow import FrameFlow
 from services.master.peers import ROLE, Peer, Peers
 from services.settings import Settings
@@ -55,6 +56,7 @@ class Master:
         json: bool,
         plot: bool = False,
         page_port: int | None = None,
+        start_each_message: bool = False,
     ) -> None:
         self._settings = settings
         self._once = once
@@ -68,7 +70,8 @@ class Master:
         self._drawn: Publish | None = None
         self._log = get_logger(ROLE, settings.log_level)
         self._deployment = deployment
-        self._peers = Peers(settings, deployment, self._log, once=once)
+        kind = EachMessagePeers if start_each_message else Peers
+        self._peers = kind(settings, deployment, self._log, once=once)
         self._flow = FrameFlow(
             settings, deployment, self._peers, self._log, once=once, count=self._count, show=self._show
         )
@@ -284,7 +287,10 @@ class ChildrenWatch:
     async def run(self) -> None:
         """Ask until cancelled."""
         while True:
-            running = [peer.role for peer in self._peers if peer.child is not None and peer.child.is_running]
+            # one that is not ready has a time limit of its own
+            running = [
+                peer.role for peer in self._peers if peer.ready and peer.child and peer.child.is_running
+            ]
             if all(await asyncio.gather(*map(self._is_well, running))):
                 self._answered = time.monotonic()
             await asyncio.sleep(ASK_EVERY)
@@ -305,7 +311,17 @@ async def run_master(
     json: bool,
     plot: bool,
     page_port: int | None = None,
+    start_each_message: bool = False,
 ) -> int:
     """Create a master inside the event loop, to which its futures belong, and run it to its end (see `Master.run`)."""
-    master = Master(settings, deployment, once=once, count=count, json=json, plot=plot, page_port=page_port)
+    master = Master(
+        settings,
+        deployment,
+        once=once,
+        count=count,
+        json=json,
+        plot=plot,
+        page_port=page_port,
+        start_each_message=start_each_message,
+    )
     return await master.run()

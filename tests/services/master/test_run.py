@@ -211,7 +211,10 @@ async def test_a_child_that_does_not_answer_is_noticed(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "_ANSWER_TIME", PATIENCE)
     process = SimpleNamespace(is_running=True)
     peers = Peers(
-        [SimpleNamespace(role="subscriber", child=process), SimpleNamespace(role="publisher", child=None)]
+        [
+            SimpleNamespace(role="subscriber", child=process, ready=True),
+            SimpleNamespace(role="publisher", child=None, ready=True),
+        ]
     )
     watch = ChildrenWatch(peers, tmp_path)
 

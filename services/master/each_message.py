@@ -1,0 +1,103 @@
+"""Peers of a run that starts subscriber and publisher for every message, as the thesis did (4.3).
+
+    subscriber starts ─▶ a reading ─▶ it ends ─▶ publisher starts ─▶ pcie-app ─▶ a result ─▶ it ends ─▶ subscriber ...
+
+The time from one result to the next contains both starts, as in figure 4.5. pcie-app and the boards stay. A first
+publisher, which finds out whether the server accepts the topics, ends when the run begins.
+"""
+
+import asyncio
+import time
+
+from services.errors import SettingsError
+from services.master.peers import Awaited, Peer, Peers
+from services.settings import LONGEST_S, Settings
+from services.sockets.records import AnyRecord, Outcome, Published, Reading, Ready, Seen, Unusable
+
+
+class EachMessagePeers(Peers):
+    """The three services, of which each message has a subscriber and a publisher of its own."""
+
+    # Those that have done their work and were told to end, until they have ended. What such a one still sends does not
+    # count: a reading is one that arrived beside the one that was taken, and is missed as if nobody had subscribed.
+    _done: set[Peer]
+    # True from the outcome of a result to the end of its publisher.
+    _publishing: bool
+    # Set by everything that may end the wait of a service for its turn, and cleared by each that goes on waiting.
+    _changed: asyncio.Event
+
+    def prepare(self) -> None:
+        """Determine the peers; a SettingsError if subscriber or publisher is not this master's to start."""
+        self._done, self._publishing, self._changed = set(), False, asyncio.Event()
+        super().prepare()
+        if self.subscriber.child is None or self.publisher.child is None:
+            raise SettingsError(
+                "--start-each-message starts subscriber and publisher itself; omit --fused, --connect, --subscriber and "
+                "--publisher"
+            )
+
+    @property
+    def not_ready(self) -> list[str]:
+        """The roles of peers that are not ready; subscriber and publisher come and go once the run has begun."""
+        return [role for role in super().not_ready if role == self.app.role or not self.begun.is_set()]
+
+    @property
+    def _service_settings(self) -> Settings:
+        # only the first of many subscribers may miss the robot, and the master has the same limit
+        return super()._service_settings.model_copy(update={"first_data_timeout": LONGEST_S})
+
+    def _dispatch(self, peer: Peer, record: AnyRecord) -> None:
+        if peer in self._done:
+            return
+        super()._dispatch(peer, record)
+        match record:
+            case Reading() | Unusable() | Seen():
+                self._end(peer)
+            case Published():
+                self._publishing = True
+                # one that was published is only over when it was seen on the wire, or looked for long enough
+                if record.outcome is not Outcome.PUBLISHED:
+                    self._end(peer)
+        self._changed.set()
+
+    def _end(self, peer: Peer) -> None:
+        if peer.child is not None:
+            self._done.add(peer)
+            peer.ready, peer.since = False, time.monotonic()
+            peer.child.terminate()
+
+    def _awaited(self, peer: Peer) -> Awaited | None:
+        if peer in self._done:
+            return Awaited("end", peer.since, self._settings.stop_timeout)
+        return super()._awaited(peer)
+
+    def _ready(self, peer: Peer, record: Ready) -> None:
+        begun = self.begun.is_set()
+        super()._ready(peer, record)
+        if self.begun.is_set() and not begun:
+            self._end(self.publisher)
+
+    def _log_ready(self, peer: Peer, record: Ready) -> None:
+        if not self.begun.is_set():
+            super()._log_ready(peer, record)
+
+    async def _bring_back(self, peer: Peer) -> None:
+        child, done = peer.child, peer in self._done
+        if done and child is not None:
+            await self._ended(child)
+            self._done.remove(peer)
+        if peer is self.publisher:
+            self._publishing = False
+        self._changed.set()
+        if not done or child is None:
+            await super()._bring_back(peer)
+            return
+        while not self._is_its_turn(peer):
+            self._changed.clear()
+            await self._changed.wait()
+        await child.start()
+
+    def _is_its_turn(self, peer: Peer) -> bool:
+        if peer is self.publisher:
+            return not self._events.is_idle and self.subscriber not in self._done
+        return self._events.is_idle and not self._publishing
