@@ -1,19 +1,34 @@
 """The VHDL in short: sessions of two machines, units, a proof, datasheets and logic; scripts/verify hdl has all of them."""
 
+import json
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from hdl.test.datasheets import PAGES, THEORY, main
 from hdl.test.datasheets import units as documented_units
-from hdl.test.netlist import synthesised
-from hdl.test.project import HDL, SOURCES, BM1Parameters, RngKind, SensorMode, image_of_parameters, run_tool
+from hdl.test.netlist import BLACK_BOX, run_yosys, synthesised
+from hdl.test.project import (
+    HDL,
+    SOURCES,
+    BM1Parameters,
+    RngKind,
+    SensorMode,
+    image_of,
+    image_of_parameters,
+    run_tool,
+    verilog,
+    write_hardware_files,
+)
 from hdl.test.verification import Check, formal, units
+from machines.parameters import PriorMode
 from tests.patience import FACTOR, PROCESS_PATIENCE
-from toolchain.analysis.logic import WORST_ERROR, logic_of
+from toolchain.analysis.logic import WORST_ERROR, logic_of, random_memories_of, tables_of, word_memories_of
+from toolchain.outputs.mif import LENGTH
 
 needs_ghdl = pytest.mark.skipif(
     shutil.which("ghdl") is None, reason="ghdl is not installed (Debian: apt-get install ghdl)"
@@ -94,6 +109,38 @@ def test_the_logic_of_a_small_board_is_unchanged(tmp_path, parameters, aluts, re
     assert estimate.registers == registers
     assert estimate.aluts == pytest.approx(found.aluts, rel=WORST_ERROR)
     assert estimate.alms == pytest.approx(found.alms, rel=WORST_ERROR)
+
+
+@pytest.mark.thorough
+@needs_ghdl
+@pytest.mark.parametrize(
+    "others",
+    [
+        {"prior_bits": 3},
+        {"sensor_mode": SensorMode.CELL, "replicas": 2, "prior_bits": 1},
+        {"prior_mode": PriorMode.WRITTEN, "replicas": 2},
+        {"rng": RngKind.TABLE, "shared": False, "steps_per_clock": 1},
+    ],
+    ids=["prior select", "replicas of cells", "written priors", "a table for each cell"],
+)
+def test_the_hardware_has_the_memories_of_the_estimate(tmp_path, others):
+    parameters = BM1Parameters(lines=5, sensor_bits=(4, 2), **others)
+    image = image_of(image_of_parameters(parameters).machine, more_inputs=9)
+    write_hardware_files(image, tmp_path)
+    (tmp_path / "bm1.v").write_text(verilog(tmp_path, table=BLACK_BOX))
+    passes = "hierarchy -top bm1; proc; flatten; opt_clean; memory -nomap; write_json flat.json"
+    run_yosys(f"read_verilog bm1.v; {passes}", tmp_path)
+    cells = json.loads((tmp_path / "flat.json").read_text())["modules"]["bm1"]["cells"].values()
+    sizes = {"bm1_table": ("DEPTH", "DATA_BITS"), "$mem_v2": ("SIZE", "WIDTH")}
+    found = Counter(
+        tuple(int(cell["parameters"][name], 2) for name in sizes[cell["type"]])
+        for cell in cells
+        if cell["type"] in sizes
+    )
+    del found[1, 5 * 8]  # the only row of a prior is a constant
+    estimated = tables_of(parameters) + random_memories_of(parameters, LENGTH)
+    estimated += word_memories_of(parameters, image.interface_sensors)
+    assert found == sum((Counter({(each.words, each.width): each.count}) for each in estimated), Counter())
 
 
 @pytest.mark.thorough

@@ -70,7 +70,10 @@ def inspect_deployment(
         stop=section.stop,
     )
     resources = tuple(
-        estimate(machine.parameters, device, table_length=table_length(machine)) for machine in machines
+        estimate(
+            machine.parameters, device, table_length=table_length(machine), inputs=section.interface_sensors
+        )
+        for machine in machines
     )
     banks = options.banks or (SLOW_BANKS if _is_slow(whole) else BANKS)
     with progress(len(readings)) as advance:

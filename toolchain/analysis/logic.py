@@ -12,6 +12,7 @@ from enum import StrEnum
 from typing import Final
 
 from machines.bm1_kind import BM1
+from machines.bm2 import BM2Parameters
 from machines.parameters import BM1Parameters, PriorMode, RngKind, SensorMode
 from toolchain.errors import BuildError
 from toolchain.outputs.memories import generators
@@ -158,13 +159,16 @@ class Logic:
         return sum(part.registers for part in self.parts)
 
 
-def state_bits(p: BM1Parameters, table_length: int) -> int:
+def state_bits(p: BM1Parameters | BM2Parameters, table_length: int) -> int:
     """Return the width of a generator's state: an LFSR, or an index in the table of random numbers."""
     return p.rng.lfsr_bits or _index_bits(table_length)
 
 
-def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH) -> Logic:
-    """Return the logic of a machine on a board, without memories; a BuildError if its generators are only emulated."""
+def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH, inputs: int = 0) -> Logic:
+    """Return the logic of a machine on a board, without memories; a BuildError if its generators are only emulated.
+
+    `inputs` are those of the interface, if it has more than the machine needs.
+    """
     p = parameters
     if p.rng is RngKind.IDEAL:
         raise BuildError("rng = ideal exists only in emulation; use an LFSR")
@@ -181,7 +185,7 @@ def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH) -> Logic:
             LogicPart(name="cells", counts={Of.CODE_BIT: cells * p.prob_bits}, registers=held * p.prob_bits),
             LogicPart(name="counters", counts={Of.COUNTER_BIT: counters}, registers=counters),
             _generators(p, table_length),
-            _inputs(p),
+            _inputs(p, inputs),
             LogicPart(
                 name="control",
                 counts={Of.BOARD: 1, Of.REPLICA: several},
@@ -200,27 +204,26 @@ def _generators(p: BM1Parameters, table_length: int) -> LogicPart:
     return LogicPart(name="generators", counts=counts, registers=count * width + loading)
 
 
-def _inputs(p: BM1Parameters) -> LogicPart:
+def _inputs(p: BM1Parameters, inputs: int) -> LogicPart:
     """Return the words that the host writes for a frame (bm1_words): readings, prior addresses of replicas, codes."""
     used = BM1.registers(p)
-    inputs, results = used.input_words, used.result_words
-    sensor_bits = sum(p.sensor_bits) * inputs // max(p.sensors, 1)
-    # words, and their used bits
-    blocks = [(inputs, sensor_bits)]
+    sensor_bits = sum(p.sensor_bits) * used.input_words // max(p.sensors, 1)
+    # used words, their used bits, and the depth of the memory
+    blocks = [(used.input_words, sensor_bits, max(inputs, used.input_words))]
     if p.replicas > 1:
-        blocks.append((p.replicas, p.replicas * p.prior_bits))
+        blocks.append((p.replicas, p.replicas * p.prior_bits, p.replicas))
     place_bits = 0
     if p.prior_mode is PriorMode.WRITTEN:
-        blocks.append((results, results * p.prob_bits))
+        blocks.append((used.result_words, used.result_words * p.prob_bits, used.result_words))
         place_bits = _index_bits(p.lines)  # in the memory of their initial codes
-    # a word has a flag, whether it is too large; a block has two indices, each with a flag, and an output
+    # a used word has a flag, whether it is too large; a block has two indices, each with a flag, and an output
     registers = sum(
-        words + bits + 2 * _index_bits(words) + 2 + (WORD_BITS if words <= _FEW_WORDS else 0)
-        for words, bits in blocks
+        words + bits + 2 * _index_bits(depth) + 2 + (WORD_BITS if depth <= _FEW_WORDS else 0)
+        for words, bits, depth in blocks
     )
     return LogicPart(
         name="inputs",
-        counts={Of.WORD: sum(words for words, _ in blocks), Of.MEMORY: len(blocks)},
+        counts={Of.WORD: sum(words for words, _, _ in blocks), Of.MEMORY: len(blocks)},
         registers=registers + place_bits,
     )
 
@@ -247,14 +250,16 @@ def blocks_of(words: int, width: int) -> int:
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class _Memory:
+class EqualMemories:
+    """A number of memories of the same words and width."""
+
     words: int
     width: int
     count: int
 
     @property
     def blocks(self) -> int:
-        """Minimum number of M20Ks for one table."""
+        """Minimum number of M20Ks for one of them."""
         return blocks_of(self.words, self.width)
 
 
@@ -269,41 +274,49 @@ class Memories:
     alms: float
 
 
-def _tables(p: BM1Parameters) -> list[_Memory]:
-    """Return the tables: one per column with one address, otherwise one per cell; a one-row prior has none.
+def tables_of(p: BM1Parameters) -> list[EqualMemories]:
+    """Return the tables: one per column with one address, otherwise one per cell.
 
-    Every replica has its own tables, because it uses its own addresses.
+    Every replica has its own tables, because it uses its own addresses. A prior of one row, whose MIF has one word, is a
+    constant and no memory.
     """
     column, cell = (p.lines * p.prob_bits, p.replicas), (p.prob_bits, p.replicas * p.lines)
-    tables = [_Memory(1 << p.prior_bits, *column)] if p.prior_bits else []
+    tables = [EqualMemories(1 << p.prior_bits, *column)] if p.prior_bits else []
     if p.has_tables:
         shape = column if p.sensor_mode is SensorMode.COLUMN else cell
-        tables += [_Memory(1 << bits, *shape) for bits in p.sensor_bits]
+        tables += [EqualMemories(1 << bits, *shape) for bits in p.sensor_bits]
     return tables
 
 
-def _other_memories(p: BM1Parameters, table_length: int) -> list[_Memory]:
-    """Return the seeds, the table of random numbers (one for each generator), and the words that the host writes."""
+def random_memories_of(p: BM1Parameters | BM2Parameters, table_length: int) -> list[EqualMemories]:
+    """Return the seeds, and the table of random numbers, of which every generator has its own."""
+    seeds = EqualMemories(p.rng_banks * generators(p), state_bits(p, table_length), 1)
+    table = EqualMemories(table_length, p.prob_bits, generators(p))
+    return [seeds, table] if p.rng is RngKind.TABLE else [seeds]
+
+
+def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
+    """Return the words that the host writes (bm1_words), and the initial codes of a written prior."""
     used = BM1.registers(p)
-    inputs, results = used.input_words, used.result_words
-    memories = [
-        _Memory(p.rng_banks * generators(p), state_bits(p, table_length), 1),
-        _Memory(max(inputs, 1), WORD_BITS, 1),
-    ]
-    if p.rng.lfsr_bits is None:
-        memories.append(_Memory(table_length, p.prob_bits, generators(p)))
+    depths = [max(inputs, used.input_words, 1)]
+    initial = []
     if p.replicas > 1:
-        memories.append(_Memory(p.replicas, WORD_BITS, 1))
+        depths.append(p.replicas)
     if p.prior_mode is PriorMode.WRITTEN:
-        memories += [_Memory(results, WORD_BITS, 1), _Memory(p.lines, p.prob_bits, 1)]
-    return memories
+        depths.append(used.result_words)
+        initial.append(EqualMemories(p.lines, p.prob_bits, 1))
+    # a power of two, because the index is an address of the bus
+    return [EqualMemories(1 << _index_bits(depth), WORD_BITS, 1) for depth in depths] + initial
 
 
-def place_memories(parameters: BM1Parameters, device: Device, table_length: int = LENGTH) -> Memories:
+def place_memories(
+    parameters: BM1Parameters, device: Device, table_length: int = LENGTH, inputs: int = 0
+) -> Memories:
     """Place tables in the remaining memory blocks, the deepest first, and the rest in memory LABs."""
-    tables = _tables(parameters)
+    tables = tables_of(parameters)
     room = math.floor(device.usable * device.blocks)
-    blocks = sum(each.count * each.blocks for each in _other_memories(parameters, table_length))
+    others = random_memories_of(parameters, table_length) + word_memories_of(parameters, inputs)
+    blocks = sum(each.count * each.blocks for each in others)
     logic_tables = mlabs = 0
     alms = 0.0
     for table in sorted(tables, reverse=True):

@@ -69,16 +69,23 @@ class Estimate:
         return ""
 
 
-def estimate(parameters: BM1Parameters, device: Device, *, table_length: int = LENGTH) -> Estimate:
-    """Return the resources of a machine on a device, or raise a BuildError if it exists only in emulation."""
+def estimate(
+    parameters: BM1Parameters, device: Device, *, table_length: int = LENGTH, inputs: int = 0
+) -> Estimate:
+    """Return the resources of a machine on a device, or raise a BuildError if it exists only in emulation.
+
+    `inputs` are those of the interface, if it has more than the machine needs; results are counters and take no memory.
+    """
     return Estimate(
         device=device,
-        logic=logic_of(parameters, table_length=table_length),
-        memories=place_memories(parameters, device, table_length),
+        logic=logic_of(parameters, table_length=table_length, inputs=inputs),
+        memories=place_memories(parameters, device, table_length, inputs),
     )
 
 
-def most_replicas(board: BM1Parameters, device: Device, *, table_length: int = LENGTH) -> tuple[int, str]:
+def most_replicas(
+    board: BM1Parameters, device: Device, *, table_length: int = LENGTH, inputs: int = 0
+) -> tuple[int, str]:
     """Return how many machines with the lines of a board fit it, 0 if none does, and why no more, as a clause."""
 
     def why_not(replicas: int) -> str:
@@ -89,7 +96,7 @@ def most_replicas(board: BM1Parameters, device: Device, *, table_length: int = L
         ):
             if needed > room:
                 return f"it takes {needed:,} {what} registers, and the map has {room:,}"
-        return estimate(machines, device, table_length=table_length).why_not
+        return estimate(machines, device, table_length=table_length, inputs=inputs).why_not
 
     most = bisect_left(range(1, REPLICAS_MAX + 1), True, key=lambda replicas: why_not(replicas) != "")
     if most == REPLICAS_MAX:
@@ -98,12 +105,12 @@ def most_replicas(board: BM1Parameters, device: Device, *, table_length: int = L
 
 
 def boards_needed(
-    parameters: BM1Parameters, device: Device, *, table_length: int = LENGTH
+    parameters: BM1Parameters, device: Device, *, table_length: int = LENGTH, inputs: int = 0
 ) -> tuple[int, str]:
     """Return the minimum number of boards for a machine, and why, as a sentence; or raise a BuildError."""
 
     def on(lines: int) -> Estimate:
-        return estimate(replace(parameters, lines=lines), device, table_length=table_length)
+        return estimate(replace(parameters, lines=lines), device, table_length=table_length, inputs=inputs)
 
     room = interface_room(BM1.registers(parameters))
     largest_lines = room[1] // parameters.replicas

@@ -19,19 +19,23 @@ from toolchain.analysis.logic import (
     MLAB_SHAPE,
     WORD_BITS,
     Device,
+    EqualMemories,
     Logic,
     LogicPart,
     Memories,
     Of,
-    blocks_of,
+    random_memories_of,
 )
 from toolchain.analysis.readings import check_frames
 from toolchain.analysis.resources import Estimate
 from toolchain.deployment import Dimension
 from toolchain.errors import BuildError
 from toolchain.models.network import NetworkModel
+from toolchain.outputs.memories import seed_width
+from toolchain.outputs.mif import table_length
 
 _INFINITE: Final = 1e9
+_SEQUENCER_BITS: Final = 16  # an LFSR16 of its own, and its seeds
 Addresses = tuple[int, ...]
 """A frame's readings: an address per known variable."""
 
@@ -130,13 +134,13 @@ def run_chains(
 def chain_resources(machine: BM2Machine, device: Device) -> Estimate:
     """Return the resources of a board, estimated from the units of a BM1; there is no VHDL of a BM2 to compare."""
     p = machine.parameters
-    seed, adders = p.rng.lfsr_bits or 16, len([bits for bits in p.bits if bits]) + 1
+    seed, adders = seed_width(machine), len([bits for bits in p.bits if bits]) + 1
     # each local bit of a CDE moves by one place in the address if the pointer is below it
-    moved, state = sum(len(p.factor_bits(cde)) for cde in range(p.cdes)), p.cdes * seed + 16
+    moved, state = sum(len(p.factor_bits(cde)) for cde in range(p.cdes)), p.cdes * seed + _SEQUENCER_BITS
     counts: dict[str, tuple[dict[Of, float], int]] = {
         "CDEs": ({Of.CODE_BIT: p.cdes * p.prob_bits, Of.STATE_BIT: moved}, 0),
         "histograms": ({Of.COUNTER_BIT: adders * WORD_BITS}, adders * WORD_BITS),
-        "generators": ({Of.STATE_BIT: state, Of.STEP: p.cdes * p.steps_per_clock + 16}, state),
+        "generators": ({Of.STATE_BIT: state, Of.STEP: p.cdes * p.steps_per_clock + _SEQUENCER_BITS}, state),
         "inputs": (
             {Of.WORD: 2 * p.state_words, Of.MEMORY: 2, Of.STATE_BIT: 2 * p.state_bits},
             3 * p.state_bits,
@@ -146,15 +150,19 @@ def chain_resources(machine: BM2Machine, device: Device) -> Estimate:
     parts = tuple(LogicPart(name=name, counts=of, registers=own) for name, (of, own) in counts.items())
     small = [table for table in machine.tables if 0 < table.size <= MLAB_SHAPE[0]]
     labs = len(small) * math.ceil(p.prob_bits / MLAB_SHAPE[1])
-    blocks = [(table.size, p.prob_bits) for table in machine.tables if table.size > MLAB_SHAPE[0]]
-    blocks += [
-        (p.rng_banks * p.cdes, seed),
-        (p.result_words, WORD_BITS),
-        (p.stream * p.state_words, WORD_BITS),
+    placed = random_memories_of(p, table_length(machine))
+    placed += [
+        EqualMemories(words, width, 1)
+        for words, width in (
+            *((table.size, p.prob_bits) for table in machine.tables if table.size > MLAB_SHAPE[0]),
+            (p.rng_banks, _SEQUENCER_BITS),
+            (p.result_words, WORD_BITS),
+            (p.stream * p.state_words, WORD_BITS),
+        )
     ]
     memories = Memories(
         table_bits=sum(table.size for table in machine.tables) * p.prob_bits,
-        blocks=sum(blocks_of(words, width) for words, width in blocks),
+        blocks=sum(each.count * each.blocks for each in placed),
         logic_tables=len(small),
         mlabs=labs,
         alms=float(MLAB_ALMS * labs),

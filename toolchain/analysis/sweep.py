@@ -380,7 +380,7 @@ def with_resources(task: Task, point: Point, device: Device) -> Point:
         return point
     lines = partition_lines(parameters.lines, options.partitions)[0].lines
     largest = replace(parameters, lines=lines)
-    took = estimate(largest, device)
+    took = estimate(largest, device, inputs=(options.interface or (0, 0))[0])
     update = {"alms": took.alms, "blocks": took.memories.blocks, "fits": took.fits}
     return point.model_copy(update=update)
 

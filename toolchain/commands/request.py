@@ -224,16 +224,18 @@ def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan",
 
     options, parameters, device = plan.options, plan.parameters, device_named(name)
     length = LENGTH if options.rng_table is None else options.rng_table.size
-    count, why = boards_needed(parameters, device, table_length=length)
+    inputs = (options.interface or (0, 0))[0]
+    count, why = boards_needed(parameters, device, table_length=length, inputs=inputs)
     if options.partitions > count:
         why += f" --partitions {options.partitions} asks for more."
     options = replace(options, partitions=max(count, options.partitions))
     if options.replicas == FILL:
         board = replace(parameters, lines=partition_lines(parameters.lines, options.partitions)[0].lines)
-        most, limit = most_replicas(board, device, table_length=length)
+        most, limit = most_replicas(board, device, table_length=length, inputs=inputs)
         options = replace(options, replicas=max(most, 1))
         parameters = replace(parameters, replicas=options.replicas)
-        took = estimate(replace(board, replicas=options.replicas), device, table_length=length)
+        filled = replace(board, replicas=options.replicas)
+        took = estimate(filled, device, table_length=length, inputs=inputs)
         why += (
             f" {counted(options.replicas, 'machine')} fill a board, with {took.alms:,.0f} ALMs ({took.alm_share:.0%}) and "
             f"{took.memories.blocks:,} memory blocks ({took.block_share:.0%}): {limit}."

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machines.bm1 import BM1Machine
+from machines.bm2 import BM2Machine
 from machines.rng import GOLDEN, mix
 from toolchain.bounded_files import read_bounded
 from toolchain.errors import BuildError, MifError
@@ -240,7 +241,7 @@ LENGTH: Final = 1 << 16
 """Length of a generated table: a multiple of every number of codes."""
 
 
-def table_length(machine: BM1Machine) -> int:
+def table_length(machine: BM1Machine | BM2Machine) -> int:
     """Return the length of a machine's table of random numbers, or of a generated one if it has none."""
     return LENGTH if machine.rng_table is None else machine.rng_table.size
 

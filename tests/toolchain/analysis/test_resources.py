@@ -1,14 +1,27 @@
 """Resources: exact counts where possible, and the figures of the thesis."""
 
 import math
+from collections import Counter
 from dataclasses import replace
 
 import pytest
 
+from hdl.test.project import image_of_parameters
 from machines.parameters import REPLICAS_MAX, BM1Parameters, PriorMode, RngKind, SensorMode
-from toolchain.analysis.logic import DEVICES, device_named, logic_of
+from toolchain.analysis.logic import (
+    DEVICES,
+    WORD_BITS,
+    device_named,
+    logic_of,
+    random_memories_of,
+    tables_of,
+    word_memories_of,
+)
 from toolchain.analysis.resources import boards_needed, estimate, most_replicas
 from toolchain.errors import BuildError
+from toolchain.hardware import board_memories
+from toolchain.outputs.memories import generators
+from toolchain.outputs.mif import LENGTH
 
 D8 = DEVICES["proce-v-d8"]
 BOAT = BM1Parameters(lines=1024, sensor_bits=(7, 7, 7, 9, 9, 9))
@@ -28,10 +41,49 @@ def test_tables_in_bits_and_blocks():
     assert on_d8(deep).memories.blocks == 2 + seeds_and_inputs  # 4096 words of 8 bits: two blocks of 4096 x 5
     assert on_d8(replace(deep, prior_bits=9)).memories.blocks == 3 + seeds_and_inputs
     cells = on_d8(replace(BOAT, sensor_mode=SensorMode.CELL)).memories
-    # a block a cell: 512 words of 8 bits, or fewer; 12 blocks hold 6144 input words
+    # a block a cell: 512 words of 8 bits, or fewer; 14 blocks hold 8192 input words, of which 6144 are used
     assert cells.blocks == int(0.8 * 2567)
-    assert cells.logic_tables == 6 * 1024 - (cells.blocks - 12 - 1)
+    assert cells.logic_tables == 6 * 1024 - (cells.blocks - 14 - 1)
     assert cells.table_bits == on_d8(BOAT).memories.table_bits
+
+
+MACHINES = {
+    "columns": {},
+    "prior select": {"prior_bits": 3},
+    "cells": {"sensor_mode": SensorMode.CELL, "prior_bits": 2},
+    "thresholds": {"sensor_mode": SensorMode.THRESHOLD, "sensor_bits": (8, 8)},
+    "replicas": {"replicas": 3, "prior_bits": 1},
+    "replicas of cells": {"replicas": 3, "sensor_mode": SensorMode.CELL},
+    "written prior": {"prior_mode": PriorMode.WRITTEN, "lines": 600},
+    "table": {"rng": RngKind.TABLE, "steps_per_clock": 1},
+    "generator per cell": {"shared": False, "rng": RngKind.LFSR16},
+}
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_the_memories_are_those_of_the_mifs(name):
+    parameters = BM1Parameters(**{"lines": 6, "sensor_bits": (4, 9)} | MACHINES[name])
+    found = Counter()
+    for memory in board_memories(image_of_parameters(parameters)):
+        kind, count, width = memory.name.removeprefix("board0_"), 1, memory.width
+        if kind.startswith("column") and parameters.sensor_mode is SensorMode.CELL:
+            # the file has the column's words; each cell has its own bits of them
+            count, width = parameters.replicas * parameters.lines, width // parameters.lines
+        elif kind.startswith("column") or (kind == "prior.mif" and parameters.prior_mode is PriorMode.TABLE):
+            count = parameters.replicas if memory.depth > 1 else 0
+        elif kind == "rng_table.mif":
+            count = generators(parameters)
+        found[memory.depth, width] += count
+    # the words that the host writes have no file
+    files = [each for each in word_memories_of(parameters) if each.width != WORD_BITS]
+    files += tables_of(parameters) + random_memories_of(parameters, LENGTH)
+    assert +found == sum((Counter({(each.words, each.width): each.count}) for each in files), Counter())
+
+
+def test_the_inputs_of_a_larger_interface_take_memory():
+    blocks = [on_d8(replace(BOAT, lines=8), inputs=inputs).memories.blocks for inputs in (0, 6, 20, 600)]
+    assert [each - blocks[0] for each in blocks] == [0, 0, 0, 1]
+    assert logic_of(BOAT, inputs=20).registers - logic_of(BOAT).registers == 2 * (5 - 3) - WORD_BITS
 
 
 def test_a_table_of_random_numbers_is_as_long_as_the_users():
