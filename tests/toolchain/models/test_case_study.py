@@ -109,7 +109,7 @@ def test_mistakes_in_the_file(case, text, line):
 def test_no_folder_and_no_model(tmp_path):
     with pytest.raises(ModelError, match=r"has no model\.py"):
         load_model(tmp_path, {})
-    with pytest.raises(ModelError, match="does not exist; .* boat, mrclam, sprinkler$"):
+    with pytest.raises(ModelError, match="does not exist; .* boat, disparity, mrclam, sprinkler$"):
         load_model(tmp_path / "nowhere", {})
 
 
