@@ -1,7 +1,7 @@
-"""One message after another as in the thesis, with a subscriber and a publisher for each, and with those of a usual run.
+"""One message after another as probably in the thesis, with a subscriber and a publisher for each, and with those of a usual run.
 
 client --reading--> hub --> subscriber -> master -> pcie-app -> 4 boards -> pcie-app -> master -> publisher --> hub --> client
-                            `-- started for each message (4.3), or once ------------------------'
+                            `-- started for each message, or once ------------------------------'
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def main() -> int:
     """Parse the flags and measure."""
     parser = ScriptParser(
         prog="scripts/bench thesis",
-        description="Compare a subscriber and a publisher for each message, as in the thesis, with those of a usual run.",
+        description="Compare a subscriber and a publisher for each message, as probably in the thesis, with those of a usual run.",
     )
     parser.add_argument("--messages", type=int, default=25, help="number of messages")
     parser.add_argument(

@@ -49,7 +49,7 @@ def master(
         bool,
         typer.Option(
             "--start-each-message",
-            help="Start subscriber and publisher for every message, as the thesis did, to see what that costs.",
+            help="Start subscriber and publisher for every message, as the thesis probably did, to see what that costs.",
         ),
     ] = False,
     connect: Annotated[

@@ -1,8 +1,8 @@
-"""Peers of a run that starts subscriber and publisher for every message, as the thesis did (4.3).
+"""Peers of a run that starts subscriber and publisher for every message, as the thesis probably did (3.1, 3.3).
 
     subscriber starts ─▶ a reading ─▶ it ends ─▶ publisher starts ─▶ pcie-app ─▶ a result ─▶ it ends ─▶ subscriber ...
 
-The time from one result to the next contains both starts, as in figure 4.5. pcie-app and the boards stay. A first
+The time from one result to the next contains both starts. pcie-app and the boards stay. A first
 publisher, which finds out whether the server accepts the topics, ends when the run begins.
 """
 
