@@ -92,7 +92,7 @@ class Both:
 
     def power_up(self) -> None:
         """Create a new emulated board, and reset the hardware with its pin."""
-        self.board = EmulatedBoard(self._make)
+        self.board = EmulatedBoard(self._make, sends_results=False)
         self.board.load(image_bytes(self.case.image))
         self.slow.slow = True
 
