@@ -32,8 +32,8 @@ class EachMessagePeers(Peers):
         super().prepare()
         if self.subscriber.child is None or self.publisher.child is None:
             raise SettingsError(
-                "--start-each-message starts subscriber and publisher itself; omit --fused, --connect, --subscriber and "
-                "--publisher"
+                "--start-each-message starts subscriber and publisher itself; omit --fused, --connect, BM_SUBSCRIBER and "
+                "BM_PUBLISHER"
             )
 
     @property
