@@ -4,8 +4,7 @@ An edit is taken if the files that it gives are the sources again: what the new 
 what the person has written, so sources that contradict each other are refused.
 """
 
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -35,17 +34,25 @@ from toolchain.outputs.output_files import (
 )
 from toolchain.outputs.vhdl_parameters import PARAMETERS_FILE, PackageTokens, parameters_vhd
 
-_PARAMETERS: Final = {
-    "COUNTER_BITS": "counter_bits",
-    "RNG_KIND": "rng",
-    "RNG_SHARED": "shared",
-    "STEPS_PER_CLOCK": "steps_per_clock",
-    "RNG_RESET_BANK": "rng_reset",
-    "RNG_BANKS": "rng_banks",
-    "TARGET_COUNT": "target_count",
-    "MAX_CYCLES": "max_cycles",
+
+def _number(text: str) -> int:
+    return int(text[2:-1], 16) if text.startswith('x"') else int(text)
+
+
+_PARAMETERS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
+    "COUNTER_BITS": ("counter_bits", _number),
+    "RNG_KIND": ("rng", lambda text: text.removeprefix("rng_")),
+    "RNG_SHARED": ("shared", {"true": True, "false": False}.__getitem__),
+    "STEPS_PER_CLOCK": ("steps_per_clock", _number),
+    "RNG_RESET_BANK": ("rng_reset", {"true": RngReset.BANK, "false": RngReset.FREE}.__getitem__),
+    "RNG_BANKS": ("rng_banks", _number),
+    "TARGET_COUNT": ("target_count", _number),
+    "MAX_CYCLES": ("max_cycles", _number),
 }
-"""The constants that may be edited, and their keys in `[machine]`; the others are the sizes of memories and boards."""
+"""The constants that may be edited, each with its key in `[machine]` and the reading of its value.
+
+The others are the sizes of memories and boards.
+"""
 _SHOWN: Final = 3
 """Number of codes of a memory that are listed."""
 
@@ -93,11 +100,16 @@ def _with_parameters(
     built = PackageTokens.of(parameters_vhd(deployment, images))
     values: dict[str, Any] = {}
     edits = []
-    for constant, key in _PARAMETERS.items():
+    for constant, (key, value) in _PARAMETERS.items():
         (old, _), (new, line) = built.value(constant), found.value(constant)
-        if new != old:
-            values[key] = _value(found.name, constant, new, line)
-            edits.append(f"{PARAMETERS_FILE}, line {line}: {constant} {old} -> {new}")
+        if new == old:
+            continue
+        edits.append(f"{PARAMETERS_FILE}, line {line}: {constant} {old} -> {new}")
+        try:
+            values[key] = value(new)
+        except (ValueError, KeyError):
+            what = f"{constant} is {new}, expected a value such as {old}"
+            raise BuildError(what, path=found.name, line=line) from None
     own = {key: value for key, value in values.items() if key in MACHINE_KEYS}
     try:
         machines = [
@@ -113,23 +125,6 @@ def _with_parameters(
     except (MachineError, PcieShimError) as reason:
         raise BuildError(str(reason), path=found.name) from None
     return changed, new_images, edits
-
-
-def _value(name: str, constant: str, text: str, line: int) -> int | str | bool | RngReset:
-    """Return the value of a token of VHDL."""
-    truth = {"true": True, "false": False}.get(text)
-    if constant == "RNG_RESET_BANK" and truth is not None:
-        return RngReset.BANK if truth else RngReset.FREE
-    if constant == "RNG_SHARED" and truth is not None:
-        return truth
-    if constant == "RNG_KIND" and text.startswith("rng_"):
-        return text.removeprefix("rng_")
-    if constant not in {"RNG_RESET_BANK", "RNG_SHARED", "RNG_KIND"}:
-        if found := re.fullmatch(r'x"([0-9a-f]{1,16})"', text):
-            return int(found[1], 16)
-        if re.fullmatch(r"[0-9]{1,10}", text, re.ASCII):
-            return int(text)
-    raise BuildError(f"{constant} is {text}, expected a value like that of the build", path=name, line=line)
 
 
 def _with_memory(path: Path, memory: Memory, images: Sequence[Image]) -> tuple[list[Image], list[str]]:
