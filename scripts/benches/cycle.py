@@ -107,6 +107,8 @@ class Measured:
         self.times: Times = defaultdict(list)
         self.cpu: dict[str, float] = {}
         self.per_second = 0.0
+        self.lost = 0
+        """Frames without a posterior, of those whose stages were measured."""
         self._pids = processes_of(master) if master else {}
 
     async def one_by_one(self, some: list[dict[str, int]]) -> None:
@@ -129,10 +131,15 @@ class Measured:
         for reading in some:
             await self._publication.publish(message(reading))
             frame = await frames.next(timeout=30)
-            result = await self._answers.next(timeout=30)
             values = {pair["key"]: pair["value"] for pair in frame.msg["status"][0]["values"]}
+            if values["published"] != "true":
+                self.lost += 1
+                continue
+            result = await self._answers.next(timeout=30)
             for name in STAGES[1:-1]:
                 self.times[name].append(float(values[f"{name}_us"]))
+            for name in ("cycles", "link_bytes"):
+                self.times[name].append(float(values[name]))
             stamp = header_stamp_ns(frame.msg) or 0
             self.times["wire_in"].append((int(values["received_ns"]) - stamp) / 1e3)
             out = result.received_ns - int(values["sent_ns"])
@@ -252,9 +259,22 @@ def main() -> int:
     parser.add_argument(
         "--seed", type=int, shown="a new one each time", help="seed of the positions of the boat"
     )
+    parser.add_argument(
+        "--sizes",
+        action="store_true",
+        help="vary lines, sensors and the message's size instead, without the echo",
+    )
+    parser.add_argument("--json", type=Path, help="with --sizes, write all numbers to this file")
+    parser.add_argument("--picture", type=Path, help="with --sizes, draw them into this PNG")
     arguments = parser.parse_args()
     if arguments.frames < 1:
         parser.error("--frames must be 1 or more")
+    if arguments.sizes:
+        from scripts.benches.sizes import bench_sizes  # which needs this module
+
+        return run_script(lambda: bench_sizes(arguments), 900)
+    if arguments.json or arguments.picture:
+        parser.error("--json and --picture need --sizes")
     return run_script(lambda: bench(arguments), 300)
 
 
