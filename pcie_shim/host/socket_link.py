@@ -15,6 +15,7 @@ access (the link stays open), and any other error if the link is broken (it is c
 """
 
 import hmac
+import select
 import socket
 import struct
 import time
@@ -113,6 +114,9 @@ class SocketLink:
 
         deadline = time.monotonic() + connect_timeout
         self._socket = connect(endpoint, timeout=connect_timeout)
+        # a poll of this descriptor alone
+        self._readable = select.poll()
+        self._readable.register(self._socket, select.POLLIN)
         try:
             self._limit(connect_timeout)
             frame = self._receive(deadline, connect_timeout, "greet")
@@ -321,12 +325,13 @@ class SocketLink:
     # ---- receiving ------------------------------------------------------------------------------------
 
     def _receive(self, deadline: float, timeout: float, what: str) -> Frame:
-        """Return the next frame of any kind; the timeout of the socket bounds each receive."""
+        """Return the next frame of any kind, or raise a LinkTimeoutError after the deadline."""
         while (frame := self._next_frame()) is None:
-            if time.monotonic() > deadline:
+            left = deadline - time.monotonic()
+            # an event loop that watches the descriptor may have made it non-blocking (uvloop does)
+            if left <= 0 or not self._readable.poll(1000 * left):
                 raise self.timeout_error(timeout, what)
-            if not self._fill():
-                raise self.timeout_error(timeout, what)
+            self._fill()
         return frame
 
     def _next_frame(self) -> Frame | None:
@@ -339,18 +344,17 @@ class SocketLink:
         self.bytes_moved += size
         self.transfers += 1
 
-    def _fill(self) -> bool:
-        """Receive once; return False if nothing came within the timeout of the socket."""
+    def _fill(self) -> None:
+        """Receive once, what is there."""
         try:
             count = self._socket.recv_into(self._decoder.room())
         except BlockingIOError:
-            return False
+            return
         except OSError as error:
             raise self._closed_error(error.strerror or str(error)) from error
         if count == 0:
             raise self._closed_error("it closed the link")
         self._decoder.received(count)
-        return True
 
     def _interrupt(self, frame: Frame) -> Done:
         if frame.words < DONE_BLOCK.size // 4:

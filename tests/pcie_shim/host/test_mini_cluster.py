@@ -6,6 +6,7 @@ MiniCluster (the test's thread) ══ 4 links ══ 4 boards (a thread each)
 import contextlib
 import dataclasses
 import itertools
+import os
 import re
 import select
 import subprocess
@@ -100,6 +101,8 @@ def cluster(request):
     sends_results = "read" not in request.param
     with opened(PARTS, tcp=request.param == "tcp", sends_results=sends_results) as cluster:
         assert all(board.sends_results is sends_results for board in cluster._boards)
+        for board in () if sends_results else cluster._boards:
+            os.set_blocking(board.link.fileno(), False)  # as uvloop does when it watches them
         yield cluster
 
 
