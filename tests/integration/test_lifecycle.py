@@ -29,13 +29,13 @@ from tests.patience import PROCESS_PATIENCE
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("how", [(), ("--fused",)], ids=["processes", "fused"])
+@pytest.mark.parametrize("how", ["--read-results", "--fused"])
 async def test_once_publishes_one_result_sees_it_and_ends(stage, boat, how):
-    """The result is to the bit what the machines count, so with `--fused` it is the same."""
+    """The result is to the bit what the machines count, so with these it is the same."""
     _, uri = await stage.hub()
     async with Robot(uri) as robot:
         await robot.keep_publishing()
-        master = stage.start("master", "--once", *how, "-d", str(boat), "--uri", uri, "--json")
+        master = stage.start("master", "--once", how, "-d", str(boat), "--uri", uri, "--json")
         assert await master.end() == 0, master.err
         assert json.loads(master.out)["seen"] is True
         await robot.have(1)
