@@ -15,7 +15,7 @@ IMAGE_TYPE: Final = "sensor_msgs/Image"
 DISPARITY_TYPE: Final = "stereo_msgs/DisparityImage"
 _DTYPES: Final = {"mono8": "u1", "8UC1": "u1", "32FC1": "f4"}
 """Types of a pixel by encoding."""
-_WAITING: Final = 4
+_WAITING: Final = 16
 """Images of each camera that wait for the other's."""
 
 
@@ -119,7 +119,7 @@ class ImagePairs:
     def add(self, side: int, message: Mapping[str, Any]) -> StereoImages | None:
         """Add an image of the left (0) or right (1) camera; return the pair that it completes, or raise a BadImageError.
 
-        Older images of both cameras are given up: the newest pair matters.
+        Older images of both cameras are given up; newer ones, of a camera that is ahead, wait for the other's.
         """
         stamp_ns = header_stamp_ns(message)
         if stamp_ns is None:
@@ -133,7 +133,8 @@ class ImagePairs:
             return None
         self.unpaired = [0, 0]
         for waiting in self._waiting:
-            waiting.clear()
+            for older in [each for each in waiting if each < stamp_ns]:
+                del waiting[older]
         left, right = (message, other) if side == 0 else (other, message)
         images = [read_image(each, "mono8", "8UC1") for each in (left, right)]
         if images[0].shape != images[1].shape:

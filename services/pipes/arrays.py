@@ -5,12 +5,13 @@ import base64
 import contextlib
 import re
 import sys
+from collections import deque
 from dataclasses import dataclass
 from typing import Any, Final
 
 from bridge.client import Ros, Subscription
 from bridge.codecs.message_check import SCALAR, Definitions, FieldType, bundled_definitions
-from bridge.errors import MessageTooLargeError, NoMessageError
+from bridge.errors import MessageTooLargeError
 from bridge.fields import Place, format_place
 from bridge.names import ros1_type, ros_version_of_type
 from services.errors import InputLineError, SettingsError
@@ -31,12 +32,17 @@ from toolchain.deployment import Source
 
 _EXPECTED: Final = "numbers: a JSON array such as [0.1, 0.9], or 0.1 0.9, or 0.1,0.9"
 _NUMBER: Final = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_INTEGER: Final = re.compile(rb"[+-]?\d{1,20}")
+_INTEGER: Final = re.compile(rb"[+-]?\d{1,40}")
 _MULTI_ARRAY: Final = re.compile(r"std_msgs/((?:Float(?:32|64)|U?Int(?:8|16|32|64)))MultiArray")
 _SHOWN: Final = 40
 _MAX_FIELDS: Final = 10_000
+_LONG: Final = 1 << 16
+"""Length in bytes of a line whose conversion would keep the event loop from answering pings."""
+_AHEAD: Final = 64
+"""Messages that may be on their way, so that none is lost in a queue of the server or of ours."""
 
-_FLOAT32_MAX: Final = float.fromhex("0x1.fffffep127")
+# the largest double that rounds to a float32: its usual text, 3.4028235e+38, is above it
+_FLOAT32_MAX: Final = float.fromhex("0x1.fffffefffffffp127")
 _RANGES: Final[dict[str, tuple[float, float]]] = {
     **{f"int{bits}": (-(1 << bits - 1), (1 << bits - 1) - 1) for bits in (8, 16, 32, 64)},
     **{f"uint{bits}": (0, (1 << bits) - 1) for bits in (8, 16, 32, 64)},
@@ -87,8 +93,10 @@ class ArrayField:
     def _fitting(self, value: float, where: str) -> float:
         low, high = _RANGES[self.kind.element]
         is_whole = isinstance(low, int)
-        if not low <= value <= high or (is_whole and value != int(value)):
-            expected = f"an integer from {low} to {high}" if is_whole else f"a number up to {high:.3g}"
+        # a float of this size may not be the integer that was written
+        is_exact = not is_whole or isinstance(value, int) or (value == int(value) and abs(value) < 1 << 53)
+        if not low <= value <= high or not is_exact:
+            expected = f"an integer from {low} to {high}" if is_whole else f"a number up to {high:.4g}"
             raise InputLineError(
                 f"{where} has {repr(value)[:_SHOWN]}, but {self.path} of {self.message_type} is {self.kind}: "
                 f"expected {expected}"
@@ -160,12 +168,12 @@ async def _definitions(ros: Ros, message_type: str) -> Definitions:
 
 
 async def publish_arrays(settings: Settings, source: Source, path: str | None) -> int:
-    """Publish each line of standard input as one message of a topic, and wait until the last one is seen.
+    """Publish each line of standard input as one message of a topic, and wait until each is seen.
 
     Raises:
         InputLineError: A line cannot be a message of the type, or there is no line.
         SettingsError: The type does not have this field.
-        BridgeError: The topic has another type, or the server is unreachable.
+        BridgeError: The topic has another type, the server is unreachable, or a message was not seen.
     """
     async with contextlib.AsyncExitStack() as stack:
         uris, report = [source.uri], report_waits()
@@ -179,31 +187,89 @@ async def publish_arrays(settings: Settings, source: Source, path: str | None) -
         publication = await ros.advertise(source.topic, source.type)
         watched = ros.subscribe(source.topic, source.type, queue_size=RESULTS_DEPTH)
         say(f"publishing on {source.topic} at {source.uri}")
-        count, last = 0, []
+        echoes = _Echoes(field, watched, settings.seen_timeout)
+        watching = asyncio.create_task(echoes.watch())
+        stack.callback(watching.cancel)
+        topic = AdvertisedTopic(ros, source.uri, source.topic, source.type)
+        count = 0
         async for number, line in lines():
-            last = field.numbers(line, number)
+            convert = asyncio.to_thread(field.numbers, line, number) if len(line) > _LONG else None
+            numbers = field.numbers(line, number) if convert is None else await convert
             try:
-                await publication.publish(field.message(last))
+                await publication.publish(field.message(numbers))
             except MessageTooLargeError as error:
                 raise InputLineError(f"line {number} of standard input: {error}") from error
             count += 1
+            # what the server does not pass on at all is reported at once, and not at the end of an endless input
+            if not await echoes.add(number, numbers, most=_AHEAD if count > 1 else 0) and count == 1:
+                await _raise_refusal(topic)
         if not count:
             raise InputLineError(f"standard input is empty; expected {_EXPECTED} on each line")
-        topic = AdvertisedTopic(ros, source.uri, source.topic, source.type)
-        unseen = not await _seen(watched, field, last, settings.seen_timeout)
-        if unseen and (refused := await refusals([topic], settled=True) | reported_refusals([topic])):
-            raise NotReceivableError(refused[source.topic])
-    lost = f", but the last was not seen on the wire within {settings.seen_timeout:g} s" if unseen else ""
-    say(f"{count} published{lost}")
+        if not await echoes.at_most(0):
+            await _raise_refusal(topic)
+    if echoes.lost:
+        raise NotReceivableError(
+            f"{count} published, of which {len(echoes.lost)} were not seen on the wire within {settings.seen_timeout:g} s, "
+            f"first line {echoes.lost[0]} of standard input"
+        )
+    say(f"{count} published")
     return 0
 
 
-async def _seen(watched: Subscription, field: ArrayField, numbers: list[float], limit: float) -> bool:
-    """Return whether a message with these numbers comes back in time."""
-    # of earlier messages and other publishers, any number may come before
-    with contextlib.suppress(TimeoutError, NoMessageError):
-        async with asyncio.timeout(limit):
-            while not field.holds((await watched.next(limit)).msg, numbers):
-                pass
-            return True
-    return False
+async def _raise_refusal(topic: AdvertisedTopic) -> None:
+    """Raise a NotReceivableError if the server says why it does not pass on a topic."""
+    if refused := await refusals([topic], settled=True) | reported_refusals([topic]):
+        raise NotReceivableError(refused[topic.name])
+
+
+class _Echoes:
+    """Lines whose messages have not come back yet."""
+
+    def __init__(self, field: ArrayField, watched: Subscription, limit: float) -> None:
+        """Store the field to compare, the subscription of the topic, and the seconds after which a message is lost."""
+        self._field = field
+        self._watched = watched
+        self._limit = limit
+
+        # Number of each line and what it has, in the order of publication. A message comes before those published after
+        # it, so the lines before one that is seen are lost.
+        self._waiting: deque[tuple[int, list[float]]] = deque()
+        self.lost: list[int] = []
+
+        # Set when a message was seen; and whether one ever was, since a server that sends none back must not delay.
+        self._seen = asyncio.Event()
+        self._has_seen = False
+
+    async def watch(self) -> None:
+        """Compare what the topic brings, until cancelled."""
+        async for received in self._watched:
+            for at, (_, numbers) in enumerate(self._waiting):
+                if self._field.holds(received.msg, numbers):
+                    self.lost += [self._waiting.popleft()[0] for _ in range(at)]
+                    self._waiting.popleft()
+                    self._has_seen = True
+                    self._seen.set()
+                    break
+
+    async def add(self, number: int, numbers: list[float], *, most: int) -> bool:
+        """Add a published line; wait as `at_most` if any message was ever seen, or for the first one."""
+        first = not self._waiting and not self.lost
+        self._waiting.append((number, numbers))
+        return await self.at_most(most) if first or self._has_seen else not self._give_up(most)
+
+    async def at_most(self, most: int) -> bool:
+        """Return True as soon as at most so many lines wait, or give up the others and return False."""
+        while len(self._waiting) > most:
+            self._seen.clear()
+            try:
+                async with asyncio.timeout(self._limit):
+                    await self._seen.wait()
+            except TimeoutError:
+                return not self._give_up(most)
+        return True
+
+    def _give_up(self, most: int) -> bool:
+        """Regard all but the last so many lines as lost; return whether there were any."""
+        lost = [self._waiting.popleft()[0] for _ in range(len(self._waiting) - most)]
+        self.lost += lost
+        return bool(lost)

@@ -92,9 +92,10 @@ def test_images_of_one_stamp_are_a_pair():
     assert (pair.stamp_ns, pair.head) == (2, header(2, "left", 2))
     assert (pair.left == GREY).all()
     assert (pair.right == GREY + 1).all()
-    # 1 and 3 are older than the newest pair
-    assert pairs.add(0, grey(3)) is None
-    assert pairs.add(1, grey(3)).stamp_ns == 3
+    # 1 is older than the newest pair, and the right camera is ahead with 3
+    assert pairs.add(1, grey(1)) is None
+    assert pairs.add(1, grey(4)) is None
+    assert [pairs.add(0, grey(stamp)).stamp_ns for stamp in (3, 4)] == [3, 4]
 
 
 def test_a_camera_alone_does_not_fill_the_memory():

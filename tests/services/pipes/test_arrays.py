@@ -33,7 +33,8 @@ def of(element, length=0):
         (b"7", "double", [7.0]),
         (b"-128 127", "int8", [-128, 127]),
         (b"[2.0, 255]", "uint8", [2, 255]),
-        (b"18446744073709551615", "uint64", [2**64 - 1]),
+        (b"0" * 20 + b"18446744073709551615", "uint64", [2**64 - 1]),
+        (b"3.4028235e+38", "float32", [3.4028235e38]),
         (b"9223372036854775807,-9223372036854775808", "int64", [2**63 - 1, -(2**63)]),
     ],
 )
@@ -52,7 +53,7 @@ def test_the_numbers_of_a_line(line, element, numbers):
         ),
         *((line, "float64") for line in (b'["1"]', b"[1", b"\xff\xb2", b"[" * 10**5, b'{"data": [1]}')),
         *((b"300", "uint8"), (b"-1", "uint8"), (b"1.5", "int16"), (b"18446744073709551616", "uint64")),
-        *((b"1e39", "float32"), (b"-1e39", "float")),
+        *((b"1e39", "float32"), (b"-1e39", "float"), (b"9007199254740993.0", "int64")),
     ],
 )
 def test_a_line_that_cannot_be_the_array_is_refused(line, element):
@@ -134,11 +135,21 @@ async def test_a_bad_line_ends_it_after_those_before(monkeypatch, tmp_path):
             assert (await subscription.next(PATIENCE)).msg["data"] == [1.0]
 
 
-async def test_what_the_server_does_not_pass_on_is_reported(monkeypatch, tmp_path, capsys):
+async def test_a_message_that_the_server_loses_is_named(monkeypatch, tmp_path):
+    async with FakeRosbridge(max_size=1000) as fake:
+        text = b"1\n" + b"2 " * 1000 + b"\n"
+        with pytest.raises(
+            NotReceivableError, match="2 published, of which 1 .* first line 2 of standard input"
+        ):
+            await published(monkeypatch, tmp_path, text, fake.uri, seen_timeout=PATIENCE / 10)
+        assert [each["msg"]["data"] for each in fake.ops("publish", topic="/t")] == [[1.0]]
+
+
+async def test_what_the_server_does_not_pass_on_is_reported(monkeypatch, tmp_path):
     async with FakeRosbridge() as fake, connect(fake.uri) as robot:
         fake.refused_topics = {"/t"}
-        assert await published(monkeypatch, tmp_path, b"1", fake.uri, seen_timeout=0.05) == 0
-        assert "1 published, but the last was not seen" in capsys.readouterr().err
+        with pytest.raises(NotReceivableError, match="3 published, of which 3 .* first line 1"):
+            await published(monkeypatch, tmp_path, b"1\n2\n3", fake.uri, seen_timeout=0.05)
         with pytest.raises(SettingsError, match="boat_msgs/Sensors are not known"):
             await published(monkeypatch, tmp_path, b"1", fake.uri, "boat_msgs/Sensors")
         fake.rosapi = True
