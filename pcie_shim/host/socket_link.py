@@ -114,9 +114,10 @@ class SocketLink:
 
         deadline = time.monotonic() + connect_timeout
         self._socket = connect(endpoint, timeout=connect_timeout)
-        # a poll of this descriptor alone
-        self._readable = select.poll()
+        # polls of this descriptor alone
+        self._readable, self._writable = select.poll(), select.poll()
         self._readable.register(self._socket, select.POLLIN)
+        self._writable.register(self._socket, select.POLLOUT)
         try:
             self._limit(connect_timeout)
             frame = self._receive(deadline, connect_timeout, "greet")
@@ -268,10 +269,17 @@ class SocketLink:
     def _send(self, frames: bytes) -> None:
         self._check_open()
         self._count(len(frames))
-        try:
-            self._socket.sendall(frames)
-        except OSError as error:
-            self._broken_send(error)
+        left, deadline = memoryview(frames), time.monotonic() + self.timeout
+        while left:
+            try:
+                left = left[self._socket.send(left) :]
+            except BlockingIOError:
+                # the buffer is full, and uvloop may have made the descriptor non-blocking, as for `_receive`
+                wait = max(0.0, deadline - time.monotonic())
+                if not wait or not self._writable.poll(1000 * wait):
+                    self._give_up(self.timeout_error(self.timeout, "accept the data"))
+            except OSError as error:
+                self._broken_send(error)
 
     def receive_done(self) -> Done | None:
         """Receive once, after a poll; return the board's answer if it is complete."""
@@ -398,8 +406,6 @@ class SocketLink:
         raise AccessError(sentence, code=code, detail=detail)
 
     def _broken_send(self, error: OSError) -> NoReturn:
-        if isinstance(error, BlockingIOError):
-            self._give_up(self.timeout_error(self.timeout, "accept the data"))
         # A board sends the reason before it closes: an ERROR may be in the buffer.
         frame = None
         # what came before it does not matter any more

@@ -4,6 +4,7 @@ SocketLink ──AF_UNIX── board (a socket in this process, which has greete
 """
 
 import contextlib
+import os
 import socket
 import threading
 
@@ -153,3 +154,27 @@ def test_an_id_of_all_ones_is_no_device(folder, address, gone):
         with pytest.raises(DeviceGoneError) if gone else contextlib.nullcontext():
             assert link.read32(address) == ALL_ONES
         assert link.is_open is not gone
+
+
+@pytest.mark.parametrize("blocking", [True, False], ids=["blocking", "as uvloop leaves it"])
+def test_a_board_that_reads_late_gets_everything(folder, blocking):
+    block = (rm.INPUTS, bytes(4 * rm.INPUTS.words))
+    with linked(folder) as (link, board):
+        os.set_blocking(link.fileno(), blocking)
+        posts = 2 + 2 * link._socket.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) // len(block[1])
+        due, received = posts * (framing.HEADER_BYTES + len(block[1])), 0
+        thread = threading.Thread(target=lambda: link.post([block] * posts))
+        thread.start()
+        while received < due:
+            received += len(board.recv(1 << 16))
+        thread.join()
+        assert received == due
+
+
+@pytest.mark.parametrize("blocking", [True, False], ids=["blocking", "as uvloop leaves it"])
+def test_a_board_that_never_reads_is_given_up(folder, blocking):
+    with linked(folder, timeout=0.05, connect_timeout=PATIENCE) as (link, _):
+        os.set_blocking(link.fileno(), blocking)
+        with pytest.raises(LinkTimeoutError, match=r"did not accept the data within 0\.05 s"):
+            link.post([(rm.INPUTS, bytes(4 * rm.INPUTS.words))] * 1000)
+        assert not link.is_open
