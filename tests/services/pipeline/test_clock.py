@@ -17,6 +17,7 @@ from services.settings import Settings
 from services.sockets.records import Begin, Notice, Reading
 from tests.fake_rosbridge import FakeRosbridge
 from tests.integration.conftest import build_corridor
+from tests.patience import PATIENCE
 from tests.services.conftest import until
 from tests.services.pipeline.conftest import running
 from tests.services.pipeline.test_publisher import result
@@ -62,7 +63,9 @@ class Simulation:
 async def simulated(link, tmp_path, **options):
     async with FakeRosbridge() as fake:
         deployment = load_deployment(build_corridor(tmp_path, KNOWN, SOURCES.format(uri=fake.uri)))
-        subscriber = Subscriber(Settings(use_sim_time=True, ready_timeout=0.2), deployment, link.make)
+        subscriber = Subscriber(
+            Settings(use_sim_time=True, ready_timeout=0.2, first_data_timeout=PATIENCE), deployment, link.make
+        )
         async with running(subscriber, link):
             link.take(Begin(once=False))
             for topic in ("/range", "/cells", "/clock"):
@@ -118,7 +121,7 @@ async def test_a_topic_is_waited_for_as_long_as_simulated_time_says(link, tmp_pa
 
 async def test_a_paused_simulation_is_ready_and_one_that_begins_again_goes_on(link, tmp_path):
     async with simulated(link, tmp_path) as (simulation, subscriber):
-        for begin in (100_000, 0):
+        for begin in (2_000, 0):
             before = len(link.of(Reading))
             for turn in range(1, 3):
                 await simulation.at(begin + 100 * turn)
