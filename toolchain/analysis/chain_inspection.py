@@ -91,7 +91,7 @@ class ChainInspection:
             ),
             (
                 f"{count:,} samples after {p.burn_in:,} sweeps, {p.sequencer} order, {p.rng} "
-                f"({p.steps_per_clock} steps per clock, {p.rng_banks} banks)."
+                f"({counted(p.steps_per_clock, 'step')} per clock, {counted(p.rng_banks, 'bank')})."
             ),
             *([edited_sentence(self.deployment)] if self.deployment.edited_boards else []),
             f"Readings: {self.readings}. Boards stopped by: {stops}. Without a posterior: {ran.without:.1%} of frames.",

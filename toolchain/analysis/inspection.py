@@ -25,7 +25,7 @@ from toolchain.building.build import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
 from toolchain.building.report import edited_sentence, loss_heading, many_sentence
 from toolchain.deployment import Deployment, Scale
-from toolchain.errors import BuildError
+from toolchain.errors import BuildError, counted
 from toolchain.models.model import Model
 from toolchain.outputs.mif import table_length
 
@@ -207,8 +207,8 @@ def _machine_part(found: Inspection) -> str:
         ),
         (
             f"Codes of {p.prob_bits} bits (scale = {machine.scale}), counters of {p.counter_bits} "
-            f"bits, {p.rng} {'one per column' if p.shared else 'one per cell'} with {p.steps_per_clock} steps per clock and "
-            f"{p.rng_banks} bank{'s' if p.rng_banks > 1 else ''}; stops at a count of {machine.target_count} or after "
+            f"bits, {p.rng} {'one per column' if p.shared else 'one per cell'} with {counted(p.steps_per_clock, 'step')} per clock and "
+            f"{counted(p.rng_banks, 'bank')}; stops at a count of {machine.target_count} or after "
             f"{machine.max_cycles} cycles, stop = {machine.stop}."
         ),
         *([many] if (many := many_sentence(machine).strip()) else []),
@@ -256,10 +256,10 @@ def _time_part(found: Inspection) -> str:
     ):
         row = f"  {name:6}  {count:10,.0f}  {with_unit(count / found.clock_hz, 's'):>10}"
         rows.append(row + (f"   {interval.low:,.0f}..{interval.high:,.0f}" if interval else ""))
-    counted = "posteriors" if found.deployment.machine.replicas > 1 else "frames"
+    kept = "posteriors" if found.deployment.machine.replicas > 1 else "frames"
     rows.append(
         f"  {found.accuracy.overflow:.0%} of runs end with an overflow; without a posterior: {found.accuracy.without:.1%} of "
-        f"runs (in {found.accuracy.impossible:.1%} of {counted} no line can count)."
+        f"runs (in {found.accuracy.impossible:.1%} of {kept} no line can count)."
     )
     if found.deployment.machine.replicas > 1:
         replicas = found.deployment.machine.replicas

@@ -84,18 +84,30 @@ def estimate(
 
 
 def most_replicas(
-    board: BM1Parameters, device: Device, *, table_length: int = LENGTH, inputs: int = 0
+    board: BM1Parameters,
+    device: Device,
+    *,
+    table_length: int = LENGTH,
+    interface: tuple[int, int] | None = None,
 ) -> tuple[int, str]:
-    """Return how many machines with the lines of a board fit it, 0 if none does, and why no more, as a clause."""
+    """Return how many machines with the lines of a board fit it, 0 if none does, and why no more, as a clause.
+
+    `interface` is that of `--interface`; without it, the interface may be as large as the register map.
+    """
+    inputs = (interface or (0, 0))[0]
 
     def why_not(replicas: int) -> str:
         machines = replace(board, replicas=replicas)
         used = BM1.registers(machines)
         for what, needed, room in zip(
-            ("input", "result"), (used.input_words, used.result_words), interface_room(used), strict=True
+            ("input", "result"),
+            (used.input_words, used.result_words),
+            interface or interface_room(used),
+            strict=True,
         ):
             if needed > room:
-                return f"it takes {needed:,} {what} registers, and the map has {room:,}"
+                whose = "the map" if interface is None else "the interface"
+                return f"it takes {needed:,} {what} registers, and {whose} has {room:,}"
         return estimate(machines, device, table_length=table_length, inputs=inputs).why_not
 
     most = bisect_left(range(1, REPLICAS_MAX + 1), True, key=lambda replicas: why_not(replicas) != "")

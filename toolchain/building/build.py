@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -114,6 +114,7 @@ def assemble(
 ) -> Built:
     """Return a deployment without writing anything, or raise a BuildError; `place` may change its topics and paths."""
     model, options, quantised = plan.model, plan.options, None
+    _variables(plan)  # refuses --order and --path before the tables are computed
     machines: Sequence[BM1Machine | BM2Machine]
     if isinstance(plan, BM2Plan):
         machines = chain_machines(plan)
@@ -273,8 +274,10 @@ def read_images(deployment: Deployment) -> list[Image]:
     return [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
 
 
-def check_agreement(deployment: Deployment, images: Sequence[Image]) -> None:
-    """Raise a DeploymentError if `deployment.toml` describes another machine than its images."""
+def check_agreement(
+    deployment: Deployment, images: Sequence[Image], *, edited: Container[str] = frozenset()
+) -> None:
+    """Raise a DeploymentError if `deployment.toml` describes another machine than its images; keys of `edited` may differ."""
     machine = deployment.machine
     total = machine.lines if machine.is_divided else len(images)
     for index, (board, image) in enumerate(zip(deployment.boards, images, strict=True)):
@@ -288,7 +291,7 @@ def check_agreement(deployment: Deployment, images: Sequence[Image]) -> None:
             "part of the model": (part, image.partition),
         }
         for key, (expected, found) in pairs.items():
-            if found != expected:
+            if found != expected and key not in edited:
                 raise DeploymentError(
                     f"{deployment.path} has {key} = {expected}, but {board.image} was built with {found}: set it back, "
                     "or build again with 'toolchain build'"

@@ -20,7 +20,7 @@ from pcie_shim.programming_file import Image
 from toolchain.building.build import check_agreement, read_images
 from toolchain.building.machine import MACHINE_KEYS
 from toolchain.deployment import FILE_NAME, Deployment, deployment_text, load_deployment
-from toolchain.deployment.deployment import with_hash
+from toolchain.deployment.deployment import other_image, with_hash
 from toolchain.errors import BuildError
 from toolchain.outputs.memories import MEMORIES_FOLDER, Memory, memories, unpacked_codes
 from toolchain.outputs.mif import read_mif
@@ -41,17 +41,14 @@ def _number(text: str) -> int:
 
 _PARAMETERS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
     "COUNTER_BITS": ("counter_bits", _number),
-    "RNG_KIND": ("rng", lambda text: text.removeprefix("rng_")),
-    "RNG_SHARED": ("shared", {"true": True, "false": False}.__getitem__),
     "STEPS_PER_CLOCK": ("steps_per_clock", _number),
     "RNG_RESET_BANK": ("rng_reset", {"true": RngReset.BANK, "false": RngReset.FREE}.__getitem__),
-    "RNG_BANKS": ("rng_banks", _number),
     "TARGET_COUNT": ("target_count", _number),
     "MAX_CYCLES": ("max_cycles", _number),
 }
 """The constants that may be edited, each with its key in `[machine]` and the reading of its value.
 
-The others are the sizes of memories and boards.
+The others are the sizes of memories and boards, and the generators, from which the seeds follow.
 """
 _SHOWN: Final = 3
 """Number of codes of a memory that are listed."""
@@ -60,16 +57,19 @@ _SHOWN: Final = 3
 def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Change]]]:
     """Write the images again from the memories and parameters; return the edits, as sentences, and the files.
 
-    Edited sources are written in canonical form, and `deployment.toml` gets the hashes and parameters.
+    Edited sources are written in canonical form, and `deployment.toml` gets the hashes and parameters. If this is
+    interrupted, some images are new ones that `deployment.toml` does not name: the next call goes on with them, since it
+    needs only what sources and images of a build have in common.
 
     Raises:
         BuildError: The sources contradict each other, or need another machine.
         MifError: A memory is not that of this machine.
         DeploymentError: The deployment is missing or damaged.
     """
-    deployment = load_deployment(directory)
+    deployment = load_deployment(directory, interrupted=True)
+    deployment.new_filter()
     images = read_images(deployment)
-    check_agreement(deployment, images)
+    check_agreement(deployment, images, edited={key for key, _ in _PARAMETERS.values()})
     changed, new = deployment, images
     edits: list[str] = []
     if deployment.machine.type == "BM1":
@@ -78,14 +78,15 @@ def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Chang
         new, edit = _with_memory(directory / MEMORIES_FOLDER / memory.name, memory, new)
         edits += edit
     boards = []
-    for board, image in zip(changed.boards, new, strict=True):
+    for board, old, image in zip(changed.boards, images, new, strict=True):
+        # the package, and so images[0] of a BM1, has the hash of the model; of a BM2, what is possible has no source
+        same_model = changed.machine.type == "BM1" and old.model_hash == images[0].model_hash
+        if not same_model and old.image_hash not in {board.image_hash, image.image_hash}:
+            raise other_image(changed.directory / board.image, old.image_hash, board.image_hash)
         built = board.built_hash or board.image_hash
         edited = image.image_hash != built
         boards.append(board.replace(image_hash=image.image_hash, built_hash=built if edited else None))
     changed = with_hash(changed.replace(boards=tuple(boards)))
-    if deployment.machine.type == "BM1":
-        due = PackageTokens.of(parameters_vhd(changed, new))
-        PackageTokens.read(directory / PARAMETERS_FILE).check_same(due)
     parts = [image_files(changed, new), memory_files(changed, new), quartus_files(changed, new)]
     if changed != deployment:  # last, so that a partially written folder has the old hashes
         parts.append(text_file(FILE_NAME, deployment_text(changed)))
@@ -102,10 +103,9 @@ def _with_parameters(
     edits = []
     for constant, (key, value) in _PARAMETERS.items():
         (old, _), (new, line) = built.value(constant), found.value(constant)
-        if new == old:
-            continue
-        edits.append(f"{PARAMETERS_FILE}, line {line}: {constant} {old} -> {new}")
-        try:
+        if new != old:
+            edits.append(f"{PARAMETERS_FILE}, line {line}: {constant} {old} -> {new}")
+        try:  # also of the old value, which another board may not have yet
             values[key] = value(new)
         except (ValueError, KeyError):
             what = f"{constant} is {new}, expected a value such as {old}"
@@ -120,10 +120,17 @@ def _with_parameters(
         changed = deployment.replace(machine=machine)
         new_images = [replace(image, machine=each) for image, each in zip(images, machines, strict=True)]
     except ValidationError as reason:
-        what = reason.errors()[0]["msg"].removeprefix("Value error, ")
+        detail = reason.errors()[0]
+        what = detail["msg"].removeprefix("Value error, ")
+        for constant, (key, _) in _PARAMETERS.items():
+            if key in detail["loc"]:
+                new, line = found.value(constant)
+                what = f"{constant} is {new}, expected {what.removeprefix('Input should be ')}"
+                raise BuildError(what, path=found.name, line=line) from None
         raise BuildError(what, path=found.name) from None
     except (MachineError, PcieShimError) as reason:
         raise BuildError(str(reason), path=found.name) from None
+    found.check_same(PackageTokens.of(parameters_vhd(changed, new_images)))
     return changed, new_images, edits
 
 
@@ -134,27 +141,30 @@ def _with_memory(path: Path, memory: Memory, images: Sequence[Image]) -> tuple[l
         for address, (seed, due) in enumerate(zip(words, memory.words(), strict=True)):
             if seed != due:
                 raise BuildError(
-                    f"address {address:#x} has {seed:#x}, expected {due:#x}: seeds follow from RNG_KIND and RNG_BANKS; set it "
-                    "back, or run 'toolchain regenerate memories'",
+                    f"address {address:#x} has {seed:#x}, expected {due:#x}: seeds follow from the generators of the build; "
+                    "set it back, or undo all edits with 'toolchain regenerate memories'",
                     path=path,
                 )
         return list(images), []
-    first = images[memory.board or 0]
-    bits = first.machine.parameters.prob_bits
-    before = dict(first.kind.sections(first.machine))[memory.section]
+    bits = images[0].machine.parameters.prob_bits
     found = unpacked_codes(words, bits, memory.width // bits)
-    old = before.reshape(found.shape) & (1 << bits) - 1
-    if (found == old).all():
-        return list(images), []
-    # where a code is as before, so are the bits of a random number above it
-    codes = np.where(found == old, before.reshape(found.shape), found).astype(before.dtype)
-    new = [
-        _with_section(path, image, memory.section, codes.reshape(before.shape))
-        if memory.board in {None, board}
-        else image
-        for board, image in enumerate(images)
-    ]
-    return new, [_sentence(path, old, found, first.partition.line_offset)]
+    new, edits = list(images), []
+    for board, image in enumerate(images):
+        if memory.board not in {None, board}:
+            continue
+        before = dict(image.kind.sections(image.machine))[memory.section]
+        if before.size != found.size:  # of another build, with another table of random numbers
+            raise BuildError(
+                f"the image of board {board} has {before.size} of these, not {found.size}", path=path
+            )
+        old = before.reshape(found.shape) & (1 << bits) - 1
+        if (found == old).all():
+            continue
+        # where a code is as before, so are the bits of a random number above it
+        codes = np.where(found == old, before.reshape(found.shape), found).astype(before.dtype)
+        new[board] = _with_section(path, image, memory.section, codes.reshape(before.shape))
+        edits.append(_sentence(path, old, found, image.partition.line_offset))
+    return new, edits[:1]
 
 
 def _with_section(path: Path, image: Image, section: str, codes: NDArray[Any]) -> Image:

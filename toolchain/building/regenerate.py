@@ -86,8 +86,9 @@ def regenerate_memories(
         BuildError: The model now needs another machine, so a new build is necessary.
         DeploymentError: The deployment is missing or damaged.
     """
-    deployment = load_deployment(directory)
+    deployment = load_deployment(directory, interrupted=model is not None)
     images = read_images(deployment)
+    check_agreement(deployment, images)
     if model is None:
         return write_files(directory, memory_files(deployment, images))
     options = replace(

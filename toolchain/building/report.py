@@ -16,7 +16,7 @@ from toolchain.models.model import Model
 from toolchain.models.network import NetworkModel
 
 SHARED_BITS: Final = {
-    "BM1": "means are correct, but counts vary up to 2.6 times as much",
+    "BM1": "means are correct, but the variance of counts is up to 2.6 times as large",
     "BM2": "this biases all samples",
 }
 """What it does to a machine that random numbers share bits with those of the next cycle, as a clause."""

@@ -32,7 +32,7 @@ from toolchain.checks.findings import (
 )
 from toolchain.checks.generators import generator_findings
 from toolchain.deployment import Deployment, Variable, load_deployment
-from toolchain.errors import ToolchainError
+from toolchain.errors import ToolchainError, counted
 from toolchain.models.distribution import NO, NUMBER, YES
 from toolchain.models.model import Model
 from toolchain.models.network import NetworkModel
@@ -81,7 +81,8 @@ def check_deployment(directory: Path) -> list[Finding]:
             Check.EDITED,
             ", ".join(f"board {board}" for board in deployment.edited_boards),
             "the image was made from memories or parameters that were edited since the build, so it may not be the model's",
-            "'toolchain regenerate memories --model' returns to the model",
+            "'toolchain regenerate memories --model' returns to the model's codes; undo edits of parameters by hand, then use "
+            "'toolchain regenerate images'",
         )
     ]
     return _sorted(
@@ -136,10 +137,13 @@ def _files(directory: Path, deployment: Deployment, images: Sequence[Image]) -> 
         ]
         if wrong:
             name, change = wrong[0]
-            more = f", and {len(wrong) - 1} more files" if len(wrong) > 1 else ""
-            yield warning(
-                Check.FILES, name, f"{words[change]}{more}", f"use 'toolchain regenerate {part} {directory}'"
-            )
+            more = f", and {counted(len(wrong) - 1, 'more file')}" if len(wrong) > 1 else ""
+            advice = f"use 'toolchain regenerate {part} {directory}'"
+            if part == "memories":
+                advice = (
+                    f"to keep an edit, use 'toolchain regenerate images {directory}'; to undo it, {advice}"
+                )
+            yield warning(Check.FILES, name, f"{words[change]}{more}", advice)
 
 
 def _sorted(findings: Iterable[Finding]) -> list[Finding]:

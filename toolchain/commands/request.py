@@ -231,7 +231,7 @@ def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan",
     options = replace(options, partitions=max(count, options.partitions))
     if options.replicas == FILL:
         board = replace(parameters, lines=partition_lines(parameters.lines, options.partitions)[0].lines)
-        most, limit = most_replicas(board, device, table_length=length, inputs=inputs)
+        most, limit = most_replicas(board, device, table_length=length, interface=options.interface)
         options = replace(options, replicas=max(most, 1))
         parameters = replace(parameters, replicas=options.replicas)
         filled = replace(board, replicas=options.replicas)

@@ -233,11 +233,14 @@ def with_hash(deployment: Deployment) -> Deployment:
     return deployment.replace(hash=deployment_hash(deployment))
 
 
-def load_deployment(directory: Path, *, images: bool = True, edited: bool = False) -> Deployment:
+def load_deployment(
+    directory: Path, *, images: bool = True, edited: bool = False, interrupted: bool = False
+) -> Deployment:
     """Read and check the deployment in a folder written by `toolchain build`.
 
     Without `images`, they are not read and compared with their hashes, and a process starts without NumPy. With
-    `edited`, a `deployment.toml` whose hash does not match its content is accepted.
+    `edited`, a `deployment.toml` whose hash does not match its content is accepted. With `interrupted`, images and a
+    filter are accepted that it does not name, as they are written before it.
 
     Raises:
         DeploymentError: The deployment is absent, not TOML, or has a wrong key or value.
@@ -272,12 +275,21 @@ def load_deployment(directory: Path, *, images: bool = True, edited: bool = Fals
         )
     deployment = Deployment(**dict(file), directory=directory)
     if images:
-        _check_images(deployment)
-        deployment.new_filter()
+        _check_images(deployment, interrupted)
+        if not interrupted:
+            deployment.new_filter()
     return deployment
 
 
-def _check_images(deployment: Deployment) -> None:
+def other_image(path: Path, found: str, named: str) -> DamagedDeploymentError:
+    """Return the error for an image that `deployment.toml` does not name, with both hashes."""
+    return DamagedDeploymentError(
+        f"{path} is another board's or another build's image: its hash is {found[:16]}, {FILE_NAME} names {named[:16]}; "
+        "if 'toolchain regenerate' was interrupted, run it again, otherwise build again with 'toolchain build'"
+    )
+
+
+def _check_images(deployment: Deployment, interrupted: bool) -> None:
     # Here, not above, because a subscriber loads a deployment without NumPy.
     from pcie_shim.errors import DamagedImageError, PcieShimError
     from pcie_shim.programming_file import read_image
@@ -294,11 +306,8 @@ def _check_images(deployment: Deployment) -> None:
             raise DamagedDeploymentError(str(reason)) from reason
         except PcieShimError as reason:
             raise DeploymentError(str(reason)) from reason
-        if image.image_hash != board.image_hash:
-            raise DamagedDeploymentError(
-                f"{path} is another board's or another build's image: its hash is {image.image_hash[:16]}, "
-                f"{deployment.path} names {board.image_hash[:16]}"
-            )
+        if image.image_hash != board.image_hash and not interrupted:
+            raise other_image(path, image.image_hash, board.image_hash)
 
 
 _TOML_HEADER: Final = """\

@@ -210,6 +210,8 @@ def _memory_files(images: Sequence[Image]) -> str:
 
 _TOKEN: Final = re.compile(r'\n|--[^\n]*|\w*"[^"\n]*"|[\w.]+|:=|=>|[^\s]')
 _MOST_BYTES: Final = 4 << 20
+_FLAGS: Final = {"RNG_KIND": " --rng", "RNG_SHARED": " --per-cell", "RNG_BANKS": " --rng-banks"}
+"""The flags of a build for constants of the generators, which somebody might wish to edit."""
 _IMAGE_HASH: Final = re.compile(r'(image_hash\s*=>\s*)x"[0-9a-f]{64}"')
 
 
@@ -258,7 +260,7 @@ class PackageTokens:
                 line = found[1] or self.tokens[-1][1]
                 raise BuildError(
                     f"expected {due[0]} in {constant}, as memories and images have it, found {found[0]}; set it back, or "
-                    "build again with 'toolchain build'",
+                    f"build again with 'toolchain build{_FLAGS.get(constant, '')}'",
                     path=self.name,
                     line=line,
                 )

@@ -17,7 +17,10 @@ from pcie_shim.register_layout import next_doorbell
 from pcie_shim.register_map import ErrorCode
 from services.boards.hardware import Engine, SimulatedHardware
 from tests.toolchain.running import TARGET, assert_refused, contents, done, toolchain
+from toolchain.building.edited_sources import regenerate_images
+from toolchain.checks.check import check_deployment
 from toolchain.deployment import load_deployment
+from toolchain.outputs import output_files
 
 MODEL = """
 import numpy as np
@@ -147,18 +150,92 @@ def test_edited_parameters_are_those_of_the_machine(built):
     assert contents(built) == again
 
 
-def test_other_generators_come_with_their_seeds(case, built):
-    edit(built / PARAMETERS, "RNG_LFSR32;", "RNG_LFSR16;")
-    before = contents(built)
-    assert_refused(toolchain("regenerate", "images", built), "rng_seeds.mif, line", "WIDTH is 32", "16")
-    assert contents(built) == before
-    other = case.parent / "other"
-    arguments = ("--partitions", "2", "--prob-bits", "7", "--rng", "lfsr16")
-    done(toolchain("build", case, "-o", other, *TARGET, *arguments))
-    for name in (PARAMETERS, "bm_arch/Memory_MIFs/rng_seeds.mif"):
-        shutil.copy(other / name, built / name)
+def interrupted(monkeypatch, folder, last):
+    """Make images, and stop after the file of this name is written, as a killed process does."""
+    whole = output_files._write
+
+    def write(path, pieces):
+        whole(path, pieces)
+        if path.name == last:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(output_files, "_write", write)
+        with pytest.raises(KeyboardInterrupt):
+            regenerate_images(folder)
+
+
+@pytest.mark.parametrize("last", ["board0.bm", "board1.bm", "bm1_parameters.vhd", "board0_prior.mif"])
+def test_an_interrupted_command_goes_on(case, built, monkeypatch, last):
+    """With the same edits, and with others; the model's way back is open, too."""
+    other, originals = case.parent / "other", contents(built)
+    for column in ("board0_column1.mif", Path(COLUMN).name):
+        with_word(built / "bm_arch/Memory_MIFs" / column, 3, lambda word: word ^ 1)
+    interrupted(monkeypatch, built, last)
+    assert_refused(toolchain("inspect", built, "--frames", 1), "'toolchain regenerate' was interrupted")
+    shutil.copytree(built, other)
+    done(toolchain("regenerate", "memories", other, "--model", case))
+    assert contents(other) == originals
+    edit(built / PARAMETERS, "STEPS_PER_CLOCK   : positive := 8", "STEPS_PER_CLOCK : positive := 1")
+    interrupted(monkeypatch, built, last)
+    shutil.rmtree(other)
+    shutil.copytree(built, other)
     done(toolchain("regenerate", "images", built))
-    assert [each.image_hash for each in images(built)] == [each.image_hash for each in images(other)]
+    assert load_deployment(built).edited_boards == (0, 1)
+    for image in images(built):
+        assert image.machine.parameters.steps_per_clock == 1
+    # undone: the deployment that was built
+    for name in originals:
+        if name.endswith((".mif", ".vhd")):
+            (other / name).write_bytes(originals[name])
+    done(toolchain("regenerate", "images", other))
+    assert contents(other) == originals
+
+
+def test_an_interrupted_change_of_a_bm2_goes_on(network, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    asked = ("--searched", "rain", "--known", "shoes", "--machine", "bm2", "--partitions", "2")
+    done(toolchain("build", network, "-o", out, *TARGET, *asked))
+    with_word(out / "bm_arch/Memory_MIFs/cde0.mif", 0, lambda word: word ^ 3)
+    interrupted(monkeypatch, out, "board0.bm")
+    done(toolchain("regenerate", "images", out))
+    assert [board.built_hash is None for board in load_deployment(out).boards] == [False, False]
+    one, two = images(out)
+    assert one.machine.tables[0][0] == two.machine.tables[0][0]
+
+
+def test_images_of_another_build_are_no_basis(case, network, built):
+    """Neither other sizes, nor another model of the same sizes, nor another board's."""
+    other = case.parent / "other"
+    done(
+        toolchain(
+            "build", case, "-o", other, *TARGET, "--partitions", "2", "--prob-bits", "7", "--set", "sigma=2"
+        )
+    )
+    original = (built / "boards/board1.bm").read_bytes()
+    for source in (other / "boards/board1.bm", built / "boards/board0.bm"):
+        shutil.copy(source, built / "boards/board1.bm")
+        before = contents(built)
+        assert_refused(toolchain("regenerate", "images", built), "board1.bm")
+        assert contents(built) == before
+    (built / "boards/board1.bm").write_bytes(original)
+    shutil.copy(other / "boards/board0.bm", built / "boards/board0.bm")
+    assert_refused(toolchain("regenerate", "images", built), "MODEL_HASH")
+    shutil.rmtree(other)
+    asked = ("--searched", "rain", "--known", "shoes", "--machine", "bm2")
+    done(toolchain("build", network, "-o", other, *TARGET, *asked))
+    shutil.copy(other / "boards/board0.bm", built / "boards/board0.bm")
+    assert_refused(toolchain("regenerate", "images", built), "type = BM1", "board0.bm", "BM2")
+
+
+def test_the_check_of_an_edit_names_both_ways(built):
+    with_word(built / COLUMN, 3, lambda word: word ^ 1)
+    edit(built / PARAMETERS, "STEPS_PER_CLOCK   : positive := 8", "STEPS_PER_CLOCK : positive := 1")
+    (found,) = [each for each in check_deployment(built) if each.check == "files"]
+    assert "and 1 more file;" in found.sentence
+    assert all(f"'toolchain regenerate {each} {built}'" in found.advice for each in ("images", "memories"))
+    done(toolchain("regenerate", "images", built))
+    assert "with 1 step per clock" in done(toolchain("inspect", built, "--frames", 2)).stdout
 
 
 @pytest.mark.parametrize(
@@ -178,6 +255,15 @@ def test_other_generators_come_with_their_seeds(case, built):
         ),
         (PARAMETERS, "STEPS_PER_CLOCK   : positive := 8", "STEPS_PER_CLOCK : positive := eight", ["eight"]),
         (PARAMETERS, "STEPS_PER_CLOCK   : positive := 8", "STEPS_PER_CLOCK : positive := 99999", ["99999"]),
+        (
+            PARAMETERS,
+            'x"000000FF"',
+            'x"00000000"',
+            ["line ", 'TARGET_COUNT is x"00000000", expected greater'],
+        ),
+        (PARAMETERS, "RNG_LFSR32;", "RNG_LFSR16;", ["RNG_KIND", "rng_lfsr16", "'toolchain build --rng'"]),
+        (PARAMETERS, "RNG_BANKS         : positive := 16", "RNG_BANKS : positive := 8", ["--rng-banks'"]),
+        (PARAMETERS, "RNG_SHARED        : boolean := true", "RNG_SHARED : boolean := false", ["--per-cell'"]),
         (PARAMETERS, "constant COUNTER_BITS", "constant COUNTER", ["COUNTER_BITS"]),
         (PARAMETERS, "end package", "or package", ["line", "end", "or"]),
         (PARAMETERS, "COUNTER_BITS      : positive := 8", "COUNTER_BITS : positive := 4", ["target"]),

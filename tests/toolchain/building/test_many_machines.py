@@ -300,6 +300,9 @@ def test_boards_are_filled_with_machines(case):
     done(toolchain(*fill, "--device", "proce-v-d8", "--set", "size=5000"))
     deployment = load_deployment(out)
     assert (deployment.machine.replicas, len(deployment.boards)) == (1, 2)
+    report = done(toolchain(*fill, "--device", "proce-v-d8", "--interface", "20x1200")).stdout
+    assert "12 machines fill a board" in report
+    assert "with 13, it takes 1,300 result registers, and the interface has 1,200." in report
     over = ("build", case, "-o", out, *TARGET, "--replicas", "50")
     assert_refused(toolchain(*over), "--partitions 2 or more", "--replicas 40 or fewer")
     assert_refused(
