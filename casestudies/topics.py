@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final
 from pydantic import BaseModel, BeforeValidator, ConfigDict, FiniteFloat, ValidationError
 
 from bridge.client import Publication, Ros, Subscription
-from bridge.errors import DisconnectedError, SlowPeerError
+from bridge.errors import DisconnectedError, MessageTooLargeError, SlowPeerError
 from bridge.names import same_type
 from bridge.stamps import stamp_ns
 from posteriors.errors import BadResultError, NoResultError
@@ -105,12 +105,16 @@ async def report_refused(
 
 
 class LossyPublication:
-    """A publication that drops messages while the server is disconnected or slow, with one warning each time."""
+    """A publication that drops messages while the server is disconnected or slow, with one warning each time.
+
+    A message that is too large for the server is dropped, too.
+    """
 
     def __init__(self, publication: Publication) -> None:
         """Wrap a publication."""
         self._publication = publication
-        self._slow = False
+        # Whether the last message was dropped with a warning.
+        self._slow = self._large = False
 
     async def publish(self, message: Mapping[str, Any]) -> bool:
         """Publish the message or drop it, and return whether it was published."""
@@ -123,9 +127,14 @@ class LossyPublication:
                 warn(f"{error}; messages on {self._publication.topic} are dropped until it keeps up")
             self._slow = True
             return False
-        if self._slow:
+        except MessageTooLargeError as error:
+            if not self._large:
+                warn(f"{error}; it is dropped")
+            self._large = True
+            return False
+        if self._slow or self._large:
             say(f"{self._publication.topic} is published again")
-        self._slow = False
+        self._slow = self._large = False
         return True
 
 

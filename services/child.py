@@ -27,6 +27,7 @@ from terminal.signals import ENDING_SIGNALS, raise_on_signals, stopped_error
 RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
 """Environment variable with the folder of status sockets (the setting `run_directory`)."""
 
+_IGNORED_BY_PYTHON: Final = (signal.SIGPIPE, signal.SIGXFSZ)
 LONGEST_LINE: Final = 1 << 20
 """Maximum number of bytes of a line from a child; a longer one is passed on in pieces."""
 
@@ -119,7 +120,7 @@ class Child:
         # The run directory, whose lock the child holds too, so that the next run waits for its end.
         self._directory = directory
         # Of the last start: the process, its pipes (standard error and error reports), and its last report.
-        self._process: asyncio.subprocess.Process | Forked | None = None
+        self._process: Forked | None = None
         self._pipes: list[_Pipe] = []
         self._error = ""
         # Times of the last exits (monotonic, s), whose number within a window is limited, and the number of restarts.
@@ -155,19 +156,33 @@ class Child:
         with contextlib.suppress(msgspec.MsgspecError):
             self._error = _decoder.decode(line).error
 
-    async def _spawn(self, environment: dict[str, str], lines: int) -> asyncio.subprocess.Process | Forked:
+    async def _spawn(self, environment: dict[str, str], lines: int) -> Forked:
+        """Start the process, whose standard error is the descriptor `lines`."""
+        return Forked(self._execute(environment, lines))
+
+    def _execute(self, environment: dict[str, str], lines: int) -> int:
         inherited = [int(environment[ERROR_DESCRIPTOR])]
         if self._directory is not None:
             inherited.append(self._directory.lock)
-        return await asyncio.create_subprocess_exec(
-            *self._command,
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.DEVNULL,
-            stderr=lines,
-            pass_fds=inherited,
-            env=environment,
-            start_new_session=True,
-        )
+        for descriptor in inherited:
+            os.set_inheritable(descriptor, True)
+        try:
+            # not by the event loop: uvloop aborts a process that was forked without the descriptors of its parent
+            return os.posix_spawnp(
+                self._command[0],
+                self._command,
+                environment,
+                file_actions=[
+                    (os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0),
+                    (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0),
+                    (os.POSIX_SPAWN_DUP2, lines, 2),
+                ],
+                setsid=True,
+                setsigdef=_IGNORED_BY_PYTHON,
+            )
+        finally:
+            for descriptor in inherited:
+                os.set_inheritable(descriptor, False)
 
     @property
     def pid(self) -> int:
@@ -272,7 +287,7 @@ class ForkedCommand(Child):
         self._role = role
         self._arguments = arguments
 
-    async def _spawn(self, environment: dict[str, str], lines: int) -> asyncio.subprocess.Process | Forked:
+    async def _spawn(self, environment: dict[str, str], lines: int) -> Forked:
         if self._process is not None:
             return await super()._spawn(environment, lines)
         kept = [int(environment[ERROR_DESCRIPTOR])]

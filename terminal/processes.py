@@ -46,7 +46,7 @@ def ask_for_end_with_parent() -> None:
 
 
 class Forked:
-    """A forked process, with the part of the interface of `asyncio.subprocess.Process` that is used here."""
+    """A process that was forked or spawned here, with the part of the interface of `asyncio.subprocess.Process` that is used here."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid

@@ -22,7 +22,7 @@ class StageKind(StrEnum):
 
     ROSBRIDGE = "rosbridge"
     HOST = "between the host's processes"
-    REGISTERS = "registers of the boards"
+    REGISTERS = "link to the boards"
     COMPUTING = "computing on the boards"
 
 
@@ -45,6 +45,24 @@ def _reported(field: str) -> Callable[[Instance], float | None]:
     return lambda instance: getattr(instance.report.stages, field) if instance.report else None
 
 
+def _of_computing(instance: Instance) -> tuple[float, float] | None:
+    """Return the time of computing and that of the link, both before the boards' answers; None if not known."""
+    if instance.report is None or (waited := instance.report.stages.compute) is None:
+        return None
+    own = instance.report.stages.boards_compute
+    return (waited, 0.0) if own is None else (own, max(0.0, waited - own))
+
+
+def _computing(instance: Instance) -> float | None:
+    times = _of_computing(instance)
+    return None if times is None else times[0]
+
+
+def _answering(instance: Instance) -> float | None:
+    times = _of_computing(instance)
+    return None if times is None else times[1]
+
+
 _Stage: TypeAlias = "tuple[str, StageKind, Callable[[Instance], float | None]]"
 """A stage's name and part, and its time in microseconds in a frame, None if not known."""
 
@@ -52,7 +70,8 @@ _STAGES: Final[tuple[_Stage, ...]] = (
     ("rosbridge in", StageKind.ROSBRIDGE, _reported("rosbridge_in")),
     ("local hops", StageKind.HOST, _reported("local_hops")),
     ("register writes", StageKind.REGISTERS, _reported("register_writes")),
-    ("computing", StageKind.COMPUTING, _reported("compute")),
+    ("computing", StageKind.COMPUTING, _computing),
+    ("start and answer", StageKind.REGISTERS, _answering),
     ("register reads", StageKind.REGISTERS, _reported("reads")),
     (
         "rosbridge out",

@@ -40,7 +40,8 @@ async def publish_pairs(
         scene = Scene(seed)
         begin = time.monotonic()
         for number in numbers() if count is None else range(count):
-            pair = scene.pair(number, width, height)
+            # in a thread: a large one takes seconds
+            pair = await asyncio.to_thread(scene.pair, number, width, height)
             head = header(time.time_ns(), "left_camera", version)
             seen = np.where(pair.occluded, np.nan, pair.disparity)
             await truth.publish(image_message(seen, head, "32FC1"))  # first, for who waits for the pair
@@ -61,8 +62,8 @@ def disparity_cameras(
         typer.Option(min=0, help="Seed of scene and noise.", show_default="one is chosen and printed"),
     ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Pairs per second.")] = 2.0,
-    width: Annotated[int, typer.Option(min=16, max=4096, help="Pixels across.")] = 160,
-    height: Annotated[int, typer.Option(min=16, max=4096, help="Pixels down.")] = 120,
+    width: Annotated[int, typer.Option(min=16, max=1024, help="Pixels across.")] = 160,
+    height: Annotated[int, typer.Option(min=16, max=1024, help="Pixels down.")] = 120,
     count: Annotated[int | None, typer.Option(min=1, help="Exit after this many pairs.")] = None,
 ) -> int:
     """Publish stereo pairs of a simulated scene, and the true disparity."""

@@ -15,6 +15,8 @@ IMAGE_TYPE: Final = "sensor_msgs/Image"
 DISPARITY_TYPE: Final = "stereo_msgs/DisparityImage"
 _DTYPES: Final = {"mono8": "u1", "8UC1": "u1", "32FC1": "f4"}
 """Types of a pixel by encoding."""
+_MOST_PIXELS: Final = 1 << 19
+"""Maximum size of an image, because costs and likelihoods take 0.8 kB of memory for each pixel."""
 _WAITING: Final = 16
 """Images of each camera that wait for the other's."""
 
@@ -42,6 +44,10 @@ def read_image(message: Mapping[str, Any], *encodings: str) -> NDArray[Any]:
         image = np.ascontiguousarray(rows).view(dtype)
     except (binascii.Error, TypeError, ValueError):
         image = np.empty((0, 0))
+    if image.size > _MOST_PIXELS:
+        raise BadImageError(
+            f"it has {width} x {height} pixels, expected at most {_MOST_PIXELS}; scale it down"
+        )
     if image.shape != (height, width) or not image.size:
         raise BadImageError(
             f"its data do not hold {height} rows of {step} bytes with {width} pixels of {encoding}"

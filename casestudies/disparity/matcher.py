@@ -155,9 +155,10 @@ class Matcher:
         self._truths: deque[tuple[int | None, NDArray[Any]]] = deque(maxlen=64)
         self._warned: set[str] = set()
 
-    def _warn_once(self, sentence: str) -> None:
-        if sentence not in self._warned:
-            self._warned.add(sentence)
+    def _warn_once(self, sentence: str, of: str = "") -> None:
+        """Warn, unless a sentence of this topic, or the same one, was said before."""
+        if (key := of or sentence) not in self._warned:
+            self._warned.add(key)
             warn(sentence)
 
     def take_image(self, side: int, message: Message) -> None:
@@ -165,7 +166,7 @@ class Matcher:
         try:
             pair = self._images.add(side, message.msg)
         except BadImageError as error:
-            self._warn_once(f"an image on {message.topic} is skipped: {error}")
+            self._warn_once(f"an image on {message.topic} is skipped: {error}", message.topic)
             return
         if pair is not None:
             self._newest = pair
@@ -176,7 +177,7 @@ class Matcher:
         try:
             self._truths.append((header_stamp_ns(message.msg), read_image(message.msg, "32FC1")))
         except BadImageError as error:
-            self._warn_once(f"an image on {message.topic} is skipped: {error}")
+            self._warn_once(f"an image on {message.topic} is skipped: {error}", message.topic)
 
     async def next_pair(self, limit_s: float) -> StereoImages:
         """Return the newest pair, once, or wait for one; a NoResultError if none comes in time."""
@@ -196,10 +197,9 @@ class Matcher:
 
     async def match(self, images: StereoImages, stack: Stack) -> Matched:
         """Match a pair on the host and on the boards."""
-        begin, begin_cpu = time.monotonic(), time.thread_time()
-        likely = likelihoods(matching_costs(images.left, images.right, self._disparities))
-        tiles = tiles_of(as_bytes(likely), self._pixels)
-        host_s = time.thread_time() - begin_cpu
+        begin = time.monotonic()
+        # in a thread: a large pair takes seconds
+        likely, tiles, host_s = await asyncio.to_thread(self._on_host, images)
         found, cycles = await stack.posteriors(tiles)
         total_s = time.monotonic() - begin
         height, width = images.left.shape
@@ -214,6 +214,13 @@ class Matcher:
             boards_s=cycles / self._clock,
             cycles=cycles,
         )
+
+    def _on_host(self, images: StereoImages) -> tuple[NDArray[np.float32], NDArray[np.uint8], float]:
+        """Return the likelihoods, their tiles, and the seconds of CPU that they took."""
+        begin = time.thread_time()
+        likely = likelihoods(matching_costs(images.left, images.right, self._disparities))
+        tiles = tiles_of(as_bytes(likely), self._pixels)
+        return likely, tiles, time.thread_time() - begin
 
     async def watch(
         self,

@@ -3,10 +3,12 @@
 import asyncio
 import json
 import re
+from unittest.mock import AsyncMock
 
 import pytest
 
 from bridge.discovery import UnknownRobotError
+from bridge.errors import MessageTooLargeError
 from casestudies import topics
 from casestudies.boat.normaliser import app as normaliser
 from casestudies.boat.simulator import app as simulator
@@ -14,7 +16,7 @@ from casestudies.boat.viewer import app as viewer
 from casestudies.mrclam.player import app as player
 from casestudies.sprinkler.garden import app as garden
 from casestudies.sprinkler.viewer import app as sprinkler_viewer
-from casestudies.topics import Readiness, serve_readiness
+from casestudies.topics import LossyPublication, Readiness, serve_readiness
 from terminal.health import is_ready, read_status, status_socket
 from tests.command_runner import invoke
 from tests.patience import PATIENCE
@@ -106,3 +108,15 @@ def test_a_robots_name_stands_for_its_uri(command, looked_up, monkeypatch):
 def test_a_player_looks_it_up_too(looked_up):
     assert invoke(player, ["nowhere.csv", "--uri", "robot:Adam"]).exit_code == 3
     assert looked_up == ["Adam"]
+
+
+async def test_messages_that_are_too_large_are_dropped_with_one_warning(capsys):
+    publication = AsyncMock(topic="/t")
+    lossy = LossyPublication(publication)
+    for error in (MessageTooLargeError("it has 9 bytes"), MessageTooLargeError("it has 9 bytes"), None):
+        publication.publish.side_effect = error
+        assert await lossy.publish({}) is (error is None)
+    assert [line.partition(": ")[2] or line for line in capsys.readouterr().err.splitlines()] == [
+        "it has 9 bytes; it is dropped",
+        "/t is published again",
+    ]

@@ -10,6 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from casestudies.sprinkler.model import exact_rain
+from tests.integration.conftest import until
 
 
 @pytest.mark.process
@@ -34,4 +35,25 @@ async def test_the_demo_answers_within_its_own_error(stage, tmp_path):
     (picture,) = re.findall(r"^wrote (.*)$", demo.out, re.MULTILINE)
     assert picture == str(tmp_path / "sprinkler.png")
     assert imread(picture).shape[1] > 800
+    await stage.nothing_left()
+
+
+@pytest.mark.process
+async def test_a_demo_outlives_its_boards_and_its_pcie_application(stage, tmp_path):
+    """The master of a demo is forked, and starts processes again all the same."""
+    demo = stage.start(
+        *(sys.executable, "-m", "rosbayes", "demo", "--sprinkler"),
+        *("--count", "30", "--seed", "2", "--out", str(tmp_path)),
+    )
+    for role in ("pcie-app", "board"):
+        seen = demo.out.count("\n")
+        await until(lambda seen=seen: demo.out.count("\n") > seen + 3, lambda: demo.err + demo.out)
+        for process in stage.processes()[role]:
+            process.kill()
+    assert await demo.end() == 0, demo.err + demo.out
+    said = (tmp_path / "master.log").read_text()
+    assert re.findall(r"\[warning\] (.+) was killed by SIGKILL; restarting it", said) == [
+        "pcie-app",
+        "the boards' process",
+    ]
     await stage.nothing_left()

@@ -108,21 +108,23 @@ def test_frames_without_a_truth_are_spread_over_time_and_those_without_a_posteri
     assert far_apart([Instance(heard=FrameReport(stamp_ns=1, heard_ns=1, outcome=""))]) == ()
 
 
-STAGES = {"rosbridge_in": 100, "local_hops": 200, "register_writes": 50, "compute": 600, "reads": 50}
+STAGES = {"rosbridge_in": 100, "local_hops": 200, "register_writes": 50, "reads": 50}
+STAGES |= {"compute": 700, "boards_compute": 600}
 
 
 def test_means_and_shares():
     double = {name: 2 * time for name, time in STAGES.items()}
     shares = stage_shares([instance(1, **STAGES), instance(2, **double)])
     assert [stage.name for stage in shares] == [
-        *("rosbridge in", "local hops", "register writes", "computing", "register reads", "rosbridge out")
+        *("rosbridge in", "local hops", "register writes", "computing", "start and answer"),
+        *("register reads", "rosbridge out"),
     ]
-    assert [stage.mean_us for stage in shares] == [150, 300, 75, 900, 75, 500]
+    assert [stage.mean_us for stage in shares] == [150, 300, 75, 900, 150, 75, 500]
     assert sum(stage.share for stage in shares) == pytest.approx(1)
     assert shares[3].part is StageKind.COMPUTING
-    assert shares[3].share == pytest.approx(900 / 2000)
+    assert shares[3].share == pytest.approx(900 / 2150)
     some = stage_shares([instance(1, compute=500), instance(2)])  # the others were not told
-    assert [(stage.name, stage.mean_us) for stage in some] == [("computing", 500), ("rosbridge out", 500)]
+    assert [stage.mean_us for stage in some] == [500, 0, 500]
     assert stage_shares([]) == ()
 
 

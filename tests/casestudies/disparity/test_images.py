@@ -57,6 +57,7 @@ def test_rows_may_be_padded_and_floats_big_endian():
         ({"width": "4"}, "4 pixels"),
         ({"step": None}, "None bytes"),
         ({"height": 0, "data": b""}, "0 rows"),
+        ({"height": 1024, "width": 1024, "step": 1024, "data": bytes(1 << 20)}, "1024 x 1024 pixels"),
     ],
 )
 def test_what_is_no_grey_image_is_named(changed, named):
