@@ -301,10 +301,10 @@ def show(transfers: Sequence[Transfer], frames: Sequence[FrameTime], fitted: Seq
     console.print(table)
     for each in fitted:
         wire = WIRES[each.link]
-        verdict = "agrees" if each.is_right else "does not agree; measure again on a quiet computer"
+        verdict = "equal within" if each.is_right else "on a quiet computer, they differ by at most"
         print(
             f"{each.link}, {each.direction}: {each.mbps:,.4g} Mbps and {each.latency_us:,.3g} us a transfer more than the "
-            f"socket alone; the model has {wire.mbps:,g} Mbps and {wire.latency_us:g} us, which {verdict} within {TOLERANCE:.0%}"
+            f"socket alone; the model has {wire.mbps:,g} Mbps and {wire.latency_us:g} us; {verdict} {TOLERANCE:.0%}"
         )
     by_link = {each.link: each.mbps for each in fitted if each.direction == "read"}
     slow, fast = (

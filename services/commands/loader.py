@@ -62,6 +62,9 @@ def loader(
             failed[at] = error
             warn(f"{board} is not programmed: {error}")
     if failed:
-        say_error(f"of {len(images)} boards, these are not programmed: {', '.join(map(str, failed))}")
+        names = ", ".join(f"board {at}" for at in failed)
+        say_error(
+            f"{len(failed)} of {len(images)} boards {'is' if len(failed) == 1 else 'are'} not programmed: {names}"
+        )
         return next(iter(failed.values())).exit_code
     return 0

@@ -131,7 +131,7 @@ def test_boards_beside_one_that_is_not_there_are_programmed_and_named(boat, prog
     lines = ended.stderr.splitlines()
     assert [f"board{at}.sock" in line for at, line in enumerate(lines[:4])] == [True] * 4
     assert ["not programmed" in line for line in lines[:4]] == [False, True, True, False]
-    assert lines[4].endswith("1, 2")
+    assert lines[4].endswith("2 of 4 boards are not programmed: board 1, board 2")
 
 
 def test_one_board_gets_its_image(boat, programmed):
