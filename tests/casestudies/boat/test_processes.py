@@ -112,7 +112,7 @@ async def test_from_the_simulator_to_the_pictures(tmp_path):
         assert first["mean_value"][label] == pytest.approx(first["true_position"][label], abs=half)
     printed = re.findall(r"-?[\d.]+, -?[\d.]+", lines[0])
     assert printed == ["{x:.1f}, {y:.1f}".format(**first[key]) for key in ("true_position", "mean_value")]
-    assert [stage["stage"] for stage in numbers["stages"]][::5] == ["rosbridge in", "rosbridge out"]
+    assert [stage["stage"] for stage in numbers["stages"]][::6] == ["rosbridge in", "rosbridge out"]
     assert sum(stage["share"] for stage in numbers["stages"]) == pytest.approx(1)
     # the server says that it speaks for ROS 2, and the stamp is kept from the raw reading on
     first = sensors[0]["msg"]
