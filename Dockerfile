@@ -1,6 +1,6 @@
 # One image for every service: the commands, the boat's deployment, and the kernels' machine code.
 #   docker compose build
-# If RUN steps have no network access, first download the wheels of requirements-dashboard.lock into wheelhouse/
+# If RUN steps have no network access, first download the wheels of requirements-image.lock into wheelhouse/
 # (docs/how-to/containers.md).
 ARG PYTHON_IMAGE=python:3.11-slim-bookworm
 
@@ -9,8 +9,8 @@ ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1 PIP_ROOT_USER_ACTION=igno
 RUN python -m venv --without-pip /opt/rosbayes
 WORKDIR /build
 # a pattern, because COPY fails if a plain name does not exist
-COPY requirements-dashboard.lock wheelhous[e] ./wheels/
-RUN set -- --require-hashes --no-deps --only-binary :all: -r wheels/requirements-dashboard.lock; \
+COPY requirements-image.lock wheelhous[e] ./wheels/
+RUN set -- --require-hashes --no-deps --only-binary :all: -r wheels/requirements-image.lock; \
     if ls wheels/*.whl >/dev/null 2>&1; then set -- --no-index --find-links wheels "$@"; fi; \
     python -m pip --python /opt/rosbayes/bin/python install --quiet "$@"
 COPY . .

@@ -40,7 +40,7 @@ def run(*command, cwd):
 def test_the_bill_has_every_package_that_users_install(tmp_path):
     run(ROOT / "scripts" / "bill-of-materials", tmp_path / "bill.json", cwd=tmp_path)
     bill = json.loads((tmp_path / "bill.json").read_text())
-    lines = re.findall(r"^(\S.*?) \\$", (ROOT / "requirements-dashboard.lock").read_text(), re.MULTILINE)
+    lines = re.findall(r"^(\S.*?) \\$", (ROOT / "requirements-image.lock").read_text(), re.MULTILINE)
     pins = [each for each in map(Requirement, lines) if each.marker is None or each.marker.evaluate()]
     found = {canonicalize_name(each["name"]): f"=={each['version']}" for each in bill["components"]}
     assert found == {each.name: str(each.specifier) for each in pins}

@@ -15,9 +15,11 @@ SERVICES = COMPOSE["services"]
 COMMANDS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 ENDING = {"check"}
 """Services that end before the others start."""
-PUBLISHED = {"hub", "dashboard"}
+CLUSTER = {"cluster-scheduler", "cluster-worker"}
+"""Services of dask, which do not know those of the stack."""
+PUBLISHED = {"hub", "dashboard", "cluster-scheduler"}
 """Services that this machine can reach."""
-WATCHED = [name for name in SERVICES if name not in ENDING | {"viewer"}]
+WATCHED = [name for name in SERVICES if name not in ENDING | CLUSTER | {"viewer"}]
 ALL_BUT_ENDING = [name for name in SERVICES if name not in ENDING]
 
 every_service = pytest.mark.parametrize("name", SERVICES)
@@ -77,6 +79,9 @@ def test_ended_in_time(name):
 @every_service
 def test_its_command_exists_and_its_variables_are_settings(name):
     command = SERVICES[name]["command"].split()[0]
+    if name in CLUSTER:
+        assert command == "dask"
+        return
     assert command in COMMANDS
     assert command == {"boards": "board", "viewer": "listen", "check": "master"}.get(name, name)
     known = {ENV_PREFIX + field.upper() for field in Settings.model_fields}
@@ -87,6 +92,14 @@ def test_ports_on_loopback_only():
     ports = {name: service["ports"] for name, service in SERVICES.items() if "ports" in service}
     assert set(ports) == PUBLISHED
     assert all(each.startswith("127.0.0.1:") for listed in ports.values() for each in listed)
+
+
+def test_workers_of_a_cluster_find_its_scheduler():
+    scheduler, worker = SERVICES["cluster-scheduler"], SERVICES["cluster-worker"]
+    assert " --port 8786 " in scheduler["command"]
+    assert worker["command"].startswith("dask worker tcp://cluster-scheduler:8786 --nthreads 1 ")
+    assert worker["deploy"] == {"replicas": 3}
+    assert worker["networks"] == ["cluster"]
 
 
 def networks_of(name, **variables):
@@ -117,7 +130,7 @@ def test_only_these_share_the_sockets(volume, services):
     sharing = {
         name
         for name, service in SERVICES.items()
-        if any(str(each).startswith(f"{volume}:") for each in service["volumes"])
+        if any(str(each).startswith(f"{volume}:") for each in service.get("volumes", []))
     }
     assert sharing == services
     assert volume in COMPOSE["volumes"]
@@ -162,7 +175,7 @@ def test_a_stack_that_cannot_start_ends():
 
     for name in ALL_BUT_ENDING:
         assert "check" in awaited(name)
-        if name != "hub":
+        if name not in CLUSTER | {"hub"}:
             assert "hub" in awaited(name)  # whose port may be taken
 
 
@@ -202,5 +215,5 @@ def test_another_deployment_is_mounted_where_it_is_looked_for():
 def test_profiles(variables, profiles):
     line = re.search(r"^COMPOSE_PROFILES=(.*)$", (ROOT / ".env").read_text(), re.MULTILINE)
     used = {each for service in SERVICES.values() for each in service.get("profiles", [])}
-    assert used == {"hub", "boat", "boards", "viewer"}
+    assert used == {"hub", "boat", "boards", "viewer", "cluster"}
     assert set(filled(line[1], **variables).split(",")) & used == profiles

@@ -404,6 +404,18 @@ async def until_rosapi(uri, question, is_wanted, **args):
             await asyncio.sleep(0.02)
 
 
+def inferred(folder, rows, where):
+    """The posteriors that `toolchain infer` computes for readings: a row for each frame, in the order of the variables."""
+    names = [variable.name for variable in load_deployment(folder).variables]
+    lines = [",".join("" if value is None else str(value) for value in row) for row in [names, *rows]]
+    (where / "recording.csv").write_text("\n".join(lines) + "\n")
+    ended = invoke(main.app, ("infer", where / "recording.csv", "-d", folder, "-o", where / "posteriors.npz"))
+    assert ended.exit_code == 0, ended.output
+    with np.load(where / "posteriors.npz") as arrays:
+        posteriors = arrays["probabilities"].reshape(len(rows), -1)
+    return [each.tolist() for each in posteriors if not np.isnan(each).any()]
+
+
 async def until_subscribed(uri, topic):
     """Wait until somebody hears a topic at a hub."""
     await until_rosapi(uri, "subscribers", lambda answer: answer["subscribers"], topic=topic)

@@ -16,7 +16,7 @@ from machines.encode import encode_probability
 from machines.kind import FrameInput
 from machines.posterior import joint_posterior
 from pcie_shim.programming_file import read_image
-from tests.integration.conftest import LOOP, Robot, build, until_subscribed
+from tests.integration.conftest import LOOP, Robot, build, inferred, until_subscribed
 from tests.pcie_shim.boards import expected
 from toolchain.deployment import load_deployment
 
@@ -111,5 +111,11 @@ async def test_the_stack_filters_as_a_reference_does(stage, tmp_path, options):
         exact = exact / exact.sum()
         variation.append(0.5 * abs(belief - exact).sum())
     assert np.mean(variation) < 0.06
+    if not options:
+        names = [
+            [None if at is None else states[at] for states, at in zip(STATES, each, strict=True)]
+            for each in readings
+        ]
+        assert inferred(folder, names, tmp_path) == [result["data"] for result in robot.results]
     numbers = [json.dumps(result["data"]) for result in robot.results]
     assert all(one != other for one, other in itertools.pairwise(numbers))

@@ -19,6 +19,7 @@ from machines.encode import decode_code
 from machines.parameters import RngReset
 from toolchain.analysis.emulation import EmulatedBoards, Inputs, inputs_of_boards, priors_of_boards
 from toolchain.analysis.readings import Readings
+from toolchain.cluster import Run, Work, in_this_process
 from toolchain.deployment.filter import Filter
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.model import Model, exact_posterior, fuse
@@ -164,28 +165,33 @@ class _Differences:
     """Differences of many frames, total variation, KL and agreement; runs and replicas of a frame are averaged."""
 
     def __init__(self) -> None:
-        self._all: dict[int, list[NDArray[np.float64]]] = {}
-        self._alone: dict[int, list[NDArray[np.float64]]] = {}
+        self.every: dict[int, list[NDArray[np.float64]]] = {}
+        self.alone: dict[int, list[NDArray[np.float64]]] = {}
 
     def add(self, frame: int, ours: Sequence[_Posterior], theirs: _Posterior) -> None:
         runs = [_difference(each, theirs) for each in ours if each is not None and theirs is not None]
         lost = [_LOST] * (len(ours) - len(runs))
-        self._all.setdefault(frame, []).append(np.mean([*runs, *lost], axis=0))
+        self.every.setdefault(frame, []).append(np.mean([*runs, *lost], axis=0))
         if runs:
-            self._alone.setdefault(frame, []).append(np.mean(runs, axis=0))
+            self.alone.setdefault(frame, []).append(np.mean(runs, axis=0))
+
+    def take(self, other: "_Differences") -> None:
+        """Add the differences of other frames."""
+        self.every |= other.every
+        self.alone |= other.alone
 
     def summary(self) -> Difference | None:
-        if not self._all:
+        if not self.every:
             return None
         alone = None
-        if self._alone:
-            variation, divergence, same = _columns(self._alone)
+        if self.alone:
+            variation, divergence, same = _columns(self.alone)
             alone = Difference(
                 total_variation=bootstrap(variation, np.mean),
                 map_agreement=share_of_frames(float(same.mean()), len(same)),
                 kl_bits=bootstrap(divergence, np.mean),
             )
-        variation, _, same = _columns(self._all)
+        variation, _, same = _columns(self.every)
         return Difference(
             total_variation=bootstrap(variation, np.mean),
             map_agreement=share_of_frames(float(same.mean()), len(same)),
@@ -195,7 +201,7 @@ class _Differences:
 
 def _columns(frames: dict[int, list[NDArray[np.float64]]]) -> NDArray[np.float64]:
     """Return total variation, KL and agreement of each frame, averaged over its replicas: float64[3, frames]."""
-    return np.array([np.mean(replicas, axis=0) for replicas in frames.values()]).T
+    return np.array([np.mean(frames[frame], axis=0) for frame in sorted(frames)]).T
 
 
 def measure(
@@ -207,6 +213,7 @@ def measure(
     replicas: int = 1,
     own: Filter | None = None,
     advance: Callable[[], None] = lambda: None,
+    run: Run = in_this_process,
 ) -> Accuracy:
     """Run a machine on readings and compare its posteriors with exact inference.
 
@@ -227,69 +234,108 @@ def measure(
     parameters = boards.parameters
     banks = 1 if own is not None else banks
     banks = max(1, min(banks, parameters.rng_banks if parameters.rng_reset is RngReset.BANK else banks))
-    found = _Results(boards, readings, banks)
-    impossible = 0
-    belief = None if own is None else own.transition.start
-    for place in range(len(readings) // replicas * replicas):
-        exact = codes = None
-        if own is not None and belief is not None:
-            belief, codes = own.transition.after(belief), own.predict()
-        if model is not None:
-            addresses, row = readings.of_model(place)
-            try:
-                exact = exact_posterior(model, addresses, prior_address=row, prior=belief)
-            except ModelError:
-                impossible += 1
-        last = found.add(place, place // replicas, exact, codes, compare=model is not None)
-        if own is not None:
-            own.update(last)
-            belief = belief if exact is None else exact
-        advance()
-    if impossible == found.posteriors:
+    if own is not None or parameters.rng_reset is RngReset.FREE:
+        run = in_this_process  # a frame depends on those before
+    frames = _Frames(boards, readings, model, banks, replicas, own)
+    found = _Results(banks)
+
+    def keep(_: int, result: _Results) -> None:
+        found.take(result)
+        for _ in range(replicas):
+            advance()
+
+    run(frames, range(len(readings) // replicas), keep)
+    if found.unlikely == found.posteriors:
         raise ModelError(f"none of the readings ({readings.source}) is possible in the model")
-    return found.summary()
+    return found.summary(boards, readings, run)
+
+
+@dataclass(frozen=True, slots=True)
+class _Frames:
+    """The job of running the readings: piece n is frame n, whose result is that of this frame alone."""
+
+    boards: EmulatedBoards
+    readings: Readings
+    model: Model | None
+    banks: int
+    replicas: int
+    own: Filter | None
+
+    def prepare(self) -> Work:
+        """Return the function that runs the readings of a frame."""
+        belief = None if self.own is None else self.own.transition.start
+
+        def measured(frame: int) -> _Results:
+            nonlocal belief
+            found = _Results(self.banks)
+            for place in range(frame * self.replicas, (frame + 1) * self.replicas):
+                exact = codes = None
+                if self.own is not None and belief is not None:
+                    belief, codes = self.own.transition.after(belief), self.own.predict()
+                if self.model is not None:
+                    addresses, row = self.readings.of_model(place)
+                    try:
+                        exact = exact_posterior(self.model, addresses, prior_address=row, prior=belief)
+                    except ModelError:
+                        found.unlikely += 1
+                last = found.add(
+                    self.boards, self.readings, place, frame, exact, codes, compare=self.model is not None
+                )
+                if self.own is not None:
+                    self.own.update(last)
+                    belief = belief if exact is None else exact
+            return found
+
+        return measured
 
 
 @dataclass(slots=True)
 class _Results:
-    """Results of the readings so far; `lengths` are cycles with each bank, by frame and replica."""
+    """Results of some readings; `lengths` are cycles with each bank, by frame and replica.
 
-    boards: EmulatedBoards
-    readings: Readings
+    `places` are those of the readings that are possible in the codes, with their written prior.
+    """
+
     banks: int
     of_machine: _Differences = field(default_factory=_Differences)
     of_codes: _Differences = field(default_factory=_Differences)
     of_sampling: _Differences = field(default_factory=_Differences)
     lengths: dict[int, list[list[int]]] = field(default_factory=dict)
-    places: list[int] = field(default_factory=list)
-    priors: list[NDArray[np.uint16] | None] = field(default_factory=list)
-    weights: list[NDArray[np.float64]] = field(default_factory=list)
+    places: dict[int, NDArray[np.uint16] | None] = field(default_factory=dict)
+    unlikely: int = 0
+    """Readings that are impossible in the model."""
     posteriors: int = 0
     impossible: int = 0
     without: int = 0
     overflow: int = 0
 
+    def take(self, other: "_Results") -> None:
+        """Add the results of other frames."""
+        for name in ("of_machine", "of_codes", "of_sampling"):
+            getattr(self, name).take(getattr(other, name))
+        self.lengths |= other.lengths
+        self.places |= other.places
+        for name in ("unlikely", "posteriors", "impossible", "without", "overflow"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
     def add(
-        self, place: int, frame: int, exact: _Posterior, prior: NDArray[np.uint16] | None, *, compare: bool
+        self,
+        boards: EmulatedBoards,
+        readings: Readings,
+        place: int,
+        frame: int,
+        exact: _Posterior,
+        prior: NDArray[np.uint16] | None,
+        *,
+        compare: bool,
     ) -> _Posterior:
         """Run the reading at an index with every bank, and compare it with `exact`, the posterior of the model, if any.
 
         `prior` is a written one. Return the posterior of the last bank.
         """
-        boards, banks = self.boards, self.banks
-        inputs, prior_row = self.readings.of_machine(place, boards.machines[0])
-        likelihood = np.concatenate(
-            [
-                _line_probabilities(machine, own, prior_row, codes)
-                for machine, own, codes in zip(
-                    boards.machines,
-                    inputs_of_boards(inputs, boards.machines),
-                    priors_of_boards(prior, boards.machines),
-                    strict=True,
-                )
-            ]
-        )
-        numbers = [(frame * banks + run) % boards.parameters.rng_banks for run in range(banks)]
+        inputs, prior_row = readings.of_machine(place, boards.machines[0])
+        likelihood = _line_probabilities(boards, inputs, prior_row, prior)
+        numbers = [(frame * self.banks + run) % boards.parameters.rng_banks for run in range(self.banks)]
         ran = [boards.run(inputs, prior_row, bank, prior) for bank in numbers]
         posteriors = [each.posterior for each in ran]
         self.posteriors += 1
@@ -300,24 +346,24 @@ class _Results:
         if of_codes is None:
             self.impossible += 1
         else:
-            self.weights.append(likelihood)
-            self.places.append(place)
-            self.priors.append(prior)
+            self.places[place] = prior
         self.of_sampling.add(frame, posteriors, of_codes)
         if compare:
             self.of_codes.add(frame, [of_codes], exact)
             self.of_machine.add(frame, posteriors, exact)
         return posteriors[-1]
 
-    def summary(self) -> Accuracy:
-        lengths = np.array([np.max(each, axis=0) for each in self.lengths.values()])
+    def summary(self, boards: EmulatedBoards, readings: Readings, run: Run) -> Accuracy:
+        """Return the statistics over all frames."""
+        frames = sorted(self.lengths)
+        lengths = np.array([np.max(self.lengths[frame], axis=0) for frame in frames])
         # the z-score of a count uses the cycles of single replicas
-        by_themselves = np.array([length for each in self.lengths.values() for length in each])
+        by_themselves = np.array([length for frame in frames for length in self.lengths[frame]])
         runs = self.posteriors * self.banks
         z = None
         if (by_themselves > 0).any():
             usual = int(np.median(by_themselves[by_themselves > 0]))
-            z = _z_scores(self.boards, self.readings, self.places, self.priors, self.weights, usual)
+            z = _z_scores(_Counts(boards, readings, self.places, usual), run)
         return Accuracy(
             frames=len(self.lengths),
             posteriors=self.posteriors,
@@ -344,12 +390,13 @@ def addressed_chances(
 
 
 def _line_probabilities(
-    machine: BM1Machine, addresses: Inputs, prior_address: int, prior: NDArray[np.uint16] | None = None
+    boards: EmulatedBoards, inputs: Inputs, prior_address: int, prior: NDArray[np.uint16] | None
 ) -> NDArray[np.float64]:
-    """Return the probability that each line counts in a cycle: float64[lines]."""
-    chances = addressed_chances(machine, addresses, prior_address, prior)
-    product: NDArray[np.float64] = np.prod(chances, axis=0)
-    return product
+    """Return the probability that each line of all boards counts in a cycle: float64[lines]."""
+    machines = boards.machines
+    parts = zip(machines, inputs_of_boards(inputs, machines), priors_of_boards(prior, machines), strict=True)
+    chances = [addressed_chances(machine, own, prior_address, codes) for machine, own, codes in parts]
+    return np.concatenate([np.prod(each, axis=0) for each in chances])
 
 
 def _difference(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> tuple[float, float, float]:
@@ -362,38 +409,52 @@ def _difference(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> tuple
     return variation, divergence, float(same.any())
 
 
-def _z_scores(
-    boards: EmulatedBoards,
-    readings: Readings,
-    places: list[int],
-    priors: list[NDArray[np.uint16] | None],
-    weights: list[NDArray[np.float64]],
-    cycles: int,
-) -> ZScores | None:
+@dataclass(frozen=True, slots=True)
+class _Counts:
+    """The job of comparing counts with equation 2.1: piece n is the reading at index n, run for a number of cycles."""
+
+    boards: EmulatedBoards
+    readings: Readings
+    places: dict[int, NDArray[np.uint16] | None]
+    cycles: int
+
+    def prepare(self) -> Work:
+        """Return the function for a reading: sums of z^2, of z and of 1, and the number beyond 3; None without counts."""
+
+        def compared(place: int) -> tuple[NDArray[np.float64], int] | None:
+            boards, prior, cycles = self.boards, self.places[place], self.cycles
+            addresses, row = self.readings.of_machine(place, boards.machines[0])
+            chance = _line_probabilities(boards, addresses, row, prior)
+            ran = boards.run_for(addresses, row, place % boards.parameters.rng_banks, cycles, prior)
+            looked_at = (chance * cycles >= EXPECTED_COUNT) & (chance < 1)
+            if not looked_at.any():
+                return None
+            p = chance[looked_at]
+            z = (np.concatenate(ran.counts)[looked_at] - cycles * p) / np.sqrt(cycles * p * (1 - p))
+            return np.array([(z**2).sum(), z.sum(), len(z)]), int((np.abs(z) > 3).sum())
+
+        return compared
+
+
+def _z_scores(job: _Counts, run: Run) -> ZScores | None:
+    found: dict[int, tuple[NDArray[np.float64], int] | None] = {}
+    run(job, sorted(job.places), found.__setitem__)
     # Frames with the same bank share all random numbers, so a bank is one draw for all of them.
-    free = boards.parameters.rng_reset is RngReset.FREE
+    free = job.boards.parameters.rng_reset is RngReset.FREE
     drawn: dict[int, NDArray[np.float64]] = {}
     beyond = 0
-    for frame, prior, chance in zip(places, priors, weights, strict=True):
-        addresses, row = readings.of_machine(frame, boards.machines[0])
-        bank = frame % boards.parameters.rng_banks
-        ran = boards.run_for(addresses, row, bank, cycles, prior)
-        looked_at = (chance * cycles >= EXPECTED_COUNT) & (chance < 1)
-        if not looked_at.any():
-            continue
-        p = chance[looked_at]
-        z = (np.concatenate(ran.counts)[looked_at] - cycles * p) / np.sqrt(cycles * p * (1 - p))
-        sums = np.array([(z**2).sum(), z.sum(), len(z)])
-        key = frame if free else bank
-        drawn[key] = drawn[key] + sums if key in drawn else sums
-        beyond += int((np.abs(z) > 3).sum())
+    for place in sorted(found):  # the sum of floats depends on their order
+        if (each := found[place]) is not None:
+            key = place if free else place % job.boards.parameters.rng_banks
+            drawn[key] = drawn[key] + each[0] if key in drawn else each[0]
+            beyond += each[1]
     if not drawn:
         return None
     table = np.array(list(drawn.values()))
     counts = int(table[:, 2].sum())
 
     return ZScores(
-        cycles=cycles,
+        cycles=job.cycles,
         counts=counts,
         draws=len(table),
         rms=bootstrap_rows(table, lambda rows: math.sqrt(rows[:, 0].sum() / rows[:, 2].sum())),

@@ -14,6 +14,7 @@ from toolchain.analysis.resources import Estimate
 from toolchain.analysis.sampling import Sampled, chain_resources, drawn_readings, run_chains
 from toolchain.building.build import read_images
 from toolchain.building.report import edited_sentence
+from toolchain.cluster import Run, in_this_process
 from toolchain.deployment import Deployment
 from toolchain.errors import BuildError, counted
 from toolchain.models.network import NetworkModel
@@ -110,7 +111,11 @@ class ChainInspection:
 
 
 def inspect_chain(
-    deployment: Deployment, model: NetworkModel | None, options: InspectOptions, progress: Progress
+    deployment: Deployment,
+    model: NetworkModel | None,
+    options: InspectOptions,
+    progress: Progress,
+    run: Run = in_this_process,
 ) -> ChainInspection:
     """Run a deployment's chains on readings, and estimate their costs, or raise a ToolchainError."""
     machines = [image.machine for image in read_images(deployment)]
@@ -135,6 +140,7 @@ def inspect_chain(
             samples=limits.target_count,
             max_cycles=limits.max_cycles,
             advance=lambda: advance("frames"),
+            run=run,
         )
     return ChainInspection(
         deployment=deployment,

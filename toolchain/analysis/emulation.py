@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from functools import partial
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,13 @@ class EmulatedBoards:
             )
             for machine in machines
         ]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the machines alone, since each process has its own kernels."""
+        make = partial(
+            EmulatedBoards, target_count=self.target_count, max_cycles=self.max_cycles, stop=self.stop
+        )
+        return make, (self.machines,)
 
     @property
     def parameters(self) -> BM1Parameters:

@@ -24,6 +24,7 @@ from toolchain.analysis.resources import ASSUMPTIONS, Energy, Estimate, energy, 
 from toolchain.building.build import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
 from toolchain.building.report import edited_sentence, loss_heading, many_sentence
+from toolchain.cluster import Run, in_this_process
 from toolchain.deployment import Deployment, Scale
 from toolchain.errors import BuildError, counted
 from toolchain.models.model import Model
@@ -54,7 +55,11 @@ class Inspection:
 
 
 def inspect_deployment(
-    deployment: Deployment, model: Model | None, options: InspectOptions, progress: Progress
+    deployment: Deployment,
+    model: Model | None,
+    options: InspectOptions,
+    progress: Progress,
+    run: Run = in_this_process,
 ) -> Inspection:
     """Run the machine of a deployment on readings, and estimate its costs, or raise a ToolchainError."""
     device = device_named(options.device)
@@ -85,6 +90,7 @@ def inspect_deployment(
             replicas=section.replicas,
             own=deployment.new_filter(),
             advance=lambda: advance("frames"),
+            run=run,
         )
     return Inspection(
         deployment=deployment,

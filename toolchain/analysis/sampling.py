@@ -11,7 +11,7 @@ import numpy as np
 from machines.bm2 import BM2Machine
 from machines.bm2_kind import BM2, kernels_of, run_batches
 from machines.kind import FrameInput
-from machines.parameters import SampleEvery
+from machines.parameters import RngReset, SampleEvery
 from toolchain.analysis.accuracy import Cycles, Interval, bootstrap
 from toolchain.analysis.chain import distance
 from toolchain.analysis.logic import (
@@ -28,6 +28,7 @@ from toolchain.analysis.logic import (
 )
 from toolchain.analysis.readings import check_frames
 from toolchain.analysis.resources import Estimate
+from toolchain.cluster import Run, Work, in_this_process
 from toolchain.deployment import Dimension
 from toolchain.errors import BuildError
 from toolchain.models.network import NetworkModel
@@ -87,6 +88,47 @@ class Sampled:
     reasons: Mapping[str, int]
 
 
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """A frame: why each board stopped, and distance, effective samples, R-hat and cycles; None without a posterior."""
+
+    reasons: tuple[str, ...]
+    row: tuple[float, ...] | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Frames:
+    """The job of running the readings: piece n is reading n."""
+
+    machines: Sequence[BM2Machine]
+    readings: Sequence[Addresses]
+    model: NetworkModel | None
+    samples: int
+    max_cycles: int
+
+    def prepare(self) -> Work:
+        """Return the function that runs a reading on all boards."""
+        kernels, banks = kernels_of(self.machines), self.machines[0].parameters.rng_banks
+
+        def measured(number: int) -> _Frame:
+            addresses, row = self.readings[number], None
+            frame = FrameInput(
+                addresses=addresses,
+                target_count=self.samples,
+                max_cycles=self.max_cycles,
+                bank=number % banks,
+            )
+            found = BM2.infer(run_batches(kernels, frame))
+            if found.posterior is not None:
+                exact = found.posterior if self.model is None else self.model.exact(addresses)
+                details = (float(found.details.get(key, 0)) for key in ("effective_samples", "r_hat"))
+                cycles = max(kernel.cycles for kernel in kernels)
+                row = (distance(found.posterior, exact), *details, cycles)
+            return _Frame(tuple(kernel.reason.name.lower() for kernel in kernels), row)
+
+        return measured
+
+
 def run_chains(
     machines: Sequence[BM2Machine],
     readings: Sequence[Addresses],
@@ -95,22 +137,21 @@ def run_chains(
     samples: int,
     max_cycles: int,
     advance: Callable[[], None] = lambda: None,
+    run: Run = in_this_process,
 ) -> Sampled:
     """Run every reading on boards with these machines; a BuildError if none of them gives a posterior."""
-    p, kernels = machines[0].parameters, kernels_of(machines)
-    rows, reasons = [], Counter[str]()
-    for number, addresses in enumerate(readings):
-        frame = FrameInput(
-            addresses=addresses, target_count=samples, max_cycles=max_cycles, bank=number % p.rng_banks
-        )
-        found = BM2.infer(run_batches(kernels, frame))
-        reasons.update(kernel.reason.name.lower() for kernel in kernels)
-        if found.posterior is not None:
-            exact = found.posterior if model is None else model.exact(addresses)
-            details = (float(found.details.get(key, 0)) for key in ("effective_samples", "r_hat"))
-            cycles = max(kernel.cycles for kernel in kernels)
-            rows.append((distance(found.posterior, exact), *details, cycles))
+    p, found = machines[0].parameters, dict[int, _Frame]()
+
+    def keep(number: int, frame: _Frame) -> None:
+        found[number] = frame
         advance()
+
+    if p.rng_reset is RngReset.FREE:
+        run = in_this_process  # the generators run on from frame to frame
+    run(_Frames(machines, readings, model, samples, max_cycles), range(len(readings)), keep)
+    frames = [found[number] for number in sorted(found)]
+    reasons = Counter(reason for frame in frames for reason in frame.reasons)
+    rows = [frame.row for frame in frames if frame.row is not None]
     if not rows:
         ends = ", ".join(f"{name} {count}" for name, count in sorted(reasons.items()))
         raise BuildError(f"none of the readings gives a posterior; boards stopped by: {ends}")

@@ -1,13 +1,15 @@
 """Sweeps over the possible machines of a model: points, stored one by one in a file, their Pareto front, table and picture."""
 
+import fcntl
 import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, cast
+from typing import Any, BinaryIO, Final, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -19,7 +21,7 @@ from toolchain.analysis.emulation import EmulatedBoards
 from toolchain.analysis.logic import Device
 from toolchain.analysis.readings import Readings
 from toolchain.analysis.resources import estimate
-from toolchain.bounded_files import file_errors, read_bounded
+from toolchain.bounded_files import file_errors, read_bounded, whole_file
 from toolchain.building.machine import (
     MachinePlan,
     board_layout,
@@ -29,6 +31,7 @@ from toolchain.building.machine import (
     whole_machine,
 )
 from toolchain.building.quantise import quantise
+from toolchain.cluster import Run, Work
 from toolchain.errors import BuildError
 from toolchain.models.model import Model
 
@@ -120,15 +123,36 @@ class Results:
     def append(self, point: Point) -> None:
         """Append a point with one write, and wait until it is on the disk."""
         line = point.model_dump_json().encode() + b"\n"
-        with file_errors(self.path, "written", BuildError):
+        with file_errors(self.path, "written", BuildError), self._locked() as file:
             if self._torn_at is not None:
                 os.truncate(self.path, self._torn_at)
                 self._torn_at = None
-            with self.path.open("ab", buffering=0) as file:
-                written = file.write(line)
-                os.fsync(file.fileno())
+            written = file.write(line)
+            os.fsync(file.fileno())
         if written != len(line):
             raise BuildError(f"{self.path} cannot be written: the disk is full")
+        self.points[point.key] = point
+
+    @contextmanager
+    def _locked(self) -> Iterator[BinaryIO]:
+        """Open the file to append, alone among the sweeps that write it."""
+        while True:
+            with self.path.open("ab", buffering=0) as file:
+                fcntl.flock(file, fcntl.LOCK_EX)
+                if os.fstat(file.fileno()).st_nlink:  # otherwise, another sweep has sorted it
+                    yield file
+                    return
+
+    def sort(self, keys: Sequence[str]) -> None:
+        """Move the points of these keys to the end of the file, in this order, as a sweep in one process writes them."""
+        with self._locked():
+            points = Results(self.path).points  # with those of other sweeps
+            last = dict.fromkeys(keys)
+            order = [*(key for key in points if key not in last), *last]
+            if order != list(points):
+                lines = (points[key].model_dump_json() + "\n" for key in order)
+                with whole_file(self.path, BuildError) as partial:
+                    partial.write_text("".join(lines), encoding="utf-8")
 
 
 _MOST_LOST: Final = 0.5
@@ -385,17 +409,36 @@ def with_resources(task: Task, point: Point, device: Device) -> Point:
     return point.model_copy(update=update)
 
 
-def run_sweep(
-    found: Sequence[Task],
-    kept: dict[str, Point],
-    measured: Callable[[Task], Point],
-    keep: Callable[[Point], None],
-    advance: Callable[[Point], None],
-) -> None:
-    """Measure the machines without a stored result, and store every point before the next one begins."""
-    for task in found:
-        if task.key not in kept:
-            point = measured(task)
-            keep(point)
-            kept[task.key] = point
-        advance(kept[task.key])
+@dataclass(frozen=True, slots=True)
+class SweepJob:
+    """The job of a sweep: piece n measures the machine of task n."""
+
+    tasks: Sequence[Task]
+    readings: Readings
+    device: Device
+    banks: int
+
+    def prepare(self) -> Work:
+        """Return the function that measures a machine."""
+        return lambda number: run_task(self.tasks[number], self.readings, self.device, self.banks)
+
+
+def run_sweep(job: SweepJob, run: Run, results: Results, advance: Callable[[Point], None]) -> None:
+    """Measure the machines without a stored result, and store every point as soon as it is there.
+
+    At the end, the points of the sweep stand in the file in its order, whoever has measured them.
+    """
+    left = []
+    for number, task in enumerate(job.tasks):
+        if task.key in results.points:
+            advance(results.points[task.key])
+        else:
+            left.append(number)
+
+    def keep(_: int, point: Point) -> None:
+        results.append(point)
+        advance(point)
+
+    run(job, left, keep)
+    if left:
+        results.sort([task.key for task in job.tasks])

@@ -10,6 +10,7 @@ import typer
 
 from toolchain.analysis import AdviceOptions, InspectOptions, ReadingOptions, Sweep
 from toolchain.bounded_files import file_errors
+from toolchain.cluster import SchedulerOptions, runner
 from toolchain.commands.request import ModelFlags, ModelPath, read_model, read_source
 from toolchain.errors import BuildError, NotFusionError
 from toolchain.flags import Bits
@@ -37,6 +38,7 @@ def inspect(
     directory: Annotated[Path, typer.Argument(help="Folder of a deployment.", metavar="DIR")],
     flags: ModelFlags,
     options: InspectOptions,
+    where: SchedulerOptions,
     bits: Bits = None,
     model: Annotated[
         Path | None,
@@ -64,11 +66,13 @@ def inspect(
         from toolchain.building.choice import network_for
 
         network = None if model is None else network_for(read_source(model, flags))
-        chain = inspect_chain(deployment, network, options, progress)
+        with runner(where) as run:
+            chain = inspect_chain(deployment, network, options, progress, run)
         typer.echo(chain.as_json() if json else chain.report(), nl=False)
         return
     read = None if model is None else read_model(model, flags, bits or deployment.model.bits)
-    found = inspect_deployment(deployment, read, options, progress)
+    with runner(where) as run:
+        found = inspect_deployment(deployment, read, options, progress, run)
     typer.echo(as_json(found) if json else inspection_report(found), nl=False)
 
 
@@ -93,6 +97,7 @@ def explore(
     flags: ModelFlags,
     sweep: Sweep,
     readings: ReadingOptions,
+    where: SchedulerOptions,
     bits: Bits = None,
     frames: Annotated[int, typer.Option(help="Maximum number of frames.")] = 50,
     results: Annotated[
@@ -141,12 +146,11 @@ def explore(
         err=True,
     )
     try:
-        with progress(len(found)) as advance:
+        with runner(where) as run, progress(len(found)) as advance:
             sweeps.run_sweep(
-                found,
-                kept.points,
-                lambda task: sweeps.run_task(task, drawn, device, sweep.banks),
-                kept.append,
+                sweeps.SweepJob(found, drawn, device, sweep.banks),
+                run,
+                kept,
                 lambda point: advance(
                     f"{point.rng}, codes of {point.prob_bits} bits, target {point.target_count}, scale {point.scale}"
                 ),

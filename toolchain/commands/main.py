@@ -18,6 +18,7 @@ from toolchain.bounded_files import file_errors
 from toolchain.building.options import DeploymentEdits
 from toolchain.commands.build import build, check
 from toolchain.commands.explore import advise, explore, inspect
+from toolchain.commands.infer import infer
 from toolchain.commands.query import query, show
 from toolchain.commands.request import ModelFlags, model_file, read_source
 from toolchain.deployment import FILE_NAME
@@ -231,4 +232,4 @@ Then change model.py, build it again, and point --uri at the robot.
 
 
 add_commands(regeneration, memories, images, project, deployment)
-add_commands(app, build, check, inspect, advise, explore, query, show, fit, new)
+add_commands(app, build, check, inspect, advise, explore, infer, query, show, fit, new)

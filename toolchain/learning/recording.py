@@ -36,6 +36,8 @@ class Recording:
     """The number of rows."""
     columns: dict[str, list[object]]
     """Values by name, one per row: a number, a text, or None if missing."""
+    stamps: tuple[int, ...] = ()
+    """Nanoseconds of each row in a bag; none in a CSV file."""
 
 
 def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0.1) -> Recording:
@@ -180,7 +182,7 @@ def _read_bag(path: Path, columns: Sequence[str], tolerance_ns: int) -> Recordin
         nearest = [_nearest(times[topic], stamp, tolerance_ns) for stamp in times[base]]
         for column in names:
             found[column] = [None if at is None else values[column][at] for at in nearest]
-    return Recording(path, len(times[base]), found)
+    return Recording(path, len(times[base]), found, tuple(times[base]))
 
 
 def _messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, Any]]:

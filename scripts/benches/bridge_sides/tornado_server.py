@@ -78,7 +78,7 @@ subscribers: dict[str, list[socket.socket]] = defaultdict(list)
 lock = threading.Lock()
 
 
-class Connection(tornado.websocket.WebSocketHandler):  # type: ignore[misc]  # tornado is in an environment of its own
+class Connection(tornado.websocket.WebSocketHandler):
     """One client: a queue, the thread that empties it, and a thread for each of its subscriptions."""
 
     def open(self, *_args: str) -> None:

@@ -289,6 +289,23 @@ def check_hub_alone(stack: Stack) -> None:
             stack.compose("down", "--volumes", "--remove-orphans")
 
 
+def check_cluster(stack: Stack) -> None:
+    """Check `docker compose up cluster-worker`: only a scheduler and its workers run, and an analysis gives the same bytes."""
+    inspect = ("with-kernels", "toolchain", "inspect", "/deployment", "--json", "--frames", "8")
+    inside = ("exec", "--no-TTY", "cluster-worker", *inspect)
+    scheduler = ("--scheduler", "tcp://cluster-scheduler:8786", "--insecure")
+    with stack.cleared():
+        try:
+            stack.compose("up", "--detach", "cluster-worker", limit=UP_LIMIT)
+            expect(
+                set(stack.states()) == {"cluster-scheduler", "cluster-worker"}, f"it runs {[*stack.states()]}"
+            )
+            there = stack.compose(*inside, *scheduler, limit=UP_LIMIT)
+            expect(there == stack.compose(*inside, limit=UP_LIMIT), f"inspect --scheduler prints {there}")
+        finally:
+            stack.compose("--profile", "cluster", "down")
+
+
 def check_refused(stack: Stack) -> None:
     """Check that a start that cannot succeed ends with a reason that names the user's input."""
     broken = stack.project / "build" / "broken"
@@ -344,6 +361,7 @@ FULL: tuple[tuple[str, Check], ...] = (
     ("an absent robot that appears", check_absent_robot),
     ("a user's model", check_own_model),
     ("the hub alone", check_hub_alone),
+    ("a cluster alone", check_cluster),
     ("starts that cannot succeed", check_refused),
     ("a processor of another name", check_processor),
 )

@@ -74,7 +74,7 @@ def fetch_wheels() -> None:
     Raises:
         DownloadError: pip cannot download them.
     """
-    folder, lock = home() / "wheels", ROOT / "requirements-dashboard.lock"
+    folder, lock = home() / "wheels", ROOT / "requirements-image.lock"
     made = folder / ".made"
     stamp = hashlib.sha256(lock.read_bytes()).hexdigest()
     if made.exists() and made.read_text() == stamp:

@@ -165,10 +165,10 @@ def test_how_often_codes_let_lines_count():
         np.array([[255, 128, 64]], dtype=np.uint16),
         (np.array([[255, 128, 0], [255, 255, 255]], dtype=np.uint16),),
     )
-    chances = _line_probabilities(machine, (0,), 0)
+    chances = _line_probabilities(boards_of(machine, 1), (0,), 0, None)
     assert chances / chances.sum() == pytest.approx([0.8, 0.2, 0])
     zero = BM1Machine(machine.parameters, np.zeros((1, 3), dtype=np.uint16), machine.tables)
-    assert not _line_probabilities(zero, (0,), 0).any()
+    assert not _line_probabilities(boards_of(zero, 1), (0,), 0, None).any()
 
 
 def test_a_machine_beside_its_model():

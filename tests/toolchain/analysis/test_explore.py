@@ -17,6 +17,7 @@ from toolchain.analysis.readings import sample_readings
 from toolchain.analysis.sweep import (
     Point,
     Results,
+    SweepJob,
     _name_points,
     draw_sweep,
     pareto,
@@ -25,6 +26,7 @@ from toolchain.analysis.sweep import (
     table,
     tasks,
 )
+from toolchain.cluster import in_this_process
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 
@@ -90,23 +92,24 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path):
     readings = sample_readings(model, 5, seed=1)
     found = tasks(model, sweep(), readings, D8)
 
-    def measure_two(task):
-        if len(measured) == 2:
-            raise KeyboardInterrupt
-        return measure(task)
+    job = SweepJob(found, readings, D8, 1)
 
-    def measure(task):
-        measured.append(task.key)
-        return run_task(task, readings, D8, 1)
+    def two(job, numbers, keep):
+        in_this_process(job, numbers[:2], keep)
+        raise KeyboardInterrupt
 
-    first = Results(tmp_path / "r.jsonl")
+    def reversed_rest(job, numbers, keep):
+        measured.extend(numbers)
+        in_this_process(job, numbers[::-1], keep)
+
     with pytest.raises(KeyboardInterrupt):
-        run_sweep(found, first.points, measure_two, first.append, lambda _: None)
+        run_sweep(job, two, Results(tmp_path / "r.jsonl"), lambda _: None)
     again = Results(tmp_path / "r.jsonl")
-    assert list(again.points) == measured
-    run_sweep(found, again.points, measure, again.append, lambda _: None)
-    assert measured == [task.key for task in found]
-    assert len(Results(tmp_path / "r.jsonl").points) == 4
+    assert list(again.points) == [task.key for task in found[:2]]
+    run_sweep(job, reversed_rest, again, lambda _: None)
+    assert measured == [2, 3]
+    # the file has the order of the sweep, whatever the order of the work
+    assert list(Results(tmp_path / "r.jsonl").points) == [task.key for task in found]
 
 
 def test_results_are_below_build_unless_a_flag_names_a_file(case, monkeypatch):

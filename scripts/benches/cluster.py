@@ -1,0 +1,301 @@
+"""Work on a dask scheduler against the same work in one process: a sweep of designs, and a recording.
+
+one core   ─▶ in_this_process(job)                                            serial seconds
+            this process ─▶ scheduler ─▶ a worker on each core                efficiency = serial / (cores * seconds)
+hosts 1-4  ─▶ the same, with a worker in each of several network namespaces   bytes on the wire
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from casestudies.boat.model import model as boat
+from scripts.running.flags import ScriptParser
+from terminal.ending import outcome
+from terminal.errors import ProcessError
+from toolchain.analysis import Sweep
+from toolchain.analysis.logic import device_named
+from toolchain.analysis.readings import sample_readings
+from toolchain.analysis.replay import Frames, Replay
+from toolchain.analysis.sweep import SweepJob, tasks
+from toolchain.building.build import build_deployment, read_images
+from toolchain.building.machine import plan_machine
+from toolchain.building.options import BuildOptions
+from toolchain.cluster import Job, Run, SchedulerOptions, in_this_process, runner
+from toolchain.deployment import load_deployment
+from toolchain.errors import BuildError
+
+AIM: Final = 0.95
+"""Efficiency that `--check` requires of two workers on two cores."""
+NETWORK: Final = "10.213.7"
+"""Of the namespaces; the scheduler's host is number 1."""
+TASKS: Final = 2000
+"""Empty tasks, to measure the scheduler."""
+START_S: Final = 60.0
+
+
+def sweep_job(designs: int, frames: int) -> SweepJob:
+    """Return the job of some designs of the boat."""
+    model, device = boat().model(), device_named("proce-v-d8")
+    sweep = Sweep(
+        prob_bits="4,5,6,7,8",
+        targets="15,31,63,127,255,511",
+        rngs="lfsr8,lfsr16,lfsr24,lfsr32",
+        scales="address,column",
+    )
+    readings = sample_readings(model, frames, seed=1)
+    return SweepJob(tasks(model, sweep, readings, device)[:designs], readings, device, sweep.banks)
+
+
+def replay_job(folder: Path, frames: int) -> Replay:
+    """Return the job of a recording of the boat."""
+    model = boat().model()
+    options = BuildOptions(
+        uri="ws://robot:9090", topic="/boat/sensors", type="boat_msgs/Sensors", partitions=4
+    )
+    build_deployment(plan_machine(model, options), folder)
+    deployment = load_deployment(folder)
+    addresses = sample_readings(model, frames, seed=1).addresses
+    recorded = Frames(addresses, np.ones(frames, bool), np.arange(frames), "")
+    return Replay(deployment, read_images(deployment), recorded)
+
+
+class Hosts:
+    """A scheduler, and workers of one core each: on this host, or each in a network namespace."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._running: list[subprocess.Popen[bytes]] = []
+        self.address = ""
+
+    def _start(self, *command: str) -> None:
+        with (self._folder / f"{len(self._running)}.log").open("wb") as log:
+            self._running.append(subprocess.Popen(command, stdout=log, stderr=log, cwd=self._folder))
+
+    @contextmanager
+    def serving(self, workers: int, *, namespaces: bool) -> Iterator[str]:
+        """Run a scheduler and workers, and yield the address; in namespaces, worker n is the host NETWORK.n+2."""
+        dask = str(Path(sys.executable).with_name("dask"))
+        host, names = "127.0.0.1", [f"rosbayes{at}" for at in range(workers)] if namespaces else []
+        try:
+            if namespaces:
+                host = f"{NETWORK}.1"
+                _ip("link", "add", "rosbayes", "type", "bridge")
+                _ip("address", "add", f"{host}/24", "dev", "rosbayes")
+                _ip("link", "set", "rosbayes", "up")
+            for at, name in enumerate(names):
+                _ip("netns", "add", name)
+                _ip("link", "add", name, "type", "veth", "peer", "name", "eth0", "netns", name)
+                _ip("link", "set", name, "master", "rosbayes", "up")
+                _ip("-n", name, "address", "add", f"{NETWORK}.{at + 2}/24", "dev", "eth0")
+                _ip("-n", name, "link", "set", "eth0", "up")
+                _ip("-n", name, "link", "set", "lo", "up")
+            file = self._folder / "scheduler.json"
+            file.unlink(missing_ok=True)  # of the scheduler before
+            self._start(
+                dask,
+                "scheduler",
+                "--host",
+                host,
+                "--port",
+                "0",
+                "--scheduler-file",
+                str(file),
+                "--no-dashboard",
+                "--no-show",
+            )
+            address = _address_in(file)
+            cores = sorted(os.sched_getaffinity(0))
+            for at in range(workers):
+                inside = ("ip", "netns", "exec", names[at]) if namespaces else ()
+                pinned = ("taskset", "-c", str(cores[at % len(cores)]))
+                self._start(
+                    *inside,
+                    *pinned,
+                    dask,
+                    "worker",
+                    address,
+                    "--nthreads",
+                    "1",
+                    "--no-nanny",
+                    "--no-dashboard",
+                    "--memory-limit",
+                    "0",
+                )
+            yield address
+        finally:
+            for process in self._running:
+                process.kill()
+            for process in self._running:
+                process.wait()
+            self._running.clear()
+            for name in names:
+                with suppress(ProcessError):
+                    _ip("netns", "delete", name)
+            if namespaces:
+                with suppress(ProcessError):
+                    _ip("link", "delete", "rosbayes")
+
+
+def _ip(*arguments: str) -> None:
+    ran = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
+    if ran.returncode:
+        raise ProcessError(f"ip {' '.join(arguments)}: {ran.stderr.strip()}")
+
+
+def _address_in(file: Path) -> str:
+    until = time.monotonic() + START_S
+    while time.monotonic() < until:
+        with suppress(OSError, ValueError):
+            return str(json.loads(file.read_text())["address"])
+        time.sleep(0.05)
+    raise ProcessError(f"the scheduler did not write {file}")
+
+
+def seconds_of(run: Run, job: Job, numbers: Sequence[int]) -> float:
+    """Return the time of a job."""
+    begun = time.perf_counter()
+    run(job, numbers, lambda *_: None)
+    return time.perf_counter() - begun
+
+
+def _load_kernels(jobs: Sequence[Job]) -> None:
+    for job in jobs:
+        in_this_process(job, [0], lambda *_: None)
+
+
+def tasks_per_second(address: str, workers: int, small: Sequence[Job]) -> float:
+    """Wait until all workers have loaded the kernels of small jobs; return how many empty tasks are done in a second."""
+    from distributed import Client
+
+    with Client(address) as client:
+        client.wait_for_workers(workers, timeout=START_S)
+        client.run(_load_kernels, small)
+        client.gather(client.map(int, range(100), pure=False))
+        begun = time.perf_counter()
+        client.gather(client.map(int, range(TASKS), pure=False))
+        return TASKS / (time.perf_counter() - begun)
+
+
+def _sent(name: str) -> int:
+    """Return the bytes that have passed a network interface, in both directions."""
+    folder = Path("/sys/class/net", name, "statistics")
+    return sum(int((folder / f"{way}_bytes").read_text()) for way in ("rx", "tx"))
+
+
+def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> float:
+    """Measure everything, and return the lowest efficiency of two workers on this host."""
+    # of the same kinds, so that the workers have loaded the kernels
+    small: Sequence[Job] = sweep_job(4, 1), replay_job(folder / "small", 1)
+    jobs: dict[str, tuple[Job, int]] = {
+        f"{arguments.designs} designs": (
+            sweep_job(arguments.designs, arguments.sweep_frames),
+            arguments.designs,
+        ),
+        f"{arguments.frames:,} frames": (replay_job(folder / "boat", arguments.frames), arguments.frames),
+    }
+    _load_kernels(small)
+    serial: dict[str, float] = {}
+    for name, (job, pieces) in jobs.items():
+        allowed = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, {min(allowed)})
+        serial[name] = seconds_of(in_this_process, job, range(pieces))
+        os.sched_setaffinity(0, allowed)
+    table = Table(title="serial time / (cores x time on the scheduler)", title_justify="left")
+    for name in ("work", "serial, s", "workers", "hosts", "time, s", "efficiency", "bytes a batch"):
+        table.add_column(name, justify="right" if name != "work" else "left")
+    cores, lowest, rate = len(os.sched_getaffinity(0)), 2.0, 0.0
+    for workers, namespaces in ((2, False), (1, True), (2, True), (4, True)):
+        try:
+            with (
+                Hosts(folder).serving(workers, namespaces=namespaces) as address,
+                runner(SchedulerOptions(scheduler=address, insecure=True)) as run,
+            ):
+                done = tasks_per_second(address, workers, small)
+                rate = rate or done
+                for name, (job, pieces) in jobs.items():
+                    before = sum(_sent(f"rosbayes{at}") for at in range(workers)) if namespaces else 0
+                    with counted_batches() as batches:
+                        took = seconds_of(run, job, range(pieces))
+                    used = min(workers, cores)
+                    efficiency = serial[name] / (used * took)
+                    sent = "-"
+                    if namespaces:
+                        bytes_ = sum(_sent(f"rosbayes{at}") for at in range(workers)) - before
+                        sent = f"{bytes_ / len(batches):,.0f}"
+                    else:
+                        lowest = min(lowest, efficiency)
+                    hosts = str(workers) if namespaces else "this one"
+                    table.add_row(
+                        name,
+                        f"{serial[name]:.1f}",
+                        str(workers),
+                        hosts,
+                        f"{took:.1f}",
+                        f"{efficiency:.1%}",
+                        sent,
+                    )
+        except ProcessError as reason:
+            if not namespaces:
+                raise
+            console.print(f"no network namespaces here: {reason}")
+            break
+    console.print(table)
+    console.print(f"The scheduler does {rate:,.0f} empty tasks/s.")
+    return lowest
+
+
+@contextmanager
+def counted_batches() -> Iterator[list[int]]:
+    """Yield a list that grows with each batch that is submitted."""
+    from distributed import Client
+
+    submit, found = Client.submit, list[int]()
+
+    def counting(self: Any, *given: Any, **options: Any) -> Any:
+        found.append(1)
+        return submit(self, *given, **options)
+
+    Client.submit = counting
+    try:
+        yield found
+    finally:
+        Client.submit = submit
+
+
+def main() -> int:
+    """Parse the flags and measure."""
+    parser = ScriptParser(
+        prog="scripts/bench cluster",
+        description="Print the efficiency of a sweep and a recording on dask workers, against one process.",
+    )
+    parser.add_argument("--designs", type=int, default=200, help="number of designs of the boat")
+    parser.add_argument("--sweep-frames", type=int, default=20, help="number of frames of each design")
+    parser.add_argument("--frames", type=int, default=20_000, help="number of frames of the recording")
+    parser.add_argument(
+        "--check", action="store_true", help=f"fail below {AIM:.0%} on two cores of this host"
+    )
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="bench-cluster-") as name:
+        lowest = measure(arguments, Path(name), Console())
+    if arguments.check and lowest < AIM:
+        raise BuildError(f"the efficiency is {lowest:.1%}, expected {AIM:.0%} or more")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(outcome(main))

@@ -1,0 +1,183 @@
+"""Recordings through the machines: an interrupted run goes on, also of a filter, and the file has the same bytes."""
+
+from zlib import crc32
+
+import numpy as np
+import pytest
+
+from tests.toolchain.builders import corridor
+from tests.toolchain.building.test_filter import ASKED, UMBRELLA
+from tests.toolchain.running import TARGET, assert_refused, build_model, done, toolchain
+from toolchain.analysis.replay import PartFile, recorded_frames, replay
+from toolchain.cluster import in_this_process
+from toolchain.deployment import load_deployment
+from toolchain.errors import BuildError
+
+LAYOUT = np.dtype([("crc", "<u8"), ("cycles", "<u8"), ("posterior", "<f8", 3)])
+
+
+def stop_after_five(job, numbers, keep):
+    in_this_process(job, numbers[:5], keep)
+    raise KeyboardInterrupt
+
+
+def backwards(job, numbers, keep):
+    in_this_process(job, numbers[::-1], keep)
+
+
+@pytest.fixture(params=["plain", "free", "filter", "two"])
+def deployment(request, tmp_path):
+    """A deployment of a corridor with two boards, with generators that run on, a filter, or a BM2."""
+    folder = tmp_path / "deployment"
+    if request.param in ("plain", "free"):
+        options = {"rng_reset": "free", "stop": "own"} if request.param == "free" else {}
+        build_model(corridor(), folder, partitions=2, **options)
+    else:
+        (tmp_path / "umbrella.bif").write_text(UMBRELLA)
+        asked = (
+            ASKED
+            if request.param == "filter"
+            else ("--searched", "rain", "--known", "umbrella", "--machine", "bm2")
+        )
+        done(toolchain("build", tmp_path / "umbrella.bif", *asked, "-o", folder, *TARGET))
+    return load_deployment(folder)
+
+
+@pytest.fixture
+def recording(deployment, tmp_path):
+    names = [variable.name for variable in deployment.variables]
+    rows = ["yes", "yes", "no", "no", "maybe", "no", "yes", "maybe", "no", "no", "yes", "no"]
+    if names == ["range", "loud"]:
+        rows = [f"{at},{at % 2}" if at % 5 else ",1" for at in range(12)]
+    path = tmp_path / "recording.csv"
+    path.write_text("\n".join([",".join(names), *rows]) + "\n")
+    return path
+
+
+def test_an_interrupted_run_goes_on_to_the_same_bytes(deployment, recording, tmp_path):
+    frames = recorded_frames(recording, deployment, ())
+    whole, resumed = tmp_path / "whole.npz", tmp_path / "resumed.npz"
+    assert replay(deployment, frames, whole, in_this_process).computed == 12
+    # those of a sequence are computed in order, whatever the way
+    is_sequence = deployment.filter is not None or deployment.machine.rng_reset == "free"
+    if is_sequence:
+        stopping = 0
+
+        def advance():
+            nonlocal stopping
+            stopping += 1
+            if stopping == 5:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            replay(deployment, frames, resumed, backwards, advance=advance)
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            replay(deployment, frames, resumed, stop_after_five)
+    assert not resumed.exists()
+    found = replay(deployment, frames, resumed, backwards)
+    assert found.computed == (12 if deployment.machine.rng_reset == "free" else 7)
+    assert resumed.read_bytes() == whole.read_bytes()
+    assert not list(tmp_path.glob("*.frames"))
+    with np.load(whole) as arrays:
+        assert arrays["probabilities"].shape == (12, *(each.size for each in deployment.searched))
+        has_none = np.isnan(arrays["probabilities"]).any(axis=tuple(range(1, arrays["probabilities"].ndim)))
+        assert (has_none >= ~frames.fits).all()
+        assert has_none.sum() == found.without < 12
+        assert (arrays["frame"][frames.fits] == np.arange(1, frames.fits.sum() + 1)).all()
+        assert (arrays["frame"] == -1).sum() == found.unfit
+        assert arrays["probabilities"][~has_none].reshape(-1, deployment.machine.lines).sum(
+            axis=1
+        ) == pytest.approx(1)
+
+
+def test_the_command_writes_a_bag_that_rosbags_reads(tmp_path):
+    from rosbags.highlevel import AnyReader
+
+    build_model(corridor(), tmp_path / "corridor")
+    (tmp_path / "r.csv").write_text("range,loud\n3,1\n,0\n5,0\n")
+    for name in ("posteriors.npz", "posteriors.mcap"):
+        result = done(
+            toolchain("infer", tmp_path / "r.csv", "-d", tmp_path / "corridor", "-o", tmp_path / name)
+        )
+        assert "1 rows have no posterior because they do not fit: row 1: " in result.stderr
+        assert "3 frames, 1 without a posterior" in result.stderr
+    with AnyReader([tmp_path / "posteriors.mcap"]) as reader:
+        found = [
+            (stamp, reader.deserialize(raw, connection.msgtype).data.tolist())
+            for connection, stamp, raw in reader.messages()
+        ]
+    with np.load(tmp_path / "posteriors.npz") as arrays:
+        assert found == [(at, arrays["probabilities"][at].tolist()) for at in (0, 2)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "corridor",
+        "posteriors.mcap",
+        "posteriors.npz",
+        "r.csv",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("recording", "output", "named"),
+    [
+        ("range\n3\n", "p.npz", ("r.csv has no column 'loud'",)),
+        ("range,loud\nx,no\n", "p.npz", ("has no row that fits this machine: row 0: ",)),
+        ("range,loud\n3,1\n", "p.txt", ("must end with .npz or .mcap",)),
+        ("range,loud\n3,1\n", "none/p.npz", ("is not a folder; create it first",)),
+    ],
+)
+def test_what_cannot_be_inferred_is_one_sentence(tmp_path, recording, output, named):
+    build_model(corridor(), tmp_path / "corridor")
+    (tmp_path / "r.csv").write_text(recording)
+    result = toolchain("infer", tmp_path / "r.csv", "-d", tmp_path / "corridor", "-o", tmp_path / output)
+    assert_refused(result, *named)
+
+
+def record(value):
+    found = np.zeros((), LAYOUT)
+    found["posterior"] = value
+    found["crc"] = crc32(found.tobytes()[8:])
+    return found.tobytes()
+
+
+def test_a_part_file_keeps_whole_records_alone(tmp_path):
+    path = tmp_path / "p.frames"
+    part = PartFile(path, "key", LAYOUT, 4)
+    assert part.missing() == [0, 1, 2, 3]
+    for row in (3, 0, 1):
+        part.add(row, record(row))
+    assert part.missing() == [2]
+    with pytest.raises(BuildError, match="another run is writing .*frames"):
+        PartFile(path, "key", LAYOUT, 4)
+    part.close(remove=False)
+    content = path.read_bytes()
+    path.write_bytes(content[:-9])  # torn at its end
+    again = PartFile(path, "key", LAYOUT, 4)
+    assert again.missing() == [2, 3]
+    assert [again.posterior(row).tolist() for row in (0, 1)] == [[0, 0, 0], [1, 1, 1]]
+    again.add(2, record(np.nan))
+    assert again.posterior(2) is None
+    again.close(remove=False)
+    with path.open("r+b") as file:  # a damaged record
+        file.seek(len(content) - 3 * LAYOUT.itemsize - 1)
+        file.write(b"\x55")
+    last = PartFile(path, "key", LAYOUT, 4)
+    assert last.missing() == [0, 3]
+    last.close(remove=True)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    "content", [b"x", b'{"rosbayes": 1, "key": "other"}\n', b'{"rosbayes": 1, "key": "ke"}\n']
+)
+def test_a_part_file_of_other_work_is_refused(tmp_path, content):
+    path = tmp_path / "p.frames"
+    path.write_bytes(content)
+    with pytest.raises(BuildError, match="belongs to another recording, deployment or version; delete it"):
+        PartFile(path, "key", LAYOUT, 4)
+    assert path.read_bytes() == content
+
+
+def test_a_full_disk_is_noticed_before_the_work(tmp_path):
+    with pytest.raises(BuildError, match="cannot be written: "):
+        PartFile(tmp_path / "p.frames", "key", LAYOUT, 1 << 50)

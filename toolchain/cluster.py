@@ -1,0 +1,409 @@
+"""Independent pieces of work, in this process or on the workers of a dask scheduler (the extra `cluster`).
+
+    this process                          scheduler           workers
+    job, once ────────────────────────────────┼─────────────▶ prepare(): tables and kernels, once for each
+    batches of numbers, half a second each ───┼─────────────▶ work(number) for each number
+    keep(number, result) ◀────────────────────┴────────────── as batches are done, in any order
+
+A piece is a number, so that only the job has tables. Results depend on job and number alone, not on the place or the
+order. Whoever keeps results on disk can begin again with the numbers that are missing.
+"""
+
+import logging
+import pickle
+import ssl
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from hashlib import sha256
+from importlib import metadata
+from ipaddress import ip_address
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import get_ident
+from typing import Annotated, Any, Final, Protocol, TypeAlias
+from urllib.parse import urlsplit
+
+import typer
+
+from toolchain.errors import BuildError, ToolchainError
+
+Work: TypeAlias = Callable[[int], Any]
+Keep: TypeAlias = Callable[[int, Any], None]
+
+BATCH_S: Final = 0.8
+"""Seconds of work in a batch, so that dask's share of about 4 ms for each is small."""
+_SMALLEST_S: Final = BATCH_S / 8
+"""The same at the end, so that the workers finish at about the same time."""
+_AHEAD: Final = 3
+"""Batches on their way for each worker: one that is computed, one that waits there, and one at the scheduler."""
+_PATIENCE_S: Final = 60.0
+"""Seconds in which a scheduler must come back, or get a worker again."""
+_CONNECT_S: Final = 10.0
+_POLL_S: Final = 1.0
+_COUNT_S: Final = 5.0
+"""Seconds between two counts of the workers."""
+_JOBS: Final = 8
+"""Jobs that a worker keeps prepared, for each of its threads."""
+
+
+class Job(Protocol):
+    """Pieces of work with the same tables. A job is pickled, and so is every result."""
+
+    def prepare(self) -> Work:
+        """Return the function that does the piece of a number."""
+
+
+class Run(Protocol):
+    """A way to do the pieces of a job."""
+
+    def __call__(self, job: Job, numbers: Sequence[int], keep: Keep) -> None:
+        """Do the pieces of these numbers, and call `keep` with each result as soon as it is there."""
+
+
+def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:
+    """Do the pieces in this process, in order."""
+    work = job.prepare() if numbers else None
+    for number in numbers:
+        keep(number, work(number) if work else None)
+
+
+class ClusterError(ToolchainError):
+    """A scheduler that cannot be used, or workers that cannot do the work."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SchedulerOptions:
+    """Where independent pieces of work are done."""
+
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Do the work on the workers of a dask scheduler; local: one worker for each core of this host.",
+            metavar="tcp://HOST:PORT|tls://HOST:PORT|local",
+            show_default="in this process",
+        ),
+    ] = None
+    tls_ca_file: Annotated[
+        Path | None,
+        typer.Option(help="Of tls://: certificates (PEM) that sign the scheduler's.", metavar="FILE"),
+    ] = None
+    tls_cert: Annotated[
+        Path | None, typer.Option(help="Of tls://: our certificate (PEM).", metavar="FILE")
+    ] = None
+    tls_key: Annotated[Path | None, typer.Option(help="Of tls://: its key (PEM).", metavar="FILE")] = None
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Permit tcp:// to a scheduler on another host.")
+    ] = False
+
+    def __post_init__(self) -> None:
+        """Refuse flags that contradict each other."""
+        files = {"--tls-ca-file": self.tls_ca_file, "--tls-cert": self.tls_cert, "--tls-key": self.tls_key}
+        if self.scheduler in (None, "local"):
+            given = [flag for flag, file in files.items() if file is not None]
+            if given:
+                raise BuildError(f"{given[0]} is for --scheduler tls://HOST:PORT")
+            return
+        try:
+            parts = urlsplit(self.scheduler)
+            ok = parts.scheme in ("tcp", "tls") and bool(parts.hostname) and parts.port is not None
+        except ValueError:
+            ok = False
+        if not ok:
+            raise BuildError(
+                f"--scheduler {self.scheduler}: expected tcp://HOST:PORT or tls://HOST:PORT, as the scheduler prints it, or "
+                "local"
+            )
+        missing = [flag for flag, file in files.items() if file is None]
+        if parts.scheme == "tls" and missing:
+            raise BuildError(f"--scheduler {self.scheduler} needs {', '.join(missing)} too")
+        if parts.scheme == "tls":
+            try:
+                ssl.create_default_context(cafile=self.tls_ca_file).load_cert_chain(
+                    str(self.tls_cert), self.tls_key
+                )
+            except OSError as reason:
+                names = ", ".join(str(file) for file in files.values())
+                raise BuildError(f"one of {names} cannot be used: {reason.strerror or reason}") from None
+        if parts.scheme == "tcp" and len(missing) < len(files):
+            raise BuildError(f"--scheduler {self.scheduler} does not use TLS: write tls:// instead of tcp://")
+        if parts.scheme == "tcp" and not self.insecure and not _is_loopback(parts.hostname or ""):
+            raise BuildError(
+                f"--scheduler {self.scheduler}: without TLS, everybody on the way there can run programs as this user; use "
+                "tls:// with --tls-ca-file, --tls-cert and --tls-key, or --insecure"
+            )
+
+
+def _is_loopback(host: str) -> bool:
+    with suppress(ValueError):
+        return ip_address(host).is_loopback
+    return host == "localhost"
+
+
+@contextmanager
+def runner(options: SchedulerOptions) -> Iterator[Run]:
+    """Yield the way to do work that the options ask for, or raise a ClusterError."""
+    if options.scheduler is None:
+        yield in_this_process
+        return
+    try:
+        from distributed import Client, LocalCluster, Security
+    except ImportError:
+        raise ClusterError("--scheduler needs dask: pip install 'rosbayes[cluster]'") from None
+    except ValueError as reason:
+        raise ClusterError(
+            f"dask cannot be used: {str(reason).splitlines()[0]}"
+        ) from None  # a damaged file of its settings
+    # log lines of dask on standard error repeat what is said here
+    for name in ("distributed", "distributed.client", "tornado.application"):
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+    if options.scheduler == "local":
+        with TemporaryDirectory(prefix="rosbayes-") as folder:
+            try:
+                # with certificates of its own, because other users of this host could connect too
+                local = LocalCluster(
+                    threads_per_worker=1,
+                    security=True,
+                    local_directory=folder,
+                    dashboard_address="127.0.0.1:0",
+                    scheduler_kwargs={"dashboard": False},
+                    silence_logs=logging.CRITICAL,
+                )
+            except (OSError, RuntimeError) as reason:
+                raise ClusterError(f"--scheduler local cannot start its workers: {reason}") from None
+            with local:
+                yield _OnScheduler("local", lambda: Client(local))
+        return
+    address, security = options.scheduler, None
+    if address.startswith("tls:"):
+        security = Security(
+            tls_ca_file=str(options.tls_ca_file),
+            tls_client_cert=str(options.tls_cert),
+            tls_client_key=str(options.tls_key),
+            require_encryption=True,
+        )
+    yield _OnScheduler(address, lambda: Client(address, security=security, timeout=_CONNECT_S))
+
+
+@cache
+def software() -> str:
+    """Return a hash of everything here on which results depend: our modules, NumPy and Numba."""
+    digest = sha256()
+    for name in ("numpy", "numba", "scipy"):
+        with suppress(metadata.PackageNotFoundError):
+            digest.update(f"{name} {metadata.version(name)}\n".encode())
+    root = Path(__file__).parent.parent
+    for folder in ("machines", "pcie_shim", "toolchain"):
+        for path in sorted((root / folder).rglob("*.py")):
+            digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+@lru_cache(_JOBS)
+def _prepared(_key: str, _thread: int, pickled: bytes) -> Work:
+    """Return the work of a job, which each thread of a worker prepares once: two cannot share a kernel."""
+    job: Job = pickle.loads(pickled)  # noqa: S301 - dask runs whatever its client sends anyway
+    return job.prepare()
+
+
+def do_batch(key: str, pickled: bytes, numbers: Sequence[int], theirs: str) -> tuple[list[Any], float]:
+    """Do some pieces on a worker; return their results, and the seconds that they took.
+
+    Raises:
+        ClusterError: This worker has another version of our software than the client.
+    """
+    if software() != theirs:
+        raise ClusterError("it has another version of rosbayes, NumPy or Numba")
+    work = _prepared(key, get_ident(), pickled)
+    begun = time.perf_counter()
+    results = [work(number) for number in numbers]
+    return results, time.perf_counter() - begun
+
+
+class _LostError(Exception):
+    """The scheduler, or the last worker that had the job, is gone."""
+
+
+@contextmanager
+def _noticing_loss() -> Iterator[None]:
+    """Convert what dask's client raises when its connection is lost or being closed, and for results that are lost."""
+    try:
+        yield
+    except (OSError, RuntimeError, ValueError, CancelledError):
+        raise _LostError from None
+
+
+class _OnScheduler:
+    """Work on the workers of a scheduler; what was not done when it disappeared is given to the next one."""
+
+    def __init__(self, address: str, connect: Callable[[], Any]) -> None:
+        self._address = address
+        self._connect = connect
+
+    def __call__(self, job: Job, numbers: Sequence[int], keep: Keep) -> None:
+        """Do the pieces on the workers; a ClusterError if they cannot, or if they stay away for a minute."""
+        if not numbers:
+            return
+        left = dict.fromkeys(numbers)  # in order; those without a result
+
+        def keep_once(number: int, result: Any) -> None:
+            keep(number, result)
+            del left[number]
+
+        pickled = pickle.dumps(job)
+        client, progress_at = self._client(), time.monotonic()
+        try:
+            while left:
+                before = len(left)
+                try:
+                    _Session(self._address, client, pickled, left).run(keep_once)
+                except _LostError:
+                    if len(left) < before:
+                        progress_at = time.monotonic()
+                    if time.monotonic() > progress_at + _PATIENCE_S:
+                        raise ClusterError(
+                            f"--scheduler {self._address} lost this work again and again; read the logs of its workers"
+                        ) from None
+                    print(
+                        f"{self._address} lost the work; waiting for it with {len(left)} pieces left",
+                        file=sys.stderr,
+                    )
+                    client.close(timeout=_POLL_S)
+                    client = self._client(time.monotonic() + _PATIENCE_S)
+        finally:
+            with suppress(_LostError), _noticing_loss():
+                client.close(timeout=_POLL_S)
+
+    def _client(self, until: float = 0.0) -> Any:
+        """Return a client of a scheduler that has a worker; try until a monotonic time."""
+        while True:
+            client = None
+            try:
+                client = self._connect()
+                client.wait_for_workers(1, timeout=_CONNECT_S)
+            except (OSError, ValueError):
+                if client is not None:
+                    client.close(timeout=_POLL_S)
+                if time.monotonic() < until:
+                    time.sleep(_POLL_S)
+                    continue
+                if client is None:
+                    why = (
+                        "no scheduler answers there; start one with 'dask scheduler', or correct the address"
+                    )
+                else:
+                    why = f"it has no worker; start one with 'dask worker {self._address} --nthreads 1'"
+                raise ClusterError(f"--scheduler {self._address}: {why}") from None
+            else:
+                return client
+
+
+class _Session:
+    """The pieces of one job, as long as its scheduler lives."""
+
+    def __init__(self, address: str, client: Any, pickled: bytes, left: Iterable[int]) -> None:
+        self._address = address
+        self._client = client
+        self._pickled = pickled
+        self._key = sha256(pickled).hexdigest()
+        # Numbers that are not on their way yet, in order; and the numbers of each batch that is.
+        self._waiting = deque(left)
+        self._batches: dict[Any, list[int]] = {}
+        # Seconds of a piece, of the last batches; 0 before the first result.
+        self._seconds = 0.0
+        # Pieces that are done at the same time, and when that was counted; and when there was a worker (monotonic).
+        self._threads = 0
+        self._counted_at = 0.0
+        self._served_at = time.monotonic()
+
+    def run(self, keep: Keep) -> None:
+        """Do the pieces; a `_LostError` if that cannot go on here."""
+        with _noticing_loss():
+            # a copy for each worker, so that the job outlives each of them; one that comes later fetches it from these
+            [table] = self._client.scatter([self._pickled], broadcast=True)
+        try:
+            self._submit(table)
+            while self._batches:
+                for batch in self._done():
+                    numbers = self._batches.pop(batch)
+                    results, seconds = self._results(batch)
+                    # pieces differ, so the last batch counts as much as all before it
+                    own = seconds / len(numbers)
+                    self._seconds = (self._seconds + own) / 2 if self._seconds else own
+                    for number, result in zip(numbers, results, strict=True):
+                        keep(number, result)
+                self._submit(table)
+        finally:
+            with suppress(_LostError), _noticing_loss():
+                self._client.cancel(list(self._batches))
+
+    def _count(self) -> None:
+        """Count the workers' threads every few seconds; a `_LostError` if there have been none for a minute."""
+        now = time.monotonic()
+        if self._threads and now < self._counted_at + _COUNT_S:
+            return
+        with _noticing_loss():
+            self._threads, self._counted_at = sum(self._client.nthreads().values()), now
+        if self._threads:
+            self._served_at = now
+        elif now > self._served_at + _PATIENCE_S:
+            raise _LostError
+
+    def _done(self) -> list[Any]:
+        """Return the batches that are done, after a second at most."""
+        from distributed import wait
+
+        with _noticing_loss():
+            try:
+                return list(wait(list(self._batches), timeout=_POLL_S, return_when="FIRST_COMPLETED").done)
+            except TimeoutError:
+                if self._client.status == "running":
+                    return []
+                raise
+
+    def _submit(self, table: Any) -> None:
+        """Submit batches until there are enough on their way."""
+        self._count()
+        threads = max(1, self._threads)
+        while self._waiting and len(self._batches) < _AHEAD * threads:
+            size = 1  # until it is known how long a piece takes
+            if self._seconds:
+                share = max(_SMALLEST_S / self._seconds, len(self._waiting) / (2 * threads))
+                size = max(1, round(min(BATCH_S / self._seconds, share)))
+            numbers = [self._waiting.popleft() for _ in range(min(size, len(self._waiting)))]
+            with _noticing_loss():
+                batch = self._client.submit(do_batch, self._key, table, numbers, software(), pure=False)
+            self._batches[batch] = numbers
+
+    def _results(self, batch: Any) -> tuple[list[Any], float]:
+        """Return the results of a batch; a ToolchainError if it failed, a `_LostError` if it is gone."""
+        from distributed import KilledWorker
+
+        with _noticing_loss():
+            error = batch.exception()
+            if error is None:
+                results: tuple[list[Any], float] = batch.result()
+                return results
+        worker = f"a worker of {self._address}"
+        if isinstance(error, CancelledError):
+            raise _LostError
+        if isinstance(error, ClusterError):
+            raise ClusterError(f"{worker} cannot do this work: {error}; {_SAME}")
+        if isinstance(error, ToolchainError):
+            raise error
+        if isinstance(error, KilledWorker):
+            raise ClusterError(
+                f"the workers of {self._address} died over the same piece of work, probably for want of memory; start fewer "
+                "on a host, or with more memory (--memory-limit)"
+            )
+        if any(isinstance(each, ImportError | AttributeError) for each in (error, error.__cause__)):
+            raise ClusterError(f"{worker} has no rosbayes, or another version of it ({error}); {_SAME}")
+        raise ClusterError(f"{worker} failed: {type(error).__name__}: {error}")
+
+
+_SAME: Final = "install the same version there, and start it again"

@@ -1,0 +1,69 @@
+"""The command `infer`: the posteriors of a whole recording."""
+
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from toolchain.cluster import SchedulerOptions, runner
+from toolchain.commands.explore import progress
+from toolchain.flags import ReadingColumns
+
+
+def infer(
+    recording: Annotated[
+        Path, typer.Argument(help="Recorded readings: CSV, MCAP or bag.", metavar="RECORDING")
+    ],
+    directory: Annotated[
+        Path, typer.Option("--deployment", "-d", help="Folder written by `toolchain build`.", metavar="DIR")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Posteriors: .npz, or .mcap with a message on /BMresults for each.",
+            metavar="FILE",
+        ),
+    ],
+    where: SchedulerOptions,
+    reading: ReadingColumns = None,
+    tolerance_s: Annotated[
+        float,
+        typer.Option(
+            "--tolerance", help="bags: maximum time between readings that belong together.", metavar="SECONDS"
+        ),
+    ] = 0.1,
+) -> None:
+    """Compute the posterior of every row of a recording, as the boards would.
+
+    For example `toolchain infer DATA/ds1_robot3.csv -d build/mrclam -o posteriors.npz --reading 'range_*=range_*_m'
+    --reading 'bearing_*=bearing_*_rad'`; after Ctrl-C, the same command goes on where it was.
+    """
+    from toolchain.analysis.replay import check_output, recorded_frames, replay
+    from toolchain.deployment import load_deployment
+
+    check_output(output)
+    deployment = load_deployment(directory)
+    frames = recorded_frames(recording, deployment, reading or (), tolerance_s=tolerance_s)
+
+    def begun(done: int) -> None:
+        there = f"; {done} of them are in {output}.frames" if done else ""
+        typer.echo(f"{len(frames)} frames of {recording.name} through {deployment.name}{there}", err=True)
+        for _ in range(done):
+            step("")
+
+    with runner(where) as run, progress(len(frames)) as step:
+        started = time.perf_counter()
+        found = replay(deployment, frames, output, run, begun=begun, advance=lambda: step(""))
+        seconds = time.perf_counter() - started
+    print(f"{output}: {found.frames} frames, {found.without} without a posterior", file=sys.stderr)
+    if found.unfit:
+        print(f"{found.unfit} rows have no posterior because they do not fit: {frames.why}", file=sys.stderr)
+    if found.computed:
+        print(
+            f"{found.computed} frames in {seconds:.1f} s: {found.computed / seconds:,.0f} frames/s",
+            file=sys.stderr,
+        )
