@@ -83,8 +83,11 @@ class Cluster:
         self.port = self.address.rpartition(":")[2]
 
     def start_worker(self, path=ROOT):
+        """Start a worker, and wait until the scheduler knows it."""
         options = ("--nthreads", "1", "--no-nanny", "--no-dashboard")
-        return self.start("dask", "worker", self.address, *options, path=path)
+        worker = self.start("dask", "worker", self.address, *options, path=path)
+        wait_until(lambda: "Registered to" in self.log(worker), lambda: self.log(worker))
+        return worker
 
     def end(self, process):
         """Wait for the end of a command; return its exit code and its output."""
