@@ -19,6 +19,7 @@ COMMANDS = {
     "inspect": ("toolchain.commands.main:inspect", "Explain a deployment."),
     "advise": ("toolchain.commands.main:advise", "Compare the machines for a model, and recommend one."),
     "explore": ("toolchain.commands.main:explore", "Sweep over machines for a model."),
+    "infer": ("toolchain.commands.main:infer", "Compute the posterior of every row of a recording."),
     "fit": ("toolchain.commands.main:fit", "Learn the tables of a model from recordings."),
     "query": ("toolchain.commands.main:query", "Print a posterior of a network, exact and of a machine."),
     "show": ("toolchain.commands.main:show", "List the variables of a network."),
