@@ -53,7 +53,7 @@ class Case:
     publishers: Mapping[str, Sequence[str]]
     """The commands on the robot's side with their options, in the order of their start."""
     is_frame: bool = True
-    """Whether a result of the viewer is a frame of the master, so that both end after the same number."""
+    """True if the viewer counts the same frames as the master, so that both end after the same number."""
 
 
 def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:

@@ -79,7 +79,7 @@ class ClusterError(ToolchainError):
 
 @dataclass(frozen=True, kw_only=True)
 class SchedulerOptions:
-    """Where independent pieces of work are done."""
+    """The place where independent pieces of work are done: this process or a cluster."""
 
     scheduler: Annotated[
         str | None,

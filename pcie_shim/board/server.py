@@ -127,7 +127,8 @@ def serve_board(
     With `pin`, this thread is pinned to one of its allowed cores, number `index` modulo their number. Boards compute
     for tenths of a millisecond, too short for Linux to distribute the threads woken by one host over the cores:
     without pinning, the boards of a mini-cluster would compute one after the other. The thread also gets the policy
-    SCHED_BATCH, so that it does not preempt others when it wakes. `link` delays the frames of hosts. `on_ready` is called when both sockets are listening.
+    SCHED_BATCH, so that it does not preempt others when it wakes. `link` delays the frames of hosts. `on_ready` is called
+    when both sockets are listening.
 
     Raises:
         EndpointError: The endpoint is invalid or in use.

@@ -48,7 +48,7 @@ BOARDS = (1, 2, 4)
 WORDS = (1, 16, 256, 1024, 4096, 8192)
 RESULTS = 4096
 WAYS = {"sent": (), "read": ("--read-results",)}
-"""How the host gets the results: with the done message, or as the thesis's host from the registers; flags of `board`."""
+"""How results reach the host: with the done message, or read from the registers as in the thesis. The flags are `board`'s."""
 SLOWER = 20
 """A measurement over JTAG for so many of the others, because each takes milliseconds."""
 TOLERANCE = 0.15

@@ -1,4 +1,4 @@
-"""How the time of a cycle grows with the problem: lines, sensors, and the size of the readings' message (thesis 2.1.2, 4.3).
+"""The time of a cycle by lines, sensors and the size of the readings' message (thesis 2.1.2, 4.3).
 
 client --reading of some bytes--> hub --> master and its services --> one board of so many lines and columns --> ... --> client
 

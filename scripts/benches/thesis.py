@@ -28,7 +28,7 @@ from scripts.running.script import run_script
 from terminal.processes import Process
 
 RUNS = {"each message": ["--start-each-message"], "once": []}
-"""What subscriber and publisher are started for, and the flags of such a master."""
+"""Flags of `master`: subscriber and publisher started for each message, or once."""
 THESIS = {"rosbridge": 98.74, "computing": 1.24, "PCIe": 0.01}
 """The shares of figure 4.5 in percent."""
 TURN = 5

@@ -282,7 +282,8 @@ async def check_hostile(scene: Scene) -> None:
     await visit.page.locator("[data-testid=posterior].bm-old").wait_for()
     report = FrameReport(
         stamp_ns=now, received_ns=now, sent_ns=now, outcome=HOSTILE, deployment=HOSTILE, number=10**6, cycles=1,
-        counts_total=1, link_bytes=1, link_transfers=1, stages=StageTimes(**{each.name: 1.0 for each in fields(StageTimes)}),
+        counts_total=1, link_bytes=1, link_transfers=1,
+        stages=StageTimes(**{each.name: 1.0 for each in fields(StageTimes)}),
         boards=(BoardReport(name=HOSTILE, stopped=HOSTILE, cycles=1, counts_total=1),),
         missing=(HOSTILE,), readings={HOSTILE: VariableReading(HOSTILE, 1, 1.0)}, details={HOSTILE: HOSTILE},
     )  # fmt: skip

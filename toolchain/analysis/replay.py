@@ -183,7 +183,7 @@ class Replay:
 
     @property
     def is_sequence(self) -> bool:
-        """Whether a frame depends on those before: the prior of a filter, or generators that run on."""
+        """True if a frame depends on the frames before it, because of a filter or of generators that are never reset."""
         section = self.deployment.machine
         return self.deployment.filter is not None or section.rng_reset is RngReset.FREE
 
@@ -300,7 +300,7 @@ class PartFile:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What became of the frames of a recording."""
+    """Numbers of frames of a recording that were computed, kept or left out."""
 
     frames: int
     computed: int

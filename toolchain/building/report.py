@@ -19,7 +19,7 @@ SHARED_BITS: Final = {
     "BM1": "means are correct, but the variance of counts is up to 2.6 times as large",
     "BM2": "this biases all samples",
 }
-"""What it does to a machine that random numbers share bits with those of the next cycle, as a clause."""
+"""The effect on a machine if successive random numbers share bits, as a clause."""
 
 
 def build_report(model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str) -> str:
