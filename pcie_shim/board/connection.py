@@ -22,6 +22,8 @@ from pcie_shim.register_map import ErrorCode
 
 SEND_S: Final = 5.0
 """Seconds after which the link of a host that does not read the board's frames is closed."""
+_TOGETHER: Final = 1 << 16
+"""Answers to requests that arrived together leave together, in pieces of about so many bytes."""
 KEEPALIVE_S: Final = 5
 """Interval of TCP keep-alive probes in seconds; three unanswered ones close the link."""
 
@@ -49,6 +51,11 @@ class Connection:
         # first one is decoded, so that its time comes on top of the socket's; 0 before that.
         self._link = link
         self._sent_ns = 0
+
+        # Frames that are sent when all requests received so far have been handled, as they arrived together; empty
+        # outside of `answer`.
+        self._answering = False
+        self._unsent = bytearray()
 
         # Sequence number of the last request. Every request has the next one, so a lost or repeated one is noticed.
         self.sequence = 0
@@ -81,6 +88,12 @@ class Connection:
 
     def answer(self, handle: Callable[[Frame], None]) -> None:
         """Handle all complete frames with `handle`, and answer its refusals with ERROR."""
+        self._answering = True
+        self._handle_all(handle)
+        self._answering = False
+        self._flush()
+
+    def _handle_all(self, handle: Callable[[Frame], None]) -> None:
         while self.open:
             sequence = address = 0
             try:
@@ -120,7 +133,15 @@ class Connection:
         self.send(reply + self._greeting)
 
     def send(self, data: bytes) -> None:
-        """Send all bytes; a connection that accepts none for SEND_S is closed."""
+        """Send all bytes, those for requests together; a connection that accepts none for SEND_S is closed."""
+        self._unsent += data
+        if not self._answering or len(self._unsent) >= _TOGETHER:
+            self._flush()
+
+    def _flush(self) -> None:
+        data, self._unsent = self._unsent, bytearray()
+        if not data:
+            return
         if self._link is not None:
             self._link.carry(len(data), time.monotonic_ns())
         try:

@@ -71,6 +71,9 @@ class DrivenBoard:
         self.waiting = False
         self.done: Done | None = None
 
+        # True from `ask` until `fetch` has read what was asked for.
+        self.asked = False
+
         # Of the last answer: its words (set by `fetch`), the stop reason of each replica, and with several their cycles.
         self.answer = memoryview(b"")
         self.reasons: tuple[int, ...] = (0,) * self.replicas
@@ -183,7 +186,7 @@ class DrivenBoard:
             self.link.close(reason)
             self.link = None
         self.broken = reason
-        self.waiting = False
+        self.waiting = self.asked = False
 
     # ---- a frame --------------------------------------------------------------------------------------
 
@@ -258,19 +261,27 @@ class DrivenBoard:
         self.waiting = False
         self.done = done
 
+    def ask(self) -> None:
+        """Request the answer of a board that is done, if its interrupt did not carry it."""
+        if not self.sends_results:
+            self.asked = True
+            self.open_link.ask([*self._answer_blocks, (rm.DONE, DONE_BLOCK.size // 4)])
+
     def fetch(self) -> None:
-        """Store the answer of a board that is done, after reading its blocks if the interrupt did not carry them.
+        """Store the answer of a board that is done, which the interrupt carried or `ask` has requested.
 
         This host holds the board, so nobody else starts it; but a reset, or a power cycle, between the interrupt and
-        the reads would clear the results. DONE to COMPUTE_NS is therefore read last: if it is still what the interrupt
+        the reads would clear the results. DONE to COMPUTE_NS is therefore asked for last: if it is still what the interrupt
         announced, the machine has stood still since, and the blocks are those of the frame.
         """
         done = self._answered()
         words = done.results
-        if not self.sends_results:
+        if self.asked:
             link = self.open_link
-            words = memoryview(b"".join([link.read_block(*block) for block in self._answer_blocks]))
-            number, status, cycles, _ = DONE_BLOCK.unpack(link.read_block(rm.DONE, DONE_BLOCK.size // 4))
+            *blocks, last = link.answers()
+            self.asked = False
+            words = memoryview(b"".join(blocks))
+            number, status, cycles, _ = DONE_BLOCK.unpack(last)
             if (number, status, cycles) != done[:3]:
                 raise SequenceError(
                     f"The board at {self.endpoint} changed while its results were read: DONE is {number} and STATUS "

@@ -105,8 +105,8 @@ class MiniCluster:
         # The posted frame, from `post` until `collect` returns its result or either raises an error.
         self._progress: _Progress | None = None
 
-        # Boards that were still computing when another one failed the frame. Their links were closed, which stops
-        # them, and the next frame opens them again; for the caller they are open.
+        # Boards that were still computing or answering when another one failed the frame. Their links were closed, which
+        # stops them, and the next frame opens them again; for the caller they are open.
         self._interrupted: list[DrivenBoard] = []
 
         # The links of all open boards: registered in the poll when a board is opened, removed when it is closed.
@@ -287,11 +287,13 @@ class MiniCluster:
         progress.computing_ns += max(
             board.done.compute_ns for board in progress.running if board.done is not None
         )
-        for board in progress.running:
-            try:
-                board.fetch()
-            except LinkError as error:
-                self._fail(board, error)
+        # all are asked before any is waited for: their round trips overlap
+        for act in (DrivenBoard.ask, DrivenBoard.fetch):
+            for board in progress.running:
+                try:
+                    act(board)
+                except LinkError as error:
+                    self._fail(board, error)
         now = time.perf_counter_ns()
         progress.reads_ns += now - progress.clock_ns
         progress.clock_ns = now
@@ -322,11 +324,11 @@ class MiniCluster:
         )
 
     def _abandon(self) -> None:
-        """Drop the frame, and stop the boards that are still computing it by closing their links."""
+        """Drop the frame, and close the links of boards that are still computing it, or answering."""
         self._progress = None
-        # only closing its link stops a board; those that are done stay open
+        # only closing its link stops a board, or drops its answers; those that are done stay open
         for board in self._boards:
-            if board.waiting:
+            if board.waiting or board.asked:
                 self._close(board, "another board failed the frame")
                 self._interrupted.append(board)
 

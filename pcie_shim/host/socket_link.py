@@ -109,6 +109,9 @@ class SocketLink:
         # Bytes of all frames in both directions, and transfers: frames that were sent together count once.
         self.bytes_moved = self.transfers = 0
 
+        # Reads whose answers `answers` returns: their sequence numbers, addresses and words, in order.
+        self._asked: list[tuple[int, int, int]] = []
+
         # An interrupt that came while a request waited for its answer, with a copy of its results, until it is taken.
         self._done: Done | None = None
 
@@ -238,21 +241,43 @@ class SocketLink:
 
     def read_block(self, address: int, count: int) -> bytes:
         """Read `count` words from `address` on, as little-endian bytes; a ShortReadError for fewer or more."""
-        frame = self.request(framing.READ, 0, address, count)
-        if frame.words != count:
-            self._give_up(
-                ShortReadError(
-                    f"The board at {self.endpoint} answered a read of {count} words at {address:#06x} with "
-                    f"{frame.words}: the link is closed"
-                )
-            )
-        return bytes(frame.payload)
+        self.ask([(address, count)])
+        return self.answers()[0]
 
     def write_block(self, address: int, words: Octets) -> None:
         """Write little-endian words from `address` on and wait for the acknowledgement."""
         self.request(framing.WRITE, 0, address, len(words) // 4, words)
 
     # ---- for a host that drives many boards -----------------------------------------------------------
+
+    def ask(self, blocks: Iterable[tuple[int, int]]) -> None:
+        """Request blocks, each an address and a number of words, without waiting; `answers` returns them."""
+        requests = []
+        for address, count in blocks:
+            self._sequence = (self._sequence + 1) & ALL_ONES
+            self._asked.append((self._sequence, address, count))
+            requests.append(framing.encode(framing.READ, 0, self._sequence, address, count))
+        self._send(b"".join(requests))
+
+    def answers(self) -> list[bytes]:
+        """Return the words of the requested blocks in order, as `read_block` does.
+
+        After an AccessError, answers to the other requests may still come: then close the link.
+        """
+        asked, self._asked = self._asked, []
+        blocks = []
+        for sequence, address, count in asked:
+            frame = self._answer(framing.READ, sequence, address)
+            if frame.words != count:
+                self._give_up(
+                    ShortReadError(
+                        f"The board at {self.endpoint} answered a read of {count} words at {address:#06x} with "
+                        f"{frame.words}: the link is closed"
+                    )
+                )
+            blocks.append(bytes(frame.payload))
+        self.transfers += 1
+        return blocks
 
     def post(self, writes: Iterable[RegisterWrite]) -> None:
         """Send posted writes; a refusal is raised when the next answer or interrupt is received."""
@@ -268,7 +293,8 @@ class SocketLink:
 
     def _send(self, frames: bytes) -> None:
         self._check_open()
-        self._count(len(frames))
+        self.bytes_moved += len(frames)
+        self.transfers += 1
         left, deadline = memoryview(frames), time.monotonic() + self.timeout
         while left:
             try:
@@ -313,6 +339,11 @@ class SocketLink:
         """
         self._sequence = sequence = (self._sequence + 1) & ALL_ONES
         self._send(framing.encode(operation, flags, sequence, address, count, payload))
+        frame = self._answer(operation, sequence, address)
+        self.transfers += 1
+        return frame
+
+    def _answer(self, operation: int, sequence: int, address: int) -> Frame:
         deadline = time.monotonic() + self.timeout
         while True:
             try:
@@ -345,12 +376,8 @@ class SocketLink:
     def _next_frame(self) -> Frame | None:
         frame = self._decoder.next_frame()
         if frame is not None:
-            self._count(framing.HEADER_BYTES + len(frame.payload))
+            self.bytes_moved += framing.HEADER_BYTES + len(frame.payload)
         return frame
-
-    def _count(self, size: int) -> None:
-        self.bytes_moved += size
-        self.transfers += 1
 
     def _fill(self) -> None:
         """Receive once, what is there."""
@@ -371,6 +398,7 @@ class SocketLink:
                     f"The board at {self.endpoint} sent an interrupt of {frame.words} words: the link is closed"
                 )
             )
+        self.transfers += 1
         self._interrupts = (self._interrupts + 1) & ALL_ONES
         if frame.sequence != self._interrupts:
             self._give_up(SequenceError(f"interrupt {frame.sequence} arrived instead of {self._interrupts}"))

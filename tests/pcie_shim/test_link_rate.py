@@ -53,7 +53,8 @@ def test_only_a_shared_wire_is_that_of_other_processes(shared, left_ns):
     assert arrivals == [left_ns]
 
 
-def test_every_frame_of_a_host_is_carried_once_in_each_direction(start_board, monkeypatch):
+@pytest.mark.parametrize("sends_results", [True, False])
+def test_every_frame_of_a_host_is_carried_once_in_each_direction(start_board, monkeypatch, sends_results):
     carried = []
     monkeypatch.setattr(LinkModel, "carry", lambda _self, size, _sent_ns: carried.append(size))
     initialise = BoardServer.__init__
@@ -61,7 +62,7 @@ def test_every_frame_of_a_host_is_carried_once_in_each_direction(start_board, mo
         BoardServer, "__init__", lambda *given: initialise(*given[:-1], link_model(LinkRate.JTAG))
     )
     parts = images(3, [4])
-    with MiniCluster.open([start_board().endpoint], parts) as boards:
+    with MiniCluster.open([start_board(sends_results=sends_results).endpoint], parts) as boards:
         carried.clear()
         frame = FrameInput(
             addresses=(1, 2), target_count=10, max_cycles=900, bank=0, prior_address=0, stop="own"
@@ -69,6 +70,10 @@ def test_every_frame_of_a_host_is_carried_once_in_each_direction(start_board, mo
         output = boards.run(frame)
         assert output.boards[0].counts.max() == 10
         # sensors; settings with the doorbell; the answer from DONE on, with the counts
-        assert carried == [HEADER_BYTES + 4 * words for words in (2, 8, 6 + 4)]
+        assert carried[:2] == [HEADER_BYTES + 4 * words for words in (2, 8)]
+        assert carried[2] == HEADER_BYTES + 4 * (6 + 4 * sends_results)
+        # the requests for the counts and DONE come together, and so do their answers
+        reads = [] if sends_results else [HEADER_BYTES, HEADER_BYTES, 2 * HEADER_BYTES + 4 * (4 + 6)]
+        assert carried[3:] == reads
         # both writes are one post
-        assert (output.link_bytes, output.link_transfers) == (sum(carried), 2)
+        assert (output.link_bytes, output.link_transfers) == (sum(carried), 2 if sends_results else 4)

@@ -45,7 +45,7 @@ from pcie_shim.host import mini_cluster
 from pcie_shim.host.driven_board import DrivenBoard
 from pcie_shim.host.loader import program
 from pcie_shim.host.mini_cluster import MiniCluster
-from pcie_shim.host.socket_link import Done
+from pcie_shim.host.socket_link import Done, SocketLink
 from pcie_shim.register_layout import in_field
 from pcie_shim.register_map import BoardState
 from tests.patience import PATIENCE, PROCESS_PATIENCE
@@ -152,6 +152,20 @@ def test_an_output_says_how_each_board_ended_and_where_the_time_went(cluster, mo
     assert outcome(output) == kept
     assert output.boards[0].counts.dtype == np.uint32
     assert output.boards[0].counts.flags.owndata
+
+
+def test_all_boards_are_asked_for_their_results_before_any_is_waited_for(start_board, monkeypatch):
+    parts = images(10, (3, 2, 2))
+    boards = [start_board(index=at, sends_results=False) for at in range(3)]
+    calls = []
+    with MiniCluster.open(endpoints_of(boards), parts) as cluster:
+        for name in ("ask", "answers"):
+            good = getattr(SocketLink, name)
+            monkeypatch.setattr(
+                SocketLink, name, lambda *given, good=good, name=name: calls.append(name) or good(*given)
+            )
+        assert outcome(cluster.run(frame(stop="own"))) == expected(parts, frame(stop="own"))
+    assert calls == ["ask"] * 3 + ["answers"] * 3
 
 
 def test_the_computing_times_of_the_slices_are_added(start_board, monkeypatch):
@@ -364,7 +378,7 @@ OWN = {"stop": "own"}
 )  # fmt: skip
 def test_a_misbehaving_board_fails_the_frame_and_comes_back(start_board, clock, kind, error, on_opening):
     sends_results = kind not in {"more-results", "reset-after-done"}
-    boards = [start_board(index=0), start_board(index=2)]
+    boards = [start_board(index=at, sends_results=sends_results) for at in (0, 2)]
     boards.insert(1, start_board(index=1, misbehave=f"{kind}:1:1", sends_results=sends_results))
     parts = images(70, (3, 2, 2))
     with MiniCluster.open(endpoints_of(boards), parts, timeout=PATIENCE) as cluster:
