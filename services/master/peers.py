@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pcie_shim.endpoint import Endpoint
+from pcie_shim.link_rate import LinkRate
 from services.child import RESTARTS, Child, ForkedCommand, end_all
 from services.errors import (
     BoardFailedError,
@@ -221,6 +222,11 @@ class Peers:
             )
             arguments = boards_arguments(len(endpoints), directory, settings, once=self._once)
             self._boards = ForkedCommand("the boards' process", "board", arguments, directory=self._run)
+        elif settings.link_rate is not LinkRate.NONE or settings.read_results:
+            raise SettingsError(
+                "--link-rate and --read-results are for boards that the master starts, and those of this run are started "
+                "elsewhere: give the flags to their command `board`"
+            )
         for role, text in given.items():
             self._by_role[role] = Peer(role, None, None) if settings.fused else self._peer(role, text)
 

@@ -184,6 +184,17 @@ def test_a_fused_master_has_all_services_inside(boat, tmp_path, given):
     assert [(peer.endpoint, peer.child) for peer in peers] == ([] if given else [(None, None)] * 3)
 
 
+@pytest.mark.parametrize("given", [{"link_rate": "jtag"}, {"read_results": True}])
+@pytest.mark.parametrize(
+    "where", [{}, {"boards": ("tcp://10.0.0.2:7000",) * 4}, {"pcie_app": "unix:/tmp/a.sock"}]
+)
+def test_flags_of_boards_that_are_started_elsewhere_are_refused(boat, tmp_path, given, where):
+    peers = Peers(Settings(run_directory=tmp_path, **given, **where), boat, get_logger("test"), once=True)
+    with pytest.raises(SettingsError, match="board") if where else nullcontext():
+        peers.prepare()
+    peers._run.release()
+
+
 @pytest.fixture
 def connected(peers):
     """A service of the master's own that has just connected."""
