@@ -17,9 +17,10 @@ import ipaddress
 import re
 import socket
 from collections.abc import AsyncIterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from threading import Thread
 from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 from bridge.errors import BridgeError
@@ -39,6 +40,8 @@ _HOST: Final = re.compile(r"[A-Za-z0-9.-]{1,253}")
 _LAST_PORT: Final = 65535
 _PORT: Final = re.compile(r"[0-9]+(/.*)?")
 """A port: `robot:9090` is a URI without its ws://, and does not name a robot."""
+_TIMEOUT: Final = 10.0
+"""Seconds in which a robot must answer, unless the caller has another limit; that of `connect` is the same."""
 _TAKEN_TIME: Final = 3.0
 """Seconds to wait for an objection from another owner of a name."""
 
@@ -114,7 +117,7 @@ async def discover(timeout: float = 2.0, *, interfaces: Sequence[str] | None = N
     return sorted(from_name.values(), key=lambda robot: robot.name)
 
 
-async def resolve(name: str, timeout: float = 5.0, *, interfaces: Sequence[str] | None = None) -> str:
+async def resolve(name: str, timeout: float = _TIMEOUT, *, interfaces: Sequence[str] | None = None) -> str:
     """Return the URI of the rosbridge server of a robot; `interfaces` as for `discover`.
 
     Raises:
@@ -133,18 +136,27 @@ async def resolve(name: str, timeout: float = 5.0, *, interfaces: Sequence[str] 
     return robot.uri
 
 
-async def announced_uri(uri: str) -> str:
+async def announced_uri(uri: str, timeout: float = _TIMEOUT) -> str:
     """Return a URI unchanged, or for `robot:NAME` that of the robot's server; errors are those of `resolve`."""
-    return await resolve(uri.removeprefix(ROBOT)) if uri.startswith(ROBOT) else uri
+    return await resolve(uri.removeprefix(ROBOT), timeout) if uri.startswith(ROBOT) else uri
 
 
-def find_uri(uri: str) -> str:
+def find_uri(uri: str, timeout: float = _TIMEOUT) -> str:
     """Return the same as `announced_uri`, for callers that cannot await, even inside an event loop."""
     if not uri.startswith(ROBOT):
         return uri
-    # A loop of its own, because `asyncio.run` refuses to run inside another one.
-    with ThreadPoolExecutor(1) as pool:
-        return pool.submit(lambda: asyncio.run(announced_uri(uri))).result()
+    found: Future[str] = Future()
+
+    def look() -> None:
+        try:
+            found.set_result(asyncio.run(announced_uri(uri, timeout)))
+        except BaseException as error:
+            found.set_exception(error)
+
+    # A loop in a thread of its own, because `asyncio.run` refuses to run inside another loop. Unlike that of an executor,
+    # the thread does not delay the end of a process that is interrupted meanwhile.
+    Thread(target=look, daemon=True).start()
+    return found.result()
 
 
 @asynccontextmanager

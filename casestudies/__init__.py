@@ -9,10 +9,15 @@ import typer
 
 from bridge.discovery import find_uri
 
+
+def _found(uri: str) -> str:
+    return find_uri(uri)
+
+
 Uri = Annotated[
     str,
     typer.Option(
-        envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT|robot:NAME", callback=find_uri
+        envvar="BM_URI", help="The rosbridge server.", metavar="ws://HOST:PORT|robot:NAME", callback=_found
     ),
 ]
 DEFAULT_URI = "ws://127.0.0.1:9090"

@@ -209,7 +209,7 @@ def load_settings(**flags: Any) -> Settings:
         use_log_format(settings.log_format)
     # looked up only where the server is used: a board would wait for a robot that it never contacts
     if "uri" in flags and settings.uri is not None:
-        return settings.model_copy(update={"uri": find_uri(settings.uri)})
+        return settings.model_copy(update={"uri": find_uri(settings.uri, settings.connect_timeout)})
     return settings
 
 

@@ -482,7 +482,7 @@ def connect(
     Args:
         uri: `ws://host:port`, or `wss://` for TLS, whose certificate is always verified; or `robot:NAME`, which is
             looked up when the client is opened (`bridge.discovery`).
-        connect_timeout: Timeout of the first connection in seconds.
+        connect_timeout: Timeout of the first connection in seconds, and before it of looking up a robot.
         retry: Whether to repeat the first attempt until `connect_timeout` is over, while nothing answers at the URI;
             `on_state` is then called with `CONNECTING` and the reason, once.
         ros_version: ROS version of type names on the wire. `auto` uses ROS 1, which ROS 2 servers accept too,
@@ -537,7 +537,7 @@ def connect(
     known = None if uri.startswith(ROBOT) else server(uri)
 
     async def locate() -> tuple[WebSocketURI, str, Route]:
-        return known or server(await announced_uri(uri))
+        return known or server(await announced_uri(uri, connect_timeout))
 
     core = ClientCore(ros_version=configured_version, max_size=max_size, fragment_size=fragment_size)
     session = Session(shown(uri), locate, core, limits, on_state, retry=retry)

@@ -15,7 +15,7 @@ def _nothing_may_start(monkeypatch):
 
 
 def test_a_robot_is_looked_up_before_anything_starts(tmp_path, monkeypatch):
-    async def resolve(name):
+    async def resolve(name, _timeout):
         raise UnknownRobotError(f"no robot called {name}")
 
     monkeypatch.setattr("bridge.discovery.resolve", resolve)

@@ -80,7 +80,7 @@ async def test_a_refused_topic_is_reported_as_far_as_rosapi_tells(known, warning
 def looked_up(monkeypatch):
     """The names that are looked up; only `Zoë` is announced, at a port where nothing listens."""
 
-    async def resolve(name):
+    async def resolve(name, _timeout):
         names.append(name)
         if name != "Zoë":
             raise UnknownRobotError(f"no robot called {name}")

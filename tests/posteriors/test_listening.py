@@ -281,7 +281,7 @@ def test_a_thread_without_a_loop_raises_in_the_caller(monkeypatch):
 
 
 def test_a_robots_name_is_a_server(monkeypatch):
-    async def resolve(name):
+    async def resolve(name, _timeout):
         raise UnknownRobotError(f"no robot called {name}")
 
     monkeypatch.setattr("bridge.discovery.resolve", resolve)

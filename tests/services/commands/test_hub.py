@@ -132,10 +132,10 @@ def test_a_network_without_robots_is_one_sentence():
 def _zoe(monkeypatch):
     """Only this robot is announced."""
 
-    async def resolve(name):
+    async def resolve(name, timeout):
         await asyncio.sleep(0)
         if name != "Zoë":
-            raise UnknownRobotError(f"no robot called {name}")
+            raise UnknownRobotError(f"no robot called {name} within {timeout:g} s")
         return "ws://192.0.2.7:9090"
 
     monkeypatch.setattr("bridge.discovery.resolve", resolve)
@@ -143,9 +143,10 @@ def _zoe(monkeypatch):
 
 @pytest.mark.usefixtures("_zoe")
 @pytest.mark.parametrize("command", [dashboard, listen, master, publisher, subscriber])
-def test_every_command_with_a_uri_looks_a_robot_up(command):
+def test_every_command_with_a_uri_looks_a_robot_up_in_its_time(command, monkeypatch):
+    monkeypatch.setenv("BM_CONNECT_TIMEOUT", "7")
     ended = invoke(command.app, ["--uri", "robot:Adam"])
-    assert (ended.exit_code, ended.stderr) == (3, "error: no robot called Adam\n")
+    assert (ended.exit_code, ended.stderr) == (3, "error: no robot called Adam within 7 s\n")
 
 
 @pytest.mark.usefixtures("_zoe")

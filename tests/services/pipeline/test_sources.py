@@ -175,7 +175,7 @@ async def test_a_certificate_that_only_the_settings_know(tmp_path):
 async def test_a_robot_of_the_deployment_is_looked_up(monkeypatch):
     async with running_hub() as port:
 
-        async def resolve(name):
+        async def resolve(name, _timeout):
             assert name == "Robot 7"
             return f"ws://127.0.0.1:{port}"
 

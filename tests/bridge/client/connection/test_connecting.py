@@ -61,20 +61,20 @@ async def test_a_uri_that_is_none():
 async def test_a_robots_name_is_looked_up_once(fake, monkeypatch):
     asked = []
 
-    async def resolve(name):
-        asked.append(name)
+    async def resolve(name, timeout):
+        asked.append((name, timeout))
         if name == "Adam":
             raise UnknownRobotError("no robot called Adam")
         return fake.uri if name == "Zoë" else "http://robot:9090"
 
     monkeypatch.setattr("bridge.discovery.resolve", resolve)
-    ros = connect("robot:Zoë")
+    ros = connect("robot:Zoë", connect_timeout=7)
     assert (ros.uri, asked) == ("robot:Zoë", [])
     async with ros:
         assert ros.uri == fake.uri
         await fake.cut()
         await fake.wait_for_connections(2)
-    assert asked == ["Zoë"]
+    assert asked == [("Zoë", 7)]  # within the time to connect
     for name, error in (("Adam", UnknownRobotError), ("Eve", UriError)):
         ros = connect(f"robot:{name}")
         with pytest.raises(error):
