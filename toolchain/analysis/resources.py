@@ -117,23 +117,33 @@ def most_replicas(
 
 
 def boards_needed(
-    parameters: BM1Parameters, device: Device, *, table_length: int = LENGTH, inputs: int = 0
+    parameters: BM1Parameters,
+    device: Device,
+    *,
+    table_length: int = LENGTH,
+    interface: tuple[int, int] | None = None,
 ) -> tuple[int, str]:
-    """Return the minimum number of boards for a machine, and why, as a sentence; or raise a BuildError."""
+    """Return the minimum number of boards for a machine, and why, as a sentence; or raise a BuildError.
+
+    `interface` is that of `most_replicas`.
+    """
+    inputs = (interface or (0, 0))[0]
+    whose = "the register map" if interface is None else "the interface"
 
     def on(lines: int) -> Estimate:
         return estimate(replace(parameters, lines=lines), device, table_length=table_length, inputs=inputs)
 
-    room = interface_room(BM1.registers(parameters))
+    room = interface or interface_room(BM1.registers(parameters))
     largest_lines = room[1] // parameters.replicas
     if parameters.sensor_mode is not SensorMode.COLUMN and parameters.sensors:
         largest_lines = min(largest_lines, room[0] // (parameters.replicas * parameters.sensors))
     possible = range(1, min(parameters.lines, largest_lines) + 1)
     most = bisect_left(possible, True, key=lambda lines: not on(lines).fits)
     if most == 0 and largest_lines == 0:
-        fewer, _ = most_replicas(replace(parameters, lines=1), device, table_length=table_length)
+        line = replace(parameters, lines=1)
+        fewer, _ = most_replicas(line, device, table_length=table_length, interface=interface)
         raise BuildError(
-            f"not even one line of {parameters.replicas} replicas fits the register map: it has room for {room[0]} inputs "
+            f"not even one line of {parameters.replicas} replicas fits {whose}: it has room for {room[0]} inputs "
             f"and {room[1]} results; use --replicas {fewer} or fewer"
         )
     if most == 0:
@@ -147,13 +157,14 @@ def boards_needed(
     if count == 1:
         return 1, f"All {parameters.lines} lines fit one {device.title}: {share}."
     if largest_lines < parameters.lines and on(largest_lines).fits:
-        reason = f"the register map has room for {largest_lines} lines per board"
+        reason = f"{whose} has room for {largest_lines} lines per board"
     else:
         reason = f"on one {device.title} {on(parameters.lines).why_not}"
     boards = f"{count} boards" if count > 2 else "two boards"
     why = f"{parameters.lines} lines need {boards}: {reason}; {largest} lines per board take {share}. An estimate, not a compilation."
-    if parameters.replicas > 1 and (whole := most_replicas(parameters, device, table_length=table_length)[0]):
-        why += f" With --replicas {whole} or fewer, all lines fit one board."
+    if parameters.replicas > 1:
+        whole, _ = most_replicas(parameters, device, table_length=table_length, interface=interface)
+        why += f" With --replicas {whole} or fewer, all lines fit one board." if whole else ""
     return count, why
 
 

@@ -224,8 +224,7 @@ def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan",
 
     options, parameters, device = plan.options, plan.parameters, device_named(name)
     length = LENGTH if options.rng_table is None else options.rng_table.size
-    inputs = (options.interface or (0, 0))[0]
-    count, why = boards_needed(parameters, device, table_length=length, inputs=inputs)
+    count, why = boards_needed(parameters, device, table_length=length, interface=options.interface)
     if options.partitions > count:
         why += f" --partitions {options.partitions} asks for more."
     options = replace(options, partitions=max(count, options.partitions))
@@ -235,6 +234,7 @@ def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan",
         options = replace(options, replicas=max(most, 1))
         parameters = replace(parameters, replicas=options.replicas)
         filled = replace(board, replicas=options.replicas)
+        inputs = (options.interface or (0, 0))[0]
         took = estimate(filled, device, table_length=length, inputs=inputs)
         why += (
             f" {counted(options.replicas, 'machine')} fill a board, with {took.alms:,.0f} ALMs ({took.alm_share:.0%}) and "

@@ -155,6 +155,14 @@ def test_boards_for_more_lines_than_the_register_map_holds():
     assert " 4096 lines " in why
 
 
+def test_boards_for_more_lines_than_the_interface_holds():
+    count, why = boards_needed(BOAT, D8, interface=(20, 300))
+    assert count == 4
+    assert "the interface has room for 300 lines" in why
+    with pytest.raises(BuildError, match="use --replicas 2 or fewer"):
+        boards_needed(replace(BOAT, lines=8, replicas=3), D8, interface=(20, 2))
+
+
 @pytest.mark.parametrize(
     ("board", "limit"),
     [
