@@ -69,14 +69,24 @@ def memories(
     from toolchain.building.build import build_date
     from toolchain.building.regenerate import regenerate_memories
     from toolchain.deployment import load_deployment
+    from toolchain.outputs.vhdl_parameters import PARAMETERS_FILE
 
     if model is not None:
-        built = load_deployment(directory, images=False).model
-        flags = flags.over(built)
+        old = load_deployment(directory, images=False)
+        flags = flags.over(old.model)
         source = read_source(model, flags)
         before, date = _lines(directory), build_date(model_file(model))
-        changes = regenerate_memories(directory, source, flags=flags.section(built.bits), build_date=date)
+        changes = regenerate_memories(directory, source, flags=flags.section(old.model.bits), build_date=date)
         _print_changes(changes, before, _lines(directory), verbose=verbose)
+        # the parameters of the build are not stored: other images than the built ones may be due to them, or to the model
+        new = load_deployment(directory, images=False)
+        built = [(one.built_hash, two.image_hash) for one, two in zip(old.boards, new.boards, strict=True)]
+        if old.machine.type == "BM1" and any(one not in {None, two} for one, two in built):
+            typer.echo(
+                f"memories are the model's again, but parameters that were edited stay: to undo those edits, set them back "
+                f"in {PARAMETERS_FILE} and run 'toolchain regenerate images {directory}'",
+                err=True,
+            )
     elif flags.settings or flags.question:
         raise BuildError(f"{'--set' if flags.settings else flags.question[0]} is for a model: add --model")
     else:

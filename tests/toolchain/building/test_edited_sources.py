@@ -116,7 +116,7 @@ def test_the_model_replaces_an_edit(case, built):
     originals = contents(built)
     with_word(built / COLUMN, 3, lambda word: word ^ 1)
     done(toolchain("regenerate", "images", built))
-    done(toolchain("regenerate", "memories", built, "--model", case))
+    assert not done(toolchain("regenerate", "memories", built, "--model", case)).stderr
     assert contents(built) == originals
 
 
@@ -131,7 +131,7 @@ def test_every_form_of_a_memory_is_read(built):
     assert contents(built) == before
 
 
-def test_edited_parameters_are_those_of_the_machine(built):
+def test_edited_parameters_are_those_of_the_machine(case, built):
     path = built / PARAMETERS
     edit(path, "STEPS_PER_CLOCK   : positive := 8", "STEPS_PER_CLOCK : positive := 1 -- slower\n ")
     edit(path, "RNG_RESET_BANK    : boolean := true", "RNG_RESET_BANK : Boolean := FALSE")
@@ -148,6 +148,9 @@ def test_edited_parameters_are_those_of_the_machine(built):
     done(toolchain("regenerate", "deployment", built))  # file and images agree
     done(toolchain("regenerate", "images", built))
     assert contents(built) == again
+    # the model has no parameters, and the deployment only the edited ones
+    assert PARAMETERS in done(toolchain("regenerate", "memories", built, "--model", case)).stderr
+    assert load_deployment(built).machine == machine
 
 
 def interrupted(monkeypatch, folder, last):
