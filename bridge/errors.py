@@ -150,10 +150,6 @@ class ExtrapolationError(TransformError):
     """Raised when a transform is requested for a time before the oldest or after the newest known one."""
 
 
-class DefinitionError(UsageError):
-    """Raised when serialised bytes cannot be read: their type is unknown, or rosbags is not installed."""
-
-
 class PathError(UsageError):
     """Raised when the path of a variable (`pose.position.x`, `ranges[3]`) is not well-formed."""
 

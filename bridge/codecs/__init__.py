@@ -1,1 +1,1 @@
-"""Encodings of rosbridge messages: JSON, CBOR, PNG, fragments and serialised ROS messages."""
+"""Encodings of rosbridge messages: JSON, CBOR, PNG and fragments."""

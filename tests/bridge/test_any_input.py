@@ -25,7 +25,6 @@ from bridge.client.protocol.events import (
 from bridge.codecs import cbor_codec, json_codec, png
 from bridge.codecs.cbor_codec import with_arrays, with_lists
 from bridge.codecs.fragments import Reassembler, split
-from bridge.codecs.serialised import MessageTypes
 from bridge.errors import BridgeError, DecodeError, EncodeError
 from bridge.hub.broker import Broker
 from bridge.hub.limits import HubLimits
@@ -168,24 +167,6 @@ def test_any_path_in_any_message_gives_a_value_or_a_reason_in_one_line(name, dat
         except BridgeError as error:
             said = str(error)
         assert "\n" not in said
-
-
-_TYPES = MessageTypes()
-
-
-@given(
-    st.sampled_from(
-        ("sensor_msgs/LaserScan", "std_msgs/String", "std_msgs/Float64MultiArray", "tf2_msgs/TFMessage")
-    ),
-    st.binary(max_size=200),
-)
-@example("std_msgs/String", b"\0\1\0\0\x04\0\0\0abc\0")
-@example("std_msgs/String", b"\x03\0\0\0abc")
-def test_serialised_bytes_give_a_message_of_the_type(name, data):
-    try:
-        assert type(_TYPES.read(data, name)) is dict
-    except DecodeError as error:
-        check_sentence(error)
 
 
 # The client's core between a user and a server that both may do anything

@@ -17,14 +17,16 @@ import socket
 import sys
 import tempfile
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
+from rosbags.typesys import Stores, get_typestore
 
 from bridge.client import connect
-from bridge.codecs.serialised import MessageTypes
 from bridge.errors import BridgeError
+from bridge.names import ros2_type
 from bridge.stamps import header, header_stamp_ns
 from casestudies.boat.sensors import SET_POSE_TOPIC, TRUE_POSE_TYPE, true_pose
 from posteriors.standard_messages import Level
@@ -76,7 +78,7 @@ class Scene(NamedTuple):
 async def grid_and_pose(stand: Stand) -> dict[str, tuple[str, bytes, dict[str, Any]]]:
     """Return type, bytes and content of the grid and the pose of one frame, after putting the boat in its place."""
     types = {"/bm/posterior": "nav_msgs/OccupancyGrid", "/bm/pose": "geometry_msgs/PoseWithCovarianceStamped"}
-    read = MessageTypes(1).read
+    store = get_typestore(Stores.ROS1_NOETIC)
     async with asyncio.timeout(2 * PATIENCE), connect(stand.uri, check_types=False) as ros:
         topics = {name: ros.subscribe(name, type_, compression="cbor-raw") for name, type_ in types.items()}
         await topics["/bm/pose"].next(timeout=PATIENCE)  # the boat advertises its services first
@@ -89,7 +91,7 @@ async def grid_and_pose(stand: Stand) -> dict[str, tuple[str, bytes, dict[str, A
         while True:
             behind = min(stamps, key=lambda name: stamps[name])
             raw = (await topics[behind].next(timeout=PATIENCE)).raw
-            found[behind] = types[behind], raw, (message := read(raw, types[behind]))
+            found[behind] = types[behind], raw, (message := asdict(store.deserialize_ros1(raw, ros2_type(types[behind]))))
             stamps[behind] = header_stamp_ns(message) or 0
             if len(set(stamps.values())) == 1:
                 mean = found["/bm/pose"][2]["pose"]["pose"]["position"]

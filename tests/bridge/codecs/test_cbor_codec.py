@@ -2,6 +2,8 @@
 
 import math
 import struct
+import subprocess
+import sys
 
 import cbor2
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 
 from bridge.codecs.cbor_codec import TYPED_ARRAYS, decode, encode, typed_array, with_arrays, with_lists
 from bridge.errors import DecodeError, EncodeError
+from tests.patience import PROCESS_PATIENCE
 
 FORMATS = {69: "H", 70: "I", 71: "Q", 72: "b", 77: "h", 78: "i", 79: "q", 85: "f", 86: "d"}
 
@@ -179,3 +182,17 @@ def test_lists_of_numbers_become_arrays():
 def test_arrays_become_lists():
     message = {"a": np.array([1.5]), "b": [{"c": np.array([1, 2], np.uint8)}], "d": 1, "e": [np.array([3])]}
     assert with_lists(message) == {"a": [1.5], "b": [{"c": b"\x01\x02"}], "d": 1, "e": [[3]]}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    "use",
+    [
+        "import bridge.client, bridge.discovery",
+        "import bridge.fields, bridge.stamps; from bridge.codecs.json_codec import encode; encode({'a': 1.0})",
+        "from bridge.codecs.cbor_codec import *; decode(encode({'a': typed_array([1.5], 'f8')}))",
+    ],
+)
+def test_nothing_heavy_is_imported_before_it_is_wanted(use):
+    code = f"import sys; {use}; assert not {{'rosbags', 'numpy', 'zeroconf'}} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=PROCESS_PATIENCE)

@@ -8,14 +8,15 @@ import math
 import re
 import socket
 import time
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_typestore
 
 from bridge import stamps
 from bridge.client import Message, State, connect
-from bridge.codecs.serialised import MessageTypes
 from bridge.errors import (
     ConcurrentReadError,
     DecodeError,
@@ -551,7 +552,10 @@ async def test_a_scan_arrives_in_every_form(hub, compression, fragment_size, arr
         received = await scans.next(PATIENCE)
     if compression == "cbor-raw":
         assert received.msg["secs"] > 1_600_000_000
-        msg = MessageTypes().read(received.raw, SCAN_TYPE)
+        is_cdr = received.raw.startswith(b"\0\1\0\0")
+        store = get_typestore(Stores.ROS2_JAZZY if is_cdr else Stores.ROS1_NOETIC)
+        read = store.deserialize_cdr if is_cdr else store.deserialize_ros1
+        msg = asdict(read(received.raw, "sensor_msgs/msg/LaserScan"))
     else:
         msg = received.msg
         assert isinstance(msg["ranges"], np.ndarray if arrays == "numpy" else list)
