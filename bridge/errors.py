@@ -99,10 +99,6 @@ class NoAnswerError(BridgeError):
     """Raised when a service did not answer in time."""
 
 
-class ParamError(BridgeError):
-    """Raised when a parameter does not exist, or the server refuses to change it."""
-
-
 class SlowPeerError(BridgeError):
     """Raised when the server does not accept messages in time, or too many are waiting."""
 
@@ -132,22 +128,6 @@ class GoalError(BridgeError):
     def __init__(self, reason: str, action: str) -> None:
         self.reason = reason
         super().__init__(f"action {action} has no result: {reason or 'it gave no reason'}")
-
-
-class TransformError(BridgeError):
-    """Base class of errors of coordinate transforms."""
-
-
-class FrameUnknownError(TransformError):
-    """Raised when no transform with this frame is known."""
-
-
-class FramesUnconnectedError(TransformError):
-    """Raised when two frames have no common ancestor."""
-
-
-class ExtrapolationError(TransformError):
-    """Raised when a transform is requested for a time before the oldest or after the newest known one."""
 
 
 class PathError(UsageError):

@@ -10,9 +10,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 
-def issue(
-    folder: Path, name: str, *, ca: str | None = None, password: bytes | None = None
-) -> tuple[Path, Path]:
+def issue(folder: Path, name: str, *, ca: str | None = None) -> tuple[Path, Path]:
     """Make NAME.pem and its key NAME.key for localhost, signed by another certificate of the folder or by itself."""
     certificate, key = folder / f"{name}.pem", folder / f"{name}.key"
     private = signer = ec.generate_private_key(ec.SECP256R1())
@@ -36,9 +34,6 @@ def issue(
         .sign(signer, hashes.SHA256())
     )
     certificate.write_bytes(made.public_bytes(serialization.Encoding.PEM))
-    lock = (
-        serialization.NoEncryption() if password is None else serialization.BestAvailableEncryption(password)
-    )
-    form = serialization.PrivateFormat.PKCS8
+    form, lock = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     key.write_bytes(private.private_bytes(serialization.Encoding.PEM, form, lock))
     return certificate, key

@@ -105,15 +105,7 @@ class Subscription(Handle):
     """
 
     def __init__(
-        self,
-        session: Session,
-        topic: str,
-        type_name: str | None,
-        *,
-        throttle_rate: int,
-        queue_length: int,
-        queue_size: int,
-        delivery: Delivery,
+        self, session: Session, topic: str, type_name: str | None, *, queue_size: int, delivery: Delivery
     ) -> None:
         super().__init__(session)
         self.topic = topic
@@ -142,9 +134,7 @@ class Subscription(Handle):
         self._is_prompt = False
 
         # Registered only after the core has accepted the subscription, because it may raise.
-        self._number = session.core.subscriptions.subscribe(
-            topic, type_name, throttle_rate=throttle_rate, queue_length=queue_length, delivery=delivery
-        )
+        self._number = session.core.subscriptions.subscribe(topic, type_name, delivery)
         session.readers[self._number] = self
         # If the topic is left out, perhaps since before this subscription: the reason, as the end of a sentence.
         self._left_out = session.why_left_out() if session.core.subscriptions.has_left_out(topic) else ""

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from ssl import SSLContext
-from typing import TYPE_CHECKING, Any, Final, Literal, Self
+from typing import Any, Final, Literal, Self
 
 from websockets.uri import WebSocketURI
 
@@ -20,9 +20,9 @@ from bridge.client.actions import ActionServer, Goal, GoalHandler
 from bridge.client.handles import PUBLISH_QUEUE_SIZE, QUEUE_SIZE, Handler, Publication, Service, Subscription
 from bridge.client.protocol import ClientCore, Compression, Delivery, RosVersion
 from bridge.client.protocol.events import StatusReceived
-from bridge.client.rosapi import NodeDetails, Params, TypeChecks
 from bridge.client.route import Path, Route, make_route, shown
 from bridge.client.session import Session, State, StateCallback
+from bridge.client.type_checks import TypeChecks
 from bridge.client.websocket import Limits, check_uri
 from bridge.codecs.cbor_codec import Arrays
 from bridge.codecs.json_codec import MAX_SIZE
@@ -32,9 +32,6 @@ from bridge.errors import ActionlibError, OptionError
 from bridge.names import ros2_type, ros_version_of_type
 from bridge.qos import Qos
 
-if TYPE_CHECKING:
-    from bridge.client.tf import Transforms
-
 DETECT_TIMEOUT: Final = 2.0
 """Timeout in seconds for detecting the ROS version of the server."""
 FAREWELL_TIMEOUT: Final = 0.3
@@ -42,17 +39,12 @@ FAREWELL_TIMEOUT: Final = 0.3
 
 
 class Ros:
-    """A client of one rosbridge server, created by `connect`, and opened and closed once by `async with`.
-
-    Attributes:
-        params: The parameters of the ROS system.
-    """
+    """A client of one rosbridge server, created by `connect`, and opened and closed once by `async with`."""
 
     def __init__(self, session: Session, *, check_types: bool = True) -> None:
         self._session = session
         # None if the program has switched the checks off.
         self._types = TypeChecks(session) if check_types else None
-        self.params = Params(session)
         # Whether anything was advertised; if so, `close` waits until the server has read the last messages.
         self._publishes = False
 
@@ -211,10 +203,10 @@ class Ros:
             self._session,
             topic,
             type,
-            throttle_rate=throttle_rate,
-            queue_length=queue_length,
             queue_size=queue_size,
             delivery=Delivery(
+                throttle_rate=throttle_rate,
+                queue_length=queue_length,
                 compression=compression,
                 arrays=arrays,
                 fragment_size=fragment_size,
@@ -222,12 +214,6 @@ class Ros:
                 max_bytes=max_bytes,
             ),
         )
-
-    def transforms(self) -> "Transforms":
-        """Return the transforms of `/tf` and `/tf_static`, which `async with` subscribes to."""
-        from bridge.client.tf import Transforms  # needs NumPy
-
-        return Transforms(self.subscribe)
 
     # Services
 
@@ -387,71 +373,37 @@ class Ros:
 
     async def topic_type(self, topic: str, timeout: float = 1.0) -> str | None:
         """Return the type of a topic at the server: empty if it does not know the topic, None without rosapi."""
-        return await self._ask_text(timeout, "topic_type", "type", topic=topic)
+        return await self._ask_type(timeout, "topic_type", topic=topic)
 
     async def topics(self, timeout: float = 1.0) -> list[str] | None:
         """Return the names of all topics at the server; None without rosapi."""
-        return await self._ask_names(timeout, "topics", "topics")
+        return await self._ask_names(timeout, "topics")
 
     async def publishers(self, topic: str, timeout: float = 1.0) -> list[str] | None:
         """Return the names of the nodes that publish a topic; None without rosapi."""
-        return await self._ask_names(timeout, "publishers", "publishers", topic=topic)
-
-    async def subscribers(self, topic: str, timeout: float = 1.0) -> list[str] | None:
-        """Return the names of the nodes that subscribe to a topic; None without rosapi."""
-        return await self._ask_names(timeout, "subscribers", "subscribers", topic=topic)
-
-    async def topics_for_type(self, type: str, timeout: float = 1.0) -> list[str] | None:
-        """Return the names of the topics of a type; None without rosapi."""
-        await self.detect_ros_version()  # rosapi compares type names literally
-        spelt = self._session.core.wire.type_name(type)
-        return await self._ask_names(timeout, "topics_for_type", "topics", type=spelt)
+        return await self._ask_names(timeout, "publishers", topic=topic)
 
     async def message_details(self, type: str, timeout: float = 1.0) -> Definitions:
         """Return the fields of a message type and of its parts, by type in the form of ROS 1; empty if unknown."""
         args = {"type": self._session.core.wire.type_name(type)}
         return definitions_from_rosapi(await self._session.ask_rosapi("message_details", args, timeout))
 
-    async def nodes(self, timeout: float = 1.0) -> list[str] | None:
-        """Return the names of all nodes; None without rosapi."""
-        return await self._ask_names(timeout, "nodes", "nodes")
-
-    async def node_details(self, node: str, timeout: float = 1.0) -> NodeDetails | None:
-        """Return the topics and services of a node, none if it is unknown; None without rosapi."""
-        answer = await self._session.ask_rosapi("node_details", {"node": node}, timeout)
-        fields = [_names_in(answer, name) for name in ("subscribing", "publishing", "services")]
-        return None if None in fields else NodeDetails(*(names or [] for names in fields))
-
     async def services(self, timeout: float = 1.0) -> list[str] | None:
         """Return the names of all services; None without rosapi."""
-        return await self._ask_names(timeout, "services", "services")
+        return await self._ask_names(timeout, "services")
 
     async def service_type(self, service: str, timeout: float = 1.0) -> str | None:
         """Return the type of a service: empty if the server does not know it, None without rosapi."""
-        return await self._ask_text(timeout, "service_type", "type", service=service)
+        return await self._ask_type(timeout, "service_type", service=service)
 
-    async def service_node(self, service: str, timeout: float = 1.0) -> str | None:
-        """Return the name of the node that serves a service, empty if none does; None without rosapi."""
-        return await self._ask_text(timeout, "service_node", "node", service=service)
+    async def _ask_type(self, limit: float, question: str, **args: str) -> str | None:
+        found = (await self._session.ask_rosapi(question, args, limit)).get("type")
+        return found if isinstance(found, str) else None
 
-    async def service_providers(self, type: str, timeout: float = 1.0) -> list[str] | None:
-        """Return the names of the nodes that serve services of a type; None without rosapi."""
-        await self.detect_ros_version()  # as in `topics_for_type`
-        spelt = self._session.core.wire.type_name(type, "srv")
-        return await self._ask_names(timeout, "service_providers", "providers", service=spelt)
-
-    async def _ask_text(self, limit: float, question: str, field: str, **args: str) -> str | None:
-        value = (await self._session.ask_rosapi(question, args, limit)).get(field)
-        return value if isinstance(value, str) else None
-
-    async def _ask_names(self, limit: float, question: str, field: str, **args: str) -> list[str] | None:
-        return _names_in(await self._session.ask_rosapi(question, args, limit), field)
-
-
-def _names_in(answer: dict[str, Any], field: str) -> list[str] | None:
-    """Return a list of names from an answer of rosapi; None if there is none."""
-    names = answer.get(field)
-    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else None
+    async def _ask_names(self, limit: float, question: str, **args: str) -> list[str] | None:
+        """Return a list of names, in the field of the question's name; None if there is none."""
+        names = (await self._session.ask_rosapi(question, args, limit)).get(question)
+        return [name for name in names if isinstance(name, str)] if isinstance(names, list) else None
 
 
 def connect(
@@ -463,11 +415,8 @@ def connect(
     token: str | None = None,
     headers: Mapping[str, str] | None = None,
     ca_file: Path | None = None,
-    client_certificate: Path | tuple[Path, Path] | None = None,
     tls: SSLContext | None = None,
-    proxy: str | None = None,
     max_size: int = MAX_SIZE,
-    fragment_size: int | None = None,
     ping_interval: float = 5.0,
     ping_timeout: float = 5.0,
     check_types: bool = True,
@@ -490,14 +439,9 @@ def connect(
         token: Sent as `Authorization: Bearer TOKEN`; like all headers it is never logged.
         headers: Additional headers of the handshake.
         ca_file: Certificate authorities (PEM) for the server, instead of those of the system.
-        client_certificate: Certificate and key (PEM) of this client, in one file or in two.
-        tls: An SSL context, instead of `ca_file` and `client_certificate`.
-        proxy: `http://proxy:3128`, `https://` or `socks5h://` (with the package python-socks), or
-            `environment` for the proxy in HTTPS_PROXY etc.; None for a direct connection.
+        tls: An SSL context instead of `ca_file`, for example with a client certificate.
         max_size: Maximum size of a message in bytes, in both directions. A larger inbound message ends the
             connection, and its topic is left out of the next one (`TopicLeftOutError`).
-        fragment_size: Maximum number of characters of a message before it is sent in fragments; None for no
-            limit.
         ping_interval: Seconds of silence after which the server is pinged.
         ping_timeout: Seconds to wait for data after a ping before the connection counts as lost.
         check_types: Refuse messages, requests and goals with a misspelt field or an array of another shape
@@ -521,15 +465,7 @@ def connect(
 
     def server(uri: str) -> tuple[WebSocketURI, str, Route]:
         parsed = check_uri(uri)
-        route = make_route(
-            parsed,
-            token=token,
-            headers=headers,
-            ca_file=ca_file,
-            client_certificate=client_certificate,
-            tls=tls,
-            proxy=proxy,
-        )
+        route = make_route(parsed, token=token, headers=headers, ca_file=ca_file, tls=tls)
         # The credentials are in the route, whose repr hides them.
         return replace(parsed, username=None, password=None), shown(uri), route
 
@@ -539,6 +475,6 @@ def connect(
     async def locate() -> tuple[WebSocketURI, str, Route]:
         return known or server(await announced_uri(uri, connect_timeout))
 
-    core = ClientCore(ros_version=configured_version, max_size=max_size, fragment_size=fragment_size)
+    core = ClientCore(ros_version=configured_version, max_size=max_size)
     session = Session(shown(uri), locate, core, limits, on_state, retry=retry)
     return Ros(session, check_types=check_types)

@@ -439,8 +439,7 @@ class Session:
 
     def send_now(self, data: bytes) -> None:
         """Write a message to the socket; call it after `must_wait` or `wait_turn`, without an `await` in between."""
-        wire, websocket = self.core.wire, self._websocket or self._connected()
-        websocket.send((data,) if wire.fragment_size is None else wire.pieces(data))
+        (self._websocket or self._connected()).send((data,))
         if len(data) > self._largest_sent:  # noqa: PLR1730 - `max` takes ten times as long
             self._largest_sent = len(data)
 

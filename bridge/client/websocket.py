@@ -292,7 +292,7 @@ async def open_websocket(
 
     try:
         async with asyncio.timeout(timeout):
-            websocket = await connect_along(route, uri, shown_uri, factory)
+            websocket = await connect_along(route, uri, factory)
             await websocket.handshake(route.headers)
     except BaseException as error:
         answered, heard = False, b""
@@ -333,7 +333,7 @@ def _connect_error(
     if isinstance(error, InvalidMessage) and not heard:
         is_tls = uri.startswith("wss:")
         perhaps = (
-            " (some servers do so without a client_certificate)" if is_tls else "; does it expect wss://?"
+            " (some servers do so without a client certificate)" if is_tls else "; does it expect wss://?"
         )
         return UnreachableError(f"{uri} is unreachable: it closed the connection without an answer{perhaps}")
     if isinstance(error, InvalidHandshake) or (isinstance(error, TimeoutError) and heard):
@@ -344,7 +344,9 @@ def _connect_error(
     if isinstance(error, ssl.SSLCertVerificationError):
         return UnreachableError(f"{uri} cannot be trusted; certificate error: {error.verify_message}")
     if isinstance(error, ssl.SSLError) and "ALERT" in (error.reason or ""):
-        return AccessRefusedError(f"{uri} refuses this client ({error.reason}): check client_certificate")
+        return AccessRefusedError(
+            f"{uri} refuses this client ({error.reason}): check the client certificate in tls"
+        )
     if isinstance(error, ssl.SSLError):
         return NotRosbridgeError(
             f"{uri} does not speak TLS ({error.reason}): is it ws:// rather than wss://?"

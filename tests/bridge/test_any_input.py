@@ -6,6 +6,7 @@ What client and hub remember of a publisher's messages changes nothing: each is 
 import contextlib
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import orjson
@@ -243,7 +244,7 @@ class AnyServer(RuleBasedStateMachine):
 
     def __init__(self):
         super().__init__()
-        self.core = ClientCore(max_size=MAX_SIZE, max_depth=MAX_DEPTH, fragment_size=50)
+        self.core = ClientCore(max_size=MAX_SIZE, max_depth=MAX_DEPTH)
         self.core.restore()
         self.now = 0.0
         self.server = PaperServer()
@@ -262,8 +263,6 @@ class AnyServer(RuleBasedStateMachine):
             assert len(data) <= MAX_SIZE
             operation = json.loads(data, parse_constant=no_constant)
             assert type(operation["op"]) is str
-            pieces = list(core.wire.pieces(data))
-            assert pieces == [data] or all(json.loads(piece)["op"] == "fragment" for piece in pieces)
             self.server.hear(operation)
         assert len(core.services) <= MAX_REQUESTS
         assert len(core.calls) <= MAX_CALLS
@@ -273,13 +272,12 @@ class AnyServer(RuleBasedStateMachine):
             assert set(self.server.advertised) == {topic for _number, topic in self.advertisements}
             assert self.server.services == self.services
             asked = {topic: by_id for topic, by_id in self.server.subscribed.items() if by_id}
-            assert set(asked) == {topic for topic, _rate, _length in self.subscriptions.values()}
+            assert set(asked) == {topic for topic, _rate in self.subscriptions.values()}
             for topic, by_id in asked.items():
                 (subscribe,) = by_id.values()  # one on the wire
-                _, rates, lengths = zip(
-                    *(w for w in self.subscriptions.values() if w[0] == topic), strict=True
-                )
-                assert (subscribe["throttle_rate"], subscribe["queue_length"]) == (min(rates), max(lengths))
+                assert {(topic, subscribe["throttle_rate"])} == {
+                    each for each in self.subscriptions.values() if each[0] == topic
+                }
 
     def take(self, data, step=0.5):
         self.now += step
@@ -287,10 +285,7 @@ class AnyServer(RuleBasedStateMachine):
         if isinstance(event, MessageReceived | MessageDiscarded):
             assert event.subscriptions
             assert len(set(event.subscriptions)) == len(event.subscriptions)
-            wanting = self.wanting(event.topic)
-            # Only those who want fewer than the server was asked for can be left out.
-            fastest = {number for number, rate in wanting.items() if rate == min(wanting.values())}
-            assert fastest <= set(event.subscriptions) <= set(wanting)
+            assert set(event.subscriptions) == self.wanting(event.topic)
         if isinstance(event, MessageReceived):
             assert type(event.msg) is dict
         elif isinstance(event, MessageDiscarded):
@@ -303,8 +298,7 @@ class AnyServer(RuleBasedStateMachine):
         return event
 
     def wanting(self, topic):
-        wanted = self.subscriptions.items()
-        return {number: rate for number, (name, rate, _length) in wanted if name == absolute(topic)}
+        return {number for number, (name, _rate) in self.subscriptions.items() if name == absolute(topic)}
 
     @rule(topic=TOPICS, step=st.sampled_from([0.0, 0.05, 0.2, 2.0]))
     def message(self, topic, step):
@@ -359,16 +353,15 @@ class AnyServer(RuleBasedStateMachine):
     @rule(
         topic=TOPICS,
         type_name=st.sampled_from((*("p/T", "p/msg/T", None) * 3, "p/U")),
-        rate=st.sampled_from((0, 100, 700, 0, 100, 700, -1)),
-        length=st.sampled_from((0, 5)),
+        rate=st.sampled_from((*[0] * 20, 100, -1)),
         delivery=st.sampled_from((*[Delivery()] * 20, *DELIVERIES)),
     )
-    def subscribe(self, topic, type_name, rate, length, delivery):
-        options = {"throttle_rate": rate, "queue_length": length, "delivery": delivery}
+    def subscribe(self, topic, type_name, rate, delivery):
         with refusals():
-            number = self.core.subscriptions.subscribe(topic, type_name, **options)
+            wanted = replace(delivery, throttle_rate=rate)
+            number = self.core.subscriptions.subscribe(topic, type_name, wanted)
             assert number not in self.subscriptions
-            self.subscriptions[number] = (absolute(topic), rate, length)
+            self.subscriptions[number] = (absolute(topic), rate)
 
     @rule(draw=st.data())
     @precondition(lambda self: self.subscriptions)
@@ -509,7 +502,7 @@ def test_a_client_that_knows_an_envelope_reads_what_one_does_that_parses_all(mes
     for core in cores:
         core.restore()
         core.subscriptions.subscribe("/b")
-        core.subscriptions.subscribe("/b", throttle_rate=1000)
+        core.subscriptions.subscribe("/b")
     for number, received in enumerate([None, *messages]):
         if received is None:  # the topic is wanted, or not wanted any more
             for core in cores:

@@ -294,9 +294,8 @@ PLAYED: dict[str, tuple[Company | None, str]] = {
     "Actions": (None, "no result: action /fibonacci"),
     "Services": (None, "{'sum': 3}\nservice /add at ws://"),
     "Serve an action": (None, "SUCCEEDED {'sequence': [0, 1, 1, 2, 3, 5]}"),
-    "Parameters, topics and nodes": (None, "15 1.0\nparameter /camera:gain at ws://"),
+    "Topics, types and parameters": (None, "geometry_msgs/msg/Twist ['/client_"),
     "Threads": (None, "{'data': 'from a thread'}"),
-    "Transforms between frames": (None, "[2. 1. 0.] [1.5 1.  0. ] (4, 4)\nframe gripper is not known"),
     "Find a variable in messages": (
         None,
         "D1 (True, 7)\ny (True, 2.5)\npose.position.x (True, 1.5)\nranges[1] (True, 0.5)\ndata[2] (True, 3)\n",
@@ -304,7 +303,7 @@ PLAYED: dict[str, tuple[Company | None, str]] = {
     "Several robots": (poses, "two {'x': 0.9,"),
     "Quality of service (ROS 2)": (None, "{'data': 'here be dragons'}"),
 }
-ELSEWHERE = {"Publish", "TLS, tokens, proxies", "roslibpy"}
+ELSEWHERE = {"Publish", "TLS and tokens", "roslibpy"}
 """Examples that have a test of their own, or need a certificate or a process."""
 
 

@@ -25,16 +25,9 @@ class ClientCore:
     """
 
     def __init__(
-        self,
-        *,
-        ros_version: RosVersion | None = None,
-        max_size: int = MAX_SIZE,
-        max_depth: int = MAX_DEPTH,
-        fragment_size: int | None = None,
+        self, *, ros_version: RosVersion | None = None, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH
     ) -> None:
-        self.wire = wire = Wire(
-            ros_version=ros_version, max_size=max_size, max_depth=max_depth, fragment_size=fragment_size
-        )
+        self.wire = wire = Wire(ros_version=ros_version, max_size=max_size, max_depth=max_depth)
         # What the program has registered; `restore` repeats it on each connection.
         self.publications = Publications(wire)
         self.subscriptions = Subscriptions(wire)
@@ -89,7 +82,7 @@ class ClientCore:
             return MessageReceived(known[0].topic, known[0].msg, subscriptions)
         # A CBOR map begins like this, and JSON does not; it is expected only if a subscription requests CBOR.
         if self.subscriptions.binary and data[:1] >= b"\x80":
-            return self._receive_cbor(data, now)
+            return self._receive_cbor(data)
         discarded = self.subscriptions.discard_known(data)
         if discarded is not None:
             return discarded
@@ -99,12 +92,12 @@ class ClientCore:
                 return self._receive_wrapped(operation, now)
         except DecodeError as error:
             return UnusableReceived(str(error))
-        return self._receive_plain(operation, now, data)
+        return self._receive_plain(operation, data)
 
     def _decode(self, data: bytes | str) -> dict[str, Any]:
         return decode(data, max_size=self.wire.max_size, max_depth=self.wire.max_depth)
 
-    def _receive_cbor(self, data: bytes, now: float) -> Event | None:
+    def _receive_cbor(self, data: bytes) -> Event | None:
         try:
             operation = cbor_codec.decode(
                 data,
@@ -115,7 +108,7 @@ class ClientCore:
         except DecodeError as error:
             return UnusableReceived(str(error))
         if operation.get("op") == "publish":
-            return self.subscriptions.receive(operation, now, data, from_cbor=True)
+            return self.subscriptions.receive(operation, data, from_cbor=True)
         return UnusableReceived(f"a CBOR message other than publish arrived: {excerpt(data)}")
 
     def _receive_wrapped(self, operation: dict[str, Any], now: float) -> Event | None:
@@ -129,7 +122,7 @@ class ClientCore:
             if data is None:
                 return None
             operation = self._decode(data)
-        return self._receive_plain(operation, now, data or "")
+        return self._receive_plain(operation, data or "")
 
     def _unwrapped(self, operation: dict[str, Any], now: float) -> bytes | str | None:
         if operation["op"] == "fragment":
@@ -139,10 +132,10 @@ class ClientCore:
             raise DecodeError("a png without data arrived")
         return png.decode(picture, max_size=self.wire.max_size)
 
-    def _receive_plain(self, operation: dict[str, Any], now: float, data: bytes | str) -> Event | None:
+    def _receive_plain(self, operation: dict[str, Any], data: bytes | str) -> Event | None:
         match operation.get("op"):
             case "publish":
-                return self.subscriptions.receive(operation, now, data)
+                return self.subscriptions.receive(operation, data)
             case "service_response":
                 return self.calls.receive(operation, data)
             case "call_service":

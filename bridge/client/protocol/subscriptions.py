@@ -5,14 +5,14 @@ Some servers deliver a first message twice, or not at all, to a client that subs
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 import orjson
 
 from bridge.client.protocol.events import Message, MessageDiscarded, MessageReceived, UnusableReceived
-from bridge.client.protocol.wire import Wire, check_fragment_size
+from bridge.client.protocol.wire import Wire
 from bridge.codecs import cbor_codec
 from bridge.codecs.cbor_codec import Arrays, with_arrays, with_lists
 from bridge.codecs.json_codec import BRACE, envelope_of, excerpt, is_deeper, topic_of
@@ -34,6 +34,8 @@ class Delivery:
     """Delivery of messages, shared by all subscriptions of a client to one topic.
 
     Attributes:
+        throttle_rate: Minimum number of milliseconds between two messages.
+        queue_length: Number of throttled messages that the server queues.
         compression: `cbor` for long arrays, `cbor-raw` for only the serialised bytes, `png` for ROS 1 servers
             over slow networks. Many servers ignore an unknown value and send JSON.
         arrays: Python type of arrays of numbers, regardless of the encoding.
@@ -43,6 +45,8 @@ class Delivery:
         max_bytes: Maximum size of a message in bytes; larger ones are discarded. None for that of the connection.
     """
 
+    throttle_rate: int = 0
+    queue_length: int = 0
     compression: Compression = "none"
     arrays: Arrays = "list"
     fragment_size: int | None = None
@@ -53,23 +57,15 @@ class Delivery:
         for name, choices in (("compression", get_args(Compression)), ("arrays", get_args(Arrays))):
             if getattr(self, name) not in choices:
                 raise OptionError(f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}")
-        check_fragment_size(self.fragment_size)
-        if self.max_bytes is not None and (type(self.max_bytes) is not int or self.max_bytes < 1):
-            raise OptionError(
-                f"max_bytes must be a whole number of at least 1, or None, not {self.max_bytes!r}"
-            )
+        for name in ("fragment_size", "max_bytes"):
+            value = getattr(self, name)
+            if value is not None and (type(value) is not int or value < 1):
+                raise OptionError(f"{name} must be a whole number of at least 1, or None, not {value!r}")
         if self.compression == "cbor-raw" and self.arrays == "numpy":
             raise OptionError("cbor-raw has bytes instead of arrays: omit arrays")
 
 
-@dataclass(slots=True)
-class _Wanted:
-    """Options of one subscription."""
-
-    throttle_rate: int
-    queue_length: int
-    # Time at which its throttle admits the next message; used only if it is slower than that of the topic.
-    due: float = 0.0
+_DEFAULT: Final = Delivery()
 
 
 @dataclass(slots=True)
@@ -82,16 +78,8 @@ class _Subscribed:
     delivery: Delivery
     wire_id: str
     max_size: int
-    # The subscriptions by number; never empty while the topic is subscribed to.
-    wanted: dict[int, _Wanted] = field(default_factory=dict)
-
-    # What the server was last asked for; `combine` updates all of these when `wanted` changes.
-    throttle_rate: int = 0
-    queue_length: int = 0
-    # The keys of `wanted`: a message nearly always goes to all of them.
-    all_numbers: tuple[int, ...] = ()
-    # Whether a subscription wants fewer messages than the server sends, and must be throttled here.
-    has_throttled: bool = False
+    # The numbers of the subscriptions, which get all messages; never empty while the topic is subscribed to.
+    numbers: tuple[int, ...] = ()
 
     # About the present connection; `restore` resets them.
     # Whether a message has arrived; after that, silence is no reason to renew the subscription.
@@ -110,35 +98,13 @@ class _Subscribed:
     # True after a message that was too large for the connection: the topic is not subscribed to again.
     left_out: bool = False
 
-    def combine(self) -> bool:
-        """Combine the options to the fastest rate and the longest queue; return whether these changed."""
-        before = (self.throttle_rate, self.queue_length)
-        self.throttle_rate = min(w.throttle_rate for w in self.wanted.values())
-        self.queue_length = max(w.queue_length for w in self.wanted.values())
-        self.all_numbers = tuple(self.wanted)
-        self.has_throttled = any(w.throttle_rate > self.throttle_rate for w in self.wanted.values())
-        return before != (self.throttle_rate, self.queue_length)
-
     def measure(self, topic: str, size: int) -> MessageDiscarded | None:
         """Return an event if a message of this size exceeds the topic's limit."""
         if size > self.max_size:
             self.discarded += 1
-            return MessageDiscarded(topic, size, self.max_size, self.discarded, self.all_numbers)
+            return MessageDiscarded(topic, size, self.max_size, self.discarded, self.numbers)
         self.largest = max(self.largest, size)
         return None
-
-    def receivers(self, now: float) -> tuple[int, ...]:
-        """Return the numbers of the subscriptions that receive a message at `now`."""
-        if not self.has_throttled:
-            return self.all_numbers
-        numbers = []
-        for number, wanted in self.wanted.items():
-            if wanted.throttle_rate > self.throttle_rate:
-                if now < wanted.due:
-                    continue
-                wanted.due = now + wanted.throttle_rate / 1000
-            numbers.append(number)
-        return tuple(numbers)
 
 
 class _Known(NamedTuple):
@@ -150,7 +116,7 @@ class _Known(NamedTuple):
     subscribed: _Subscribed
 
 
-_UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, Delivery(), "", sys.maxsize))
+_UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, _DEFAULT, "", sys.maxsize))
 """Placeholder until an envelope is known; no valid message begins with it."""
 
 
@@ -187,24 +153,13 @@ class Subscriptions:
             subscribed.renewals = 0
             self._send_subscribe(subscribed)
 
-    def subscribe(
-        self,
-        topic: str,
-        type_name: str | None = None,
-        *,
-        throttle_rate: int = 0,
-        queue_length: int = 0,
-        delivery: Delivery | None = None,
-    ) -> int:
-        """Subscribe to a topic (see `bridge.client.Ros.subscribe`), and return the subscription's number.
-
-        The server gets the fastest rate and the longest queue of all this client's subscriptions to the topic;
-        slower subscriptions are throttled here.
-        """
+    def subscribe(self, topic: str, type_name: str | None = None, delivery: Delivery = _DEFAULT) -> int:
+        """Subscribe to a topic (see `bridge.client.Ros.subscribe`), and return the subscription's number."""
         check_name(topic)
         if type_name is not None:
             split_type(type_name)
-        for name, value in (("throttle_rate", throttle_rate), ("queue_length", queue_length)):
+        for name in ("throttle_rate", "queue_length"):
+            value = getattr(delivery, name)
             # Servers silently drop a subscription with a float here.
             if type(value) is not int or value < 0:
                 raise OptionError(
@@ -214,7 +169,6 @@ class Subscriptions:
         key = absolute(topic)
         subscribed = self._subscribed.get(key)
         new = subscribed is None or (subscribed.type is None and type_name is not None)
-        delivery = delivery or Delivery()
         if subscribed is None:
             max_size = min(delivery.max_bytes or self._wire.max_size, self._wire.max_size)
             subscribed = _Subscribed(topic, type_name, delivery, f"subscribe:{topic}:{number}", max_size)
@@ -230,10 +184,10 @@ class Subscriptions:
                 "all subscriptions of a topic by one client share one on the wire"
             )
         subscribed.type = subscribed.type or type_name
-        subscribed.wanted[number] = _Wanted(throttle_rate, queue_length)
+        subscribed.numbers += (number,)
         self._subscriptions[number] = subscribed
         self.forget_envelopes()
-        if subscribed.combine() or new:
+        if new:
             self._send_subscribe(subscribed)
         return number
 
@@ -247,7 +201,7 @@ class Subscriptions:
         if subscribed is None:
             return ()
         subscribed.left_out = True
-        return subscribed.all_numbers
+        return subscribed.numbers
 
     def has_left_out(self, topic: str) -> bool:
         """Return whether a topic is left out, because its messages are too large for the connection."""
@@ -274,7 +228,7 @@ class Subscriptions:
         if delivery.qos is not None:
             operation["qos"] = delivery.qos.as_operation()
         self._wire.write(
-            **operation, throttle_rate=subscribed.throttle_rate, queue_length=subscribed.queue_length
+            **operation, throttle_rate=delivery.throttle_rate, queue_length=delivery.queue_length
         )
 
     def _note_deliveries(self) -> None:
@@ -285,12 +239,9 @@ class Subscriptions:
     def unsubscribe(self, subscription: int) -> None:
         """End a subscription; after the last one of a topic, unsubscribe from the server."""
         subscribed = self._subscriptions.pop(subscription)
-        del subscribed.wanted[subscription]
+        subscribed.numbers = tuple(each for each in subscribed.numbers if each != subscription)
         self.forget_envelopes()
-        if subscribed.wanted:
-            if subscribed.combine():
-                self._send_subscribe(subscribed)
-        else:
+        if not subscribed.numbers:
             del self._subscribed[absolute(subscribed.topic)]
             self._note_deliveries()
             self._send_unsubscribe(subscribed)
@@ -352,7 +303,7 @@ class Subscriptions:
         for data in messages[first:] if first else messages:
             if not data.startswith(envelope):
                 found = None if received else self.envelopes.get(envelope_of(data))
-                if found is None or found.subscribed.has_throttled:
+                if found is None:
                     break
                 self._known = envelope, size, topic, subscribed = found
             if len(data) > subscribed.largest:
@@ -374,7 +325,7 @@ class Subscriptions:
             except (orjson.JSONDecodeError, DecodeError):
                 break
             received.append(new(Message, (topic, msg, received_ns, monotonic_ns, 0.0)))
-        return received, subscribed.all_numbers
+        return received, subscribed.numbers
 
     def discard_known(self, data: bytes) -> MessageDiscarded | None:
         """Discard a message with a known envelope without parsing it, if it is above its topic's limit."""
@@ -390,9 +341,9 @@ class Subscriptions:
             subscribed.envelopes_tried = 0
 
     def receive(
-        self, operation: dict[str, Any], now: float, data: bytes | str, *, from_cbor: bool = False
+        self, operation: dict[str, Any], data: bytes | str, *, from_cbor: bool = False
     ) -> MessageReceived | MessageDiscarded | UnusableReceived | None:
-        """Handle a publish operation, decoded from `data`; None if its topic is not subscribed to, or throttled."""
+        """Handle a publish operation, decoded from `data`; None if its topic is not subscribed to."""
         topic = operation.get("topic")
         msg = operation.get("msg")
         if type(topic) is not str or type(msg) is not dict:
@@ -414,13 +365,10 @@ class Subscriptions:
         discarded = subscribed.measure(topic, len(data))
         if discarded is not None:
             return discarded
-        receivers = subscribed.receivers(now)
-        if not receivers:
-            return None
         # CBOR without a known envelope is decoded with arrays if any topic wants them.
         if self.numpy:
             if subscribed.delivery.arrays == "list":
                 msg = with_lists(msg) if from_cbor else msg
             elif not from_cbor:
                 msg = with_arrays(msg)
-        return MessageReceived(topic, msg, receivers)
+        return MessageReceived(topic, msg, subscribed.numbers)

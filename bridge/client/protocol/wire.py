@@ -1,12 +1,10 @@
 """The outbox of a client: whole messages in order, while there is a connection."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from itertools import count
 from typing import Any, Final
 
-from bridge.codecs.fragments import split
 from bridge.codecs.json_codec import encode
-from bridge.errors import OptionError
 from bridge.names import Kind, RosVersion, ros1_type, ros2_type
 
 SMALLEST_LIMIT: Final = 2048
@@ -16,10 +14,7 @@ SMALLEST_LIMIT: Final = 2048
 class Wire:
     """The outbox for all parts of a client's core, and the properties of the connection that they share."""
 
-    def __init__(
-        self, *, ros_version: RosVersion | None, max_size: int, max_depth: int, fragment_size: int | None
-    ) -> None:
-        check_fragment_size(fragment_size)
+    def __init__(self, *, ros_version: RosVersion | None, max_size: int, max_depth: int) -> None:
         self._outbox: list[bytes] = []
         # Whether messages are stored; without a connection they are dropped, because `restore` repeats them.
         self.connected = False
@@ -27,8 +22,6 @@ class Wire:
         self.ros_version: RosVersion | None = ros_version
         # Returns a new number at each call, for ids on the wire and for handles.
         self.number: Callable[[], int] = count(1).__next__
-        # Maximum number of characters in a message before `pieces` splits it; None for no limit.
-        self.fragment_size = fragment_size
         # Maximum size and nesting of a message in both directions, as configured.
         self.max_size = max_size
         self.max_depth = max_depth
@@ -46,10 +39,8 @@ class Wire:
         )
 
     def limit(self, size: int) -> None:
-        """Refuse messages of more bytes from now on, unless they are sent in fragments."""
-        # With fragments, the size of a message says nothing about what the server refused.
-        if self.fragment_size is None:
-            self.sendable = min(self.sendable, max(size, SMALLEST_LIMIT))
+        """Refuse messages of more bytes from now on."""
+        self.sendable = min(self.sendable, max(size, SMALLEST_LIMIT))
 
     def write_bytes(self, data: bytes) -> None:
         """Write an encoded message."""
@@ -65,15 +56,3 @@ class Wire:
     def clear(self) -> None:
         """Drop everything that was not sent."""
         self._outbox.clear()
-
-    def pieces(self, data: bytes) -> Sequence[bytes]:
-        """Return a message, or its fragments if it exceeds the size of one."""
-        if self.fragment_size is None or len(data) <= self.fragment_size:
-            return (data,)
-        return tuple(split(data, self.fragment_size, f"fragment:{self.number()}"))
-
-
-def check_fragment_size(size: int | None) -> None:
-    """Raise an error for a fragment size that is neither None nor a positive integer."""
-    if size is not None and (type(size) is not int or size < 1):
-        raise OptionError(f"fragment_size must be a whole number of at least 1, or None, not {size!r}")

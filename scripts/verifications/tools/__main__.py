@@ -91,7 +91,8 @@ async def grid_and_pose(stand: Stand) -> dict[str, tuple[str, bytes, dict[str, A
         while True:
             behind = min(stamps, key=lambda name: stamps[name])
             raw = (await topics[behind].next(timeout=PATIENCE)).raw
-            found[behind] = types[behind], raw, (message := asdict(store.deserialize_ros1(raw, ros2_type(types[behind]))))
+            read: Any = store.deserialize_ros1(raw, ros2_type(types[behind]))
+            found[behind] = types[behind], raw, (message := asdict(read))
             stamps[behind] = header_stamp_ns(message) or 0
             if len(set(stamps.values())) == 1:
                 mean = found["/bm/pose"][2]["pose"]["pose"]["position"]

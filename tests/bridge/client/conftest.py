@@ -2,7 +2,7 @@
 
 import pytest
 
-from bridge.client import connect, rosapi, session
+from bridge.client import connect, session, type_checks
 from tests.bridge.hub.sockets import running_hub
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
@@ -11,7 +11,7 @@ from tests.patience import PATIENCE
 @pytest.fixture(autouse=True)
 def patient(monkeypatch):
     """Accept an answer of rosapi however late a busy machine gives it."""
-    for module in (rosapi, session):
+    for module in (type_checks, session):
         monkeypatch.setattr(module, "_ROSAPI_TIMEOUT", PATIENCE / 2)
 
 

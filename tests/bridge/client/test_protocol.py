@@ -104,27 +104,24 @@ def test_the_form_of_type_names_follows_the_server(version, message_type, servic
 
 def test_several_subscriptions_share_one_on_the_wire():
     core = connected()
-    slow = core.subscriptions.subscribe("/a", throttle_rate=100, queue_length=2)
+    slow = Delivery(throttle_rate=100, queue_length=2)
+    one = core.subscriptions.subscribe("/a", delivery=slow)
     (first,) = sent(core)
     asked = {"topic": "/a", "throttle_rate": 100, "queue_length": 2}
     assert first == {"op": "subscribe", "id": first["id"], **asked}
-    fast = core.subscriptions.subscribe("a", "p/T", throttle_rate=50)
-    (second,) = sent(core)
-    assert second == first | {"throttle_rate": 50, "type": "p/T"}
-    same = core.subscriptions.subscribe("/a", throttle_rate=50)
+    other = core.subscriptions.subscribe("a", "p/T", slow)
+    assert sent(core) == [first | {"type": "p/T"}]
+    third = core.subscriptions.subscribe("/a", delivery=slow)
     assert sent(core) == []
-    for topic, now, receivers in (
-        ("/a", 0.0, (slow, fast, same)),
-        ("a", 0.06, (fast, same)),
-        ("/a", 0.11, (slow, fast, same)),
-    ):
-        event = tell(core, now, op="publish", topic=topic, msg={"d": 1})
-        assert event == MessageReceived(topic, {"d": 1}, receivers)
-    core.subscriptions.unsubscribe(fast)
+    with pytest.raises(TypeConflictError, match="all subscriptions of a topic by one client share one"):
+        core.subscriptions.subscribe("/a")
+    for topic in ("/a", "a"):
+        event = tell(core, op="publish", topic=topic, msg={"d": 1})
+        assert event == MessageReceived(topic, {"d": 1}, (one, other, third))
+    core.subscriptions.unsubscribe(other)
+    core.subscriptions.unsubscribe(third)
     assert sent(core) == []
-    core.subscriptions.unsubscribe(same)
-    assert sent(core) == [second | {"throttle_rate": 100}]
-    core.subscriptions.unsubscribe(slow)
+    core.subscriptions.unsubscribe(one)
     assert sent(core) == [{"op": "unsubscribe", "id": first["id"], "topic": "/a"}]
     assert tell(core, op="publish", topic="/a", msg={}) is None
 
@@ -134,7 +131,7 @@ def test_what_would_kill_a_subscription_is_refused(option):
     core = connected()
     for bad in (-1, 0.0, True, None, "5"):
         with pytest.raises(OptionError, match=f"{option} of topic /a"):
-            core.subscriptions.subscribe("/a", **{option: bad})
+            core.subscriptions.subscribe("/a", delivery=Delivery(**{option: bad}))
     assert sent(core) == []
 
 

@@ -10,7 +10,7 @@ import json
 import numpy as np
 import pytest
 
-from bridge.client.protocol import ClientCore, Delivery
+from bridge.client.protocol import Delivery
 from bridge.client.protocol.calls_and_goals import MAX_GOALS
 from bridge.client.protocol.events import GoalEnded, GoalStatus, MessageReceived, UnusableReceived
 from bridge.codecs import cbor_codec
@@ -67,9 +67,6 @@ def test_everything_that_can_be_asked_is_asked_again_after_a_loss():
 def test_what_cannot_be_asked(wrong):
     with pytest.raises(OptionError, match="|".join(wrong)):
         Delivery(**wrong)
-    if "fragment_size" in wrong:
-        with pytest.raises(OptionError, match="fragment_size"):
-            ClientCore(**wrong)
 
 
 # Deliveries
@@ -117,23 +114,6 @@ def test_fragments_of_a_lost_connection_do_not_count():
         *rest, last = [core.receive(piece, 0.0) for piece in others]
         assert rest == [None] * len(rest)
         assert (last is None) == lost
-
-
-def test_large_messages_leave_in_fragments():
-    core, other = connected(fragment_size=60), connected()
-    number = core.publications.advertise("/a", "p/T")
-    other.subscriptions.subscribe("/a", "p/T")
-    room = 60 - len(core.publications.publish(number, {"d": ""}))
-    ids = []
-    for size in (room, room + 1, 100):
-        split_up = list(core.wire.pieces(core.publications.publish(number, {"d": "x" * size})))
-        assert (len(split_up) == 1) == (size == room)
-        *rest, last = [other.receive(piece, 0.0) for piece in split_up]
-        assert rest == [None] * len(rest)
-        assert last.msg == {"d": "x" * size}
-        ids.append(json.loads(split_up[0]).get("id"))
-    assert ids[0] is None
-    assert len(set(ids)) == 3, "each message has an id of its own"
 
 
 # Goals of actions

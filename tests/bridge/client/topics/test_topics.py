@@ -22,7 +22,6 @@ from bridge.errors import (
     DecodeError,
     DisconnectedError,
     EncodeError,
-    FrameUnknownError,
     NoMessageError,
     OptionError,
     ServiceError,
@@ -32,7 +31,6 @@ from bridge.errors import (
 from bridge.qos import Qos
 from tests.bridge.client.stand_ins import give_up
 from tests.bridge.hub.sockets import until
-from tests.bridge.test_transforms import SECOND, message, turned
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 
@@ -543,7 +541,7 @@ BOTH = pytest.mark.parametrize("hub", [{"ros_version": 1}, {"ros_version": 2}], 
 )
 async def test_a_scan_arrives_in_every_form(hub, compression, fragment_size, arrays):
     options = {"compression": compression, "fragment_size": fragment_size, "arrays": arrays}
-    async with connect(hub) as one, connect(hub, fragment_size=64) as other:
+    async with connect(hub) as one, connect(hub) as other:
         scans = one.subscribe("/scan", SCAN_TYPE, qos=Qos(reliability="best_effort"), **options)
         await one.call("/rosapi/get_time", timeout=PATIENCE)
         publication = await other.advertise("/scan", SCAN_TYPE, qos=Qos(depth=5))
@@ -564,27 +562,3 @@ async def test_a_scan_arrives_in_every_form(hub, compression, fragment_size, arr
     assert (msg["header"]["frame_id"], list(msg["ranges"])) == ("laser", [0.5, 1.5, 2.5])
     if compression == "cbor":
         assert msg["ranges"].dtype == np.float32
-
-
-@BOTH
-async def test_a_lookup_waits_for_both_topics(hub):
-    async with connect(hub) as ros:
-        static = await ros.advertise("/tf_static", "tf2_msgs/TFMessage", latch=True)
-        await static.publish(message("base", "laser", turned(0.5, 0, SECOND)))
-        async with ros.transforms() as transforms:
-            with pytest.raises(FrameUnknownError):
-                await transforms.lookup("map", "laser", timeout=0.05)
-            waiting = asyncio.create_task(transforms.lookup("map", "laser", 3 * SECOND, PATIENCE))
-            moving = await ros.advertise("/tf", "tf2_msgs/TFMessage")
-            for second in (2, 4):
-                await moving.publish(message("map", "base", turned(second, 0, second * SECOND)))
-            assert np.allclose((await waiting).apply([0, 0, 0]), [3.5, 0, 0])
-        await transforms.close()
-
-
-@pytest.mark.parametrize("ros", [{"fragment_size": 300}], indirect=True)
-async def test_what_is_larger_than_its_fragments_leaves_in_them(fake, ros):
-    publication = await ros.advertise("/a", "p/T")
-    await publication.publish({"data": [1.5] * 200})
-    assert (await fake.wait_for_op("fragment", count=3))["total"] >= 3
-    assert not fake.ops("publish")

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from bridge.client import State, connect, rosapi
+from bridge.client import State, connect, type_checks
 from bridge.errors import MessageTypeError, ServiceError
 from tests.patience import PATIENCE
 
@@ -63,7 +63,7 @@ async def test_without_rosapi_standard_types_are_known_if_the_ros_version_is(ros
 
 @pytest.mark.parametrize("fake", [{"silent": True}], indirect=True)
 async def test_a_silent_server_is_waited_for_once(fake, ros, monkeypatch):
-    monkeypatch.setattr(rosapi, "_ROSAPI_TIMEOUT", 0.1)
+    monkeypatch.setattr(type_checks, "_ROSAPI_TIMEOUT", 0.1)
     for n in range(5):
         await ros.advertise(f"/t{n}", f"p/T{n}")
     await fake.wait_for_op("advertise", count=5)

@@ -1,4 +1,4 @@
-"""Questions to rosapi: parameters, topics, services, nodes, and the definitions of types to check messages with.
+"""Checks of what a client sends against the definitions of types, which rosapi knows.
 
 rosapi is a node that runs beside most rosbridge servers, and answers service calls below `/rosapi`.
 """
@@ -6,13 +6,9 @@ rosapi is a node that runs beside most rosbridge servers, and answers service ca
 import asyncio
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-import orjson
-
 from bridge.client.session import Session
-from bridge.codecs.json_codec import encode
 from bridge.codecs.message_check import (
     Definitions,
     MessageCheck,
@@ -20,10 +16,9 @@ from bridge.codecs.message_check import (
     check_from_rosapi,
     definitions_from_rosapi,
 )
-from bridge.errors import BridgeError, MessageTypeError, NoAnswerError, ParamError, ServiceError
+from bridge.errors import BridgeError, MessageTypeError, NoAnswerError, ServiceError
 from bridge.names import absolute, ros2_type
 
-_REQUIRED: Final[Any] = object()
 _ROSAPI_TIMEOUT: Final = 1.0
 _ROSAPI: Final = "/rosapi/"
 _MAX_SERVICES: Final = 1000
@@ -32,84 +27,6 @@ _MAX_SERVICES: Final = 1000
 _log = logging.getLogger("bridge")
 
 _Part = Literal["service_request", "service_response", "action_goal", "action_result", "action_feedback"]
-
-
-@dataclass(frozen=True, slots=True)
-class NodeDetails:
-    """The topics and services of a node, by name."""
-
-    subscribing: list[str]
-    publishing: list[str]
-    services: list[str]
-
-
-class Params:
-    """The parameters of a ROS system. In ROS 2 a parameter belongs to a node, and its name is `/node:param`.
-
-    Values are those of JSON: numbers, strings, booleans, lists, and in ROS 1 dictionaries.
-    """
-
-    def __init__(self, session: Session) -> None:
-        self._session = session
-
-    async def get(self, name: str, default: Any = _REQUIRED, *, timeout: float = 5.0) -> Any:
-        """Return the value of a parameter, or `default` if it does not exist.
-
-        Raises:
-            ParamError: It does not exist, and there is no default.
-            ServiceError: rosapi refused the call, or does not exist.
-            NoAnswerError: rosapi did not answer in time.
-            DisconnectedError: There is no connection.
-        """
-        answer = await self._ask("get_param", timeout, name=name)
-        # The value is JSON in a string, because a ROS service cannot have a field of any type.
-        text = answer.get("value")
-        try:
-            value = orjson.loads(text) if isinstance(text, str) and text else None
-        except orjson.JSONDecodeError:
-            value = text  # ROS 2 writes some values as plain text
-        if value is not None:
-            return value
-        if default is not _REQUIRED:
-            return default
-        raise ParamError(self._sentence(name, answer, "it does not exist"))
-
-    async def set(self, name: str, value: Any, *, timeout: float = 5.0) -> None:
-        """Set a parameter; errors as for `get`, and `ParamError` if the server refuses."""
-        # The codec encodes only objects, so the value is wrapped in one and cut out again.
-        text = encode({"": value}, nonfinite="refuse")[4:-1].decode()
-        self._require(name, await self._ask("set_param", timeout, name=name, value=text))
-
-    async def has(self, name: str, *, timeout: float = 5.0) -> bool:
-        """Return whether a parameter exists; errors as for `get`."""
-        return (await self._ask("has_param", timeout, name=name)).get("exists") is True
-
-    async def delete(self, name: str, *, timeout: float = 5.0) -> None:
-        """Delete a parameter; errors as for `set`."""
-        self._require(name, await self._ask("delete_param", timeout, name=name))
-
-    async def names(self, *, timeout: float = 5.0) -> list[str]:
-        """Return the names of all parameters; errors as for `get`."""
-        names = (await self._ask("get_param_names", timeout)).get("names")
-        return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
-
-    async def _ask(self, question: str, limit: float, **args: str) -> dict[str, Any]:
-        answer = await self._session.call(f"/rosapi/{question}", args, limit)
-        return answer if isinstance(answer, dict) else {}
-
-    def _require(self, name: str, answer: dict[str, Any]) -> None:
-        if answer.get("successful") is False:  # ROS 2; ROS 1 refuses the call
-            raise ParamError(self._sentence(name, answer, "the server refused"))
-
-    def _sentence(self, name: str, answer: dict[str, Any], otherwise: str) -> str:
-        reason = answer.get("reason")
-        why = reason[:200] if isinstance(reason, str) and reason else otherwise
-        form = (
-            "; in ROS 2 its name is /node:param"
-            if ":" not in name and self._session.core.ros_version == 2
-            else ""
-        )
-        return f"parameter {name} at {self._session.uri}: {why}{form}"
 
 
 class TypeChecks:
