@@ -32,6 +32,10 @@ from bridge.names import absolute, same_type, split_type
 _ENVELOPE_KEYS: Final = 3
 # Units of work of one message, besides those for each subscriber.
 _MESSAGE_WORK: Final = 20
+# Bytes copied for a subscriber in one unit of work. Filling a message and writing it as JSON, which happens at most once,
+# takes as long as this many copies.
+_COPIED: Final = 4096
+_JSON_COPIES: Final = 8
 TURN_WORK: Final = 10_000
 """Units of work, of about a microsecond each, after which a client's turn ends."""
 _PLAIN: Final = Encoding.NONE
@@ -168,6 +172,7 @@ class Topics:
                     # With white space between the last braces, the tail has no place.
                     if tail is None or (tail and data[-2] != BRACE):
                         payload = b"%b%b}" % (envelope, orjson.dumps(parsed))
+                        room -= len(payload) - len(data)  # together they may grow by as much as one
                     elif tail:
                         payload = data[:-2] + tail
             except (orjson.JSONDecodeError, RefusedOperationError):
@@ -199,7 +204,9 @@ class Topics:
             latched = payloads[-1][len(prefix) : -1]
             room = self._limits.latched_bytes - self._graph.latched_bytes + len(topic.latched or b"")
             self._graph.latch(topic, latched if len(latched) <= room else None)
+        copies = _JSON_COPIES + len(subscriptions)
         dispatcher.work += (_MESSAGE_WORK + 2 * len(subscriptions)) * len(payloads)
+        dispatcher.work += copies * sum(map(len, payloads)) // _COPIED
         # Subscribers that use the same name for the topic share one payload.
         encoded: list[OutgoingMessage] = []
         for client, subscription in subscriptions.items():

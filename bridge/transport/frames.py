@@ -42,7 +42,7 @@ UNSOUND: Final = -1
 
 
 def whole_messages(
-    data: bytes, at: int, *, masked: bool, largest: int, count: int = sys.maxsize, until: int = sys.maxsize
+    data: bytes, at: int, *, masked: bool, largest: int, count: int = sys.maxsize
 ) -> tuple[list[bytes], int]:
     """Read consecutive single-frame messages, up to the first other or incomplete frame.
 
@@ -52,7 +52,6 @@ def whole_messages(
         masked: whether the peer is a client, which masks its frames.
         largest: maximum size of a message in bytes; reading stops at a larger one.
         count: maximum number of messages to read.
-        until: index from which on no message may begin.
 
     Returns:
         The payloads, and the index at which the reading ended; `frame_end` examines the frame there.
@@ -60,9 +59,8 @@ def whole_messages(
     found: list[bytes] = []
     take, unmask = found.append, apply_mask
     size = len(data)
-    last = min(size - 1, until)
     bit, key = (_MASKED, 4) if masked else (0, 0)
-    while at < last and count > 0:
+    while at < size - 1 and count > 0:
         # A wrong mask bit makes the length 128 or more, which ends the loop below.
         length = data[at + 1] ^ bit
         if data[at] not in _WHOLE or length >= _MASKED:

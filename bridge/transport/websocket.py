@@ -45,7 +45,6 @@ class WebSocketTransport(asyncio.Protocol):
 
     # A turn: after this much from one peer, other tasks get theirs. A client has one peer and needs none.
     turn_frames: ClassVar[int] = sys.maxsize
-    turn_bytes: ClassVar[int] = sys.maxsize
     # Bytes that the library reads in one turn once it reads everything, in which it is much slower.
     slice_bytes: ClassVar[int] = sys.maxsize
 
@@ -332,8 +331,8 @@ class WebSocketTransport(asyncio.Protocol):
 
     def _read(self, data: bytes, at: int) -> int:
         """Handle the frames of a turn and store an incomplete one; return the index where the turn ended."""
-        size, count, turn_end, masked = len(data), 0, at + self.turn_bytes, self._is_server
-        while at < size and count < self.turn_frames and at < turn_end:
+        size, count, masked = len(data), 0, self._is_server
+        while at < size and count < self.turn_frames:
             if self._postponed or self.is_blocked:
                 break
             if not self._quick:
@@ -342,12 +341,7 @@ class WebSocketTransport(asyncio.Protocol):
                 return end
             if self._fragments is None:
                 messages, at = frames.whole_messages(
-                    data,
-                    at,
-                    masked=masked,
-                    largest=self._max_size,
-                    count=self.turn_frames - count,
-                    until=turn_end,
+                    data, at, masked=masked, largest=self._max_size, count=self.turn_frames - count
                 )
                 if messages:
                     count += len(messages)

@@ -254,14 +254,23 @@ def _publish_to_many(hub):
     return {"op": "publish", "topic": "/t", "type": "std_msgs/Empty", "msg": {}}
 
 
-@pytest.mark.parametrize("prepare", [_resubscribe, _list_topics, _replay, _publish_to_many])
+def _publish_incomplete(hub):
+    hub.connect()
+    hub.connect().subscribe("/t")
+    message = {"markers": [{}] * 2000}  # almost a mebibyte with the default values of its fields
+    return {"op": "publish", "topic": "/t", "type": "visualization_msgs/MarkerArray", "msg": message}
+
+
+@pytest.mark.parametrize(
+    "prepare", [_resubscribe, _list_topics, _replay, _publish_to_many, _publish_incomplete]
+)
 def test_a_turn_ends_after_a_bounded_amount_of_work(prepare):
     hub = Harness(client_bytes=100 * MEBIBYTE, clients=2000)
     operation = prepare(hub)
     peer = next(iter(hub.broker.graph.clients.values()))
     messages = [json.dumps(operation | ({"id": index})).encode() for index in range(64)]
     if (
-        prepare is _publish_to_many
+        operation["op"] == "publish"
     ):  # with the type the first time, and then with an envelope that becomes known
         del operation["type"]
         messages[1:] = [json.dumps(operation).encode()] * 63
