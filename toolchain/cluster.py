@@ -211,17 +211,21 @@ def _prepared(_key: str, _thread: int, pickled: bytes) -> Work:
     return job.prepare()
 
 
-def do_batch(key: str, pickled: bytes, numbers: Sequence[int], theirs: str) -> tuple[list[Any], float]:
-    """Do some pieces on a worker; return their results, and the seconds that they took.
+def do_batch(key: str, pickled: bytes, numbers: Sequence[int], theirs: str) -> tuple[bytes, float]:
+    """Do some pieces on a worker; return their results, pickled and compressed, and the seconds that they took.
+
+    A posterior is mostly zeros, and would pass through the scheduler as it is.
 
     Raises:
         ClusterError: This worker has another version of our software than the client.
     """
     if software() != theirs:
         raise ClusterError("it has another version of rosbayes, NumPy or Numba")
+    from lz4.frame import compress
+
     work = _prepared(key, get_ident(), pickled)
     begun = time.perf_counter()
-    results = [work(number) for number in numbers]
+    results = compress(pickle.dumps([work(number) for number in numbers]))
     return results, time.perf_counter() - begun
 
 
@@ -247,8 +251,6 @@ class _OnScheduler:
 
     def __call__(self, job: Job, numbers: Sequence[int], keep: Keep) -> None:
         """Do the pieces on the workers; a ClusterError if they cannot, or if they stay away for a minute."""
-        if not numbers:
-            return
         left = dict.fromkeys(numbers)  # in order; those without a result
 
         def keep_once(number: int, result: Any) -> None:
@@ -256,28 +258,27 @@ class _OnScheduler:
             del left[number]
 
         pickled = pickle.dumps(job)
-        client, progress_at = self._client(), time.monotonic()
-        try:
-            while left:
-                before = len(left)
-                try:
-                    _Session(self._address, client, pickled, left).run(keep_once)
-                except _LostError:
-                    if len(left) < before:
-                        progress_at = time.monotonic()
-                    if time.monotonic() > progress_at + _PATIENCE_S:
-                        raise ClusterError(
-                            f"--scheduler {self._address} lost this work again and again; read the logs of its workers"
-                        ) from None
-                    print(
-                        f"{self._address} lost the work; waiting for it with {len(left)} pieces left",
-                        file=sys.stderr,
-                    )
+        # Until when (monotonic) a scheduler may take to answer, 0 for the first time; and when a piece was last done.
+        until, progress_at = 0.0, time.monotonic()
+        while left:
+            before, client = len(left), self._client(until)
+            try:
+                _do(self._address, client, pickled, left, keep_once)
+            except _LostError:
+                until = time.monotonic() + _PATIENCE_S
+                if len(left) < before:
+                    progress_at = time.monotonic()
+                if time.monotonic() > progress_at + _PATIENCE_S:
+                    raise ClusterError(
+                        f"--scheduler {self._address} lost this work again and again; read the logs of its workers"
+                    ) from None
+                print(
+                    f"{self._address} lost the work; waiting for it with {len(left)} pieces left",
+                    file=sys.stderr,
+                )
+            finally:
+                with suppress(_LostError), _noticing_loss():
                     client.close(timeout=_POLL_S)
-                    client = self._client(time.monotonic() + _PATIENCE_S)
-        finally:
-            with suppress(_LostError), _noticing_loss():
-                client.close(timeout=_POLL_S)
 
     def _client(self, until: float = 0.0) -> Any:
         """Return a client of a scheduler that has a worker; try until a monotonic time."""
@@ -303,107 +304,83 @@ class _OnScheduler:
                 return client
 
 
-class _Session:
-    """The pieces of one job, as long as its scheduler lives."""
+def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Keep) -> None:
+    """Do the pieces of a job on the workers of one scheduler; a `_LostError` if that cannot go on here."""
+    from distributed import wait
 
-    def __init__(self, address: str, client: Any, pickled: bytes, left: Iterable[int]) -> None:
-        self._address = address
-        self._client = client
-        self._pickled = pickled
-        self._key = sha256(pickled).hexdigest()
-        # Numbers that are not on their way yet, in order; and the numbers of each batch that is.
-        self._waiting = deque(left)
-        self._batches: dict[Any, list[int]] = {}
-        # Seconds of a piece, of the last batches; 0 before the first result.
-        self._seconds = 0.0
-        # Pieces that are done at the same time, and when that was counted; and when there was a worker (monotonic).
-        self._threads = 0
-        self._counted_at = 0.0
-        self._served_at = time.monotonic()
-
-    def run(self, keep: Keep) -> None:
-        """Do the pieces; a `_LostError` if that cannot go on here."""
-        with _noticing_loss():
-            # a copy for each worker, so that the job outlives each of them; one that comes later fetches it from these
-            [table] = self._client.scatter([self._pickled], broadcast=True)
-        try:
-            self._submit(table)
-            while self._batches:
-                for batch in self._done():
-                    numbers = self._batches.pop(batch)
-                    results, seconds = self._results(batch)
-                    # pieces differ, so the last batch counts as much as all before it
-                    own = seconds / len(numbers)
-                    self._seconds = (self._seconds + own) / 2 if self._seconds else own
-                    for number, result in zip(numbers, results, strict=True):
-                        keep(number, result)
-                self._submit(table)
-        finally:
-            with suppress(_LostError), _noticing_loss():
-                self._client.cancel(list(self._batches))
-
-    def _count(self) -> None:
-        """Count the workers' threads every few seconds; a `_LostError` if there have been none for a minute."""
-        now = time.monotonic()
-        if self._threads and now < self._counted_at + _COUNT_S:
-            return
-        with _noticing_loss():
-            self._threads, self._counted_at = sum(self._client.nthreads().values()), now
-        if self._threads:
-            self._served_at = now
-        elif now > self._served_at + _PATIENCE_S:
-            raise _LostError
-
-    def _done(self) -> list[Any]:
-        """Return the batches that are done, after a second at most."""
-        from distributed import wait
-
-        with _noticing_loss():
-            try:
-                return list(wait(list(self._batches), timeout=_POLL_S, return_when="FIRST_COMPLETED").done)
-            except TimeoutError:
-                if self._client.status == "running":
-                    return []
-                raise
-
-    def _submit(self, table: Any) -> None:
-        """Submit batches until there are enough on their way."""
-        self._count()
-        threads = max(1, self._threads)
-        while self._waiting and len(self._batches) < _AHEAD * threads:
-            size = 1  # until it is known how long a piece takes
-            if self._seconds:
-                share = max(_SMALLEST_S / self._seconds, len(self._waiting) / (2 * threads))
-                size = max(1, round(min(BATCH_S / self._seconds, share)))
-            numbers = [self._waiting.popleft() for _ in range(min(size, len(self._waiting)))]
+    key = sha256(pickled).hexdigest()
+    # Numbers that are not on their way yet, in order; and the numbers of each batch that is.
+    waiting, batches = deque(left), dict[Any, list[int]]()
+    # Seconds of a piece, of the last batches; 0 before the first result.
+    piece_s = 0.0
+    # Pieces that are done at the same time, and when that was counted; and when there was a worker (monotonic).
+    threads, counted_at, served_at = 0, 0.0, time.monotonic()
+    with _noticing_loss():
+        # a copy for each worker, so that the job outlives each of them; one that comes later fetches it from these
+        [table] = client.scatter([pickled], broadcast=True)
+    try:
+        while waiting or batches:
+            now = time.monotonic()
+            if not threads or now > counted_at + _COUNT_S:
+                with _noticing_loss():
+                    threads, counted_at = sum(client.nthreads().values()), now
+            if threads:
+                served_at = now
+            elif now > served_at + _PATIENCE_S:
+                raise _LostError
+            while waiting and len(batches) < _AHEAD * max(1, threads):
+                size = 1  # until it is known how long a piece takes
+                if piece_s:
+                    share = max(_SMALLEST_S / piece_s, len(waiting) / (2 * max(1, threads)))
+                    size = max(1, round(min(BATCH_S / piece_s, share)))
+                numbers = [waiting.popleft() for _ in range(min(size, len(waiting)))]
+                with _noticing_loss():
+                    batches[client.submit(do_batch, key, table, numbers, software(), pure=False)] = numbers
             with _noticing_loss():
-                batch = self._client.submit(do_batch, self._key, table, numbers, software(), pure=False)
-            self._batches[batch] = numbers
+                try:
+                    done = wait(list(batches), timeout=_POLL_S, return_when="FIRST_COMPLETED").done
+                except TimeoutError:
+                    if client.status != "running":
+                        raise
+                    continue
+            for batch in done:
+                results, seconds = _results(address, batch)
+                numbers = batches.pop(batch)
+                # pieces differ, so the last batch counts as much as all before it
+                own_s = seconds / len(numbers)
+                piece_s = (piece_s + own_s) / 2 if piece_s else own_s
+                for number, result in zip(numbers, results, strict=True):
+                    keep(number, result)
+    finally:
+        with suppress(_LostError), _noticing_loss():
+            client.cancel(list(batches))
 
-    def _results(self, batch: Any) -> tuple[list[Any], float]:
-        """Return the results of a batch; a ToolchainError if it failed, a `_LostError` if it is gone."""
-        from distributed import KilledWorker
 
-        with _noticing_loss():
-            error = batch.exception()
-            if error is None:
-                results: tuple[list[Any], float] = batch.result()
-                return results
-        worker = f"a worker of {self._address}"
-        if isinstance(error, CancelledError):
-            raise _LostError
-        if isinstance(error, ClusterError):
-            raise ClusterError(f"{worker} cannot do this work: {error}; {_SAME}")
-        if isinstance(error, ToolchainError):
-            raise error
-        if isinstance(error, KilledWorker):
-            raise ClusterError(
-                f"the workers of {self._address} died over the same piece of work, probably for want of memory; start fewer "
-                "on a host, or with more memory (--memory-limit)"
-            )
-        if any(isinstance(each, ImportError | AttributeError) for each in (error, error.__cause__)):
-            raise ClusterError(f"{worker} has no rosbayes, or another version of it ({error}); {_SAME}")
-        raise ClusterError(f"{worker} failed: {type(error).__name__}: {error}")
+def _results(address: str, batch: Any) -> tuple[list[Any], float]:
+    """Return the results of a batch; a ToolchainError if it failed, a `_LostError` if it is gone."""
+    from distributed import KilledWorker
+    from lz4.frame import decompress
+
+    with _noticing_loss():
+        error = batch.exception()
+        if error is None:
+            packed, seconds = batch.result()
+            return pickle.loads(decompress(packed)), seconds  # noqa: S301 - of the worker that runs our job
+    worker = f"a worker of {address}"
+    if isinstance(error, CancelledError):
+        raise _LostError
+    if isinstance(error, ClusterError):
+        raise ClusterError(f"{worker} cannot do this work: {error}; {_SAME}")
+    if isinstance(error, ToolchainError):
+        raise error
+    if isinstance(error, KilledWorker):
+        raise ClusterError(
+            f"the workers of {address} died over the same piece of work, probably for want of memory; start fewer on a "
+            "host, or with more memory (--memory-limit)"
+        )
+    if any(isinstance(each, ImportError | AttributeError) for each in (error, error.__cause__)):
+        raise ClusterError(f"{worker} has no rosbayes, or another version of it ({error}); {_SAME}")
+    raise ClusterError(f"{worker} failed: {type(error).__name__}: {error}")
 
 
 _SAME: Final = "install the same version there, and start it again"

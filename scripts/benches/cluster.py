@@ -1,6 +1,6 @@
 """Work on a dask scheduler against the same work in one process: a sweep of designs, and a recording.
 
-one core   ─▶ in_this_process(job)                                            serial seconds
+one core   ─▶ work(in_this_process)                                         serial seconds
             this process ─▶ scheduler ─▶ a worker on each core                efficiency = serial / (cores * seconds)
 hosts 1-4  ─▶ the same, with a worker in each of several network namespaces   bytes on the wire
 """
@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
@@ -29,13 +29,13 @@ from terminal.ending import outcome
 from terminal.errors import ProcessError
 from toolchain.analysis import Sweep
 from toolchain.analysis.logic import device_named
-from toolchain.analysis.readings import sample_readings
-from toolchain.analysis.replay import Frames, Replay
-from toolchain.analysis.sweep import SweepJob, tasks
-from toolchain.building.build import build_deployment, read_images
+from toolchain.analysis.readings import Frames, sample_readings
+from toolchain.analysis.replay import replay
+from toolchain.analysis.sweep import Results, SweepJob, run_sweep, tasks
+from toolchain.building.build import build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.building.options import BuildOptions
-from toolchain.cluster import Job, Run, SchedulerOptions, in_this_process, runner
+from toolchain.cluster import Run, SchedulerOptions, in_this_process, runner
 from toolchain.deployment import load_deployment
 from toolchain.errors import BuildError
 
@@ -48,30 +48,45 @@ TASKS: Final = 2000
 START_S: Final = 60.0
 
 
-def sweep_job(designs: int, frames: int) -> SweepJob:
-    """Return the job of some designs of the boat."""
-    model, device = boat().model(), device_named("proce-v-d8")
-    sweep = Sweep(
-        prob_bits="4,5,6,7,8",
-        targets="15,31,63,127,255,511",
-        rngs="lfsr8,lfsr16,lfsr24,lfsr32",
-        scales="address,column",
-    )
-    readings = sample_readings(model, frames, seed=1)
-    return SweepJob(tasks(model, sweep, readings, device)[:designs], readings, device, sweep.banks)
+class Designs:
+    """A sweep over some designs of the boat, into a new file each time."""
+
+    def __init__(self, folder: Path, designs: int, frames: int) -> None:
+        model, device = boat().model(), device_named("proce-v-d8")
+        sweep = Sweep(
+            prob_bits="4,5,6,7,8",
+            targets="15,31,63,127,255,511",
+            rngs="lfsr8,lfsr16,lfsr24,lfsr32",
+            scales="address,column",
+        )
+        readings = sample_readings(model, frames, seed=1)
+        self._job = SweepJob(tasks(model, sweep, readings, device)[:designs], readings, device, sweep.banks)
+        self._folder = folder
+
+    def __call__(self, run: Run) -> None:
+        """Measure all designs."""
+        file = self._folder / "points.jsonl"
+        file.unlink(missing_ok=True)
+        run_sweep(self._job, run, Results(file), lambda _: None)
 
 
-def replay_job(folder: Path, frames: int) -> Replay:
-    """Return the job of a recording of the boat."""
-    model = boat().model()
-    options = BuildOptions(
-        uri="ws://robot:9090", topic="/boat/sensors", type="boat_msgs/Sensors", partitions=4
-    )
-    build_deployment(plan_machine(model, options), folder)
-    deployment = load_deployment(folder)
-    addresses = sample_readings(model, frames, seed=1).addresses
-    recorded = Frames(addresses, np.ones(frames, bool), np.arange(frames), "")
-    return Replay(deployment, read_images(deployment), recorded)
+class Recording:
+    """A recording of the boat, from its frames to the file of posteriors."""
+
+    def __init__(self, folder: Path, frames: int) -> None:
+        model = boat().model()
+        options = BuildOptions(
+            uri="ws://robot:9090", topic="/boat/sensors", type="boat_msgs/Sensors", partitions=4
+        )
+        build_deployment(plan_machine(model, options), folder)
+        self._deployment, self._output = load_deployment(folder), folder / "posteriors.npz"
+        self._frames = Frames(
+            sample_readings(model, frames, seed=1), np.ones(frames, bool), np.arange(frames)
+        )
+
+    def __call__(self, run: Run) -> None:
+        """Compute all frames, and write their posteriors."""
+        replay(self._deployment, self._frames, self._output, run)
 
 
 class Hosts:
@@ -166,25 +181,27 @@ def _address_in(file: Path) -> str:
     raise ProcessError(f"the scheduler did not write {file}")
 
 
-def seconds_of(run: Run, job: Job, numbers: Sequence[int]) -> float:
-    """Return the time of a job."""
+def seconds_of(work: Callable[[Run], None], run: Run) -> float:
+    """Return the time of some work."""
     begun = time.perf_counter()
-    run(job, numbers, lambda *_: None)
+    work(run)
     return time.perf_counter() - begun
 
 
-def _load_kernels(jobs: Sequence[Job]) -> None:
-    for job in jobs:
-        in_this_process(job, [0], lambda *_: None)
+def load_kernels(designs: int) -> None:
+    """Do small work of the same kinds, so that this process has compiled or loaded all kernels."""
+    with tempfile.TemporaryDirectory(prefix="bench-cluster-") as name:
+        for work in (Designs(Path(name), designs, 1), Recording(Path(name), 1)):
+            work(in_this_process)
 
 
-def tasks_per_second(address: str, workers: int, small: Sequence[Job]) -> float:
-    """Wait until all workers have loaded the kernels of small jobs; return how many empty tasks are done in a second."""
+def tasks_per_second(address: str, workers: int, designs: int) -> float:
+    """Load the kernels on all workers; return how many empty tasks a scheduler does in a second."""
     from distributed import Client
 
     with Client(address) as client:
         client.wait_for_workers(workers, timeout=START_S)
-        client.run(_load_kernels, small)
+        client.run(load_kernels, designs)
         client.gather(client.map(int, range(100), pure=False))
         begun = time.perf_counter()
         client.gather(client.map(int, range(TASKS), pure=False))
@@ -199,21 +216,16 @@ def _sent(name: str) -> int:
 
 def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> float:
     """Measure everything, and return the lowest efficiency of two workers on this host."""
-    # of the same kinds, so that the workers have loaded the kernels
-    small: Sequence[Job] = sweep_job(4, 1), replay_job(folder / "small", 1)
-    jobs: dict[str, tuple[Job, int]] = {
-        f"{arguments.designs} designs": (
-            sweep_job(arguments.designs, arguments.sweep_frames),
-            arguments.designs,
-        ),
-        f"{arguments.frames:,} frames": (replay_job(folder / "boat", arguments.frames), arguments.frames),
+    works: dict[str, Callable[[Run], None]] = {
+        f"{arguments.designs} designs": Designs(folder, arguments.designs, arguments.sweep_frames),
+        f"{arguments.frames:,} frames": Recording(folder / "boat", arguments.frames),
     }
-    _load_kernels(small)
+    load_kernels(arguments.designs)
     serial: dict[str, float] = {}
-    for name, (job, pieces) in jobs.items():
+    for name, work in works.items():
         allowed = os.sched_getaffinity(0)
         os.sched_setaffinity(0, {min(allowed)})
-        serial[name] = seconds_of(in_this_process, job, range(pieces))
+        serial[name] = seconds_of(work, in_this_process)
         os.sched_setaffinity(0, allowed)
     table = Table(title="serial time / (cores x time on the scheduler)", title_justify="left")
     for name in ("work", "serial, s", "workers", "hosts", "time, s", "efficiency", "bytes a batch"):
@@ -225,12 +237,13 @@ def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> fl
                 Hosts(folder).serving(workers, namespaces=namespaces) as address,
                 runner(SchedulerOptions(scheduler=address, insecure=True)) as run,
             ):
-                done = tasks_per_second(address, workers, small)
+                done = tasks_per_second(address, workers, arguments.designs)
                 rate = rate or done
-                for name, (job, pieces) in jobs.items():
+                Recording(folder / "first", 1)(run)  # the scheduler loads our modules, once in its life
+                for name, work in works.items():
                     before = sum(_sent(f"rosbayes{at}") for at in range(workers)) if namespaces else 0
                     with counted_batches() as batches:
-                        took = seconds_of(run, job, range(pieces))
+                        took = seconds_of(work, run)
                     used = min(workers, cores)
                     efficiency = serial[name] / (used * took)
                     sent = "-"

@@ -15,7 +15,7 @@ from toolchain.deployment import Dimension, Scale, Variable
 from toolchain.deployment.address import to_address
 from toolchain.deployment.address_array import written_codes
 from toolchain.errors import BuildError, ModelError, ReadingError
-from toolchain.learning.recording import read_recording, reading_columns
+from toolchain.learning.recording import Recording, read_recording, reading_columns
 from toolchain.models.model import Known, Model, PriorSelect
 
 MISSING: Final = -1
@@ -47,6 +47,10 @@ class Readings:
 
     def __len__(self) -> int:
         return len(self.addresses)
+
+    def only(self, kept: NDArray[np.bool_]) -> "Readings":
+        """Return the recorded frames of which this is true."""
+        return replace(self, addresses=self.addresses[kept], prior_addresses=self.prior_addresses[kept])
 
     def of_model(self, frame: int) -> tuple[tuple[int | NDArray[np.int64] | None, ...], int | None]:
         """Return a frame in the form for `toolchain.models.model.exact_posterior`."""
@@ -222,30 +226,71 @@ def recorded_readings(
     check_frames(frames)
     columns = reading_columns([variable.name for variable in variables], given)
     recording = read_recording(path, list(dict.fromkeys(columns.values())), tolerance_s=tolerance_s)
-    rows: list[list[int]] = []
-    refused, first = 0, ""
     count = min(frames, recording.rows)
     spread = np.unique(np.linspace(0, recording.rows - 1, count).astype(int)).tolist()
-    for at in range(count) if in_sequence else spread:
+    found = _rows_of(recording, variables, columns, range(count) if in_sequence else spread)
+    refused = int((~found.fits).sum())
+    left_out = f", without {refused} that do not fit ({found.why})" if refused else ""
+    kept = found.readings if in_sequence else found.readings.only(found.fits)
+    return replace(kept, source=f"{len(kept)} of {recording.rows} rows of {path.name}{left_out}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frames:
+    """Rows of a recording.
+
+    Attributes:
+        readings: Those of all rows; a row that does not fit has none.
+        fits: bool[rows], whether the readings are values that the machine takes; without, there is no posterior.
+        stamps: int64[rows], nanoseconds: of the messages of a bag, or else 0, 1, 2, ..., the numbers of the rows.
+        why: What is wrong with the first row that does not fit; empty if all do.
+    """
+
+    readings: Readings
+    fits: NDArray[np.bool_]
+    stamps: NDArray[np.int64]
+    why: str = ""
+
+    def __len__(self) -> int:
+        return len(self.readings)
+
+
+def recorded_frames(
+    path: Path, variables: Sequence[Variable], given: Sequence[str], *, tolerance_s: float = 0.1
+) -> Frames:
+    """Return all rows of a recording; the arguments are those of `recorded_readings`.
+
+    Raises:
+        BuildError: A name in `given` is unknown, or a variable that must have a reading has no column.
+        ModelError: The recording is missing or damaged, lacks a column, or no row fits.
+    """
+    columns = reading_columns([each.name for each in variables], given)
+    unnamed = [each.name for each in variables if each.name not in columns and each.on_missing == "error"]
+    if unnamed:
+        raise BuildError(f"{', '.join(unnamed)}: no column; add --reading {unnamed[0]}=COLUMN")
+    recording = read_recording(path, list(dict.fromkeys(columns.values())), tolerance_s=tolerance_s)
+    return _rows_of(recording, variables, columns, range(recording.rows))
+
+
+def _rows_of(
+    recording: Recording, variables: Sequence[Variable], columns: dict[str, str], rows: Sequence[int]
+) -> Frames:
+    addresses = np.full((len(rows), len(variables)), MISSING, dtype=np.int64)
+    fits, why = np.ones(len(rows), bool), ""
+    for at, row in enumerate(rows):
         try:
-            row = [
-                to_address(variable, recording.columns[columns[variable.name]][at])
-                if variable.name in columns
-                else to_address(variable, None)
-                for variable in variables
+            found = [
+                to_address(each, recording.columns[columns[each.name]][row] if each.name in columns else None)
+                for each in variables
             ]
         except ReadingError as error:
-            refused, first = refused + 1, first or str(error)
-            if in_sequence:
-                rows.append([MISSING] * len(variables))
-            continue
-        rows.append([MISSING if address is None else address for address in row])
-    if not rows or refused == len(rows):
-        raise ModelError(f"{path} has no row that fits this machine" + (f": {first}" if first else ""))
-    addresses = np.array(rows, dtype=np.int64).reshape(len(rows), len(variables))
+            fits[at], why = False, why or f"row {row}: {error}"
+        else:
+            addresses[at] = [MISSING if address is None else address for address in found]
+    if not fits.any():
+        raise ModelError(f"{recording.path} has no row that fits this machine" + (f": {why}" if why else ""))
     sensors = [at for at, variable in enumerate(variables) if variable.kind == "sensor"]
     selects = [at for at, variable in enumerate(variables) if variable.kind == "prior_select"]
     prior = addresses[:, selects[0]] if selects else np.full(len(rows), MISSING, dtype=np.int64)
-    left_out = f", without {refused} that do not fit ({first})" if refused else ""
-    source = f"{len(rows)} of {recording.rows} rows of {path.name}{left_out}"
-    return Readings(source, addresses[:, sensors], prior)
+    stamps = np.array(recording.stamps or range(recording.rows), np.int64)[list(rows)]
+    return Frames(Readings("", addresses[:, sensors], prior), fits, stamps, why)

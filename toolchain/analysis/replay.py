@@ -13,162 +13,58 @@ import os
 import shutil
 import zipfile
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from machines.kind import Blocks, BoardResult, FrameInput, FrameSettings
+from machines.bm2_kind import BM2, kernels_of, run_batches
+from machines.kind import FrameInput
 from machines.parameters import RngReset
-from pcie_shim import register_map as rm
-from pcie_shim.programming_file import Image
-from toolchain.analysis.readings import MISSING
+from toolchain.analysis.emulation import EmulatedBoards
+from toolchain.analysis.readings import MISSING, Frames, Readings
 from toolchain.bounded_files import file_errors, whole_file
 from toolchain.building.build import read_images
 from toolchain.cluster import Run, Work, in_this_process, software
 from toolchain.deployment import Deployment
-from toolchain.deployment.address import to_address
-from toolchain.errors import BuildError, ModelError, ReadingError
-from toolchain.learning.recording import read_recording, reading_columns
+from toolchain.errors import BuildError
 
 _FORMAT: Final = 1
 _TOPIC: Final = "/BMresults"
 
 _Records: TypeAlias = "np.memmap[Any, np.dtype[np.void]]"
+_Posterior: TypeAlias = NDArray[np.float64] | None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Frames:
-    """The frames of a recording.
-
-    Attributes:
-        addresses: int64[frames, variables], in the order of the deployment; `MISSING` for a missing reading.
-        fits: bool[frames], whether a row has readings that the deployment takes; the others have no posterior.
-        stamps: int64[frames], nanoseconds: of the messages of a bag, or else 0, 1, 2, ..., the numbers of the rows.
-        why: What is wrong with the first row that does not fit; empty if all do.
-    """
-
-    addresses: NDArray[np.int64]
-    fits: NDArray[np.bool_]
-    stamps: NDArray[np.int64]
-    why: str
-
-    def __len__(self) -> int:
-        return len(self.addresses)
+_Row: TypeAlias = Callable[[int, int, NDArray[np.uint16] | None], tuple[_Posterior, int]]
+"""A row, the bank of its frame, and its written prior, to posterior and cycles."""
 
 
-def recorded_frames(
-    path: Path, deployment: Deployment, given: Sequence[str], *, tolerance_s: float = 0.1
-) -> Frames:
-    """Return the frames of a recording for a deployment.
+def _run_on(deployment: Deployment, machines: Sequence[Any], readings: Readings) -> _Row:
+    """Return the function that runs a row on the boards of a deployment, in this process."""
+    section = deployment.machine
+    target_count, max_cycles = section.target_count, section.max_cycles
+    if section.is_divided:
+        boards = EmulatedBoards(machines, target_count=target_count, max_cycles=max_cycles, stop=section.stop)
 
-    `given` are NAME=COLUMN for variables whose column has another name (`reading_columns`).
+        def run_lines(row: int, bank: int, prior: NDArray[np.uint16] | None) -> tuple[_Posterior, int]:
+            ran = boards.run(*readings.of_machine(row, machines[0]), bank, prior)
+            return ran.posterior, ran.length
 
-    Raises:
-        BuildError: The machine takes arrays, or a name in `given` is unknown.
-        ModelError: The recording is missing or damaged, lacks a column, or no row fits.
-    """
-    if not deployment.machine.is_plain or deployment.prior is not None:
-        raise BuildError(
-            f"{deployment.directory} reads arrays of numbers (for each line or replica, or a prior), but the columns of a "
-            "recording are numbers"
-        )
-    variables = deployment.variables
-    columns = reading_columns([each.name for each in variables], given)
-    unnamed = [each.name for each in variables if each.name not in columns and each.on_missing == "error"]
-    if unnamed:
-        raise BuildError(f"{', '.join(unnamed)}: no column; add --reading {unnamed[0]}=COLUMN")
-    recording = read_recording(path, list(dict.fromkeys(columns.values())), tolerance_s=tolerance_s)
-    addresses = np.full((recording.rows, len(variables)), MISSING, np.int64)
-    fits, why = np.ones(recording.rows, bool), ""
-    for row in range(recording.rows):
-        try:
-            for at, variable in enumerate(variables):
-                value = recording.columns[columns[variable.name]][row] if variable.name in columns else None
-                address = to_address(variable, value)
-                addresses[row, at] = MISSING if address is None else address
-        except ReadingError as error:
-            addresses[row], fits[row] = MISSING, False
-            why = why or f"row {row}: {error}"
-    if not fits.any():
-        raise ModelError(f"{path} has no row that fits this machine: {why or 'it has no rows'}")
-    stamps = np.array(recording.stamps or range(recording.rows), np.int64)
-    return Frames(addresses, fits, stamps, why)
+        return run_lines
+    kernels = kernels_of(machines)
 
+    def run_chains(row: int, bank: int, _: object) -> tuple[_Posterior, int]:
+        addresses = tuple(None if at == MISSING else at for at in readings.addresses[row].tolist())
+        frame = FrameInput(addresses=addresses, target_count=target_count, max_cycles=max_cycles, bank=bank)
+        return BM2.infer(run_batches(kernels, frame)).posterior, max(each.cycles for each in kernels)
 
-class _Boards:
-    """The boards of a deployment in this process: machines behind the registers that they use, and their host."""
-
-    def __init__(self, deployment: Deployment, images: Sequence[Image]) -> None:
-        self._deployment = deployment
-        kind = deployment.machine.kind
-        self._host = kind.on_host([image.machine for image in images])
-        self._registers = [image.registers for image in images]
-        # The register map of each board, and its machine, which reads and writes there.
-        self._memories: list[dict[str, memoryview]] = []
-        self._machines = []
-        for image in images:
-            whole = memoryview(bytearray(rm.BAR_SIZE))
-            memory = {name: whole[block : block + 4 * block.words] for name, block in rm.BLOCKS.items()}
-            for name, words in kind.contents(image.machine).items():
-                memory[name][: len(words)] = words
-            machine = kind.on_board(kind.kernel(image.machine), memory)
-            machine.prepare()
-            self._memories.append(memory)
-            self._machines.append(machine)
-
-    def run(
-        self, addresses: Sequence[int | None], bank: int, prior: NDArray[np.uint16] | None
-    ) -> list[BoardResult]:
-        """Compute a frame; the results are those of a board's registers."""
-        section = self._deployment.machine
-        columns, row = self._deployment.machine_addresses(addresses)
-        course = self._host.begin(
-            FrameInput(
-                addresses=columns,
-                prior_address=row,
-                prior_codes=prior,
-                target_count=section.target_count,
-                max_cycles=section.max_cycles,
-                bank=bank,
-                stop="own" if section.stop == "own" else "slices",
-            )
-        )
-        for number, (machine, blocks) in enumerate(zip(self._machines, course.starts, strict=True)):
-            self._write(number, blocks, course.settings)
-            machine.start(course.settings, course.end)
-        while True:
-            reasons = [(machine.reason,) for machine in self._machines]
-            numbers, blocks = course.proceed(reasons, self._answers())
-            if not numbers:
-                break
-            for number in numbers:
-                self._write(number, blocks, course.settings)
-                self._machines[number].resume(course.end)
-        results = [
-            BoardResult(bytes(memory["RESULTS"][: 4 * used.result_words]), machine.cycles, machine.reason)
-            for memory, used, machine in zip(self._memories, self._registers, self._machines, strict=True)
-        ]
-        return list(course.conclude(results))
-
-    def _write(self, number: int, blocks: Blocks, settings: FrameSettings) -> None:
-        target = {"TARGET_COUNT": settings.target_count.to_bytes(4, "little")}  # a resume takes it from there
-        for name, words in {**blocks, **target}.items():
-            self._memories[number][name][: len(words)] = words
-
-    def _answers(self) -> list[memoryview]:
-        return [
-            memoryview(b"".join(memory[name][: 4 * words] for name, words in used.answer.items()))
-            for memory, used in zip(self._memories, self._registers, strict=True)
-        ]
-
-
-def _none(_: int) -> None:
-    """Return no posterior; unlike a lambda, it can be pickled."""
+    return run_chains
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,10 +72,10 @@ class Replay:
     """The job of a recording's frames: piece n is row n, which is frame n + 1 of a master."""
 
     deployment: Deployment
-    images: Sequence[Image]
+    machines: Sequence[Any]
     frames: Frames
-    done: Callable[[int], NDArray[np.float64] | None] = _none
-    """Returns the posterior of an earlier row, from which a filter goes on; it stays in its process."""
+    done: Callable[[int], _Posterior] | None = None
+    """Of a filter that goes on after an interruption: returns the posterior of an earlier row."""
 
     @property
     def is_sequence(self) -> bool:
@@ -190,7 +86,7 @@ class Replay:
     def prepare(self) -> Work:
         """Return the function that computes the record of a row."""
         deployment, frames = self.deployment, self.frames
-        boards, kind = _Boards(deployment, self.images), deployment.machine.kind
+        run = _run_on(deployment, self.machines, frames.readings)
         numbers, layout = np.cumsum(frames.fits), record_layout(deployment)
         own, at, steps = deployment.new_filter(), 0, 0
 
@@ -204,7 +100,7 @@ class Replay:
                 if frames.fits[each]:
                     prior, steps = own.predict(steps), 0
                     if each < row:
-                        own.update(self.done(each))
+                        own.update(self.done(each) if self.done else None)
             at = row + 1
             return prior
 
@@ -212,10 +108,8 @@ class Replay:
             prior, record = prior_of(row), np.zeros((), layout)
             record["posterior"] = np.nan
             if frames.fits[row]:
-                addresses = [None if each == MISSING else each for each in frames.addresses[row].tolist()]
-                results = boards.run(addresses, int(numbers[row]) % deployment.machine.rng_banks, prior)
-                posterior = kind.infer(results, deployment.machine.variables).posterior
-                record["cycles"] = max(each.cycles for each in results)
+                bank = int(numbers[row]) % deployment.machine.rng_banks
+                posterior, record["cycles"] = run(row, bank, prior)
                 if posterior is not None:
                     record["posterior"] = posterior
                 if own is not None:
@@ -246,32 +140,24 @@ class PartFile:
         # Where the first record begins, and the length of each; `_file` is locked against other runs.
         heading = json.dumps({"rosbayes": _FORMAT, "key": key}).encode() + b"\n"
         self._begin, self._size = len(heading), layout.itemsize
-        with file_errors(path, "written", BuildError):
-            self._file = os.fdopen(
-                os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666), "r+b", buffering=0
-            )
+        with file_errors(path, "written", BuildError), ExitStack() as opened:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            self._file = opened.enter_context(os.fdopen(descriptor, "r+b", buffering=0))
             try:
-                self._begin_file(heading, frames)
-            except BaseException:
-                self._file.close()
-                raise
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise BuildError(
+                    f"another run is writing {path}; wait for it, or name another file with -o"
+                ) from None
+            if not heading.startswith(self._file.read(len(heading))):
+                raise BuildError(
+                    f"{path} belongs to another recording, deployment or version; delete it, or name another file with -o"
+                )
+            os.pwrite(descriptor, heading, 0)
+            os.posix_fallocate(descriptor, 0, self._begin + frames * self._size)
             # All records as they are in the file, also those that `add` writes later.
             self.records = np.memmap(path, layout, "r", self._begin, (frames,))
-
-    def _begin_file(self, heading: bytes, frames: int) -> None:
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BuildError(
-                f"another run is writing {self.path}; wait for it, or name another file with -o"
-            ) from None
-        found = self._file.read(len(heading))
-        if not heading.startswith(found):
-            raise BuildError(
-                f"{self.path} belongs to another recording, deployment or version; delete it, or name another file with -o"
-            )
-        os.pwrite(self._file.fileno(), heading, 0)
-        os.posix_fallocate(self._file.fileno(), 0, self._begin + frames * self._size)
+            opened.pop_all()
 
     def missing(self) -> list[int]:
         """Return the rows without a record, in order."""
@@ -286,7 +172,7 @@ class PartFile:
         with file_errors(self.path, "written", BuildError):
             os.pwrite(self._file.fileno(), record, self._begin + row * self._size)
 
-    def posterior(self, row: int) -> NDArray[np.float64] | None:
+    def posterior(self, row: int) -> _Posterior:
         """Return the posterior of a row that is done; None without one."""
         found: NDArray[np.float64] = self.records[row]["posterior"]
         return None if math.isnan(found[0]) else np.array(found)
@@ -298,17 +184,12 @@ class PartFile:
         self._file.close()
 
 
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """Numbers of frames of a recording that were computed, kept or left out."""
+class Summary(NamedTuple):
+    """Numbers of frames of a recording: all, those that this run computed, and those without a posterior."""
 
     frames: int
     computed: int
-    """Those that this run computed; the others were in the part file."""
     without: int
-    """Those without a posterior."""
-    unfit: int
-    """Of these, rows that do not fit the machine."""
 
 
 def replay(
@@ -328,7 +209,7 @@ def replay(
     Raises:
         BuildError: A file cannot be written, or belongs to other work.
     """
-    job = Replay(deployment, read_images(deployment), frames)
+    job = Replay(deployment, [image.machine for image in read_images(deployment)], frames)
     part = PartFile(
         output.with_name(output.name + ".frames"),
         _key(deployment, frames),
@@ -355,7 +236,7 @@ def replay(
         done = True
     finally:
         part.close(remove=done)
-    return Summary(len(frames), len(missing), without, int((~frames.fits).sum()))
+    return Summary(len(frames), len(missing), without)
 
 
 def _key(deployment: Deployment, frames: Frames) -> str:
@@ -363,7 +244,8 @@ def _key(deployment: Deployment, frames: Frames) -> str:
     digest = sha256(software().encode())
     digest.update(json.dumps([board.image_hash for board in deployment.boards]).encode())
     digest.update(deployment.hash.encode())
-    digest.update(frames.addresses.tobytes() + frames.fits.tobytes())
+    readings = frames.readings
+    digest.update(readings.addresses.tobytes() + readings.prior_addresses.tobytes() + frames.fits.tobytes())
     return digest.hexdigest()
 
 
@@ -419,8 +301,13 @@ _TYPES: Final = ("Float64MultiArray", "MultiArrayLayout", "MultiArrayDimension")
 _WRITERS: Final = {".npz": _write_archive, ".mcap": _write_bag}
 
 
-def check_output(path: Path) -> None:
-    """Raise a BuildError before a long run for an output of an unknown format, or that cannot be written."""
+def check_request(path: Path, deployment: Deployment) -> None:
+    """Raise a BuildError before a long run for an output that cannot be written, or machines that take arrays."""
+    if not deployment.machine.is_plain or deployment.prior is not None:
+        raise BuildError(
+            f"{deployment.directory} reads arrays of numbers (for each line or replica, or a prior), but the columns of a "
+            "recording are numbers"
+        )
     if path.suffix not in _WRITERS:
         raise BuildError(
             f"-o {path}: the name must end with {' or '.join(_WRITERS)}, which selects the format"

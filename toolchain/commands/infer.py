@@ -42,12 +42,13 @@ def infer(
     For example `toolchain infer DATA/ds1_robot3.csv -d build/mrclam -o posteriors.npz --reading 'range_*=range_*_m'
     --reading 'bearing_*=bearing_*_rad'`; after Ctrl-C, the same command goes on where it was.
     """
-    from toolchain.analysis.replay import check_output, recorded_frames, replay
+    from toolchain.analysis.readings import recorded_frames
+    from toolchain.analysis.replay import check_request, replay
     from toolchain.deployment import load_deployment
 
-    check_output(output)
     deployment = load_deployment(directory)
-    frames = recorded_frames(recording, deployment, reading or (), tolerance_s=tolerance_s)
+    check_request(output, deployment)
+    frames = recorded_frames(recording, deployment.variables, reading or (), tolerance_s=tolerance_s)
 
     def begun(done: int) -> None:
         there = f"; {done} of them are in {output}.frames" if done else ""
@@ -60,8 +61,8 @@ def infer(
         found = replay(deployment, frames, output, run, begun=begun, advance=lambda: step(""))
         seconds = time.perf_counter() - started
     print(f"{output}: {found.frames} frames, {found.without} without a posterior", file=sys.stderr)
-    if found.unfit:
-        print(f"{found.unfit} rows have no posterior because they do not fit: {frames.why}", file=sys.stderr)
+    if unfit := int((~frames.fits).sum()):
+        print(f"{unfit} rows have no posterior because they do not fit: {frames.why}", file=sys.stderr)
     if found.computed:
         print(
             f"{found.computed} frames in {seconds:.1f} s: {found.computed / seconds:,.0f} frames/s",
