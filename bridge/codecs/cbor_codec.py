@@ -12,9 +12,10 @@ NumPy is imported when the first array is requested.
 
 import struct
 from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from io import BytesIO
+from math import nan
 from sys import byteorder
 from typing import Any, Final, Literal
 
@@ -156,101 +157,34 @@ def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
                 raise DecodeError(f"a message with an unsupported value arrived: {excerpt(data)}")
 
 
-def encode(
-    message: Mapping[str, Any],
-    *,
-    max_size: int = MAX_SIZE,
-    max_depth: int = MAX_DEPTH,
-    pack_floats: bool = False,
-) -> bytes:
-    """Write one message.
+def encode_json(message: dict[str, Any]) -> bytes:
+    """Write a message that was read from JSON, whose type is unknown.
 
-    Args:
-        message: The object. NumPy arrays (of any shape, flattened in C order) become typed arrays, and byte
-            strings remain byte strings; for typed arrays from other values, use `typed_array`.
-        max_size: Maximum of bytes.
-        max_depth: Maximum nesting of maps and arrays.
-        pack_floats: Whether lists of numbers with at least one float become typed arrays of float64, with NaN
-            for None (null in JSON). This is for a server that has a message's JSON, but no definition of its type.
-            Lists of only integers remain lists, because their width is unknown.
-
-    Raises:
-        EncodeError: A type is not supported, a key is not a string, or the message is too deep or too large.
+    Lists of numbers with at least one float become typed arrays of float64, with NaN for None. Lists of only integers
+    remain lists, because their width is unknown.
     """
+    return cbor2.dumps(_packed(message))
+
+
+def _packed(value: Any) -> Any:
+    if type(value) is dict:
+        return {key: _packed(part) for key, part in value.items()}
+    if type(value) is not list:
+        return value
+    kinds = set(map(type, value))
+    if float in kinds and kinds <= _NUMBERS:
+        return typed_array([nan if part is None else part for part in value], "f8")
+    return value if kinds <= _LEAVES else [_packed(part) for part in value]
+
+
+def typed_array(numbers: Sequence[Any], elements: str) -> cbor2.CBORTag:
+    """Return a typed array for use in a message, or raise an EncodeError; `elements` is one of `u1` to `f8`."""
+    tag = _TAGS[elements]
     try:
-        data = cbor2.dumps(_prepare(message, max_depth, pack_floats))
-    except (cbor2.CBORError, ValueError, OverflowError, RecursionError) as error:
-        raise EncodeError(f"the message cannot be written as CBOR: {error.__cause__ or error}") from None
-    if len(data) > max_size:
-        raise EncodeError(f"the message has {len(data)} bytes as CBOR, expected at most {max_size}")
-    return data
-
-
-def typed_array(values: Any, elements: str) -> cbor2.CBORTag:
-    """Return a typed array, for use as a value in a message for `encode`.
-
-    Args:
-        values: Any iterable of numbers.
-        elements: Their type: `u1 u2 u4 u8 i1 i2 i4 i8 f4 f8`.
-
-    Raises:
-        EncodeError: A value does not have this type, or the type is unknown.
-    """
-    tag = _TAGS.get(elements)
-    if tag is None:
-        raise EncodeError(
-            f"{elements!r} is not an element type of typed arrays, expected one of {' '.join(_TAGS)}"
-        )
-    try:
-        numbers = values if type(values) is list else tuple(values)
         packed = struct.pack(f"<{len(numbers)}{TYPED_ARRAYS[tag][1]}", *numbers)
-    except (TypeError, OverflowError, struct.error) as error:
+    except (OverflowError, struct.error) as error:
         raise EncodeError(f"the values do not fit a typed array of {elements}: {error}") from None
     return cbor2.CBORTag(tag, packed)
-
-
-def _prepare(value: Any, levels: int, pack_floats: bool) -> Any:
-    """Return the value with only CBOR types, nested at most `levels` deep."""
-    kind = type(value)
-    if kind in _LEAVES or kind is bytes or kind is cbor2.CBORTag:
-        return value
-    if not isinstance(value, Mapping | list | tuple):
-        return _from_numpy(value)
-    # Checked here, because the library has no such limit when it encodes.
-    if levels < 1:
-        raise EncodeError("the message is nested too deeply")
-    if isinstance(value, Mapping):
-        if set(map(type, value)) - {str}:
-            raise EncodeError("the message has a key that is not a string")
-        return {key: _prepare(part, levels - 1, pack_floats) for key, part in value.items()}
-    kinds = set(map(type, value))
-    if pack_floats and float in kinds and kinds <= _NUMBERS:
-        return _packed_floats(value, kinds)
-    return value if kinds <= _LEAVES else [_prepare(part, levels - 1, pack_floats) for part in value]
-
-
-def _packed_floats(values: list[Any] | tuple[Any, ...], kinds: set[type]) -> Any:
-    if type(None) in kinds:
-        values = [float("nan") if value is None else value for value in values]
-    try:
-        return typed_array(values, "f8")
-    except EncodeError:  # an integer beyond float64
-        return values
-
-
-def _from_numpy(value: Any) -> Any:
-    """Return the CBOR form of a NumPy array or scalar."""
-    if isinstance(value, str | int | float) and not hasattr(value, "dtype"):
-        return value  # of a subclass, for example an enumeration
-    dtype = getattr(value, "dtype", None)
-    if dtype is None or dtype.kind not in "buifU":
-        raise EncodeError(f"{type(value).__name__} is not a type of messages")
-    # Scalars, booleans and text have no typed arrays.
-    if value.ndim == 0 or dtype.str[1:] not in _TAGS:
-        return value.tolist()
-    if dtype.byteorder == ">" or byteorder == "big":
-        value = value.astype(dtype.newbyteorder("<"))
-    return cbor2.CBORTag(_TAGS[dtype.str[1:]], value.tobytes())
 
 
 # Conversion of whole messages between lists of numbers and NumPy arrays, for when the encoding differs from the

@@ -8,8 +8,8 @@ Inbound:
   For this, messages that are not strict JSON are parsed a second time.
 * Integers beyond 64 bits become floats.
 
-Outbound: NaN and infinities are either sent as `null`, as by the reference server, or refused with their
-path, because servers silently drop `null` in a float field. NumPy arrays and scalars are written without
+Outbound: NaN and infinities are refused with their path, because JSON has none, and servers silently drop `null` in a
+float field. NumPy arrays and scalars are written without
 intermediate lists; NumPy is never imported here. Bytes are written as base64, like `uint8[]` by servers.
 """
 
@@ -20,7 +20,7 @@ import re
 from array import array
 from collections.abc import Mapping
 from itertools import accumulate
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import orjson
 
@@ -70,12 +70,7 @@ def text_of(value: Any) -> str:
     """Return a server's explanation as text; some servers send an object instead of a string."""
     if isinstance(value, str):
         return value
-    if value is None:
-        return ""
-    try:
-        return encode({"": value})[4:-1].decode()
-    except EncodeError:
-        return repr(value)
+    return "" if value is None else orjson.dumps(value).decode()
 
 
 def decode(data: bytes | str, *, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH) -> dict[str, Any]:
@@ -171,27 +166,12 @@ def _finite_or_none(text: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def encode(
-    message: Mapping[str, Any],
-    *,
-    nonfinite: Literal["null", "refuse"] = "null",
-    max_size: int = MAX_SIZE,
-    max_depth: int = MAX_DEPTH,
-) -> bytes:
-    """Write one message.
-
-    Args:
-        message: The object; values may be NumPy arrays, contiguous or not, and NumPy scalars.
-        nonfinite: Treatment of NaN and infinities.
-        max_size: Maximum of bytes.
-        max_depth: Maximum nesting of objects and arrays.
-
-    Returns:
-        UTF-8 JSON without whitespace.
+def encode(message: Mapping[str, Any], *, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH) -> bytes:
+    """Write one message, whose values may be NumPy arrays and scalars, as JSON without white space.
 
     Raises:
         EncodeError: A type that JSON does not have, an integer beyond 64 bits, a key that is not a string, a NaN
-            or infinity with `nonfinite="refuse"` (the sentence gives its path), or too deep.
+            or infinity (the sentence gives its path), or too deep.
         MessageTooLargeError: It is too large.
     """
     try:
@@ -206,7 +186,7 @@ def encode(
     if len(data) > max_size:
         raise MessageTooLargeError(f"the message has {len(data)} bytes as JSON, expected at most {max_size}")
     # The first condition is the first one of `_has_null`, and the other is that of `is_deeper`, without their calls.
-    if nonfinite == "refuse" and _N in data and _has_null(data):
+    if _N in data and _has_null(data):
         place = find_nonfinite(message)
         if place is not None:
             raise EncodeError(

@@ -11,7 +11,7 @@ from typing import Any, Final
 import cbor2
 import orjson
 
-from bridge.codecs.cbor_codec import encode
+from bridge.codecs.cbor_codec import encode_json
 from bridge.codecs.png import encode as to_picture
 from bridge.errors import BridgeError
 from bridge.hub.definitions import MessageDefinitions
@@ -47,8 +47,6 @@ def json_prefix(name: str) -> bytes:
     return b'{"op":"publish","topic":"%b","msg":' % name.encode()
 
 
-# Maximum depth of JSON that the hub itself has read.
-_DEEPEST: Final = 256
 AROUND: Final = len(json_prefix("")) + 1
 """Bytes around a topic's name and a message's JSON."""
 
@@ -104,7 +102,7 @@ class OutgoingMessage:
         elif (encoded := self._definitions.encode(self._type, self._parsed)) is not None:
             msg = encoded
         else:
-            msg = encode(self._parsed, max_size=self._max_size, max_depth=_DEEPEST, pack_floats=True)
+            msg = encode_json(self._parsed)
         return _cbor_prefix(name) + msg
 
 

@@ -131,10 +131,7 @@ class Publications:
                 advertised.check(msg)
                 advertised.unchecked.discard(advertisement)
             body = encode(
-                msg,
-                nonfinite="refuse",
-                max_size=self._wire.sendable - len(prefix) - 1,
-                max_depth=self._wire.max_depth - 1,
+                msg, max_size=self._wire.sendable - len(prefix) - 1, max_depth=self._wire.max_depth - 1
             )
         except EncodeError as error:
             raise type(error)(f"a message of {advertised.topic} cannot be published: {error}") from None

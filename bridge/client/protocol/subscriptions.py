@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any, Final, Literal, NamedTuple, get_args
 
+import cbor2
 import orjson
 
 from bridge.client.protocol.events import Message, MessageDiscarded, MessageReceived, UnusableReceived
@@ -360,7 +361,7 @@ class Subscriptions:
             if envelope not in self.envelopes:
                 subscribed.envelopes_tried += 1
                 # In CBOR, a map that announces three entries: nothing can follow the message.
-                if envelope == cbor_codec.encode(empty)[:-1] if from_cbor else topic_of(envelope) == topic:
+                if envelope == cbor2.dumps(empty)[:-1] if from_cbor else topic_of(envelope) == topic:
                     self.envelopes[envelope] = _Known(envelope, len(envelope), topic, subscribed)
         discarded = subscribed.measure(topic, len(data))
         if discarded is not None:

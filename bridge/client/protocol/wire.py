@@ -34,9 +34,7 @@ class Wire:
 
     def write(self, **operation: Any) -> None:
         """Write an operation."""
-        self.write_bytes(
-            encode(operation, nonfinite="refuse", max_size=self.sendable, max_depth=self.max_depth)
-        )
+        self.write_bytes(encode(operation, max_size=self.sendable, max_depth=self.max_depth))
 
     def limit(self, size: int) -> None:
         """Refuse messages of more bytes from now on."""

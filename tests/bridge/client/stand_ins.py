@@ -4,7 +4,10 @@ import asyncio
 import contextlib
 import json
 
+import cbor2
+
 from bridge.client.protocol import ClientCore
+from bridge.codecs.cbor_codec import typed_array
 
 
 def connected(**options):
@@ -19,6 +22,15 @@ def sent(core):
 
 def tell(core, now=0.0, **operation):
     return core.receive(json.dumps(operation).encode(), now)
+
+
+def as_cbor(message):
+    """Return a message as a server writes it, with NumPy arrays as typed arrays."""
+
+    def typed(encoder, array):
+        encoder.encode(typed_array(array.tolist(), array.dtype.str[1:]))
+
+    return cbor2.dumps(message, default=typed)
 
 
 def give_up(subscription):

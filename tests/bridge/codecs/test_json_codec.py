@@ -46,7 +46,7 @@ def depth_of(value):
 
 @given(objects)
 def test_output_of_the_standard_library_is_read(message):
-    assert decode(json.dumps(message)) == json.loads(encode(message))  # both without what is not finite
+    assert decode(json.dumps(message)) == json.loads(orjson.dumps(message))  # both without what is not finite
 
 
 @pytest.mark.parametrize(
@@ -146,23 +146,20 @@ def test_arrays_of_any_layout(array):
     message = {"deep": [{"a": array}], "s": np.float32(0.5), "t": (np.int8(1), None)}
     expected = {"deep": [{"a": array.tolist()}], "s": 0.5, "t": [1, None]}
     assert json.loads(encode(message)) == expected
-    assert json.loads(encode(message, nonfinite="refuse")) == expected
 
 
 @pytest.mark.parametrize("before", ["", "n" * 2000, "an" * 700, "x" * 2000])
 def test_a_nan_is_found_wherever_it_is(before):
     for message in ({"a": before, "b": math.nan}, {"b": [math.inf], "a": before}):
         with pytest.raises(EncodeError, match="^b"):
-            encode(message, nonfinite="refuse")
-    assert encode({"a": before, "b": 1.5, "c": "null", "d": None}, nonfinite="refuse")
+            encode(message)
+    assert encode({"a": before, "b": 1.5, "c": "null", "d": None})
 
 
 @given(objects)
 def test_nothing_nonfinite_leaves(message):
-    text = encode(message)
-    json.loads(text, parse_constant=pytest.fail)
     try:
-        assert encode(message, nonfinite="refuse") == text
+        json.loads(encode(message), parse_constant=pytest.fail)
     except EncodeError:
         assert find_nonfinite(message) is not None
     else:
@@ -184,8 +181,7 @@ def test_nothing_nonfinite_leaves(message):
 )
 def test_a_refused_number_is_named_with_its_place(message, place):
     with pytest.raises(EncodeError, match=f"^{place} "):
-        encode(message, nonfinite="refuse")
-    assert b"null" in encode(message)
+        encode(message)
 
 
 @pytest.mark.parametrize(

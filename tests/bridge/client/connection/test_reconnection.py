@@ -14,10 +14,9 @@ import pytest
 
 from bridge.client import State, connect
 from bridge.client.session import FIRST_DELAY, MAX_DELAY
-from bridge.codecs import cbor_codec
 from bridge.codecs.fragments import split
 from bridge.errors import DisconnectedError, StateTimeoutError
-from tests.bridge.client.stand_ins import tcp_service
+from tests.bridge.client.stand_ins import as_cbor, tcp_service
 from tests.bridge.hub.sockets import until
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
@@ -318,7 +317,7 @@ def growth(play, rounds):
 def encoded_as(msg, kind):
     operation = {"op": "publish", "topic": "/a", "msg": msg}
     if kind == "cbor":
-        return [cbor_codec.encode(operation)]
+        return [as_cbor(operation)]
     data = json.dumps(operation).encode()
     return list(split(data, 100, 1)) if kind == "fragments" else [data]
 

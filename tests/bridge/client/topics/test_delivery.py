@@ -13,11 +13,10 @@ import pytest
 from bridge.client.protocol import Delivery
 from bridge.client.protocol.calls_and_goals import MAX_GOALS
 from bridge.client.protocol.events import GoalEnded, GoalStatus, MessageReceived, UnusableReceived
-from bridge.codecs import cbor_codec
 from bridge.codecs.fragments import split
 from bridge.errors import OptionError, SlowPeerError
 from bridge.qos import Qos
-from tests.bridge.client.stand_ins import connected, sent, tell
+from tests.bridge.client.stand_ins import as_cbor, connected, sent, tell
 
 CBOR = Delivery(compression="cbor")
 ARRAYS = Delivery(compression="cbor", arrays="numpy")
@@ -29,7 +28,7 @@ def publish(msg, topic="/a"):
 
 
 def in_cbor(msg, topic="/a"):
-    return cbor_codec.encode(publish(msg, topic))
+    return as_cbor(publish(msg, topic))
 
 
 def in_json(msg, topic="/a"):
