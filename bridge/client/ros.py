@@ -185,8 +185,7 @@ class Ros:
             queue_length: Number of throttled messages that the server queues.
             queue_size: Maximum number of messages queued here; then the oldest is dropped and counted.
             compression: `cbor` for long arrays in a tenth of the time of JSON, `cbor-raw` for only the
-                serialised bytes (`Message.raw`), `png` for ROS 1 servers over slow networks. A server that
-                does not support it sends JSON, or nothing.
+                serialised bytes (`Message.raw`). A server that does not support it sends JSON, or nothing.
             arrays: Python type of arrays of numbers: `list`, or `numpy` for NumPy arrays, read-only from CBOR.
             fragment_size: Maximum number of characters that the server sends in one fragment.
             qos: Quality of service in ROS 2; older servers ignore it.

@@ -1,1 +1,1 @@
-"""Encodings of rosbridge messages: JSON, CBOR, PNG and fragments."""
+"""Encodings of rosbridge messages: JSON, CBOR and fragments."""

@@ -3,6 +3,10 @@
 A message is encoded only once for all subscribers with the same encoding.
 """
 
+import base64
+import math
+import struct
+import zlib
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import lru_cache
@@ -12,7 +16,6 @@ import cbor2
 import orjson
 
 from bridge.codecs.cbor_codec import encode_json
-from bridge.codecs.png import encode as to_picture
 from bridge.errors import BridgeError
 from bridge.hub.definitions import MessageDefinitions
 from bridge.hub.limits import RefusedOperationError
@@ -38,8 +41,29 @@ def encoding_of(requested: object) -> Encoding:
 
 
 def as_png(payload: bytes) -> bytes:
-    """Wrap an operation (its JSON) in an operation `png`."""
-    return orjson.dumps({"op": "png", "data": to_picture(payload)})
+    """Wrap an operation in an operation `png`: its JSON is the pixels of a picture, in base64.
+
+    As on the reference server, the picture is nearly square, with three bytes a pixel, and filled up with newlines,
+    which JSON ignores (source: https://www.w3.org/TR/png-3/, chapters 5, 9 and 11).
+    """
+    pixels = -(-len(payload) // 3)
+    width = math.isqrt(pixels)
+    height = -(-pixels // width)
+    line = 3 * width
+    padded = payload.ljust(line * height, b"\n")
+    # each line after the number of its filter, 0 for none
+    lines = b"".join(b"\0" + padded[at : at + line] for at in range(0, len(padded), line))
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),
+        # the lowest level: 1 MiB of numbers takes 12 ms instead of 74 ms, and becomes 7 % longer
+        (b"IDAT", zlib.compress(lines, 1)),
+        (b"IEND", b""),
+    )
+    picture = b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        for kind, content in chunks
+    )
+    return orjson.dumps({"op": "png", "data": base64.b64encode(picture).decode()})
 
 
 def json_prefix(name: str) -> bytes:

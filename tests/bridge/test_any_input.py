@@ -24,7 +24,7 @@ from bridge.client.protocol.events import (
     ServiceRequested,
     UnusableReceived,
 )
-from bridge.codecs import cbor_codec, json_codec, png
+from bridge.codecs import cbor_codec, json_codec
 from bridge.codecs.cbor_codec import with_arrays, with_lists
 from bridge.codecs.fragments import Reassembler, split
 from bridge.errors import BridgeError, DecodeError
@@ -117,16 +117,6 @@ def test_cbor_gives_the_same_message_as_lists_and_as_arrays(data):
     assert repr(cbor_codec.decode(written, max_size=100 * MAX_SIZE)) == repr(forms["list"])
 
 
-@given(st.binary(max_size=400))
-@example(png.encode(b'{"op":"publish","topic":"/a","msg":{}}').encode())
-def test_a_picture_gives_bytes_within_the_limit(data):
-    try:
-        assert len(png.decode(data.decode("latin-1"), max_size=MAX_SIZE)) <= 16 * MAX_SIZE
-    except DecodeError as error:
-        check_sentence(error)
-    assert png.decode(png.encode(data), max_size=2 * MAX_SIZE).startswith(data)
-
-
 @given(
     st.lists(
         st.fixed_dictionaries(
@@ -188,7 +178,7 @@ DELIVERIES = (
     Delivery(compression="cbor"),
     Delivery(compression="cbor", arrays="numpy"),
     Delivery(compression="cbor-raw"),
-    Delivery(compression="png", fragment_size=7),
+    Delivery(fragment_size=7),
     Delivery(arrays="numpy", qos=Qos(depth=1)),
     Delivery(max_bytes=40),
 )
@@ -196,10 +186,6 @@ DELIVERIES = (
 
 def no_constant(name):
     raise AssertionError(f"{name} left as JSON")
-
-
-def picture(text):
-    return json.dumps({"op": "png", "data": png.encode(text)}).encode()
 
 
 @contextlib.contextmanager
@@ -311,7 +297,7 @@ class AnyServer(RuleBasedStateMachine):
     def receive_raw(self, data):
         self.take(data)
 
-    @rule(draw=st.data(), form=st.sampled_from(("json", "json", "cbor", "fragments", "png", "both")))
+    @rule(draw=st.data(), form=st.sampled_from(("json", "json", "cbor", "fragments")))
     def receive(self, draw, form):
         """Receive an operation of which any field may be right, wrong or absent."""
         right = {
@@ -335,10 +321,10 @@ class AnyServer(RuleBasedStateMachine):
         text = json.dumps(operation).encode()
         if form == "cbor":
             self.take(cbor2.dumps(operation))
-        elif form in {"json", "png"}:
-            self.take(text if form == "json" else picture(text))
+        elif form == "json":
+            self.take(text)
         else:
-            for piece in split(picture(text) if form == "both" else text, 20, "f"):
+            for piece in split(text, 20, "f"):
                 self.take(piece)
 
     @rule()

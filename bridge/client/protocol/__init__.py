@@ -16,7 +16,7 @@ A connection, as the core sees it (`->` is what `ClientCore.data_to_send` return
 
 rosbridge has no handshake and no acknowledgements: at most, a server reports a refused operation in a status message. So
 the core stores what the program wants, and sends all of it again on a new connection. Messages may also be encoded as
-CBOR, or wrapped in fragments or a PNG. Goals of actions work like calls, with feedback before the result.
+CBOR, or in fragments. Goals of actions work like calls, with feedback before the result.
 
 Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite), and
 the deviations of servers from it (`docs/reference/rosbridge-differences.md`).

@@ -76,7 +76,7 @@ class PendingCalls(_Pending):
         self._names[call] = service
         return call
 
-    def receive(self, operation: dict[str, Any], data: bytes | str) -> CallAnswered | UnusableReceived | None:
+    def receive(self, operation: dict[str, Any], data: bytes) -> CallAnswered | UnusableReceived | None:
         """Handle an answer; return None if no call waits for it."""
         call = operation.get("id")
         if not isinstance(call, str):
@@ -117,7 +117,7 @@ class PendingGoals(_Pending):
             self._wire.write(op="cancel_action_goal", id=goal, action=action)
 
     def receive(
-        self, operation: dict[str, Any], data: bytes | str
+        self, operation: dict[str, Any], data: bytes
     ) -> GoalFeedback | GoalEnded | UnusableReceived | None:
         """Handle an event of a goal; return None if the goal is unknown."""
         goal = operation.get("id")
@@ -228,9 +228,7 @@ class ServedServices(_Served):
         self._wire.write(op="service_response", service=service, result=ok, **answer, **identity)
         del self._requests[ticket]
 
-    def receive(
-        self, operation: dict[str, Any], data: bytes | str
-    ) -> ServiceRequested | UnusableReceived | None:
+    def receive(self, operation: dict[str, Any], data: bytes) -> ServiceRequested | UnusableReceived | None:
         """Handle a request; return None if it was refused here."""
         service = operation.get("service")
         args = operation.get("args")
@@ -292,7 +290,7 @@ class ServedActions(_Served):
             del self._goals[goal]
 
     def receive(
-        self, operation: dict[str, Any], data: bytes | str
+        self, operation: dict[str, Any], data: bytes
     ) -> GoalRequested | CancelRequested | UnusableReceived | None:
         """Handle a goal or its cancellation; return None if it was refused here, or has ended."""
         goal, action, args = operation.get("id"), operation.get("action"), operation.get("args")

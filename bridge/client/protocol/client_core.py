@@ -11,7 +11,7 @@ from bridge.client.protocol.events import Event, MessageReceived, StatusReceived
 from bridge.client.protocol.publications import Publications
 from bridge.client.protocol.subscriptions import Subscriptions
 from bridge.client.protocol.wire import Wire
-from bridge.codecs import cbor_codec, png
+from bridge.codecs import cbor_codec
 from bridge.codecs.fragments import Reassembler
 from bridge.codecs.json_codec import MAX_DEPTH, MAX_SIZE, decode, excerpt, text_of
 from bridge.errors import DecodeError
@@ -88,13 +88,16 @@ class ClientCore:
             return discarded
         try:
             operation = self._decode(data)
-            if operation.get("op") in ("fragment", "png"):
-                return self._receive_wrapped(operation, now)
+            if operation.get("op") == "fragment":
+                whole = self._fragments.take(operation, now)
+                if whole is None:
+                    return None
+                data, operation = whole, self._decode(whole)
         except DecodeError as error:
             return UnusableReceived(str(error))
         return self._receive_plain(operation, data)
 
-    def _decode(self, data: bytes | str) -> dict[str, Any]:
+    def _decode(self, data: bytes) -> dict[str, Any]:
         return decode(data, max_size=self.wire.max_size, max_depth=self.wire.max_depth)
 
     def _receive_cbor(self, data: bytes) -> Event | None:
@@ -111,28 +114,7 @@ class ClientCore:
             return self.subscriptions.receive(operation, data, from_cbor=True)
         return UnusableReceived(f"a CBOR message other than publish arrived: {excerpt(data)}")
 
-    def _receive_wrapped(self, operation: dict[str, Any], now: float) -> Event | None:
-        """Handle a fragment or a PNG; the message inside may be wrapped again."""
-        # Servers send a PNG in fragments; deeper nesting could only be an attack.
-        wrapped = ["fragment", "png"]
-        data: bytes | str | None = None
-        while (op := operation.get("op")) in wrapped:
-            wrapped.remove(op)  # each at most once
-            data = self._unwrapped(operation, now)
-            if data is None:
-                return None
-            operation = self._decode(data)
-        return self._receive_plain(operation, data or "")
-
-    def _unwrapped(self, operation: dict[str, Any], now: float) -> bytes | str | None:
-        if operation["op"] == "fragment":
-            return self._fragments.take(operation, now)
-        picture = operation.get("data")
-        if not isinstance(picture, str):
-            raise DecodeError("a png without data arrived")
-        return png.decode(picture, max_size=self.wire.max_size)
-
-    def _receive_plain(self, operation: dict[str, Any], data: bytes | str) -> Event | None:
+    def _receive_plain(self, operation: dict[str, Any], data: bytes) -> Event | None:
         match operation.get("op"):
             case "publish":
                 return self.subscriptions.receive(operation, data)

@@ -22,7 +22,7 @@ from bridge.names import RosVersion, absolute, check_name, same_type, split_type
 from bridge.qos import Qos
 from bridge.stamps import ros_version_of_message
 
-Compression = Literal["none", "png", "cbor", "cbor-raw"]
+Compression = Literal["none", "cbor", "cbor-raw"]
 
 _OF_ENVELOPE: Final = 3
 """Keys of an operation with a recognisable envelope: op, topic and msg."""
@@ -37,8 +37,8 @@ class Delivery:
     Attributes:
         throttle_rate: Minimum number of milliseconds between two messages.
         queue_length: Number of throttled messages that the server queues.
-        compression: `cbor` for long arrays, `cbor-raw` for only the serialised bytes, `png` for ROS 1 servers
-            over slow networks. Many servers ignore an unknown value and send JSON.
+        compression: `cbor` for long arrays, `cbor-raw` for only the serialised bytes. Many servers ignore an unknown
+            value and send JSON.
         arrays: Python type of arrays of numbers, regardless of the encoding.
         fragment_size: Maximum number of characters in a fragment; None for whole messages. Servers apply the
             last value that a client requested to everything they send to it.
@@ -342,7 +342,7 @@ class Subscriptions:
             subscribed.envelopes_tried = 0
 
     def receive(
-        self, operation: dict[str, Any], data: bytes | str, *, from_cbor: bool = False
+        self, operation: dict[str, Any], data: bytes, *, from_cbor: bool = False
     ) -> MessageReceived | MessageDiscarded | UnusableReceived | None:
         """Handle a publish operation, decoded from `data`; None if its topic is not subscribed to."""
         topic = operation.get("topic")
@@ -355,8 +355,7 @@ class Subscriptions:
         if not subscribed.has_messages:
             subscribed.has_messages = True
             self.seen_version = self.seen_version or ros_version_of_message(msg)
-        # A message from fragments or a PNG has no envelope in `data`.
-        if type(data) is bytes and len(operation) == _OF_ENVELOPE and subscribed.envelopes_tried < _ENVELOPES:
+        if len(operation) == _OF_ENVELOPE and subscribed.envelopes_tried < _ENVELOPES:
             envelope, empty = envelope_of(data), {"op": "publish", "topic": topic, "msg": {}}
             if envelope not in self.envelopes:
                 subscribed.envelopes_tried += 1

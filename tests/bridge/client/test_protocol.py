@@ -19,7 +19,6 @@ from bridge.client.protocol.events import (
     StatusReceived,
     UnusableReceived,
 )
-from bridge.codecs import png
 from bridge.errors import EncodeError, NameFormError, OptionError, SlowPeerError, TypeConflictError
 from bridge.qos import Qos
 from tests.bridge.client.stand_ins import connected, sent, tell
@@ -291,8 +290,6 @@ def wrapped(inner):
         wrapped(b"no json"),
         b'{"op":{"png":1}}',
         b'{"op":"png","data":"xx"}',
-        json.dumps({"op": "png", "data": png.encode(b"no json")}).encode(),
-        json.dumps({"op": "png", "data": png.encode(b'{"op":"png","data":""}')}).encode(),
     ],
 )
 def test_what_is_unusable_says_so(data):

@@ -1,8 +1,12 @@
 """A broker without sockets for tests, its clients, and the invariants that are checked after each of their steps."""
 
+import base64
+import io
 import json
 from dataclasses import dataclass
 from math import inf
+
+from PIL import Image
 
 from bridge.codecs import cbor_codec
 from bridge.hub.broker import Broker
@@ -181,3 +185,10 @@ def publisher_and_subscriber(type_name, ros_version=1, limits=None, **wish):
     publisher.advertise("/t", type_name)
     subscriber.subscribe("/t", **wish)
     return publisher, subscriber
+
+
+def unpacked(operation):
+    """Return the operation in a picture, in the reading of Pillow."""
+    picture = Image.open(io.BytesIO(base64.b64decode(operation["data"])))
+    assert picture.mode == "RGB"
+    return json.loads(picture.tobytes())

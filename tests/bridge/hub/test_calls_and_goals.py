@@ -1,12 +1,9 @@
 """Calls of services and goals of actions: client -> hub -> serving client -> hub -> client, each ended exactly once."""
 
-import json
-
 import pytest
 
 from bridge.client.protocol.events import GoalStatus
-from bridge.codecs import png
-from tests.bridge.hub.broker_harness import Harness
+from tests.bridge.hub.broker_harness import Harness, unpacked
 
 ASKS = {"service": "call_service", "action": "send_action_goal"}
 ENDS = {"service": "service_response", "action": "action_result"}
@@ -359,7 +356,7 @@ def test_feedback_and_result_as_png(action):
     key = action.asked("g", compression="png", feedback=True)
     action.server.send(op="action_feedback", id=key, action=DOCK, values={"a": 1})
     action.end(key, values={"b": 1}, status=GoalStatus.SUCCEEDED, result=True)
-    operations = [json.loads(png.decode(operation["data"])) for operation in action.client.read()]
+    operations = [unpacked(operation) for operation in action.client.read()]
     assert [operation["values"] for operation in operations] == [{"a": 1}, {"b": 1}]
 
 

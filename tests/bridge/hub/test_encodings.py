@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from bridge.codecs import cbor_codec, png
+from bridge.codecs import cbor_codec
 from bridge.codecs.fragments import Reassembler
 from bridge.hub import topics
 from bridge.hub.definitions import MessageDefinitions
 from bridge.hub.encodings import Encoding, OutgoingMessage
 from bridge.hub.limits import RefusedOperationError
-from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, publisher_and_subscriber
+from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, publisher_and_subscriber, unpacked
 
 ARRAY = "std_msgs/Float64MultiArray"
 
@@ -170,7 +170,7 @@ def test_a_message_in_fragments(asked, size, compression):
     heard = []
     for payloads in by_id.values():
         whole = json.loads(_whole(payloads))
-        heard.append(json.loads(png.decode(whole["data"])) if compression == "png" else whole)
+        heard.append(unpacked(whole) if compression == "png" else whole)
     assert [operation["msg"] for operation in heard] == messages
 
 
@@ -203,7 +203,7 @@ def test_the_answer_to_a_call_in_fragments_and_as_png():
     assert "/rosapi/topics" in json.loads(_whole(peer.payloads()))["values"]["services"]
     peer.send(op="call_service", service="/rosapi/services", id="x", compression="png")
     (operation,) = peer.read()
-    assert json.loads(png.decode(operation["data"]))["id"] == "x"
+    assert unpacked(operation)["id"] == "x"
 
 
 def test_of_several_wishes_the_last_form_and_the_least_size_count():

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bridge.codecs import cbor_codec, png
+from bridge.codecs import cbor_codec
 from bridge.hub.conversions import DEFAULTS, TIMES
 from bridge.hub.definitions import _HEADER, MessageDefinitions
 from bridge.hub.filling import _KNOWN
 from bridge.names import ros2_type
-from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, publisher_and_subscriber
+from tests.bridge.hub.broker_harness import WALL_CLOCK, Harness, publisher_and_subscriber, unpacked
 
 _SECONDS, _NANOSECONDS = divmod(WALL_CLOCK, 10**9)
 _NOW = {1: {"secs": _SECONDS, "nsecs": _NANOSECONDS}, 2: {"sec": _SECONDS, "nanosec": _NANOSECONDS}}
@@ -84,7 +84,7 @@ def test_all_encodings_have_the_whole_message():
     for name in ("none", "cbor"):
         assert peers[name].messages() == [whole]
     (picture,) = peers["png"].read()
-    assert json.loads(png.decode(picture["data"]))["msg"] == whole
+    assert unpacked(picture)["msg"] == whole
     (payload,) = peers["cbor-raw"].payloads()
     assert cbor_codec.decode(payload)["msg"]["bytes"] == b"\0" * 8 + b"\x01\0\0\0" + b"\0" * 6 + b"\xf8\x3f"
 

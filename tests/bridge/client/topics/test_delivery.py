@@ -1,4 +1,4 @@
-"""Forms of delivery: CBOR, serialised bytes, pictures, fragments, arrays, quality of service; without a network.
+"""Forms of delivery: CBOR, serialised bytes, fragments, arrays, quality of service; without a network.
 
 ClientCore ──data_to_send──▶ the test (plays the server)
     ▲                          │
