@@ -36,7 +36,7 @@ def raise_on_signals() -> None:
 
     A second signal is ignored, because the duration of the clean-up is bounded. Python drops an exception
     that is raised while the thread runs a callback from C code, forks, or runs a finaliser. So code must call
-    `check_signals` before it blocks. C code may also print the exception and raise another
+    `check_signals` before it blocks, as `run_async` does. C code may also print the exception and raise another
     one in its place, as numba does while it is imported.
     """
     sys.unraisablehook = _report_dropped
@@ -100,7 +100,6 @@ def run_async(main: Coroutine[Any, Any, int | None]) -> int:
     """
 
     async def guarded() -> int:
-        task = asyncio.ensure_future(main)
         received: list[signal.Signals] = []
 
         def stop(number: signal.Signals) -> None:
@@ -111,6 +110,9 @@ def run_async(main: Coroutine[Any, Any, int | None]) -> int:
         loop = asyncio.get_running_loop()
         for number in _ENDS:
             loop.add_signal_handler(number, stop, number)
+        # one that came before may have lost its exception, for example during an import
+        check_signals()
+        task = asyncio.ensure_future(main)
         try:
             code = await task
         except asyncio.CancelledError:

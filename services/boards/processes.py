@@ -70,6 +70,7 @@ def serve_one(
     # in this thread, which serves; the status is answered in another one
     for number in ENDING_SIGNALS:
         signal.signal(number, end)
+    check_signals()
 
     def status() -> ProcessStatus:
         image = board.image_hash if board.image_hash.strip("0") else ""

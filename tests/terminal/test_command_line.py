@@ -18,6 +18,7 @@ from services.errors import SettingsError
 from terminal.command_line import CommandLine
 from terminal.ending import outcome
 from terminal.errors import ExitCode, StoppedError
+from terminal.signals import run_async
 from tests.command_runner import invoke
 from tests.patience import PROCESS_PATIENCE
 
@@ -225,6 +226,25 @@ def test_a_signal_is_the_reason_of_what_fails_after_it(replaced):
 
     ended = invoke(app, [])
     assert (ended.exit_code, ended.output) == (ExitCode.TERMINATED, "terminated (SIGTERM)\n")
+
+
+def test_a_dropped_signal_ends_a_coroutine_before_it_begins():
+    app, began = CommandLine(help="a command"), []
+
+    class Held:
+        def __del__(self):
+            signal.raise_signal(signal.SIGTERM)
+
+    async def work():
+        began.append(True)
+
+    @app.command()
+    def command():
+        Held()  # Python drops what its finaliser raises
+        return run_async(work())
+
+    ended = invoke(app, [])
+    assert (ended.exit_code, began) == (ExitCode.TERMINATED, [])
 
 
 @pytest.mark.thorough
