@@ -263,7 +263,7 @@ async def bench(arguments: argparse.Namespace) -> int:
         write_json(arguments.json, numbers(transfers, frames, fitted))
     if arguments.picture:
         draw(arguments.picture, transfers, frames)
-    return 0
+    return int(arguments.check and not all(each.is_right for each in fitted))
 
 
 def show(transfers: Sequence[Transfer], frames: Sequence[FrameTime], fitted: Sequence[Fitted]) -> None:
@@ -367,6 +367,11 @@ def main() -> int:
     )
     parser.add_argument(
         "--repeats", type=int, default=400, help=f"transfers of each size; over JTAG a {SLOWER}th"
+    )
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help=f"exit 1 if a rate differs from the model's by over {TOLERANCE:.0%}",
     )
     parser.add_argument("--json", type=Path, help="write all numbers to this file")
     parser.add_argument("--picture", type=Path, help="draw them into this PNG")
