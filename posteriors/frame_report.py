@@ -11,7 +11,7 @@ import orjson
 from pydantic import BeforeValidator, Field, FiniteFloat, TypeAdapter
 
 from bridge.stamps import header, stamp_ns
-from pcie_shim.link_rate import WIRES
+from pcie_shim.wires import WIRES
 from posteriors.messages import Part, validated
 
 FRAME_TOPIC: Final = "/bm/frame"
@@ -125,49 +125,64 @@ _READING: Final = "reading."
 """Prefix of the keys of readings, before the name of the variable."""
 _BOARD_KEYS: Final = {"cycles": "%d", "counts_total": "%d", "reason": "%s"}
 _REPLICA_KEYS: Final = {"replica_cycles": "%s", "replica_reasons": "%s"}
-
-
-def _template(level: str, name: str, keys: Mapping[str, str]) -> str:
-    """Return a DiagnosticStatus as JSON, with `%` in place of message, hardware and values."""
-    pairs = ",".join(f'{{"key":"{key}","value":"{form}"}}' for key, form in keys.items())
-    return f'{{"level":{level},"name":"rosbayes: {name}","message":%s,"hardware_id":%s,"values":[{pairs}]}}'
-
-
-# Every result is preceded by a report, so the template is formatted once and only filled in for each frame.
-_FRAME: Final = _template("%d", "frame", _FRAME_KEYS)
-_BOARD: Final = _template("0", "board %d", _BOARD_KEYS)
-_BOARD_OF_REPLICAS: Final = _template("0", "board %d", _BOARD_KEYS | _REPLICA_KEYS)
+_FORMS: Final = _FRAME_KEYS | _BOARD_KEYS | _REPLICA_KEYS
+_OF_FRAME, _OF_BOARD, _OF_REPLICAS = map(tuple, (_FRAME_KEYS, _BOARD_KEYS, _BOARD_KEYS | _REPLICA_KEYS))
 _numbers: Final = attrgetter(
     "cycles", "counts_total", "link_bytes", "link_transfers", "received_ns", "sent_ns"
 )
 _times: Final = attrgetter(*_STAGES)
 
 
+# Every result is preceded by a report, so a template is formatted once and only filled in for each frame.
+@cache
+def _template(keys: tuple[str, ...]) -> str:
+    """Return a DiagnosticStatus as JSON with these keys, and `%` in place of level, name, message, hardware and values."""
+    pairs = ",".join(f'{{"key":"{key}","value":"{_FORMS[key]}"}}' for key in keys)
+    return f'{{"level":%d,"name":"rosbayes: %s","message":%s,"hardware_id":%s,"values":[{pairs}]}}'
+
+
+def _status(keys: tuple[str, ...], head: tuple[object, ...], values: tuple[object, ...]) -> str:
+    """Return a DiagnosticStatus as JSON; `head` is all before the values, of which those that are None are left out."""
+    if None in values:
+        keys = tuple(key for key, value in zip(keys, values, strict=True) if value is not None)
+        values = tuple(value for value in values if value is not None)
+    return _template(keys) % (*head, *values)
+
+
 def write_frame_report(report: FrameReport, ros_version: Literal[1, 2]) -> dict[str, Any]:
-    """Return a report as a diagnostic_msgs/DiagnosticArray; none of its numbers may be None."""
-    published = "true" if report.published else "false"
-    statuses = [
-        _FRAME
-        % (
-            *(not report.published or report.is_biased, _quoted(report.outcome), _quoted(report.deployment)),
-            *(report.number, published, *_numbers(report), *_times(report.stages)),
+    """Return a report as a diagnostic_msgs/DiagnosticArray, without the values that are not known."""
+    frame = _status(
+        _OF_FRAME,
+        (
+            not report.published or report.is_biased,
+            "frame",
+            _quoted(report.outcome),
+            _quoted(report.deployment),
+        ),
+        (
+            *(
+                report.number,
+                "true" if report.published else "false",
+                *_numbers(report),
+                *_times(report.stages),
+            ),
             _quoted(",".join(report.missing))[1:-1] if report.missing else "",
-        )
-    ]
+        ),
+    )
     pairs = [f',{{"key":{_quoted(key)},"value":{_quoted(value)}}}' for key, value in report.details.items()]
     for name, (value, address, age_ms) in report.readings.items():
         text = _quoted(value)[1:-1] if isinstance(value, str) else f"{value:.9g}"
         pairs.append(f'{_reading_begin(name)}{text};{address};{age_ms:.1f}"}}')
-    if pairs:
-        statuses[0] = f"{statuses[0].removesuffix(']}')}{''.join(pairs)}]}}"
+    statuses = [f"{frame.removesuffix(']}')}{''.join(pairs)}]}}" if pairs else frame]
     for index, board in enumerate(report.boards):
         reason = _quoted(board.stopped)
-        values = (index, reason, _quoted(board.name), board.cycles, board.counts_total, reason[1:-1])
+        head = (0, f"board {index}", reason, _quoted(board.name))
+        values = (board.cycles, board.counts_total, reason[1:-1])
         if board.replica_cycles:
             cycles, reasons = map(str, board.replica_cycles), ",".join(board.replica_stopped)
-            statuses.append(_BOARD_OF_REPLICAS % (*values, ",".join(cycles), _quoted(reasons)[1:-1]))
+            statuses.append(_status(_OF_REPLICAS, head, (*values, ",".join(cycles), _quoted(reasons)[1:-1])))
         else:
-            statuses.append(_BOARD % values)
+            statuses.append(_status(_OF_BOARD, head, values))
     return {
         "header": header(report.stamp_ns, "bm", ros_version),
         "status": orjson.Fragment(f"[{','.join(statuses)}]"),

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationIn
 from bridge.discovery import ROBOT, find_uri
 from pcie_shim.endpoint import Endpoint, parse_endpoint
 from pcie_shim.errors import PcieShimError
-from pcie_shim.link_rate import LinkRate
+from pcie_shim.wires import LinkRate
 from services.errors import SettingsError
 from terminal.flags import Flag
 from terminal.logs import LogFormat, use_log_format

@@ -36,8 +36,8 @@ from pcie_shim.endpoint import parse_endpoint
 from pcie_shim.host.loader import program
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.host.socket_link import SocketLink
-from pcie_shim.link_rate import WIRES, LinkRate
 from pcie_shim.programming_file import Image, Partition
+from pcie_shim.wires import WIRES, LinkRate
 from scripts.running.flags import ScriptParser
 from scripts.running.script import run_script
 from terminal.output import write_json

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pcie_shim.endpoint import Endpoint
-from pcie_shim.link_rate import LinkRate
+from pcie_shim.wires import LinkRate
 from services.child import RESTARTS, Child, ForkedCommand, end_all
 from services.errors import (
     BoardFailedError,

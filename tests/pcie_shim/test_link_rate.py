@@ -8,7 +8,8 @@ from machines.kind import FrameInput
 from pcie_shim.board.server import BoardServer
 from pcie_shim.framing import HEADER_BYTES
 from pcie_shim.host.mini_cluster import MiniCluster
-from pcie_shim.link_rate import WIRES, LinkModel, LinkRate, Wire, link_model
+from pcie_shim.link_rate import LinkModel, link_model
+from pcie_shim.wires import WIRES, LinkRate, Wire
 from tests.pcie_shim.boards import images
 
 SLOW = Wire(8, 125, shared=False)

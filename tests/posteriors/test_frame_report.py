@@ -80,6 +80,16 @@ def test_a_report_that_is_written_is_read_back_whole(ros_version):
     ]
 
 
+def test_what_is_not_known_is_left_out():
+    bare = FrameReport(stamp_ns=5, outcome="done", boards=(BoardReport(name="board0", stopped="slice"),))
+    message = json.loads(orjson.dumps(write_frame_report(bare, 2)))
+    assert read_frame_report(message, 0) == bare
+    assert [[pair["key"] for pair in each["values"]] for each in message["status"]] == [
+        ["published", "missing"],
+        ["reason"],
+    ]
+
+
 def frame_message(**values):
     return report_message({"sec": 12, "nanosec": 34}, **values)
 

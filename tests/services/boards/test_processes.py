@@ -17,7 +17,7 @@ import pytest
 from machines.kind import FrameInput
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.host.mini_cluster import MiniCluster
-from pcie_shim.link_rate import LinkRate
+from pcie_shim.wires import LinkRate
 from services.boards import processes
 from services.boards.processes import BoardProcesses
 from services.child import ForkedChild

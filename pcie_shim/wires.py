@@ -1,0 +1,44 @@
+"""Figures of the links to a board whose time can be modelled: rates, latencies and what is shared."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """Figures of a kind of link.
+
+    Attributes:
+        mbps: Rate in 10^6 bits per second.
+        latency_us: Microseconds of a transfer in one direction, besides its bits.
+        shared: True if one wire connects all boards, so that their transfers queue.
+    """
+
+    mbps: float
+    latency_us: float
+    shared: bool
+
+    def seconds(self, size: int, transfers: int = 1) -> float:
+        """Return the time of so many bytes in so many transfers, one after another."""
+        return 8e-6 * size / self.mbps + 1e-6 * transfers * self.latency_us
+
+
+class LinkRate(StrEnum):
+    """The kinds of links whose time can be modelled."""
+
+    NONE = "none"
+    PCIE_GEN2 = "pcie-gen2"
+    JTAG = "jtag"
+
+
+WIRES: Final[Mapping[str, Wire]] = {
+    # Thesis 2.3: 20,800 Mbps, measured with the vendor's diagnostics. A read of a device takes about 1 us there and back
+    # (Neugebauer et al., "Understanding PCIe performance for end host networking", SIGCOMM 2018). Each board has lanes
+    # of its own.
+    LinkRate.PCIE_GEN2: Wire(20_800, 0.5, shared=False),
+    # Thesis 2.3: at most 24 Mbps. A transfer waits for the next micro-frame of high-speed USB, 125 us (USB 2.0
+    # specification, 8.4.3). JTAG is a chain: one cable for all boards, and one transfer at a time.
+    LinkRate.JTAG: Wire(24, 125, shared=True),
+}
