@@ -90,7 +90,7 @@ def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
             f"--scale address is impossible with --sensor-mode {options.sensor_mode}: lines use different addresses in a "
             "frame, so the factors of addresses would not cancel; use --scale column or none"
         )
-    if options.prior_mode is PriorMode.TABLE and options.written_prior is not None:
+    if options.prior_mode is not PriorMode.WRITTEN and options.written_prior is not None:
         flag = "--prior-path" if options.sources is None else options.sources.toml.path
         raise BuildError(f"{flag} is for a written prior: add --prior-mode written")
     if options.prior_mode is PriorMode.WRITTEN and model.prior_select is not None:
@@ -132,6 +132,10 @@ def _filter_options(options: BuildOptions) -> BuildOptions:
     if options.written_prior is not None:
         flag = "--prior-path" if options.sources is None else f"the prior in {options.sources.toml.path}"
         raise BuildError(f"{flag} cannot be used with a filter, which writes the prior itself: leave it out")
+    if options.prior_mode is PriorMode.TABLE:
+        raise BuildError(
+            "--prior-mode table cannot be used with a filter, which writes the prior: leave it out"
+        )
     if options.replicas != 1 or options.sensor_mode is not SensorMode.COLUMN:
         flag = "--replicas" if options.replicas != 1 else f"--sensor-mode {options.sensor_mode}"
         raise BuildError(

@@ -345,8 +345,12 @@ class BM1Options:
         ),
     ] = None
     prior_mode: Annotated[
-        PriorMode, typer.Option(help="table: the prior is in the images; written: the host writes it.")
-    ] = PriorMode.TABLE
+        PriorMode | None,
+        typer.Option(
+            help="table: the prior is in the images; written: the host writes it.",
+            show_default="table; written for a filter",
+        ),
+    ] = None
     counter_bits: Annotated[int, typer.Option(help="Bits of a line's counter.", min=1, max=32)] = 8
     stop: StopWhen = Stop.SLICES
     shared: Annotated[

@@ -241,6 +241,7 @@ def test_a_network_becomes_a_machine_with_a_filter(umbrella):
     ("more", "named"),
     [
         (["--replicas", "2"], "--replicas cannot be used with a filter"),
+        (["--prior-mode", "table"], "--prior-mode table cannot be used with a filter"),
         (["--sensor-mode", "cell"], "--sensor-mode cell cannot be used with a filter"),
         (["--prior-path", "p"], "--prior-path cannot be used with a filter"),
         (["--machine", "bm2"], "a filter needs a BM1"),
