@@ -42,6 +42,8 @@ _SMALLEST_S: Final = BATCH_S / 8
 """The same at the end, so that the workers finish at about the same time."""
 _AHEAD: Final = 3
 """Batches on their way for each worker: one that is computed, one that waits there, and one at the scheduler."""
+_LATELY: Final = 4
+"""Batches whose speed decides on the size of the next."""
 _PATIENCE_S: Final = 60.0
 """Seconds in which a scheduler must come back, or get a worker again."""
 _CONNECT_S: Final = 10.0
@@ -311,8 +313,8 @@ def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Ke
     key = sha256(pickled).hexdigest()
     # Numbers that are not on their way yet, in order; and the numbers of each batch that is.
     waiting, batches = deque(left), dict[Any, list[int]]()
-    # Seconds of a piece, of the last batches; 0 before the first result.
-    piece_s = 0.0
+    # Pieces and seconds of the last batches; a worker's first pieces are slow, so larger batches count for more.
+    done_lately = deque[tuple[int, float]](maxlen=_LATELY)
     # Pieces that are done at the same time, and when that was counted; and when there was a worker (monotonic).
     threads, counted_at, served_at = 0, 0.0, time.monotonic()
     with _noticing_loss():
@@ -330,7 +332,8 @@ def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Ke
                 raise _LostError
             while waiting and len(batches) < _AHEAD * max(1, threads):
                 size = 1  # until it is known how long a piece takes
-                if piece_s:
+                if done_lately:
+                    piece_s = sum(s for _, s in done_lately) / sum(pieces for pieces, _ in done_lately)
                     share = max(_SMALLEST_S / piece_s, len(waiting) / (2 * max(1, threads)))
                     size = max(1, round(min(BATCH_S / piece_s, share)))
                 numbers = [waiting.popleft() for _ in range(min(size, len(waiting)))]
@@ -346,9 +349,7 @@ def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Ke
             for batch in done:
                 results, seconds = _results(address, batch)
                 numbers = batches.pop(batch)
-                # pieces differ, so the last batch counts as much as all before it
-                own_s = seconds / len(numbers)
-                piece_s = (piece_s + own_s) / 2 if piece_s else own_s
+                done_lately.append((len(numbers), seconds))
                 for number, result in zip(numbers, results, strict=True):
                     keep(number, result)
     finally:

@@ -1,7 +1,8 @@
 """Work on a dask scheduler against the same work in one process: a sweep of designs, and a recording.
 
-one core   ─▶ work(in_this_process)                                         serial seconds
-            this process ─▶ scheduler ─▶ a worker on each core                efficiency = serial / (cores * seconds)
+one core   ─▶ work(in_this_process)
+all cores  ─▶ the same in a process on each, at once: what the machine can do
+            this process ─▶ scheduler ─▶ a worker on each core                efficiency = alone / (cores * seconds)
 hosts 1-4  ─▶ the same, with a worker in each of several network namespaces   bytes on the wire
 """
 
@@ -9,12 +10,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
@@ -40,7 +42,7 @@ from toolchain.deployment import load_deployment
 from toolchain.errors import BuildError
 
 AIM: Final = 0.95
-"""Efficiency that `--check` requires of two workers on two cores."""
+"""Efficiency that `--check` requires of two workers on two cores, against two processes without dask."""
 NETWORK: Final = "10.213.7"
 """Of the namespaces; the scheduler's host is number 1."""
 TASKS: Final = 2000
@@ -188,6 +190,31 @@ def seconds_of(work: Callable[[Run], None], run: Run) -> float:
     return time.perf_counter() - begun
 
 
+def seconds_at_once(
+    kind: Callable[[Path], Callable[[Run], None]], folder: Path, cores: Sequence[int]
+) -> float:
+    """Return the time in which a process on each core does the whole work, all at the same time."""
+    context = multiprocessing.get_context("fork")
+    together, found = context.Barrier(len(cores)), context.SimpleQueue()
+
+    def do(core: int) -> None:
+        os.sched_setaffinity(0, {core})
+        own = folder / f"core{core}"
+        own.mkdir(exist_ok=True)
+        work = kind(own)
+        together.wait()
+        found.put(seconds_of(work, in_this_process))
+
+    processes = [context.Process(target=do, args=(core,)) for core in cores]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+        if process.exitcode:
+            raise ProcessError("a process without dask failed")
+    return max(float(found.get()) for _ in cores)
+
+
 def load_kernels(designs: int) -> None:
     """Do small work of the same kinds, so that this process has compiled or loaded all kernels."""
     with tempfile.TemporaryDirectory(prefix="bench-cluster-") as name:
@@ -216,21 +243,36 @@ def _sent(name: str) -> int:
 
 def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> float:
     """Measure everything, and return the lowest efficiency of two workers on this host."""
-    works: dict[str, Callable[[Run], None]] = {
-        f"{arguments.designs} designs": Designs(folder, arguments.designs, arguments.sweep_frames),
-        f"{arguments.frames:,} frames": Recording(folder / "boat", arguments.frames),
+    kinds: dict[str, Callable[[Path], Callable[[Run], None]]] = {
+        f"{arguments.designs} designs": lambda own: Designs(own, arguments.designs, arguments.sweep_frames),
+        f"{arguments.frames:,} frames": lambda own: Recording(own / "boat", arguments.frames),
     }
     load_kernels(arguments.designs)
-    serial: dict[str, float] = {}
-    for name, work in works.items():
-        allowed = os.sched_getaffinity(0)
-        os.sched_setaffinity(0, {min(allowed)})
-        serial[name] = seconds_of(work, in_this_process)
-        os.sched_setaffinity(0, allowed)
-    table = Table(title="serial time / (cores x time on the scheduler)", title_justify="left")
-    for name in ("work", "serial, s", "workers", "hosts", "time, s", "efficiency", "bytes a batch"):
+    cores = sorted(os.sched_getaffinity(0))
+    # By work and number of cores: a core may be slower while others are in use.
+    alone = {
+        (name, used): seconds_at_once(kind, folder, cores[:used])
+        for name, kind in kinds.items()
+        for used in sorted({1, min(2, len(cores)), min(4, len(cores))})
+    }
+    works = {name: kind(folder) for name, kind in kinds.items()}
+    table = Table(
+        title="efficiency: time of the work in one process / (cores x time on the scheduler)",
+        title_justify="left",
+    )
+    for name in (
+        "work",
+        "workers",
+        "hosts",
+        "time, s",
+        "one core alone, s",
+        "efficiency",
+        "all cores busy, s",
+        "efficiency",
+        "bytes a batch",
+    ):
         table.add_column(name, justify="right" if name != "work" else "left")
-    cores, lowest, rate = len(os.sched_getaffinity(0)), 2.0, 0.0
+    lowest, rate = 2.0, 0.0
     for workers, namespaces in ((2, False), (1, True), (2, True), (4, True)):
         try:
             with (
@@ -244,24 +286,19 @@ def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> fl
                     before = sum(_sent(f"rosbayes{at}") for at in range(workers)) if namespaces else 0
                     with counted_batches() as batches:
                         took = seconds_of(work, run)
-                    used = min(workers, cores)
-                    efficiency = serial[name] / (used * took)
+                    used = min(workers, len(cores))
+                    serial, busy = alone[name, 1], alone[name, used]
                     sent = "-"
                     if namespaces:
                         bytes_ = sum(_sent(f"rosbayes{at}") for at in range(workers)) - before
                         sent = f"{bytes_ / len(batches):,.0f}"
                     else:
-                        lowest = min(lowest, efficiency)
+                        lowest = min(lowest, busy / (used * took))
                     hosts = str(workers) if namespaces else "this one"
-                    table.add_row(
-                        name,
-                        f"{serial[name]:.1f}",
-                        str(workers),
-                        hosts,
-                        f"{took:.1f}",
-                        f"{efficiency:.1%}",
-                        sent,
-                    )
+                    row = [name, str(workers), hosts, f"{took:.1f}"]
+                    for seconds in (serial, busy):
+                        row += [f"{seconds:.1f}", f"{seconds / (used * took):.0%}"]
+                    table.add_row(*row, sent)
         except ProcessError as reason:
             if not namespaces:
                 raise

@@ -161,11 +161,13 @@ class PartFile:
 
     def missing(self) -> list[int]:
         """Return the rows without a record, in order."""
-        return [
+        written = np.flatnonzero(self.records["crc"]).tolist()  # reads no more of a new file
+        done = {
             row
-            for row, record in enumerate(self.records)
-            if crc32(record.tobytes()[_CRC_BYTES:]) != record["crc"]
-        ]
+            for row in written
+            if crc32(self.records[row].tobytes()[_CRC_BYTES:]) == self.records[row]["crc"]
+        }
+        return [row for row in range(len(self.records)) if row not in done]
 
     def add(self, row: int, record: bytes) -> None:
         """Write the record of a row; a BuildError if the disk fails, which keeps the others."""
