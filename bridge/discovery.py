@@ -17,10 +17,8 @@ import ipaddress
 import re
 import socket
 from collections.abc import AsyncIterator, Sequence
-from concurrent.futures import Future
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from threading import Thread
 from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
 from bridge.errors import BridgeError
@@ -142,21 +140,8 @@ async def announced_uri(uri: str, timeout: float = _TIMEOUT) -> str:
 
 
 def find_uri(uri: str, timeout: float = _TIMEOUT) -> str:
-    """Return the same as `announced_uri`, for callers that cannot await, even inside an event loop."""
-    if not uri.startswith(ROBOT):
-        return uri
-    found: Future[str] = Future()
-
-    def look() -> None:
-        try:
-            found.set_result(asyncio.run(announced_uri(uri, timeout)))
-        except BaseException as error:
-            found.set_exception(error)
-
-    # A loop in a thread of its own, because `asyncio.run` refuses to run inside another loop. Unlike that of an executor,
-    # the thread does not delay the end of a process that is interrupted meanwhile.
-    Thread(target=look, daemon=True).start()
-    return found.result()
+    """Return the same as `announced_uri`, for callers outside an event loop."""
+    return asyncio.run(announced_uri(uri, timeout)) if uri.startswith(ROBOT) else uri
 
 
 @asynccontextmanager

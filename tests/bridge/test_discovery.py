@@ -2,9 +2,7 @@
 
 import asyncio
 import os
-import signal
 import sys
-import threading
 from contextlib import AsyncExitStack
 from types import SimpleNamespace
 
@@ -48,27 +46,6 @@ async def test_a_name_that_is_taken_is_refused(monkeypatch):
         with pytest.raises(DiscoveryError, match=f"called {name}") as caught:
             await stack.enter_async_context(announced(name, "127.0.0.1", 9100, interfaces=LOOPBACK))
         assert caught.value.exit_code == 2
-
-
-def test_a_signal_ends_the_search_for_a_robot(monkeypatch):
-    may_end, ended, searching = threading.Event(), [], []
-
-    async def resolve(_name, _timeout):
-        searching.append(threading.current_thread())
-        os.kill(os.getpid(), signal.SIGUSR1)
-        may_end.wait(PATIENCE)
-        ended.append(True)
-
-    monkeypatch.setattr(discovery, "resolve", resolve)
-    before = signal.signal(signal.SIGUSR1, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            discovery.find_uri("robot:Adam", 3600)
-        assert not ended
-    finally:
-        signal.signal(signal.SIGUSR1, before)
-        may_end.set()
-    searching[0].join(PATIENCE)
 
 
 @pytest.mark.parametrize("name", ["", "x" * 64, "ü" * 32, "a.b", "a\nb", "a\x1b[31mb"])

@@ -16,7 +16,7 @@ import numpy as np
 from machines.bm1 import BM1Machine, Start, addressed_codes
 from machines.bm1_kind import BM1
 from machines.encode import decode_code
-from machines.parameters import REPLICAS_MAX, BM1Parameters, SensorMode
+from machines.parameters import REPLICAS_MAX, BM1Parameters
 from pcie_shim.register_layout import interface_room
 from toolchain.analysis.emulation import one_replica
 from toolchain.analysis.logic import MLAB_ALMS, MLAB_SHARE, Device, Logic, Memories, logic_of, place_memories
@@ -83,6 +83,26 @@ def estimate(
     )
 
 
+def _why_not(
+    machine: BM1Parameters, device: Device, table_length: int, interface: tuple[int, int] | None
+) -> str:
+    """Return what the device or the interface of a board lacks for a machine, as a clause; empty if the machine fits.
+
+    `interface` is that of `--interface`; without it, the interface may be as large as the register map.
+    """
+    used = BM1.registers(machine)
+    whose = "the map" if interface is None else "the interface"
+    for what, needed, room in zip(
+        ("input", "result"),
+        (used.input_words, used.result_words),
+        interface or interface_room(used),
+        strict=True,
+    ):
+        if needed > room:
+            return f"it takes {needed:,} {what} registers, and {whose} has {room:,}"
+    return estimate(machine, device, table_length=table_length, inputs=(interface or (0, 0))[0]).why_not
+
+
 def most_replicas(
     board: BM1Parameters,
     device: Device,
@@ -90,25 +110,10 @@ def most_replicas(
     table_length: int = LENGTH,
     interface: tuple[int, int] | None = None,
 ) -> tuple[int, str]:
-    """Return how many machines with the lines of a board fit it, 0 if none does, and why no more, as a clause.
-
-    `interface` is that of `--interface`; without it, the interface may be as large as the register map.
-    """
-    inputs = (interface or (0, 0))[0]
+    """Return how many machines with the lines of a board fit it, 0 if none does, and why no more, as a clause."""
 
     def why_not(replicas: int) -> str:
-        machines = replace(board, replicas=replicas)
-        used = BM1.registers(machines)
-        for what, needed, room in zip(
-            ("input", "result"),
-            (used.input_words, used.result_words),
-            interface or interface_room(used),
-            strict=True,
-        ):
-            if needed > room:
-                whose = "the map" if interface is None else "the interface"
-                return f"it takes {needed:,} {what} registers, and {whose} has {room:,}"
-        return estimate(machines, device, table_length=table_length, inputs=inputs).why_not
+        return _why_not(replace(board, replicas=replicas), device, table_length, interface)
 
     most = bisect_left(range(1, REPLICAS_MAX + 1), True, key=lambda replicas: why_not(replicas) != "")
     if most == REPLICAS_MAX:
@@ -123,48 +128,33 @@ def boards_needed(
     table_length: int = LENGTH,
     interface: tuple[int, int] | None = None,
 ) -> tuple[int, str]:
-    """Return the minimum number of boards for a machine, and why, as a sentence; or raise a BuildError.
+    """Return the minimum number of boards for a machine, and why, as a sentence; or raise a BuildError."""
 
-    `interface` is that of `most_replicas`.
-    """
-    inputs = (interface or (0, 0))[0]
-    whose = "the register map" if interface is None else "the interface"
+    def why_not(lines: int) -> str:
+        return _why_not(replace(parameters, lines=lines), device, table_length, interface)
 
-    def on(lines: int) -> Estimate:
-        return estimate(replace(parameters, lines=lines), device, table_length=table_length, inputs=inputs)
+    def replicas_on_a_board(lines: int) -> int:
+        board = replace(parameters, lines=lines)
+        return most_replicas(board, device, table_length=table_length, interface=interface)[0]
 
-    room = interface or interface_room(BM1.registers(parameters))
-    largest_lines = room[1] // parameters.replicas
-    if parameters.sensor_mode is not SensorMode.COLUMN and parameters.sensors:
-        largest_lines = min(largest_lines, room[0] // (parameters.replicas * parameters.sensors))
-    possible = range(1, min(parameters.lines, largest_lines) + 1)
-    most = bisect_left(possible, True, key=lambda lines: not on(lines).fits)
-    if most == 0 and largest_lines == 0:
-        line = replace(parameters, lines=1)
-        fewer, _ = most_replicas(line, device, table_length=table_length, interface=interface)
-        raise BuildError(
-            f"not even one line of {parameters.replicas} replicas fits {whose}: it has room for {room[0]} inputs "
-            f"and {room[1]} results; use --replicas {fewer} or fewer"
-        )
+    most = bisect_left(range(1, parameters.lines + 1), True, key=lambda lines: why_not(lines) != "")
     if most == 0:
-        raise BuildError(
-            f"not even one line fits a {device.title}: {on(1).why_not}; use narrower tables or another device"
-        )
+        fewer = replicas_on_a_board(1)
+        change = f"--replicas {fewer} or fewer" if fewer else "narrower tables or another device"
+        raise BuildError(f"not even one line fits a {device.title}: {why_not(1)}; use {change}")
     count = math.ceil(parameters.lines / most)
     largest = partition_lines(parameters.lines, count)[0].lines
-    took = on(largest)
+    took = estimate(
+        replace(parameters, lines=largest), device, table_length=table_length, inputs=(interface or (0, 0))[0]
+    )
     share = f"{took.alms:,.0f} ALMs ({took.alm_share:.0%}) and {took.memories.blocks:,} memory blocks ({took.block_share:.0%})"
     if count == 1:
         return 1, f"All {parameters.lines} lines fit one {device.title}: {share}."
-    if largest_lines < parameters.lines and on(largest_lines).fits:
-        reason = f"{whose} has room for {largest_lines} lines per board"
-    else:
-        reason = f"on one {device.title} {on(parameters.lines).why_not}"
     boards = f"{count} boards" if count > 2 else "two boards"
+    reason = f"on one {device.title} {why_not(parameters.lines)}"
     why = f"{parameters.lines} lines need {boards}: {reason}; {largest} lines per board take {share}. An estimate, not a compilation."
-    if parameters.replicas > 1:
-        whole, _ = most_replicas(parameters, device, table_length=table_length, interface=interface)
-        why += f" With --replicas {whole} or fewer, all lines fit one board." if whole else ""
+    if parameters.replicas > 1 and (whole := replicas_on_a_board(parameters.lines)):
+        why += f" With --replicas {whole} or fewer, all lines fit one board."
     return count, why
 
 

@@ -150,8 +150,7 @@ def test_every_command_with_a_uri_looks_a_robot_up_in_its_time(command, monkeypa
 
 
 @pytest.mark.usefixtures("_zoe")
-async def test_a_robots_name_stands_for_its_uri(monkeypatch):
-    """Also where a loop runs already, as here."""
+def test_a_robots_name_stands_for_its_uri(monkeypatch):
     assert load_settings(uri="robot:Zoë").uri == "ws://192.0.2.7:9090"
     with pytest.raises(UnknownRobotError):
         load_settings(uri="robot:Adam")
