@@ -215,5 +215,5 @@ def test_another_deployment_is_mounted_where_it_is_looked_for():
 def test_profiles(variables, profiles):
     line = re.search(r"^COMPOSE_PROFILES=(.*)$", (ROOT / ".env").read_text(), re.MULTILINE)
     used = {each for service in SERVICES.values() for each in service.get("profiles", [])}
-    assert used == {"hub", "boat", "boards", "viewer", "cluster"}
-    assert set(filled(line[1], **variables).split(",")) & used == profiles
+    assert used == {"core", "hub", "boat", "boards", "viewer", "cluster"}
+    assert set(filled(line[1], **variables).split(",")) & used == profiles | {"core"}
