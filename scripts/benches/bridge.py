@@ -14,7 +14,6 @@ import json
 import os
 import statistics
 import sys
-import tempfile
 import time
 from collections import defaultdict
 from collections.abc import AsyncIterator, Iterator
@@ -23,15 +22,12 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from rich.console import Console
-from rich.table import Table
-
 from scripts.benches.bare import advertise, bare, publish, settled, soon, subscribe
 from scripts.running.flags import ScriptParser
-from scripts.running.script import run_script
+from scripts.running.script import print_table, run_script
+from scripts.running.stand import temporary_stand
 from scripts.verifications.installation import install_roslibpy
 from services.errors import StackError
-from terminal.processes import Process
 
 SIDES = Path(__file__).with_name("bridge_sides")
 SMALL, LARGE = 6, 1024
@@ -182,23 +178,17 @@ async def bench() -> int:
     servers: defaultdict[str, list[float]] = defaultdict(list)
     found: Figures = defaultdict(lambda: defaultdict(list))
     topics = (f"/bench/turn{number}" for number in count())
-    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
-        hub, tornado = (Process(name, Path(folder, name)) for name in ("hub", "tornado"))
-        try:
-            await hub.start("hub", "--port", "0")
-            python = install_roslibpy() / "venv" / "bin" / "python"
-            await tornado.start(str(python), str(SIDES / "tornado_server.py"))
-            both = {"hub": hub, "Tornado double": tornado}
-            uris = {name: (await server.line(r"ws://\S+"))[0] for name, server in both.items()}
-            for _ in range(SERVER_TURNS):
-                for name, uri in uris.items():
-                    servers[name].append(await server_rate(uri, SERVER_MESSAGES[name]))
-            await tornado.end()
-            for _ in range(TURNS):
-                for name in (OURS, *THEIRS):
-                    await measure_turn(name, uris["hub"], topics, found)
-        finally:
-            await asyncio.gather(hub.end(), tornado.end())
+    async with temporary_stand() as stand:
+        await stand.start_hub()
+        python = install_roslibpy() / "venv" / "bin" / "python"
+        tornado = await stand.start("tornado", r"ws://\S+", str(python), str(SIDES / "tornado_server.py"))
+        for _ in range(SERVER_TURNS):
+            for name, uri in {"hub": stand.uri, "Tornado double": tornado}.items():
+                servers[name].append(await server_rate(uri, SERVER_MESSAGES[name]))
+        await stand.end("tornado")
+        for _ in range(TURNS):
+            for name in (OURS, *THEIRS):
+                await measure_turn(name, stand.uri, topics, found)
     show(servers, found)
     return 0
 
@@ -206,10 +196,8 @@ async def bench() -> int:
 def show(servers: dict[str, list[float]], found: Figures) -> None:
     """Print medians, and their ratios to those of the better transport of roslibpy."""
     columns = (OURS, CBOR, *THEIRS)
-    table = Table(title="clients on the hub (float64 values in a message; medians)")
-    for column in ("values", "", *columns, "ours to roslibpy", "CBOR to roslibpy"):
-        table.add_column(column, justify="right")
     rates = {name: statistics.median(each) for name, each in servers.items()}
+    rows = []
     for (values, quantity), by_client in found.items():
         middle = {name: statistics.median(by_client[name]) for name in columns}
         best = (max if quantity.endswith("/s") else min)(middle[name] for name in THEIRS)
@@ -217,8 +205,13 @@ def show(servers: dict[str, list[float]], found: Figures) -> None:
         figures = [
             f"{middle[name]:,.0f}" if middle[name] >= 100 else f"{middle[name]:.1f}" for name in columns
         ]
-        table.add_row(str(values), quantity, *figures, *(f"{ratio:.2f}" for ratio in ratios))
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+        rows.append((str(values), quantity, *figures, *(f"{ratio:.2f}" for ratio in ratios)))
+    print_table(
+        "clients on the hub (float64 values in a message; medians)",
+        ("values", "", *columns, "ours to roslibpy", "CBOR to roslibpy"),
+        rows,
+        left=0,
+    )
     ratio = rates["hub"] / rates["Tornado double"]
     print(
         f"messages of 64 bytes a second, {IN_FLIGHT} in flight: hub {rates['hub']:,.0f}, "

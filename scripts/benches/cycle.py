@@ -14,21 +14,17 @@ import os
 import random
 import statistics
 import sys
-import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
-
-from rich.console import Console
-from rich.table import Table
 
 from bridge.client import Publication, Ros, Subscription, connect
 from bridge.stamps import header, header_stamp_ns
 from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
-from casestudies.demo import build
-from scripts.running.flags import ScriptParser
-from scripts.running.script import run_script
-from terminal.processes import Process
+from scripts.running.flags import ScriptParser, positive
+from scripts.running.script import print_table, run_script
+from scripts.running.stand import Stand, temporary_stand
 
 STAGES = (
     *("wire_in", "rosbridge_in", "local_hops", "waited", "register_writes", "compute", "reads"),
@@ -42,7 +38,7 @@ WINDOW = 4
 TURN = 50
 """Number of readings in a turn, after which another alternative is measured."""
 FLOOR, STACKS = "floor (echo)", {"processes": SENSORS_TOPIC, "fused": SENSORS_TOPIC + "_fused"}
-BOAT_FLAGS = ("--loop", "--queue", "all")
+ALL_READINGS = ("--queue", "all")
 
 Times = defaultdict[str, list[float]]
 """Times in microseconds, by name of the measured quantity."""
@@ -60,6 +56,12 @@ def readings(seed: int, count: int) -> list[dict[str, int]]:
             reading[f"B{beacon}"] = round(math.degrees(math.atan2(y - by, x - bx))) % 360
         made.append(reading)
     return made
+
+
+def add_seed(parser: ScriptParser) -> None:
+    """Add the flag of the seed that `readings` takes."""
+    shown, new = "a new one each time", random.randrange(2**32)
+    parser.add_argument("--seed", type=int, default=new, shown=shown, help="seed of the boat's positions")
 
 
 def message(reading: dict[str, int]) -> dict[str, object]:
@@ -91,12 +93,12 @@ def cpu_us(pids: list[int]) -> float:
     return 1e6 * ticks / os.sysconf("SC_CLK_TCK")
 
 
-async def until_read(ros: Ros, topic: str) -> None:
+async def until_read(ros: Ros, topic: str, pause: float = 0.05) -> None:
     """Wait until somebody subscribes to a topic: a reading that is published earlier has no result."""
     while True:
-        if (await ros.call("/rosapi/subscribers", {"topic": topic}, timeout=30))["subscribers"]:
+        if (await ros.call("/rosapi/subscribers", {"topic": topic}, timeout=60))["subscribers"]:
             return
-        await asyncio.sleep(0.05)
+        await asyncio.sleep(pause)
 
 
 class Measured:
@@ -111,13 +113,15 @@ class Measured:
         """Frames without a posterior, of those whose stages were measured."""
         self._pids = processes_of(master) if master else {}
 
-    async def one_by_one(self, some: list[dict[str, int]]) -> None:
-        """Publish readings, each after the answer to the previous one."""
+    async def one_by_one(self, some: list[dict[str, int]], hz: float = 0.0) -> None:
+        """Publish readings, each after the answer to the previous one, and at most so many a second, if given."""
         for reading in some:
             started = time.perf_counter_ns()
             await self._publication.publish(message(reading))
             await self._answers.next(timeout=30)
             self.times["cycle"].append((time.perf_counter_ns() - started) / 1e3)
+            if hz:
+                await asyncio.sleep(max(0.0, started / 1e9 + 1 / hz - time.perf_counter()))
 
     async def stages(self, ros: Ros, some: list[dict[str, int]]) -> None:
         """Measure the stages of some frames.
@@ -162,14 +166,33 @@ class Measured:
         }
 
 
-async def measure(ros: Ros, masters: dict[str, Process], some: list[dict[str, int]]) -> dict[str, Measured]:
+async def in_turns(
+    sides: Sequence[Measured], some: list[dict[str, int]], turn: int = TURN, hz: float = 0.0
+) -> tuple[float, float, float]:
+    """Return the median cycles of two stacks, and the median of their ratios in neighbouring turns, after a warm-up.
+
+    The ratios are of neighbouring turns, because the load of the machine changes.
+    """
+    for side in sides:
+        await side.one_by_one(some[:TURN], hz)
+        side.times.clear()
+    turns = [slice(at, at + turn) for at in range(0, len(some), turn)]
+    for at, part in enumerate(turns):
+        for side in sides[:: 1 if at % 2 else -1]:
+            await side.one_by_one(some[part], hz)
+    one, other = (side.times["cycle"] for side in sides)
+    ratio = statistics.median(statistics.median(one[part]) / statistics.median(other[part]) for part in turns)
+    return statistics.median(one), statistics.median(other), ratio
+
+
+async def measure(ros: Ros, stand: Stand, some: list[dict[str, int]]) -> dict[str, Measured]:
     """Measure the echo and the stacks in turns, so that noise affects all alike."""
     kind = "std_msgs/Float64MultiArray"
     results = ros.subscribe("/BMresults", kind)
     echoes = ros.subscribe("/bench/echo", kind)
     all_ = {FLOOR: Measured(await ros.advertise("/bench/reading", SENSORS_TYPE), echoes, 0)}
     for name, topic in STACKS.items():
-        all_[name] = Measured(await ros.advertise(topic, SENSORS_TYPE), results, masters[name].pid)
+        all_[name] = Measured(await ros.advertise(topic, SENSORS_TYPE), results, stand.pid(name))
     for topic in ("/bench/reading", *STACKS.values()):
         await until_read(ros, topic)
     for each in all_.values():
@@ -188,33 +211,20 @@ async def measure(ros: Ros, masters: dict[str, Process], some: list[dict[str, in
 
 async def bench(arguments: argparse.Namespace) -> int:
     """Run everything, and print the table."""
-    seed = arguments.seed if arguments.seed is not None else random.randrange(2**32)
-    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
-        where = Path(folder)
-        hub, echo = (Process(name, where / f"{name}.log") for name in ("hub", "echo"))
-        masters = {name: Process(f"master ({name})", where / f"{name}.log") for name in STACKS}
-        try:
-            await hub.start("hub", "--port", "0")
-            uri = (await hub.line(r"ws://\S+"))[0]
-            await echo.start(sys.executable, "-P", "-m", "scripts.benches.echo", uri, str(LINES))
-            for name, topic in STACKS.items():
-                await build("boat", where / f"boat-{name}", uri, topic, SENSORS_TYPE)
-                flags = [*BOAT_FLAGS, *(["--fused"] if name == "fused" else [])]
-                (run := where / f"run-{name}").mkdir(mode=0o700)
-                flags += ["--run-directory", str(run)]
-                await masters[name].start("master", "-d", str(where / f"boat-{name}"), "--uri", uri, *flags)
-            await echo.line("listening")
-            for master in masters.values():
-                await master.line("pcie-app: 4 boards")
-            async with connect(uri) as ros:
-                all_ = await measure(ros, masters, readings(seed, arguments.frames))
-        finally:
-            await asyncio.gather(*(process.end() for process in (*masters.values(), echo, hub)))
-    show(all_, seed, arguments)
+    async with temporary_stand() as stand:
+        await stand.start_hub()
+        echo = ("-P", "-m", "scripts.benches.echo", stand.uri, str(LINES))
+        await stand.start("echo", "listening", sys.executable, *echo)
+        for name, topic in STACKS.items():
+            flags = (*ALL_READINGS, *(["--fused"] if name == "fused" else []))
+            await stand.start_boat_master(*flags, name=name, topic=topic)
+        async with connect(stand.uri) as ros:
+            all_ = await measure(ros, stand, readings(arguments.seed, arguments.frames))
+    show(all_, arguments)
     return 0
 
 
-def show(all_: dict[str, Measured], seed: int, arguments: argparse.Namespace) -> None:
+def show(all_: dict[str, Measured], arguments: argparse.Namespace) -> None:
     """Print the table on standard output."""
     medians = {
         name: {stage: statistics.median(times) for stage, times in each.times.items()}
@@ -235,17 +245,15 @@ def show(all_: dict[str, Measured], seed: int, arguments: argparse.Namespace) ->
             rows.setdefault(f"{stage.replace('_', ' ')}, us", {})[name] = medians[name][stage]
         for command, used in all_[name].cpu.items():
             rows.setdefault(f"CPU of {command}, us", {})[name] = used
-    table = Table(title=f"one cycle, {arguments.frames} frames, 32 x 32 cells on four boards")
-    for column in ("", *all_):
-        table.add_column(column, justify="right" if column else "left")
+    shown: list[tuple[str, ...] | None] = []
     for of_rows, style in ((ratios, ".2f"), (rows, ".0f")):
         for title, figures in of_rows.items():
-            table.add_row(title, *(f"{figures[name]:{style}}" if name in figures else "" for name in all_))
-        table.add_section()
-    Console().print(table)
+            shown.append((title, *(f"{figures[name]:{style}}" if name in figures else "" for name in all_)))
+        shown.append(None)
+    print_table(f"one cycle, {arguments.frames} frames, 32 x 32 cells on four boards", ("", *all_), shown)
     print(
         f"aim: a cycle takes at most {BOUND:g} times what floor and boards take; times are medians, rosbridge out is "
-        f"encoding and sending alone; {len(os.sched_getaffinity(0))} cores, seed {seed}"
+        f"encoding and sending alone; {len(os.sched_getaffinity(0))} cores, seed {arguments.seed}"
     )
 
 
@@ -255,10 +263,8 @@ def main() -> int:
         prog="scripts/bench cycle",
         description="Compare the time from a reading to its result with that of an echo.",
     )
-    parser.add_argument("--frames", type=int, default=1000, help="number of readings")
-    parser.add_argument(
-        "--seed", type=int, shown="a new one each time", help="seed of the positions of the boat"
-    )
+    parser.add_argument("--frames", type=positive, default=1000, help="number of readings")
+    add_seed(parser)
     parser.add_argument(
         "--sizes",
         action="store_true",
@@ -267,8 +273,6 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="with --sizes, write all numbers to this file")
     parser.add_argument("--picture", type=Path, help="with --sizes, draw them into this PNG")
     arguments = parser.parse_args()
-    if arguments.frames < 1:
-        parser.error("--frames must be 1 or more")
     if arguments.sizes:
         from scripts.benches.sizes import bench_sizes  # which needs this module
 

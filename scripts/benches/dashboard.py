@@ -15,15 +15,11 @@ import os
 import random
 import statistics
 import sys
-import tempfile
 import time
 from dataclasses import fields
-from pathlib import Path
 from typing import Final
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 from websockets.sync.client import connect as connect_plainly
 
 from bridge.client import Ros, connect
@@ -31,11 +27,12 @@ from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
 from posteriors import BoardReport, FrameReport, StageTimes
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, VariableReading, write_frame_report
 from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
-from scripts.benches.cycle import cpu_us, message, quantile, readings, until_read
+from scripts.benches.cycle import Measured, add_seed, cpu_us, in_turns, quantile, readings, until_read
 from scripts.benches.load import mib_of
-from scripts.running.browser import Browser, Stand, Visit, browser
-from scripts.running.flags import ScriptParser
-from scripts.running.script import run_script
+from scripts.running.browser import Browser, Visit, browser
+from scripts.running.flags import ScriptParser, positive
+from scripts.running.script import print_table, run_script
+from scripts.running.stand import Stand, temporary_stand
 
 HZ: Final = 50
 SIDE: Final = 64
@@ -46,7 +43,6 @@ SAMPLES: Final = 10
 """Number of intervals in the measurement of memory."""
 TURN: Final = 10
 """Number of cycles in a turn, after which the other stack is measured."""
-WARM_UP_TURNS: Final = 5
 PARTS: Final = ("cycle", "drag", "display")
 
 Rows = list[tuple[str, str, str]]
@@ -167,82 +163,53 @@ def read(url: str) -> None:
 
 async def cycles(plain: Stand, beside: Stand, frames: int, seed: int) -> Rows:
     """Compare the cycle times of two stacks, of which one has a dashboard with a reader, in short turns."""
-    medians: list[list[float]] = [[], []]
     async with connect(plain.uri) as one, connect(beside.uri) as other:
         # a process of its own, as a browser is
         reader = multiprocessing.get_context("spawn").Process(target=read, args=(beside.url,), daemon=True)
         reader.start()
-        sides = [
-            (await ros.advertise(SENSORS_TOPIC, SENSORS_TYPE), ros.subscribe(RESULTS_TOPIC, RESULTS_TYPE))
-            for ros in (one, other)
-        ]
-        for ros in (one, other):
+        sides = []
+        for ros in (other, one):
+            results = ros.subscribe(RESULTS_TOPIC, RESULTS_TYPE)
+            sides.append(Measured(await ros.advertise(SENSORS_TOPIC, SENSORS_TYPE), results, 0))
             await until_read(ros, SENSORS_TOPIC)
-        some = readings(seed, frames + WARM_UP_TURNS * TURN)
-        for at in range(0, len(some), TURN):
-            for taken, (publication, results) in zip(medians, sides, strict=True):
-                times = []
-                for each in some[at : at + TURN]:
-                    started = time.perf_counter()
-                    await publication.publish(message(each))
-                    await results.next(timeout=30)
-                    times.append(1e6 * (time.perf_counter() - started))
-                    await asyncio.sleep(max(0.0, started + 1 / HZ - time.perf_counter()))
-                taken.append(statistics.median(times))
+        with_it, without, ratio = await in_turns(sides, readings(seed, frames), TURN, HZ)
         reader.kill()
-    without, with_it = (each[WARM_UP_TURNS:] for each in medians)
-    # of neighbouring turns, because the load of the machine changes
-    ratio = statistics.median(b / a for a, b in zip(without, with_it, strict=True))
-    figures = f"{statistics.median(with_it):,.0f} / {statistics.median(without):,.0f}, {ratio:.3f}"
+    figures = f"{with_it:,.0f} / {without:,.0f}, {ratio:.3f}"
     return [(f"cycle at {HZ} a second, with the dashboard / without, us, ratio", figures, "at most 1.05")]
 
 
 async def bench(arguments: argparse.Namespace) -> int:
     """Measure part after part, and print the table."""
-    seed = arguments.seed if arguments.seed is not None else random.randrange(2**32)
     rows: Rows = []
-    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
-        source, boat, plain, beside = (
-            Stand(Path(folder) / name) for name in ("source", "boat", "plain", "beside")
-        )
-        async with contextlib.AsyncExitStack() as stack:
-            for stand in (source, boat, plain, beside):
-                stack.push_async_callback(stand.end)
-            if "cycle" in arguments.only:
+    async with contextlib.AsyncExitStack() as stack:
+        if "cycle" in arguments.only:
+            async with temporary_stand() as plain, temporary_stand() as beside:
                 for stand in (plain, beside):
                     await stand.start_hub()
-                    await stand.start_master()
+                    await stand.start_boat_master()
                 await beside.start_dashboard()
-                rows += await cycles(plain, beside, arguments.frames, seed)
-                await asyncio.gather(plain.end(), beside.end())
-            if set(arguments.only) <= {"cycle"}:
-                return show(rows, seed)
+                rows += await cycles(plain, beside, arguments.frames, arguments.seed)
+        if set(arguments.only) - {"cycle"}:
             chromium = await stack.enter_async_context(browser())
-            if "drag" in arguments.only:
+        if "drag" in arguments.only:
+            async with temporary_stand() as boat:
                 await boat.start_hub()
-                await boat.start_master()
-                await boat.start_boat(10.0)
+                await boat.start_boat_master()
+                await boat.start_boat()
                 await boat.start_dashboard()
-                rows += await drags(boat, chromium, random.Random(seed))
-                await boat.end()
-            if "display" in arguments.only:
+                rows += await drags(boat, chromium, random.Random(arguments.seed))
+        if "display" in arguments.only:
+            async with temporary_stand() as source:
                 await source.start_hub()
                 await source.start_dashboard()
                 rows += await display(source, chromium, arguments)
-    return show(rows, seed)
-
-
-def show(rows: Rows, seed: int) -> int:
-    """Print the table."""
-    table = Table(
-        title=f"dashboard; display: {HZ} posteriors a second of {SIDE} x {SIDE}, otherwise the boat's 32 x 32"
+    print_table(
+        f"dashboard; display: {HZ} posteriors a second of {SIDE} x {SIDE}, otherwise the boat's 32 x 32",
+        ("", "measured", "aim"),
+        rows,
     )
-    for column in ("", "measured", "aim"):
-        table.add_column(column, justify="right" if column else "left")
-    for row in rows:
-        table.add_row(*row)
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
-    print(f"{len(os.sched_getaffinity(0))} cores, shared by all processes and the browser; seed {seed}")
+    cores = len(os.sched_getaffinity(0))
+    print(f"{cores} cores, shared by all processes and the browser; seed {arguments.seed}")
     return 0
 
 
@@ -257,9 +224,9 @@ def main() -> int:
     )
     parser.add_argument("--minutes", type=float, default=2.0, help="duration of the measurement of memory")
     parser.add_argument(
-        "--frames", type=int, default=500, help="number of cycles with and without the dashboard"
+        "--frames", type=positive, default=500, help="number of cycles with and without the dashboard"
     )
-    parser.add_argument("--seed", type=int, shown="a new one each time", help="seed of the boat's positions")
+    add_seed(parser)
     parser.add_argument(
         "--only", choices=PARTS, action="append", shown="all", help="one part; repeat for more"
     )

@@ -21,8 +21,6 @@ from typing import Any, Final, cast
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from machines.bm1 import BM1Machine, Start
 from machines.bm2 import BM2Machine, BM2Start, start_state, unpack
@@ -32,10 +30,10 @@ from machines.fast import FastBM1
 from machines.parameters import BM1Parameters, Sequencer
 from scripts.benches.networks import Network
 from scripts.benches.samplers import CHAINS, THRML_LOCK, Factor, Known, pyagrum_gibbs, thrml_gibbs
-from scripts.running.flags import ScriptParser
+from scripts.running.flags import ScriptParser, positive
+from scripts.running.script import print_table, reporting_errors
 from scripts.verifications.installation import use_packages
 from scripts.verifications.networks import LOCK
-from services.errors import SettingsError
 
 SPRINKLER: Final = """network sprinkler { }
 variable R { type discrete [ 2 ] { no, yes }; }
@@ -231,15 +229,13 @@ def measure(runs: dict[str, Callable[[], Speed]]) -> dict[str, Speed]:
 
 def show(title: str, speeds: dict[str, Speed]) -> None:
     """Print a table; the ratios are those of sweeps a second to one chain."""
-    table = Table(title=title, title_justify="left")
-    for column in ("kernel or sampler", "cycles/s", "sweeps/s", "ratio"):
-        table.add_column(column, justify="left" if column.startswith("kernel") else "right")
+    rows = []
     single = next(iter(speeds.values()))
     for name, each in speeds.items():
         per_second = [f"{n / each.seconds:.2e}" if n else "" for n in (each.cycles, each.sweeps)]
         ratio = each.sweeps / each.seconds * single.seconds / single.sweeps if single.sweeps else 0
-        table.add_row(name, *per_second, f"{ratio:.3g}" if ratio else "")
-    Console(width=None if sys.stdout.isatty() else 100).print(table)
+        rows.append((name, *per_second, f"{ratio:.3g}" if ratio else ""))
+    print_table(title, ("kernel or sampler", "cycles/s", "sweeps/s", "ratio"), rows)
 
 
 def bench(arguments: argparse.Namespace) -> int:
@@ -275,11 +271,11 @@ def main() -> int:
     """Parse the flags and measure."""
     parser = ScriptParser(prog="scripts/bench kernel", description=__doc__.splitlines()[0])
     parser.add_argument(
-        "--sweeps", type=int, default=200_000, help="samples of one chain, and cycles of the BM1"
+        "--sweeps", type=positive, default=200_000, help="samples of one chain, and cycles of the BM1"
     )
     parser.add_argument(
         "--chain-sweeps",
-        type=int,
+        type=positive,
         default=80_000_000,
         help="samples of all of many chains, fewer if they are long",
     )
@@ -291,13 +287,7 @@ def main() -> int:
     )
     parser.add_argument("--check", action="store_true", help="exit 1 if an aim is missed")
     arguments = parser.parse_args()
-    if min(arguments.sweeps, arguments.chain_sweeps) < 1:
-        parser.error("--sweeps and --chain-sweeps must be 1 or more")
-    try:
-        return bench(arguments)
-    except SettingsError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+    return reporting_errors(lambda: bench(arguments))
 
 
 if __name__ == "__main__":

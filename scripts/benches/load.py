@@ -12,7 +12,6 @@ import json
 import os
 import random
 import sys
-import tempfile
 import time
 from collections import deque
 from collections.abc import AsyncIterator
@@ -21,17 +20,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rich.console import Console
-from rich.table import Table
-
 from bridge.client import connect
 from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
-from casestudies.demo import build
 from scripts.benches.bare import Bare, advertise, bare, frame, publish, settled, subscribe
-from scripts.benches.cycle import BOAT_FLAGS, WINDOW, message, processes_of, quantile, readings
+from scripts.benches.cycle import ALL_READINGS, WINDOW, message, processes_of, quantile, readings
 from scripts.running.flags import ScriptParser
-from scripts.running.script import run_script
-from terminal.processes import Process
+from scripts.running.script import print_table, run_script
+from scripts.running.stand import temporary_stand
 
 TOPICS, PUBLISHERS, SLOW = 200, 50, 50
 RATE, SLOT = 2000, 0.01
@@ -237,42 +232,24 @@ async def minutes_of(uri: str, hub: int, master: int, count: int) -> list[Row]:
 
 async def bench(arguments: argparse.Namespace) -> int:
     """Measure, and print the table."""
-    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
-        where = Path(folder)
-        hub, master = Process("hub", where / "hub.log"), Process("master", where / "master.log")
-        try:
-            await hub.start("hub", "--port", "0", "--clients", str(arguments.clients + 100))
-            uri = (await hub.line(r"ws://\S+"))[0]
-            rows = await crowd(uri, hub.pid, arguments.clients, arguments.seconds)
-            rows += [await attacked(uri, hub.pid, name, arguments.seconds) for name in ATTACKS]
-            if arguments.minutes:
-                await build("boat", where / "boat", uri, SENSORS_TOPIC, SENSORS_TYPE)
-                await master.start(
-                    "master", "-d", str(where / "boat"), "--uri", uri, *BOAT_FLAGS, "--run-directory", folder
-                )
-                await master.line("pcie-app: 4 boards")
-                rows += await minutes_of(uri, hub.pid, master.pid, arguments.minutes)
-        finally:
-            await asyncio.gather(master.end(), hub.end())
-    table = Table(title="delays, and their ratios to those of the first phase of each part")
+    async with temporary_stand() as stand:
+        await stand.start_hub("--clients", str(arguments.clients + 100))
+        hub = stand.pid("hub")
+        rows = await crowd(stand.uri, hub, arguments.clients, arguments.seconds)
+        rows += [await attacked(stand.uri, hub, name, arguments.seconds) for name in ATTACKS]
+        if arguments.minutes:
+            await stand.start_boat_master(*ALL_READINGS)
+            rows += await minutes_of(stand.uri, hub, stand.pid("master"), arguments.minutes)
     columns = ("part", "phase", "per second", "p50 ms", "p99 ms", "max ms", "MiB", "p99 ratio", "MiB ratio")
-    for column in columns:
-        table.add_column(column, justify="left" if column in columns[:2] else "right")
+    shown = []
     first = rows[0]
     for row in rows:
         first = first if row.part == first.part else row
-        p99, base = quantile(row.ms, 0.99), quantile(first.ms, 0.99)
-        figures = (
-            row.per_second,
-            quantile(row.ms, 0.5),
-            p99,
-            max(row.ms),
-            row.mib,
-            p99 / base,
-            row.mib / first.mib,
-        )
-        table.add_row(row.part, row.name, *(f"{figure:,.1f}" for figure in figures))
-    Console(width=None if sys.stdout.isatty() else 120).print(table)
+        p99, p50 = quantile(row.ms, 0.99), quantile(row.ms, 0.5)
+        ratios = p99 / quantile(first.ms, 0.99), row.mib / first.mib
+        figures = (row.per_second, p50, p99, max(row.ms), row.mib, *ratios)
+        shown.append((row.part, row.name, *(f"{figure:,.1f}" for figure in figures)))
+    print_table("delays, and their ratios to those of the first phase of each part", columns, shown, left=2)
     return 0
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,14 +16,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from casestudies.demo import build
 from casestudies.mrclam.model import BEARING_SIGMA, FLOOR, RANGE_SIGMA, Landmark, model, read_landmarks
 from casestudies.mrclam.player import RecordedFrame, area_grid, median_distance, play, read_recording
 from scripts.running.flags import ScriptParser
-from scripts.running.script import ROOT, run_script
+from scripts.running.script import ROOT, print_table, run_script
+from scripts.running.stand import Stand, temporary_stand
 from terminal.processes import Process
 from toolchain.deployment.address import to_address
 from toolchain.models import Model, exact_posterior
@@ -127,7 +125,7 @@ async def fit(arguments: argparse.Namespace) -> Model:
 
 
 async def run_stack(
-    where: Path, uri: str, arguments: argparse.Namespace, names: tuple[str, ...], fitted: Model | None
+    stand: Stand, arguments: argparse.Namespace, names: tuple[str, ...], fitted: Model | None
 ) -> list[Figures]:
     """Build a model, and play recordings through a stack that runs it."""
     title, cells = "by hand" if fitted is None else "fitted", arguments.cells
@@ -136,38 +134,33 @@ async def run_stack(
     if fitted is not None:
         settings["fit"] = arguments.fit
     options = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
-    deployment = where / title.replace(" ", "-")
-    master, found = Process("master", where / f"master-{deployment.name}.log"), []
-    try:
-        await build("mrclam", deployment, uri, TOPIC, TYPE, "--max-cycles", str(MAX_CYCLES), *options)
-        await master.start(
-            *("master", "--loop", "-d", str(deployment), "--uri", uri, "--run-directory", str(where))
+    deployment = stand.folder / title.replace(" ", "-")
+    await build("mrclam", deployment, stand.uri, TOPIC, TYPE, "--max-cycles", str(MAX_CYCLES), *options)
+    await stand.start_master(deployment)
+    found = []
+    for name in names:
+        frames = read_recording(arguments.data / name)
+        print(f"playing {name}: {len(frames)} frames, {title} ...", file=sys.stderr)
+        played = await play(stand.uri, frames)
+        for each in played:
+            if each.posterior is None:
+                print(f"{name}, frame {each.frame.number}: {each.outcome}", file=sys.stderr)
+        exact = [exact_distance(frame, landmarks, cells, fitted) for frame in frames]
+        found.append(
+            {
+                "recording": name,
+                "model": title,
+                "frames": len(played),
+                "no result": sum(each.posterior is None for each in played),
+                "stack median": median_distance(played),
+                "mean": fmean(each.distance() for each in played),
+                "exact median": median(exact),
+                "exact mean": fmean(exact),
+                "ratio of medians": median_distance(played) / median(exact),
+                "cycles": median(each.cycles for each in played if each.cycles is not None),
+            }
         )
-        await master.line("pcie-app: 4 boards")
-        for name in names:
-            frames = read_recording(arguments.data / name)
-            print(f"playing {name}: {len(frames)} frames, {title} ...", file=sys.stderr)
-            played = await play(uri, frames)
-            for each in played:
-                if each.posterior is None:
-                    print(f"{name}, frame {each.frame.number}: {each.outcome}", file=sys.stderr)
-            exact = [exact_distance(frame, landmarks, cells, fitted) for frame in frames]
-            found.append(
-                {
-                    "recording": name,
-                    "model": title,
-                    "frames": len(played),
-                    "no result": sum(each.posterior is None for each in played),
-                    "stack median": median_distance(played),
-                    "mean": fmean(each.distance() for each in played),
-                    "exact median": median(exact),
-                    "exact mean": fmean(exact),
-                    "ratio of medians": median_distance(played) / median(exact),
-                    "cycles": median(each.cycles for each in played if each.cycles is not None),
-                }
-            )
-    finally:
-        await master.end()
+    await stand.end("master")
     return found
 
 
@@ -177,24 +170,17 @@ async def bench(arguments: argparse.Namespace) -> int:
         read_recording(arguments.data / name)  # refuse an invalid recording before anything starts
     fitted = None if arguments.fit is None else await fit(arguments)
     names = RECORDINGS if fitted is None else RECORDINGS[1:]
-    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
-        hub = Process("hub", Path(folder, "hub.log"))
-        try:
-            await hub.start("hub", "--port", "0")
-            uri = (await hub.line(r"ws://\S+"))[0]
-            found = await run_stack(Path(folder), uri, arguments, names, None)
-            if fitted is not None:
-                found += await run_stack(Path(folder), uri, arguments, names, fitted)
-        finally:
-            await hub.end()
-    table = Table(title="distance of the posterior's mean to the reference position, in metres")
-    for column, figure in found[0].items():
-        table.add_column(column, justify="left" if isinstance(figure, str) else "right")
-    for each in found:
-        table.add_row(
-            *(f"{each[key]:.3f}" if isinstance(each[key], float) else str(each[key]) for key in each)
-        )
-    Console(width=None if sys.stdout.isatty() else 140).print(table)
+    async with temporary_stand() as stand:
+        await stand.start_hub()
+        found = await run_stack(stand, arguments, names, None)
+        if fitted is not None:
+            found += await run_stack(stand, arguments, names, fitted)
+    print_table(
+        "distance of the posterior's mean to the reference position, in metres",
+        list(found[0]),
+        [[f"{each:.3f}" if isinstance(each, float) else str(each) for each in row.values()] for row in found],
+        left=2,
+    )
     if fitted is not None:
         by_hand, learnt = found
         better = learnt["mean"] < by_hand["mean"]

@@ -20,8 +20,6 @@ from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from machines import make_bm2_kernel, warm_up
 from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, start_state, unpack
@@ -30,9 +28,9 @@ from machines.bm2_kernel import BM2Kernel
 from machines.parameters import Sequencer
 from scripts.benches.samplers import CHAINS, THRML_LOCK, Factor, Known, Sampled, pyagrum_gibbs, thrml_gibbs
 from scripts.running.flags import ScriptParser
+from scripts.running.script import print_table, reporting_errors
 from scripts.verifications.installation import use_packages
 from scripts.verifications.networks import LOCK, load
-from services.errors import SettingsError
 from toolchain.building.options import BuildOptions
 from toolchain.checks.check import check_model
 from toolchain.checks.findings import Finding, Severity
@@ -178,9 +176,7 @@ def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, flo
     """Print a table; return the machine's largest total variation: of the median banks, and of all banks."""
     names, sweeps = network.model.names, arguments.sweeps
     zeros = f"{network.zeros} zeros, which limit Gibbs samplers" if network.zeros else "no zeros"
-    table = Table(title=f"{network.model.name}: {len(names)} variables, {zeros}", title_justify="left")
-    for column in COLUMNS:
-        table.add_column(column, justify="left" if column in {"known", "sampler", "stop"} else "right")
+    rows: list[list[str] | None] = []
     kernels = {f"BM2 {each}": make_bm2_kernel(network.machine(each)) for each in SEQUENCERS}
     median, largest = [], []
     for title, known in network.evidences().items():
@@ -203,22 +199,16 @@ def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, flo
             runs[f"THRML, {CHAINS} chains"] = thrml_gibbs(*blocks, sweeps=sweeps, burn_in=BURN_IN)
         for sampler, each in runs.items():
             off = variation(each.marginals, exact)
-            figures = [
-                f"{max(off):.4f}",
-                f"{fmean(off):.4f}",
-                "",
-                str(each.sweeps),
-                "",
-                "",
-                f"{each.seconds:.2f}",
-            ]
+            effective = cycles = per_sweep = ""
             if each.cycles:
                 # where fewer, the batches are too short to tell
-                figures[2] = f"< {2 * BATCHES}" if each.effective < 2 * BATCHES else f"{each.effective:.0f}"
-                figures[4:6] = str(each.cycles), f"{each.cycles / (each.sweeps + BURN_IN):.1f}"
-            table.add_row(f"{len(known)} {title}" if known else title, sampler, *figures, each.stop)
-        table.add_section()
-    Console(width=None if sys.stdout.isatty() else 130).print(table)
+                effective = f"< {2 * BATCHES}" if each.effective < 2 * BATCHES else f"{each.effective:.0f}"
+                cycles, per_sweep = str(each.cycles), f"{each.cycles / (each.sweeps + BURN_IN):.1f}"
+            figures = [f"{max(off):.4f}", f"{fmean(off):.4f}", effective, str(each.sweeps), cycles, per_sweep]
+            evidence = f"{len(known)} {title}" if known else title
+            rows.append([evidence, sampler, *figures, f"{each.seconds:.2f}", each.stop])
+        rows.append(None)
+    print_table(f"{network.model.name}: {len(names)} variables, {zeros}", COLUMNS, rows, left=2)
     for warning in network.warnings:
         print(f"toolchain check: {warning.about}: {warning.what}")
     return max(median), max(largest)
@@ -277,11 +267,7 @@ def main() -> int:
     arguments.banks = 5 if arguments.check else 1
     if arguments.sweeps < BATCHES:
         parser.error(f"--sweeps must be {BATCHES} or more")
-    try:
-        return bench(arguments)
-    except SettingsError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+    return reporting_errors(lambda: bench(arguments))
 
 
 if __name__ == "__main__":

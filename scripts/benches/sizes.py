@@ -12,21 +12,19 @@ import argparse
 import json
 import os
 import random
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from bridge.client import Ros, connect
-from scripts.benches.cycle import BOAT_FLAGS, Measured, message, quantile, until_read
+from scripts.benches.cycle import ALL_READINGS, Measured, message, quantile, until_read
+from scripts.running.script import print_table
+from scripts.running.stand import Stand, temporary_stand
 from terminal.output import write_json
 from terminal.pictures import new_figure, save_figure
-from terminal.processes import Process
 from toolchain.building.build import build_deployment
 from toolchain.building.machine import plan_machine
 from toolchain.building.options import BuildOptions
@@ -87,38 +85,23 @@ def model(lines: int, sensors: int) -> Model:
     return Model(name="sizes", searched=(dimension("x", size=lines),), known=known)
 
 
-async def measure(
-    uri: str, folder: Path, problem: tuple[int, int, int], arguments: argparse.Namespace
-) -> Point:
+async def measure(stand: Stand, problem: tuple[int, int, int], arguments: argparse.Namespace) -> Point:
     """Build a problem's machine, run it, and measure its frames."""
     lines, sensors, padding = problem
     topic = f"/sizes/of_{lines}_{sensors}_{padding}"
-    options = BuildOptions(uri=uri, topic=topic, type=TYPE, max_cycles=1 << 20)
-    build_deployment(plan_machine(model(lines, sensors), options), folder / "deployment")
-    (run := folder / "run").mkdir(mode=0o700)
-    master = Process("master", folder / "master.log")
+    options = BuildOptions(uri=stand.uri, topic=topic, type=TYPE, max_cycles=1 << 20)
+    name = f"{lines}_{sensors}_{padding}"
+    build_deployment(plan_machine(model(lines, sensors), options), stand.folder / name)
     chance = random.Random(arguments.seed)
     some: list[dict[str, Any]] = [
         {f"s{at}": chance.randrange(2) for at in range(sensors)} | {"padding": "x" * padding}
         for _ in range(arguments.frames)
     ]
-    try:
-        flags = (
-            "-d",
-            str(folder / "deployment"),
-            "--uri",
-            uri,
-            "--run-directory",
-            str(run),
-            "--topic-bytes",
-            str(2 * max(PADDING)),
-        )
-        await master.start("master", *flags, *BOAT_FLAGS)
-        await master.line("pcie-app: 1 board")
-        async with connect(uri) as ros:
-            measured = await _measured(ros, topic, some)
-    finally:
-        await master.end()
+    flags = (*ALL_READINGS, "--topic-bytes", str(2 * max(PADDING)))
+    await stand.start_master(stand.folder / name, *flags, name=f"master-{name}", boards=1)
+    async with connect(stand.uri) as ros:
+        measured = await _measured(ros, topic, some)
+    await stand.end(f"master-{name}")
     times = measured.times
     parts = {
         part: [sum(of_frame) for of_frame in zip(*(times[stage] for stage in stages), strict=True)]
@@ -154,18 +137,9 @@ async def _measured(ros: Ros, topic: str, some: list[dict[str, Any]]) -> Measure
 
 async def bench_sizes(arguments: argparse.Namespace) -> int:
     """Measure every problem, and print the tables."""
-    points = []
-    arguments.seed = random.randrange(2**32) if arguments.seed is None else arguments.seed
-    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as name:
-        hub = Process("hub", Path(name) / "hub.log")
-        try:
-            await hub.start("hub", "--port", "0")
-            uri = (await hub.line(r"ws://\S+"))[0]
-            for problem in problems():
-                (folder := Path(name) / "_".join(map(str, problem))).mkdir()
-                points.append(await measure(uri, folder, problem, arguments))
-        finally:
-            await hub.end()
+    async with temporary_stand() as stand:
+        await stand.start_hub()
+        points = [await measure(stand, problem, arguments) for problem in problems()]
     show(points, arguments)
     if arguments.json:
         write_json(arguments.json, {"points": [each._asdict() for each in points]})
@@ -186,17 +160,17 @@ def varied(points: Sequence[Point]) -> dict[str, list[Point]]:
 
 def show(points: Sequence[Point], arguments: argparse.Namespace) -> None:
     """Print the table, and what holds of the thesis's claims."""
-    table = Table(
-        title=f"one cycle by the size of the problem, the fastest tenth of {arguments.frames} frames in us",
-        box=None,
-    )
-    for column in ("lines", "sensors", "bytes", "cycles", "link B", "cycle", *PARTS, "lost"):
-        table.add_column(column, justify="right")
+    rows = []
     for each in points:
         sizes = each.lines, each.sensors, each.size, each.cycles, each.link_bytes
-        figures = *sizes, each.cycle_us, *each.parts_us.values()
-        table.add_row(*(f"{figure:.0f}" for figure in figures), str(each.lost))
-    Console().print(table)
+        figures = *sizes, each.cycle_us, *each.parts_us.values(), each.lost
+        rows.append([f"{figure:.0f}" for figure in figures])
+    print_table(
+        f"one cycle by the size of the problem, the fastest tenth of {arguments.frames} frames in us",
+        ("lines", "sensors", "bytes", "cycles", "link B", "cycle", *PARTS, "lost"),
+        rows,
+        left=0,
+    )
     along = varied(points)
     cycles = {name: [each.cycles for each in those] for name, those in along.items()}
     same = len(set(cycles["lines"])) == 1

@@ -13,20 +13,17 @@ import asyncio
 import os
 import statistics
 import sys
-import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
 from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
 from casestudies.demo import build
-from scripts.running.flags import ScriptParser
-from scripts.running.script import run_script
+from scripts.running.flags import ScriptParser, positive
+from scripts.running.script import print_table, run_script
+from scripts.running.stand import temporary_stand
 from terminal.errors import ProcessError
-from terminal.processes import Process, own_command
+from terminal.processes import own_command
 
 LIMIT = 900.0
 """Time limit, in seconds."""
@@ -92,48 +89,33 @@ async def steps(folder: Path, files: Mapping[str, str], *command: str, **variabl
     return times | {"exit": time.monotonic() - began, "(longest silence)": silence}
 
 
-def show(console: Console, title: str, rounds: list[dict[str, float]]) -> None:
+def show(title: str, rounds: list[dict[str, float]]) -> None:
     """Print the median of each step, in the order of the first round, with the first round beside it."""
-    table = Table(title=title, title_justify="left")
-    for name in ("step", "first round, s", "median, s"):
-        table.add_column(name, justify="left" if name == "step" else "right")
-    for step, first in sorted(rounds[0].items(), key=lambda item: (item[0].startswith("("), item[1])):
-        table.add_row(
-            step, f"{first:.2f}", f"{statistics.median(each.get(step, first) for each in rounds):.2f}"
-        )
-    console.print(table)
+    rows = [
+        (step, f"{first:.2f}", f"{statistics.median(each.get(step, first) for each in rounds):.2f}")
+        for step, first in sorted(rounds[0].items(), key=lambda item: (item[0].startswith("("), item[1]))
+    ]
+    print_table(title, ("step", "first round, s", "median, s"), rows)
 
 
 async def bench(arguments: argparse.Namespace) -> int:
     """Measure the demo, then `master --once` with compiled kernels, and once without."""
-    console = Console()
-    with tempfile.TemporaryDirectory(prefix="bench-start-") as name:
-        folder = Path(name)
+    async with temporary_stand() as stand:
         rounds = []
         for at in range(arguments.rounds):
-            out = folder / f"demo{at}"
+            out = stand.folder / f"demo{at}"
             rounds.append(await steps(out, DEMO, "rosbayes", "demo", "--out", str(out)))
-        show(console, "rosbayes demo, 25 frames", rounds)
-        processes = [
-            Process(each, folder / f"{each}.log") for each in ("hub", "boat-normaliser", "boat-simulator")
-        ]
-        try:
-            await processes[0].start("hub", "--port", "0")
-            uri = (await processes[0].line(r"ws://\S+"))[0]
-            await build("boat", folder / "deployment", uri, SENSORS_TOPIC, SENSORS_TYPE)
-            for each in processes[1:]:
-                await each.start(each.name, "--uri", uri)
-            await processes[2].line("seed")
-            once = ("master", "--once", "-d", str(folder / "deployment"))
-            rounds = []
-            for at in range(arguments.rounds):
-                rounds.append(await steps(folder / f"once{at}", MASTER, *once))
-            show(console, "master --once", rounds)
-            kernels = folder / "kernels"
-            cold = await steps(folder / "cold", MASTER, *once, NUMBA_CACHE_DIR=str(kernels))
-            show(console, "master --once, which compiles the kernels", [cold])
-        finally:
-            await asyncio.gather(*(each.end() for each in reversed(processes)))
+        show("rosbayes demo, 25 frames", rounds)
+        await stand.start_hub()
+        deployment = stand.folder / "deployment"
+        await build("boat", deployment, stand.uri, SENSORS_TOPIC, SENSORS_TYPE)
+        await stand.start_boat()
+        once = ("master", "--once", "-d", str(deployment))
+        rounds = [await steps(stand.folder / f"once{at}", MASTER, *once) for at in range(arguments.rounds)]
+        show("master --once", rounds)
+        kernels = str(stand.folder / "kernels")
+        cold = await steps(stand.folder / "cold", MASTER, *once, NUMBA_CACHE_DIR=kernels)
+        show("master --once, which compiles the kernels", [cold])
     return 0
 
 
@@ -143,10 +125,8 @@ def main() -> int:
         prog="scripts/bench start",
         description="Print when each step of the start of the demo and of master --once is over.",
     )
-    parser.add_argument("--rounds", type=int, default=5, help="number of starts of each")
+    parser.add_argument("--rounds", type=positive, default=5, help="number of starts of each")
     arguments = parser.parse_args()
-    if arguments.rounds < 1:
-        parser.error("--rounds must be 1 or more")
     return run_script(lambda: bench(arguments), LIMIT)
 
 

@@ -1,38 +1,22 @@
-"""Debian's Chromium on the dashboard of a running stack, for `verify dashboard` and `bench dashboard`.
-
-boat-simulator --> boat-normaliser --> hub <--> master with 4 boards
-                                        ^
-                                        v
-                                    dashboard <--> pages in Chromium, which Playwright controls
-"""
+"""Debian's Chromium on the dashboard of a stand, for `verify dashboard` and `bench dashboard`."""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import io
-import os
 import shutil
-import signal
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
-from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
-from casestudies.demo import build
-from scripts.running.patience import FACTOR
+from scripts.running.stand import PATIENCE
 from scripts.verifications.installation import install_programs, use_packages
-from terminal.processes import Process
 
 if TYPE_CHECKING:
     from PIL import Image
 
 LOCK: Final = Path(__file__).parents[1] / "verifications" / "playwright.lock"
-PATIENCE: Final = 60.0 * FACTOR
-"""Time limit of each wait, in seconds."""
-TAIL: Final = 5
-"""Number of the last lines of each log that are shown when a check fails."""
 NUMBER: Final = "Number(document.querySelector('[data-testid=frame-number]')?.innerText.replace(/\\D/g, ''))"
 """The shown frame number, in JavaScript; 0 without one."""
 NEAR: Final = 0.13
@@ -212,77 +196,3 @@ async def browser() -> AsyncIterator[Browser]:
             yield Browser(chromium)
         finally:
             await chromium.close()
-
-
-class Stand:
-    """The processes of a run and the dashboard; each can be killed and started again."""
-
-    def __init__(self, folder: Path) -> None:
-        """Keep deployment, logs and sockets in a folder."""
-        self._folder = folder
-        (folder / "run").mkdir(parents=True, mode=0o700)
-        self._where: tuple[str, ...] = ()
-        self.uri = self.url = ""
-        # The processes that were started and their command lines, so that they can be started again.
-        self._commands: dict[str, tuple[str, ...]] = {}
-        self._processes: dict[str, Process] = {}
-
-    def pid(self, name: str) -> int:
-        """Return the number of a process."""
-        return self._processes[name].pid
-
-    async def start(self, name: str, ready: str, *command: str) -> str:
-        """Start a process, or start it again without a command, and return the text that shows its readiness."""
-        self._commands[name] = command or self._commands[name]
-        self._processes[name] = process = Process(name, self._folder / f"{name}.log")
-        await process.start(*self._commands[name])
-        async with asyncio.timeout(2 * PATIENCE):
-            return (await process.line(ready))[0]
-
-    async def kill(self, name: str) -> None:
-        """Kill a process as a crash would, and wait for its end."""
-        os.kill(self.pid(name), signal.SIGKILL)
-        await self._processes[name].wait()
-
-    async def start_hub(self, ros_version: str = "1") -> None:
-        """Start the hub on a free port, on which it will also start again."""
-        command = ("hub", "--ros-version", ros_version, "--port")
-        self.uri = await self.start("hub", r"ws://\S+", *command, "0")
-        self._commands["hub"] = (*command, str(urlsplit(self.uri).port))
-        self._where = ("--uri", self.uri, "--run-directory", str(self._folder / "run"))
-
-    async def start_master(self, extra: str = "") -> None:
-        """Build the boat's deployment, add lines to its deployment.toml, and start its master."""
-        await build("boat", deployment := self._folder / "boat", self.uri, SENSORS_TOPIC, SENSORS_TYPE)
-        with (deployment / "deployment.toml").open("a") as file:
-            file.write(extra)
-        flags = ("-d", str(deployment), "--loop", *self._where)
-        await self.start("master", "pcie-app: 4 boards", "master", *flags)
-
-    async def start_boat(self, rate: float) -> None:
-        """Start normaliser and simulator."""
-        await self.start("normaliser", "boat", "boat-normaliser", "--uri", self.uri)
-        flags = ("--uri", self.uri, "--rate", str(rate))
-        await self.start("simulator", "seed", "boat-simulator", *flags)
-
-    async def start_dashboard(self) -> None:
-        """Start the dashboard on a free port, on which it will also start again."""
-        command = ("dashboard", *self._where, "--port")
-        self.url = await self.start("dashboard", r"http://[\w.:]+", *command, "0")
-        self._commands["dashboard"] = (*command, str(urlsplit(self.url).port))
-
-    def tails(self) -> str:
-        """Return the last lines of the logs."""
-        logs = {name: (self._folder / f"{name}.log").read_text() for name in self._processes}
-        return "\n".join(f"    {name}: {line}" for name in logs for line in logs[name].splitlines()[-TAIL:])
-
-    def traceback(self) -> str | None:
-        """Return which processes have shown a traceback; None if none has."""
-        names = [
-            name for name in self._processes if "Traceback" in (self._folder / f"{name}.log").read_text()
-        ]
-        return f"there is one from {' and '.join(names)}" if names else None
-
-    async def end(self) -> None:
-        """End all processes."""
-        await asyncio.gather(*(process.end() for process in self._processes.values()))

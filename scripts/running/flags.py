@@ -4,10 +4,15 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[2]
+
+def positive(text: str) -> int:
+    """Return the value of a flag that is 1 or more."""
+    if (number := int(text)) < 1:
+        raise argparse.ArgumentTypeError("must be 1 or more")
+    return number
 
 
-_KINDS: dict[Any, str] = {int: "NUMBER", float: "NUMBER", Path: "FILE"}
+_KINDS: dict[Any, str] = {int: "NUMBER", positive: "NUMBER", float: "NUMBER", Path: "FILE"}
 
 
 class ScriptParser(argparse.ArgumentParser):
@@ -18,14 +23,7 @@ class ScriptParser(argparse.ArgumentParser):
         if options.get("action", "append") == "append" and names[0].startswith("-"):
             kind = "|".join(options.get("choices", ())) or _KINDS.get(options.get("type"), "TEXT")
             options.setdefault("metavar", kind)
-            if default := shown or _text(options.get("default")):
-                options["help"] = f"{options.get('help', '')} [default: {default}]".strip()
+            default = options.get("default")
+            if text := shown or (f"{default:g}" if isinstance(default, float) else str(default or "")):
+                options["help"] = f"{options.get('help', '')} [default: {text}]".strip()
         return super().add_argument(*names, **options)
-
-
-def _text(default: Any) -> str:
-    if isinstance(default, float):
-        return f"{default:g}"
-    if isinstance(default, Path):
-        return str(default.relative_to(ROOT) if default.is_relative_to(ROOT) else default)
-    return "" if default is None else ", ".join(default) if isinstance(default, list) else str(default)

@@ -1,11 +1,14 @@
-"""The main function of a script: its coroutine within a time limit, and an error in one sentence."""
+"""The main function of a script: its coroutine within a time limit, an error in one sentence, and a table of results."""
 
 from __future__ import annotations
 
 import asyncio
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
 
 from bridge.errors import BridgeError
 from services.errors import StackError
@@ -29,8 +32,13 @@ def run_script(work: Callable[[], Awaitable[int]], limit: float) -> int:
         except TimeoutError:
             raise StackError(f"this did not end within {limit:.0f} s") from None
 
+    return reporting_errors(lambda: run_async(limited()))
+
+
+def reporting_errors(work: Callable[[], int]) -> int:
+    """Return the exit code of a function, or that of its error, which is reported in one sentence."""
     try:
-        return run_async(limited())
+        return work()
     except StoppedError as stopped:
         print(stopped, file=sys.stderr)
         return stopped.exit_code
@@ -40,3 +48,18 @@ def run_script(work: Callable[[], Awaitable[int]], limit: float) -> int:
     except OSError as error:
         print(f"error: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
         return ExitCode.USAGE
+
+
+def print_table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[str] | None], *, left: int = 1
+) -> None:
+    """Print a table whose first columns are aligned on the left; a row that is None ends a section."""
+    table = Table(title=title, title_justify="left")
+    for at, column in enumerate(columns):
+        table.add_column(column, justify="left" if at < left else "right")
+    for row in rows:
+        if row is None:
+            table.add_section()
+        else:
+            table.add_row(*row)
+    Console(width=None if sys.stdout.isatty() else 140).print(table)

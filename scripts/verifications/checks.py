@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 
@@ -31,6 +33,19 @@ class Tally:
 
     passed: int = 0
     failed: int = 0
+
+    @contextlib.contextmanager
+    def check(
+        self, name: str, *errors: type[Exception], details: Callable[[], str] = lambda: ""
+    ) -> Iterator[None]:
+        """Report a check, which the block runs; it fails by a CheckError or by one of these errors, with details."""
+        started, why = time.monotonic(), None
+        known: tuple[type[Exception], ...] = (CheckError, *errors)
+        try:
+            yield
+        except known as error:
+            why = str(error) or type(error).__name__
+        self.report(name, started, why, details() if why else "")
 
     def report(self, name: str, started: float, why: str | None, details: str = "") -> None:
         """Print one check's line, and details below it."""

@@ -14,11 +14,9 @@ import logging
 import math
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -36,10 +34,11 @@ from casestudies.boat.sensors import (
 from posteriors import BoardReport, FrameReport, Posterior, StageTimes, posteriors
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, VariableReading, write_frame_report
 from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
-from scripts.running.browser import PATIENCE, Browser, Place, Stand, Visit, browser
+from scripts.running.browser import Browser, Place, Visit, browser
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
 from scripts.running.script import ROOT, run_script
+from scripts.running.stand import PATIENCE, Stand, temporary_stand
 from scripts.verifications.checks import CheckError, Tally, expect
 
 LIMIT: Final = 1200.0 * FACTOR
@@ -353,22 +352,18 @@ async def verify(only: str, *, pictures: bool) -> int:
     logging.getLogger("bridge").setLevel(logging.CRITICAL)  # the hub is killed on purpose
     os.environ |= {name: f"{limit:g}" for name, limit in PRODUCT_LIMITS.items()}
     tally = Tally()
-    with tempfile.TemporaryDirectory(prefix="verify-rosbayes-") as folder:
-        stand = Stand(Path(folder) / "stand")
-        async with contextlib.AsyncExitStack() as stack:
-            stack.push_async_callback(stand.end)
-            chromium = await stack.enter_async_context(browser())
-            await stand.start_hub()
-            await stand.start_master()
-            await stand.start_boat(10.0)
-            await stand.start_dashboard()
-            ros = await stack.enter_async_context(connect(stand.uri, retry=True, check_types=False))
-            scene = Scene(stand, chromium, await chromium.open(stand.url), ros)
-            for follow in (scene.follow_boat, scene.follow_posteriors):
-                stack.callback(asyncio.create_task(follow()).cancel)
-            for name, check in CHECKS.items():
-                if only in name and (pictures or check is not draw):
-                    await run_check(tally, name, check, scene)
+    async with temporary_stand() as stand, browser() as chromium, contextlib.AsyncExitStack() as stack:
+        await stand.start_hub()
+        await stand.start_boat_master()
+        await stand.start_boat()
+        await stand.start_dashboard()
+        ros = await stack.enter_async_context(connect(stand.uri, retry=True, check_types=False))
+        scene = Scene(stand, chromium, await chromium.open(stand.url), ros)
+        for follow in (scene.follow_boat, scene.follow_posteriors):
+            stack.callback(asyncio.create_task(follow()).cancel)
+        for name, check in CHECKS.items():
+            if only in name and (pictures or check is not draw):
+                await run_check(tally, name, check, scene)
         tally.report("no process has shown a traceback", time.monotonic(), stand.traceback())
     return tally.end()
 

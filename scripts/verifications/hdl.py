@@ -31,7 +31,8 @@ from pcie_shim.errors import PcieShimError
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import Image, read_image
-from scripts.running.flags import ROOT, ScriptParser
+from scripts.running.flags import ScriptParser
+from scripts.running.script import ROOT
 from scripts.verifications.checks import Tally
 from scripts.verifications.installation import install_programs
 from services.errors import SettingsError
@@ -56,16 +57,8 @@ def boat_failure(engine: str, count: int) -> str | None:
     boat = ROOT / "casestudies" / "boat"
     with tempfile.TemporaryDirectory(prefix="hdl-boat-") as where:
         folder, deployment = Path(where), Path(where) / "boat"
-        command = [
-            str(_BIN / "toolchain"),
-            "build",
-            str(boat),
-            "-o",
-            str(deployment),
-            "--partitions",
-            "4",
-            *source,
-        ]
+        build = ("build", str(boat), "-o", str(deployment), "--partitions", "4", *source)
+        command = [str(_BIN / "toolchain"), *build]
         subprocess.run(command, check=True, capture_output=True, timeout=_COMPILING_S)
         images = [read_image(deployment / "boards" / f"board{at}.bm") for at in range(4)]
         frames = _frames(images[BOARD], count)

@@ -22,9 +22,9 @@ from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters, RngKind
 from machines.posterior import posterior
 from scripts.running.flags import ScriptParser
+from scripts.running.script import reporting_errors
 from scripts.verifications.checks import Tally
 from scripts.verifications.installation import use_packages
-from services.errors import SettingsError
 from toolchain.building.quantise import quantise
 from toolchain.errors import ModelError
 from toolchain.models.distribution import Distribution
@@ -283,11 +283,8 @@ def main() -> int:
     """Parse the flags and verify."""
     parser = ScriptParser(prog="scripts/verify networks", description=__doc__.splitlines()[0])
     parser.add_argument("--network", action="append", metavar="NAME", help="only this one; repeat for more")
-    try:
-        return verify(parser.parse_args().network or [])
-    except SettingsError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+    arguments = parser.parse_args()
+    return reporting_errors(lambda: verify(arguments.network or []))
 
 
 if __name__ == "__main__":

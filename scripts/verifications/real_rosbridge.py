@@ -19,6 +19,7 @@ import tempfile
 import zipfile
 from pathlib import Path
 
+from scripts.running.script import reporting_errors
 from scripts.verifications.installation import cached, run
 from services.errors import SettingsError
 
@@ -170,28 +171,21 @@ def serve(port: int) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Run the subcommand, and report an error in one sentence."""
-    try:
-        match arguments:
-            case ["install"]:
-                print(install())
-            case ["alone", _, *_]:
-                become_alone(arguments[1:])
-            case ["inside", _, *_]:
-                inside(arguments[1:])
-            case ["serve", *port] if not port or (len(port) == 1 and port[0].isdigit()):
-                serve(int(port[0]) if port else DEFAULT_PORT)
-            case _:
-                print(
-                    "usage: scripts/real-rosbridge install | alone COMMAND ... | serve [PORT]",
-                    file=sys.stderr,
-                )
-                return 2
-    except SettingsError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+    """Run the subcommand."""
+    match arguments:
+        case ["install"]:
+            print(install())
+        case ["alone", _, *_]:
+            become_alone(arguments[1:])
+        case ["inside", _, *_]:
+            inside(arguments[1:])
+        case ["serve", *port] if not port or (len(port) == 1 and port[0].isdigit()):
+            serve(int(port[0]) if port else DEFAULT_PORT)
+        case _:
+            print("usage: scripts/real-rosbridge install | alone COMMAND ... | serve [PORT]", file=sys.stderr)
+            return 2
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(reporting_errors(lambda: main(sys.argv[1:])))

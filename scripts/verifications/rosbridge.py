@@ -15,7 +15,6 @@ import math
 import os
 import shutil
 import signal
-import socket
 import sys
 import tempfile
 import time
@@ -40,10 +39,11 @@ from casestudies.boat.sensors import SENSORS_TOPIC
 from casestudies.demo import build
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR
-from scripts.running.script import ROOT, run_script
+from scripts.running.script import ROOT, reporting_errors, run_script
+from scripts.running.stand import free_port
 from scripts.verifications import real_rosbridge
 from scripts.verifications.checks import CheckError, Tally, expect
-from services.errors import SettingsError, StackError
+from services.errors import StackError
 from terminal.errors import ProcessError
 from terminal.processes import Process
 
@@ -690,9 +690,7 @@ async def verify(kinds: list[str], only: str) -> int:
     shutil.rmtree(OUT, ignore_errors=True)
     OUT.mkdir(parents=True)
     logging.getLogger("bridge").setLevel(logging.CRITICAL)  # the checks print everything relevant
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     deployments = {form: OUT / f"deployment-{form}" for form in ARRAY_TYPES}
     for form, folder in deployments.items():
         uri = f"ws://127.0.0.1:{port}"
@@ -705,22 +703,14 @@ async def verify(kinds: list[str], only: str) -> int:
             for name, check in CHECKS.items():
                 if only not in name:
                     continue
-                started, why = time.monotonic(), None
                 stand.logs.clear()
-                try:
+                failed = tally.failed
+                errors = (ProcessError, StackError, BridgeError, OSError, ConnectionClosed)
+                with tally.check(f"{stand.kind}: {name}", *errors, details=stand.tails):
                     await stand.start()
                     await check(stand)
-                except (
-                    CheckError,
-                    ProcessError,
-                    StackError,
-                    BridgeError,
-                    OSError,
-                    ConnectionClosed,
-                ) as error:
-                    why = f"{type(error).__name__}: {error}"
+                if tally.failed > failed:
                     await stand.stop()  # the next check gets a new server
-                tally.report(f"{stand.kind}: {name}", started, why, stand.tails() if why else "")
         finally:
             await stand.stop()
     changed = (
@@ -728,6 +718,13 @@ async def verify(kinds: list[str], only: str) -> int:
     )
     tally.report("the deployments are as built, byte for byte", time.monotonic(), changed)
     return tally.end()
+
+
+def _again_alone() -> int:
+    real_rosbridge.install()
+    module = ["-P", "-m", "scripts.verifications.rosbridge"]
+    real_rosbridge.become_alone([sys.executable, *module, *sys.argv[1:]])
+    return 0
 
 
 def main() -> int:
@@ -738,13 +735,7 @@ def main() -> int:
     arguments = parser.parse_args()
     kinds = ["real", "hub"] if arguments.server == "both" else [arguments.server]
     if "real" in kinds and not real_rosbridge.network_is_alone():
-        try:
-            real_rosbridge.install()
-            module = ["-P", "-m", "scripts.verifications.rosbridge"]
-            real_rosbridge.become_alone([sys.executable, *module, *sys.argv[1:]])
-        except SettingsError as error:
-            print(f"error: {error}", file=sys.stderr)
-            return error.exit_code
+        return reporting_errors(_again_alone)
     return run_script(lambda: verify(kinds, arguments.only), LIMIT)
 
 

@@ -8,17 +8,15 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
-from scripts.running.script import ROOT
-from scripts.verifications.checks import CheckError, Tally, expect
+from scripts.running.script import ROOT, reporting_errors
+from scripts.verifications.checks import Tally, expect
 from scripts.verifications.installation import pip, run
-from services.errors import SettingsError
 
 LIMIT: Final = 300.0 * FACTOR
 """Time limit of a command, in seconds."""
@@ -136,28 +134,25 @@ CHECKS: Final[dict[str, Callable[[Installed], None]]] = {
 }
 
 
-def main() -> int:
+def verify(only: str) -> int:
     """Install the wheel, and check it."""
+    tally = Tally()
+    with tempfile.TemporaryDirectory(prefix="wheel-rosbayes-") as folder:
+        print("installing the wheel ...", flush=True)
+        installed = Installed(Path(folder))
+        for name, check in CHECKS.items():
+            if only in name:
+                with tally.check(name, OSError, subprocess.TimeoutExpired):
+                    check(installed)
+    return tally.end()
+
+
+def main() -> int:
+    """Parse the flags and verify."""
     parser = ScriptParser(prog="scripts/verify wheel", description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="", metavar="TEXT", help="checks with this in their names")
-    only, tally = parser.parse_args().only, Tally()
-    with tempfile.TemporaryDirectory(prefix="wheel-rosbayes-") as folder:
-        try:
-            print("installing the wheel ...", flush=True)
-            installed = Installed(Path(folder))
-        except SettingsError as error:
-            print(f"error: {error}", file=sys.stderr)
-            return error.exit_code
-        for name, check in CHECKS.items():
-            if only not in name:
-                continue
-            began, why = time.monotonic(), None
-            try:
-                check(installed)
-            except (CheckError, OSError, subprocess.TimeoutExpired) as error:
-                why = str(error)
-            tally.report(name, began, why)
-    return tally.end()
+    arguments = parser.parse_args()
+    return reporting_errors(lambda: verify(arguments.only))
 
 
 if __name__ == "__main__":

@@ -7,23 +7,21 @@ import asyncio
 import os
 import re
 import shutil
-import socket
 import sys
-import tempfile
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 from bridge.client import GoalRequest, connect
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR
 from scripts.running.script import run_script
+from scripts.running.stand import Stand, temporary_stand
 from scripts.verifications.checks import Tally
 from scripts.verifications.installation import install_node_packages, install_roslibpy
-from terminal.processes import Process
 
 NODE_SCRIPT: Final = Path(__file__).with_name("roslib.mjs")
 LIMIT: Final = 240 * FACTOR
@@ -45,21 +43,6 @@ STEP: Final = 0.3
 """Seconds per number of the Fibonacci server: the suites cancel a goal of ten numbers after two seconds."""
 
 
-@asynccontextmanager
-async def hub_of(ros_version: str, folder: Path) -> AsyncIterator[int]:
-    """Run a hub during the block, and yield its port."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = int(free.getsockname()[1])
-    hub = Process("hub", folder / "hub.log")
-    try:
-        await hub.start("hub", "--port", str(port), "--ros-version", ros_version)
-        await hub.line(r"ws://\S+")
-        yield port
-    finally:
-        await hub.end()
-
-
 async def fibonacci(goal: GoalRequest) -> dict[str, Any]:
     """Execute a goal of roslibpy's tests of ROS 2: one number of the sequence per step."""
     sequence = [0, 1]
@@ -73,35 +56,29 @@ async def fibonacci(goal: GoalRequest) -> dict[str, Any]:
     return {"sequence": sequence}
 
 
-async def roslibpy(ros_version: str, transport: str, folder: Path) -> str | None:
+async def roslibpy(ros_version: str, transport: str, stand: Stand) -> str | None:
     """Run roslibpy's suites, and return what failed, or None."""
-    clients = install_roslibpy()
+    clients, folder = install_roslibpy(), stand.folder
     shutil.copytree(clients / "source" / "tests", folder / "tests")
-    async with hub_of(ros_version, folder) as port, connect(f"ws://127.0.0.1:{port}") as ros:
+    async with connect(stand.uri) as ros:
         if ros_version == "2":
             await ros.advertise_action("/fibonacci", "example_interfaces/action/Fibonacci", fibonacci)
         for file in (folder / "tests").glob("ros?/*.py"):
-            file.write_text(re.sub(rf"\b{PORT_OF_THE_SUITES}\b", str(port), file.read_text()))
-        pytest = (
-            str(clients / "venv" / "bin" / "python"),
-            "-m",
-            "pytest",
-            "-q",
-            "-rfE",
-            "-p",
-            "no:cacheprovider",
-        )
+            file.write_text(
+                re.sub(rf"\b{PORT_OF_THE_SUITES}\b", str(urlsplit(stand.uri).port), file.read_text())
+            )
+        python = str(clients / "venv" / "bin" / "python")
+        pytest = (python, "-m", "pytest", "-q", "-rfE", "-p", "no:cacheprovider")
         flags = ("-c", os.devnull, "--rootdir", str(folder), "--timeout", str(60 * FACTOR))
         suites = (f"tests/{suite}" for suite in SUITES[ros_version])
         return await failure_of(*pytest, *flags, *suites, folder=folder, ROSLIBPY_TRANSPORT=transport)
 
 
-async def roslib(ros_version: str, folder: Path) -> str | None:
+async def roslib(ros_version: str, stand: Stand) -> str | None:
     """Run the checks of roslib.mjs, and return what failed, or None."""
     module = install_node_packages("roslib", NODE_SCRIPT.parent) / "roslib" / "dist" / "RosLib.js"
-    async with hub_of(ros_version, folder) as port:
-        uri = f"ws://127.0.0.1:{port}"
-        return await failure_of("node", str(NODE_SCRIPT), str(module), uri, ros_version, folder=folder)
+    command = ("node", str(NODE_SCRIPT), str(module), stand.uri, ros_version)
+    return await failure_of(*command, folder=stand.folder)
 
 
 async def failure_of(*command: str, folder: Path, **environment: str) -> str | None:
@@ -132,16 +109,17 @@ async def failure_of(*command: str, folder: Path, **environment: str) -> str | N
 async def verify(arguments: argparse.Namespace) -> int:
     """Run everything, each suite on its own hub."""
     tally = Tally()
-    runs: dict[str, Callable[[Path], Awaitable[str | None]]] = {}
+    runs: dict[tuple[str, str], Callable[[Stand], Awaitable[str | None]]] = {}
     for version in ("1", "2"):
         for transport in TRANSPORTS:
-            runs[f"roslibpy, {transport}, ROS {version}"] = partial(roslibpy, version, transport)
-        runs[f"roslib on Node, ROS {version}"] = partial(roslib, version)
-    for name, run in runs.items():
+            runs[version, f"roslibpy, {transport}, ROS {version}"] = partial(roslibpy, version, transport)
+        runs[version, f"roslib on Node, ROS {version}"] = partial(roslib, version)
+    for (version, name), run in runs.items():
         if arguments.only in name:
             began = time.monotonic()
-            with tempfile.TemporaryDirectory(prefix="conformance-rosbayes-") as folder:
-                tally.report(name, began, await run(Path(folder)))
+            async with temporary_stand() as stand:
+                await stand.start_hub("--ros-version", version)
+                tally.report(name, began, await run(stand))
     return tally.end()
 
 

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -196,15 +197,8 @@ def check_robot(stack: Stack) -> None:
     """Check ROSBRIDGE_URI and BM_BOARDS: with a server and boards elsewhere, none are started here."""
     ports = [BOARD_PORT + 2 * index for index in range(len(BOARDS))]
     boards = {
-        f"far-board{index}": [
-            "board",
-            "--listen",
-            f"tcp://0.0.0.0:{port}",
-            "--insecure",
-            "--index",
-            str(index),
-        ]
-        for index, port in enumerate(ports)
+        f"far-board{at}": ["board", "--listen", f"tcp://0.0.0.0:{port}", "--insecure", "--index", str(at)]
+        for at, port in enumerate(ports)
     }
     variables = {
         "ROSBRIDGE_URI": f"ws://host.docker.internal:{ROBOT_PORT}",
@@ -231,14 +225,8 @@ def check_absent_robot(stack: Stack) -> None:
 
 def check_own_model(stack: Stack) -> None:
     """Check a user's model, built by `toolchain build` in the project, with readings from outside; then as a BM2."""
-    source = (
-        "--uri",
-        "ws://127.0.0.1:9090",
-        "--topic",
-        "/mine/readings",
-        "--type",
-        "std_msgs/Float64MultiArray",
-    )
+    topic = ("--topic", "/mine/readings", "--type", "std_msgs/Float64MultiArray")
+    source = ("--uri", "ws://127.0.0.1:9090", *topic)
 
     def toolchain(*arguments: str) -> None:
         command = [str(Path(sys.executable).with_name("toolchain")), *arguments]
@@ -396,14 +384,12 @@ def verify(only: str, *, short: bool) -> int:
             needed = name in {name for name, _ in SHORT[:2]}
             if not needed and only not in name:
                 continue
-            started, why = time.monotonic(), None
-            try:
+            failed = tally.failed
+            with tally.check(
+                name, subprocess.SubprocessError, OSError, details=partial(stack.save_logs, name)
+            ):
                 check(stack)
-            except (CheckError, subprocess.SubprocessError, OSError) as error:
-                why = str(error)
-                stack.save_logs(name)
-            tally.report(name, started, why)
-            if why and (needed or short):
+            if tally.failed > failed and (needed or short):
                 break
     finally:
         stack.save_logs("last")
@@ -413,8 +399,7 @@ def verify(only: str, *, short: bool) -> int:
         stack.docker("image", "prune", "--force", check=False)
         stack.docker("builder", "prune", "--force", "--keep-storage", "2GB", check=False)
         shutil.rmtree(stack.project, ignore_errors=True)
-    print(f"{tally.passed} passed, {tally.failed} failed; logs are in {OUT.relative_to(ROOT)}")
-    return 1 if tally.failed else 0
+    return tally.end()
 
 
 def left_behind() -> list[str]:

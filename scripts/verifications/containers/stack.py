@@ -229,8 +229,9 @@ class Stack:
         """Return the log of a service since a time."""
         return self.docker("logs", "--since", f"{since:.3f}", self.container(service), streams="both")
 
-    def save_logs(self, check: str) -> None:
-        """Save all logs after a check, in the folder of results."""
+    def save_logs(self, check: str) -> str:
+        """Save all logs after a check, in the folder of results, and return where they are."""
+        path = OUT / f"{re.sub(r'[^A-Za-z0-9]+', '-', check)}.log"
         with contextlib.suppress(CheckError):
-            logs = self.compose("logs", "--timestamps", "--no-color")
-            (OUT / f"{re.sub(r'[^A-Za-z0-9]+', '-', check)}.log").write_text(logs)
+            path.write_text(self.compose("logs", "--timestamps", "--no-color"))
+        return f"    its logs are in {path.relative_to(ROOT)}"

@@ -13,9 +13,7 @@ import json
 import math
 import os
 import shutil
-import socket
 import sys
-import tempfile
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -30,10 +28,11 @@ from bridge.names import ros2_type
 from bridge.stamps import header, header_stamp_ns
 from casestudies.boat.sensors import SET_POSE_TOPIC, TRUE_POSE_TYPE, true_pose
 from posteriors.standard_messages import Level
-from scripts.running.browser import PATIENCE, Place, Stand
+from scripts.running.browser import Place
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
 from scripts.running.script import ROOT, run_script
+from scripts.running.stand import PATIENCE, Stand, free_port, temporary_stand
 from scripts.verifications.checks import CheckError, Tally
 from scripts.verifications.installation import install_node_packages, install_programs
 from services.errors import StackError
@@ -71,7 +70,6 @@ class Scene(NamedTuple):
 
     stand: Stand
     ros_version: str
-    folder: Path
     pictures: bool
 
 
@@ -105,14 +103,12 @@ async def rviz(scene: Scene) -> None:
     from PIL import ImageGrab
 
     install_programs(PROGRAMS)
-    stand, folder = scene.stand, scene.folder
+    stand, folder = scene.stand, scene.stand.folder
     found = await grid_and_pose(stand)
     messages = folder / "messages"
     lines = (f"{name} {type_} {base64.b64encode(raw).decode()}\n" for name, (type_, raw, _) in found.items())
     messages.write_text("".join(lines))
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
+    port = free_port()
     screen = ("/usr/bin/Xvfb", "-displayfd", "1", "-screen", "0", "800x560x24", "-nolisten", "tcp")
     display = ":" + await stand.start("Xvfb", r"^\d+$", *screen)
     variables = {"DISPLAY": display, "ROS_MASTER_URI": f"http://127.0.0.1:{port}", "ROS_IP": "127.0.0.1"}
@@ -188,7 +184,7 @@ def draw(last: dict[str, Any]) -> None:
 
 async def foxglove(scene: Scene) -> None:
     """Check that Foxglove's readers decode each topic, as its application would."""
-    modules, decoded = install_node_packages("foxglove", HERE), scene.folder / "decoded.json"
+    modules, decoded = install_node_packages("foxglove", HERE), scene.stand.folder / "decoded.json"
     command = (
         shutil.which("node") or "node",
         str(HERE / "foxglove.mjs"),
@@ -213,23 +209,17 @@ async def verify(only: str, *, pictures: bool) -> int:
         chosen = {name: check for tool, check in checks.items() if only in (name := f"{tool}, ROS {version}")}
         if not chosen:
             continue
-        with tempfile.TemporaryDirectory(prefix="verify-rosbayes-") as made:
-            scene = Scene(Stand(Path(made) / "stand"), version, Path(made), pictures)
-            try:
-                await scene.stand.start_hub(version)
-                await scene.stand.start_master()
-                await scene.stand.start_boat(10.0)
-                for name, check in chosen.items():
-                    started, why = time.monotonic(), None
-                    try:
-                        await check(scene)
-                    except (CheckError, ProcessError, StackError, BridgeError, TimeoutError) as error:
-                        why = str(error) or type(error).__name__
-                    tally.report(name, started, why, scene.stand.tails() if why else "")
-            finally:
-                await scene.stand.end()
+        async with temporary_stand() as stand:
+            scene = Scene(stand, version, pictures)
+            await stand.start_hub("--ros-version", version)
+            await stand.start_boat_master()
+            await stand.start_boat()
+            for name, check in chosen.items():
+                errors = (ProcessError, StackError, BridgeError, TimeoutError)
+                with tally.check(name, *errors, details=stand.tails):
+                    await check(scene)
             name = f"no process has shown a traceback, ROS {version}"
-            tally.report(name, time.monotonic(), scene.stand.traceback())
+            tally.report(name, time.monotonic(), stand.traceback())
     return tally.end()
 
 

@@ -1,0 +1,135 @@
+"""The processes of a run for benches and verifications, in a folder of their own.
+
+boat-simulator --> boat-normaliser --> hub <--> masters with 4 boards each
+                                        ^
+                                        v
+                                    dashboard
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import tempfile
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
+from casestudies.demo import build
+from scripts.running.patience import FACTOR
+from terminal.processes import Process
+
+PATIENCE: Final = 60.0 * FACTOR
+"""Time limit of each wait, in seconds."""
+TAIL: Final = 5
+"""Number of the last lines of each log that are shown when a check fails."""
+
+
+def free_port() -> int:
+    """Return a port of this machine that is free now."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+class Stand:
+    """The processes of a run; each can be killed and started again."""
+
+    def __init__(self, folder: Path) -> None:
+        """Keep deployments, logs and sockets in a folder."""
+        folder.mkdir(exist_ok=True)
+        self.folder = folder
+        self.uri = self.url = ""
+        # The processes that were started and their command lines, so that they can be started again.
+        self._commands: dict[str, tuple[str, ...]] = {}
+        self._processes: dict[str, Process] = {}
+
+    def pid(self, name: str) -> int:
+        """Return the number of a process."""
+        return self._processes[name].pid
+
+    async def start(self, name: str, ready: str, *command: str) -> str:
+        """Start a process, or start it again without a command, and return the text that shows its readiness."""
+        self._commands[name] = command or self._commands[name]
+        self._processes[name] = process = Process(name, self.folder / f"{name}.log")
+        await process.start(*self._commands[name])
+        async with asyncio.timeout(2 * PATIENCE):
+            return (await process.line(ready))[0]
+
+    async def kill(self, name: str) -> None:
+        """Kill a process as a crash would, and wait for its end."""
+        os.kill(self.pid(name), signal.SIGKILL)
+        await self._processes[name].wait()
+
+    async def start_hub(self, *flags: str) -> None:
+        """Start the hub on a free port, on which it will also start again."""
+        self.uri = await self.start("hub", r"ws://\S+", "hub", *flags, "--port", "0")
+        self._commands["hub"] = ("hub", *flags, "--port", str(urlsplit(self.uri).port))
+
+    async def start_master(
+        self, deployment: Path, *flags: str, name: str = "master", boards: int = 4
+    ) -> None:
+        """Start a master on the hub, with `--loop` and a run directory of its own, and wait for its boards."""
+        command = ("master", "--loop", "-d", str(deployment), *self._where(name), *flags)
+        await self.start(name, f"pcie-app: {boards} board", *command)
+
+    async def start_boat_master(
+        self,
+        *flags: str,
+        name: str = "master",
+        topic: str = SENSORS_TOPIC,
+        options: Sequence[str] = (),
+        extra: str = "",
+    ) -> None:
+        """Build the boat's deployment, add lines to its deployment.toml, and start its master."""
+        deployment = self.folder / f"boat-{name}"
+        await build("boat", deployment, self.uri, topic, SENSORS_TYPE, *options)
+        with (deployment / "deployment.toml").open("a") as file:
+            file.write(extra)
+        await self.start_master(deployment, *flags, name=name)
+
+    async def start_boat(self) -> None:
+        """Start normaliser and simulator."""
+        await self.start("normaliser", "boat", "boat-normaliser", "--uri", self.uri)
+        await self.start("simulator", "seed", "boat-simulator", "--uri", self.uri)
+
+    async def start_dashboard(self) -> None:
+        """Start the dashboard on a free port, on which it will also start again."""
+        command = ("dashboard", *self._where("master"), "--port")
+        self.url = await self.start("dashboard", r"http://[\w.:]+", *command, "0")
+        self._commands["dashboard"] = (*command, str(urlsplit(self.url).port))
+
+    def _where(self, name: str) -> tuple[str, ...]:
+        """Return the flags for the hub and for the run directory of a master."""
+        (run := self.folder / f"run-{name}").mkdir(mode=0o700, exist_ok=True)
+        return "--uri", self.uri, "--run-directory", str(run)
+
+    def tails(self) -> str:
+        """Return the last lines of the logs."""
+        logs = {name: (self.folder / f"{name}.log").read_text() for name in self._processes}
+        return "\n".join(f"    {name}: {line}" for name in logs for line in logs[name].splitlines()[-TAIL:])
+
+    def traceback(self) -> str | None:
+        """Return which processes have shown a traceback; None if none has."""
+        names = [name for name in self._processes if "Traceback" in (self.folder / f"{name}.log").read_text()]
+        return f"there is one from {' and '.join(names)}" if names else None
+
+    async def end(self, *names: str) -> None:
+        """End processes, all by default."""
+        await asyncio.gather(*(self._processes[name].end() for name in names or self._processes))
+
+
+@contextlib.asynccontextmanager
+async def temporary_stand() -> AsyncIterator[Stand]:
+    """Give a stand in a temporary folder, and end its processes afterwards."""
+    with tempfile.TemporaryDirectory(prefix="rosbayes-") as folder:
+        stand = Stand(Path(folder))
+        try:
+            yield stand
+        finally:
+            await stand.end()
