@@ -9,7 +9,6 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, median
 from typing import Any
@@ -39,12 +38,8 @@ Figures = dict[str, Any]
 """One robot's run with one model, by column; distances are in metres, the exact ones from float64 inference."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LandmarkReading:
-    """A reading of one landmark: metres and radians (absolute, any turn), or None if it was not seen."""
-
-    range_m: float | None = None
-    bearing_rad: float | None = None
+LandmarkReading = tuple[float | None, float | None]
+"""A reading of one landmark: metres and radians (absolute, any turn), each None if it was not seen."""
 
 
 def unquantised_posterior(
@@ -65,12 +60,12 @@ def unquantised_posterior(
     columns = grid.x_low + (np.arange(width) + 0.5) * grid.cell_width
     y, x = np.repeat(rows, width), np.tile(columns, height)
     factors = []
-    for landmark, reading in zip(landmarks, readings, strict=True):
-        if reading.range_m is not None:
-            away = reading.range_m - np.hypot(landmark.x - x, landmark.y - y)
+    for landmark, (range_m, bearing_rad) in zip(landmarks, readings, strict=True):
+        if range_m is not None:
+            away = range_m - np.hypot(landmark.x - x, landmark.y - y)
             factors.append(_likelihood(away / RANGE_SIGMA, floor))
-        if reading.bearing_rad is not None:
-            away = reading.bearing_rad - np.arctan2(landmark.y - y, landmark.x - x)
+        if bearing_rad is not None:
+            away = bearing_rad - np.arctan2(landmark.y - y, landmark.x - x)
             away = (away + np.pi) % (2 * np.pi) - np.pi
             factors.append(_likelihood(away / BEARING_SIGMA, floor))
     return fuse(np.ones(width * height), factors)
@@ -88,12 +83,8 @@ def exact_distance(
     seen = {sighting.landmark: sighting for sighting in frame.sightings}
     posterior: NDArray[np.float64]
     if fitted is None:
-        readings = [
-            LandmarkReading(range_m=seen[each.number].range_m, bearing_rad=seen[each.number].bearing_rad)
-            if each.number in seen
-            else LandmarkReading()
-            for each in landmarks
-        ]
+        found = [seen.get(each.number) for each in landmarks]
+        readings = [(each.range_m, each.bearing_rad) if each else (None, None) for each in found]
         posterior = unquantised_posterior(landmarks, readings, width=cells, height=cells)
     else:
         values = {f"range_{number}": each.range_m for number, each in seen.items()}

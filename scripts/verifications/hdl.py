@@ -25,11 +25,8 @@ from hdl.test.mutants import MUTANTS, Mutant, caught_by
 from hdl.test.project import HardwareToolError
 from hdl.test.verification import formal, sessions, units
 from machines.kind import FrameInput
-from pcie_shim import register_map
-from pcie_shim.endpoint import parse_endpoint
 from pcie_shim.errors import PcieShimError
 from pcie_shim.host.mini_cluster import MiniCluster
-from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import Image, read_image
 from scripts.running.flags import ScriptParser
 from scripts.running.script import ROOT
@@ -69,17 +66,9 @@ def boat_failure(engine: str, count: int) -> str | None:
             _board("--boards", "4", "--directory", str(folder / "boards")),
             _board(*hardware, "-d", str(deployment), "--index", str(BOARD), "--listen", simulated),
         ):
-            emulated, emulated_s = _outcomes(endpoints, images, frames)
-            speeds = [_speed(endpoints[BOARD])]
+            emulated = _outcomes(endpoints, images, frames)
             endpoints[BOARD] = simulated
-            found, simulated_s = _outcomes(endpoints, images, frames)
-            speeds.append(_speed(simulated))
-    cycles = sum(frame[BOARD][1] for frame in found)
-    print(
-        f"     {speeds[1]} cycles/s in {engine}, {speeds[0]} emulated, when all lines count; "
-        f"{cycles} cycles of {len(frames)} frames in {simulated_s:.2f} s, emulated in {emulated_s:.3f} s",
-        flush=True,
-    )
+            found = _outcomes(endpoints, images, frames)
     wrong = [at for at, (one, other) in enumerate(zip(found, emulated, strict=True)) if one != other]
     return f"frames {wrong} differ" if wrong else None
 
@@ -120,23 +109,11 @@ def _board(*flags: str) -> Iterator[None]:
 
 def _outcomes(
     endpoints: Sequence[str], images: Sequence[Image], frames: Sequence[FrameInput]
-) -> tuple[list[list[tuple[bytes, int, int]]], float]:
-    """Return counts, cycles and reason of each board in each frame, and the duration of all frames in seconds."""
+) -> list[list[tuple[bytes, int, int]]]:
+    """Return counts, cycles and reason of each board in each frame."""
     with MiniCluster.open(endpoints, images, timeout=_ANSWER_S, slack=_ANSWER_S) as cluster:
-        cluster.run(frames[0])  # the first frame also warms up
-        began = time.monotonic()
         outputs = [cluster.run(frame) for frame in frames]
-        elapsed = time.monotonic() - began
-    found = [
-        [(board.words, board.cycles, int(board.reason)) for board in output.boards] for output in outputs
-    ]
-    return found, elapsed
-
-
-def _speed(endpoint: str) -> int:
-    """Return a board's cycles per second, as measured by the board."""
-    with SocketLink.open(parse_endpoint(endpoint), timeout=_ANSWER_S) as link:
-        return link.read32(register_map.CAP_SPEED)
+    return [[(board.words, board.cycles, int(board.reason)) for board in output.boards] for output in outputs]
 
 
 # All checks, or all mutants

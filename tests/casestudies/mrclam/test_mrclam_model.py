@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from casestudies.mrclam.model import Landmark, model, read_landmarks
 from casestudies.mrclam.player import area_grid
 from machines.encode import decode_code
-from scripts.benches.mrclam import LandmarkReading, unquantised_posterior
+from scripts.benches.mrclam import unquantised_posterior
 from tests.casestudies.cells import centre
 from toolchain.building.quantise import quantise
 from toolchain.deployment.address import to_address
@@ -47,18 +47,16 @@ def sight(random, x, y, *, outlier=None):
     readings = []
     for place, landmark in enumerate(LANDMARKS):
         if place == random.integers(0, 6):
-            readings.append(LandmarkReading())
+            readings.append((None, None))
             continue
         range_m = math.dist((x, y), (landmark.x, landmark.y)) + random.normal(0, 0.25)
         bearing = math.atan2(landmark.y - y, landmark.x - x) + random.normal(0, 0.12)
-        readings.append(
-            LandmarkReading(range_m=abs(range_m) + (5.0 if place == outlier else 0.0), bearing_rad=bearing)
-        )
+        readings.append((abs(range_m) + (5.0 if place == outlier else 0.0), bearing))
     return readings
 
 
 def addresses(robot, readings):
-    values = [value for each in readings for value in (each.range_m, each.bearing_rad)]
+    values = [value for each in readings for value in each]
     return [to_address(known.as_variable(), value) for known, value in zip(robot.known, values, strict=True)]
 
 
@@ -106,13 +104,7 @@ def test_bins_and_codes_are_as_accurate_as_raw_float64(robot, codes, outlier):
 )
 def test_unquantised_fusion_is_density_and_floor_at_the_centres(x, y, range_m, bearing_rad, floor):
     landmark = Landmark(1, x, y)
-    found = unquantised_posterior(
-        [landmark],
-        [LandmarkReading(range_m=range_m, bearing_rad=bearing_rad)],
-        width=5,
-        height=4,
-        floor=floor,
-    )
+    found = unquantised_posterior([landmark], [(range_m, bearing_rad)], width=5, height=4, floor=floor)
     expected = []
     for line in range(20):
         cx, cy = centre(area_grid(5, 4), line)
