@@ -104,17 +104,17 @@ class Cost:
 
 
 # Least squares of the relative errors of 37 boards (GHDL 2.0, yosys 0.70, synth_intel_alm, Cyclone V: the same ALM as
-# a Stratix V's), 2 to 100 lines, up to 32 replicas. Their ALMs deviate by 0.8 % in the median, and by 5.1 % at most.
+# a Stratix V's), 2 to 100 lines, up to 32 replicas. Their ALMs deviate by 1.0 % in the median, and by 4.0 % at most.
 COSTS: Final[Mapping[Of, Cost]] = {
-    Of.BOARD: Cost(1683, 943.7),
-    Of.CODE_BIT: Cost(1.816, 0.9962),
-    Of.COUNTER_BIT: Cost(2.149, 1.349),
-    Of.STATE_BIT: Cost(1.011, 0.5465),
-    Of.STEP: Cost(0.3966, 0.3526),
-    Of.PLACE_BIT: Cost(2.721, 1.384),
-    Of.WORD: Cost(1.945, 1.487),
-    Of.MEMORY: Cost(109.1, 66.08),
-    Of.REPLICA: Cost(50.66, 34.13),
+    Of.BOARD: Cost(1674, 946.2),
+    Of.CODE_BIT: Cost(1.775, 0.969),
+    Of.COUNTER_BIT: Cost(2.216, 1.413),
+    Of.STATE_BIT: Cost(1.243, 0.648),
+    Of.STEP: Cost(0.254, 0.371),
+    Of.PLACE_BIT: Cost(2.678, 1.359),
+    Of.WORD: Cost(1.460, 1.172),
+    Of.MEMORY: Cost(125.3, 68.83),
+    Of.REPLICA: Cost(55.47, 36.87),
 }
 
 
