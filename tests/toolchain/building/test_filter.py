@@ -101,22 +101,15 @@ def test_the_filter_is_exact_inference_on_the_unrolled_network(seed):
 X0, X, K = (Symbol(name, LabelType("a", "b")) for name in ("x0", "x", "k"))
 HALF = [[0.6, 0.3], [0.4, 0.7]]
 START = table(X0, [0.5, 0.5])
+RIGHT = [table(X, HALF, given=[X0]), table(K, HALF, given=[X])]
 HIDDEN, OTHER = Symbol("h", LabelType("a", "b")), Symbol("z", LabelType("p", "q"))
 
 
 @pytest.mark.parametrize(
     ("factors", "question", "named"),
     [
-        (
-            [table(X, HALF, given=[X0]), table(K, HALF, given=[X])],
-            {"previous": ["x0", "h"]},
-            "1 searched and 2",
-        ),
-        (
-            [table(X, HALF, given=[X0]), table(K, HALF, given=[X])],
-            {"previous": ["z"]},
-            "z, the previous x, does",
-        ),
+        (RIGHT, {"previous": ["x0", "h"]}, "1 searched and 2"),
+        (RIGHT, {"previous": ["z"]}, "z, the previous x, does"),
         ([table(X, [0.5, 0.5]), table(K, HALF, given=[X])], {}, "x does not depend on x0"),
         (
             [table(X, HALF, given=[X0]), table(K, HALF, given=[X0])],
@@ -129,14 +122,10 @@ HIDDEN, OTHER = Symbol("h", LabelType("a", "b")), Symbol("z", LabelType("p", "q"
             "k <- h -> x <- x0",
         ),
         ([potential([X0, X], HALF), table(K, HALF, given=[X])], {}, "potential of x0, x is none"),
-        ([table(X, HALF, given=[X0]), table(K, HALF, given=[X])], {"given": {"h": "a"}}, "leave h out"),
-        ([table(X, HALF, given=[X0]), table(K, HALF, given=[X])], {"prior_select": "h"}, "leave h out"),
-        (
-            [table(X, HALF, given=[X0]), table(K, HALF, given=[X])],
-            {"previous": ["x"]},
-            "x is in the question twice",
-        ),
-        ([table(X, HALF, given=[X0]), table(K, HALF, given=[X])], {"previous": ["x9"]}, "did you mean"),
+        (RIGHT, {"given": {"h": "a"}}, "leave h out"),
+        (RIGHT, {"prior_select": "h"}, "leave h out"),
+        (RIGHT, {"previous": ["x"]}, "x is in the question twice"),
+        (RIGHT, {"previous": ["x9"]}, "did you mean"),
     ],
 )
 def test_questions_that_are_no_filter(factors, question, named):
