@@ -3,6 +3,7 @@
 This module has the common flags of their commands.
 """
 
+import random
 from typing import Annotated, Final
 
 import typer
@@ -21,6 +22,15 @@ Uri = Annotated[
     ),
 ]
 DEFAULT_URI = "ws://127.0.0.1:9090"
+Seed = Annotated[
+    int,
+    typer.Option(
+        min=0,
+        help="Seed of what is simulated.",
+        default_factory=lambda: random.SystemRandom().randrange(1_000_000),
+        show_default="one is chosen and printed",
+    ),
+]
 FirstTimeout = Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")]
 Timeout = Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")]
 KEPT: Final = 2000

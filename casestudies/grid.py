@@ -20,15 +20,6 @@ class Grid:
     width: int
     height: int
 
-    def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1 or self.x_low >= self.x_high or self.y_low >= self.y_high:
-            raise ValueError(f"a grid needs at least one cell and a positive area, not {self}")
-
-    @property
-    def cells(self) -> int:
-        """The number of cells."""
-        return self.width * self.height
-
     @property
     def cell_width(self) -> float:
         """A cell's extent along x, in the map's units."""
@@ -48,16 +39,9 @@ class Grid:
     def mean(self, posterior: Sequence[float]) -> tuple[float, float]:
         """Return the mean position (x, y) of a posterior over the cells' centres, in the map's units.
 
-        The posterior is float64[cells], row-major and not negative; it need not sum to 1.
-
-        Raises:
-            ValueError: The length is wrong, or all values are 0.
+        The posterior is float64[cells], row-major and not negative; it need not sum to 1, but not all of it is 0.
         """
-        if len(posterior) != self.cells:
-            raise ValueError(f"a posterior of {len(posterior)} values for a grid of {self.cells} cells")
         total = math.fsum(posterior)
-        if not total > 0:
-            raise ValueError("a posterior without any mass has no mean")
         by_row = [
             math.fsum(posterior[row * self.width : (row + 1) * self.width]) for row in range(self.height)
         ]

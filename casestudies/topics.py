@@ -11,17 +11,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, FiniteFloat, ValidationError
+from pydantic import BeforeValidator, FiniteFloat, TypeAdapter
 
-from bridge.client import Publication, Ros, Subscription
+from bridge.client import Publication, Ros, Subscription, connect
 from bridge.errors import DisconnectedError, MessageTooLargeError, SlowPeerError
 from bridge.names import same_type
 from bridge.stamps import stamp_ns
-from posteriors.errors import BadResultError, NoResultError
+from posteriors.errors import NoResultError
 from posteriors.frame_report import FrameReport
 from posteriors.listening import Posteriors, posteriors
+from posteriors.messages import Part, validated
 from posteriors.pairing import FrameOutcome
 from posteriors.posterior import Posterior
+from terminal.connection import report_connection
 from terminal.errors import ExitCode, StoppedError
 from terminal.health import resources, serve_health
 from terminal.one_line import shown
@@ -56,9 +58,9 @@ class Readiness:
 
 
 @contextlib.asynccontextmanager
-async def serve_readiness(name: str, readiness: Readiness) -> AsyncIterator[None]:
-    """Report the readiness within the context, on a socket in the run directory."""
-    started = time.monotonic()
+async def connected(name: str, work: str, uri: str) -> AsyncIterator[tuple[Ros, Readiness]]:
+    """Connect to a server within the context, and report the process's readiness for its `work` in the run directory."""
+    started, readiness = time.monotonic(), Readiness(work)
 
     def answer() -> bytes:
         ready, why = readiness.state()
@@ -69,8 +71,11 @@ async def serve_readiness(name: str, readiness: Readiness) -> AsyncIterator[None
 
     given = os.environ.get("BM_RUN_DIRECTORY")
     directory = status_directory(Path(given) if given else None, name)
-    async with serve_health(directory, name, answer):
-        yield
+    async with (
+        serve_health(directory, name, answer),
+        connect(uri, retry=True, on_state=report_connection(uri)) as ros,
+    ):
+        yield ros, readiness
 
 
 def run_viewer(watching: Coroutine[Any, Any, None], finish: Callable[[], None]) -> None:
@@ -173,37 +178,30 @@ class Instance:
         return self.heard.report if isinstance(self.heard, Posterior) else self.heard
 
 
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True)
-
-
-class _Header(_Part):
+class _Header(Part):
     stamp: Annotated[int, BeforeValidator(stamp_ns)]
 
 
-class _Point(_Part):
+class _Point(Part):
     x: FiniteFloat
     y: FiniteFloat
 
 
-class _Pose(_Part):
+class _Pose(Part):
     position: _Point
 
 
-class _PoseStamped(_Part):
+class _PoseStamped(Part):
     header: _Header
     pose: _Pose
 
 
+_POSE: Final = TypeAdapter(_PoseStamped)
+
+
 def read_truth(message: dict[str, Any], topic: str) -> Truth:
     """Return a geometry_msgs/PoseStamped as a true position, or raise a BadResultError."""
-    try:
-        pose = _PoseStamped.model_validate(message)
-    except ValidationError as error:
-        place = ".".join(str(step) for step in error.errors()[0]["loc"])
-        raise BadResultError(
-            f"a message on {topic} is not the {TRUTH_TYPE} of a simulator ({place or 'the message'} is wrong)"
-        ) from None
+    pose = validated(_POSE, message, topic, TRUTH_TYPE)
     return Truth(stamp_ns=pose.header.stamp, x=pose.pose.position.x, y=pose.pose.position.y)
 
 

@@ -23,6 +23,4 @@ def validated(adapter: TypeAdapter[Model], value: object, topic: str, type_name:
         first: Any = error.errors(include_url=False)[0]
         place = ".".join(str(step) for step in first["loc"]) or "the message"
         reason = f"{place}: {first['msg'][:1].lower()}{first['msg'][1:]}"
-        raise BadResultError(
-            f"a message on {topic} is not the {type_name} that the master publishes ({reason})"
-        ) from None
+        raise BadResultError(f"a message on {topic} is not the expected {type_name} ({reason})") from None

@@ -23,7 +23,6 @@ from casestudies.boat.sensors import (
     readings_message,
 )
 from terminal.command_line import CommandLine
-from terminal.connection import report_connection
 from terminal.output import say, warn
 from terminal.signals import run_async
 
@@ -56,15 +55,10 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
     A message with anything but finite numbers is dropped, and each cause is reported once. A missing reading stays
     missing.
     """
-    from bridge.client import connect
-    from casestudies.topics import LossyPublication, Readiness, report_refused, serve_readiness
+    from casestudies.topics import LossyPublication, connected, report_refused
 
     reported: set[str] = set()
-    readiness = Readiness("a reading was normalised")
-    async with (
-        serve_readiness("boat-normaliser", readiness),
-        connect(uri, retry=True, on_state=report_connection(uri)) as ros,
-    ):
+    async with connected("boat-normaliser", "a reading was normalised", uri) as (ros, readiness):
         type_ = ARRAY_TYPE if array else SENSORS_TYPE
         sensors = LossyPublication(await ros.advertise(sensors_topic, type_))
         refused = asyncio.ensure_future(report_refused(ros, sensors_topic, type_))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from casestudies import DEFAULT_URI, Uri
+from casestudies import DEFAULT_URI, Seed, Uri
 from casestudies.boat.sensors import (
     ARRAY_TYPE,
     BEACON_NAMES,
@@ -50,7 +50,6 @@ from casestudies.boat.sensors import (
     true_pose,
 )
 from terminal.command_line import CommandLine
-from terminal.connection import report_connection
 from terminal.output import say, warn
 from terminal.signals import run_async
 
@@ -69,7 +68,6 @@ SWITCHES: Final = {
 """The switches, which are services below `/boat/`, and what holds when each is on and off. All are on at first."""
 _SWITCH_TYPE = "std_srvs/SetBool"
 _SHORE = 2.0  # waypoints are at least this far from the map's edge
-_SEEDS = 1_000_000
 # Minimum number of seconds between a reading and another one that a change causes: a mouse moves 1000 times a second.
 _SHORTEST = 0.02
 _POSE_BYTES = 65_536  # a larger message on the topics that move the boat is no such message, and is discarded
@@ -184,14 +182,11 @@ async def simulate(
     with `array` std_msgs/Float64MultiArray. So does a change of the boat from outside, at once. While the server is away
     the boat sails on.
     """
-    from bridge.client import connect
     from bridge.stamps import header
-    from casestudies.topics import LossyPublication, Readiness, report_refused, serve_readiness
+    from casestudies.topics import LossyPublication, connected, report_refused
 
-    readiness = Readiness("a reading was published")
     async with (
-        serve_readiness("boat-simulator", readiness),
-        connect(uri, retry=True, on_state=report_connection(uri)) as ros,
+        connected("boat-simulator", "a reading was published", uri) as (ros, readiness),
         contextlib.AsyncExitStack() as at_the_end,
     ):
         ros_version = await ros.detect_ros_version()
@@ -292,11 +287,8 @@ app = CommandLine()
 
 @app.command(epilog="`boat-simulator --uri ws://127.0.0.1:9090 --seed 7 --rate 10`")
 def boat_simulator(
+    seed: Seed,
     uri: Uri = DEFAULT_URI,
-    seed: Annotated[
-        int | None,
-        typer.Option(min=0, help="Seed of route and noise.", show_default="one is chosen and printed"),
-    ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Readings per second.")] = 10.0,
     topic: Annotated[str, typer.Option(help="Topic of the raw readings.", metavar="TOPIC")] = RAW_TOPIC,
     speed: Annotated[
@@ -312,11 +304,8 @@ def boat_simulator(
     A velocity on /cmd_vel drives the boat, and a pose on /boat/set_pose moves it; services below /boat/ switch noise,
     beacons and sensors.
     """
-    chosen = random.SystemRandom().randrange(_SEEDS) if seed is None else seed
-    say(f"boat-simulator: seed {chosen}, {rate:g} readings a second on {topic}, {uri}")
-    return run_async(
-        simulate(uri, boat=Boat(chosen, speed), rate=rate, topic=topic, array=array, count=count)
-    )
+    say(f"boat-simulator: seed {seed}, {rate:g} readings a second on {topic}, {uri}")
+    return run_async(simulate(uri, boat=Boat(seed, speed), rate=rate, topic=topic, array=array, count=count))
 
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ from casestudies import DEFAULT_URI, KEPT, Count, FirstTimeout, Timeout, Uri
 from casestudies.boat.sensors import TRUE_POSE_TOPIC
 from posteriors.errors import NoResultError
 from terminal.command_line import CommandLine
-from terminal.connection import report_connection
 from terminal.output import check_writable, say, warn, write_json
+from toolchain.errors import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -139,13 +139,10 @@ class Viewer:
             BadResultError: A message was not a result.
             BridgeError: No rosbridge server answers at the URI.
         """
-        from bridge.client import connect
-        from casestudies.topics import Readiness, listen, serve_readiness
+        from casestudies.topics import connected, listen
 
-        readiness = Readiness("a result was shown")
         async with (
-            serve_readiness("boat-viewer", readiness),
-            connect(uri, retry=True, on_state=report_connection(uri)) as ros,
+            connected("boat-viewer", "a result was shown", uri) as (ros, readiness),
             listen(ros, truth_topic=truth_topic, truth_tolerance_s=truth_tolerance_s) as listener,
         ):
             say(f"boat-viewer: listening to {uri}")
@@ -159,7 +156,7 @@ class Viewer:
             except NoResultError as error:
                 if not self.numbers:
                     raise
-                raise NoResultError(f"after {_results(self.results)}, {error}") from None
+                raise NoResultError(f"after {counted(self.results, 'result')}, {error}") from None
             finally:
                 self.route = tuple(listener.route)
                 if listener.announced_only:
@@ -229,10 +226,6 @@ class Viewer:
         write_json(path, numbers)
 
 
-def _results(number: int) -> str:
-    return "1 result" if number == 1 else f"{number} results"
-
-
 app = CommandLine()
 
 
@@ -286,7 +279,7 @@ def _finish(viewer: Viewer, out: Path | None, numbers: Path | None) -> None:
     if not viewer.results:
         return
     distance, time = viewer.medians()
-    summary = [_results(viewer.results)]
+    summary = [counted(viewer.results, "result")]
     if without := viewer.frames - viewer.results:
         summary.append(f"{without} frames without a posterior")
     if distance is not None:

@@ -1,7 +1,6 @@
 """Simulated stereo cameras: the pairs of a rendered scene as images on two topics, and the true disparity."""
 
 import asyncio
-import random
 import time
 from itertools import count as numbers
 from typing import Annotated
@@ -9,12 +8,11 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from casestudies import DEFAULT_URI, Uri
+from casestudies import DEFAULT_URI, Seed, Uri
 from casestudies.disparity.images import IMAGE_TYPE, image_message
 from casestudies.disparity.model import LEFT_TOPIC, RIGHT_TOPIC, TRUTH_TOPIC
 from casestudies.disparity.scene import Scene
 from terminal.command_line import CommandLine
-from terminal.connection import report_connection
 from terminal.output import say
 from terminal.signals import run_async
 
@@ -23,15 +21,10 @@ async def publish_pairs(
     uri: str, *, seed: int, rate: float, width: int, height: int, count: int | None = None
 ) -> None:
     """Publish `count` pairs, or pairs until cancelled; a BridgeError if no server answers at the URI."""
-    from bridge.client import connect
     from bridge.stamps import header
-    from casestudies.topics import LossyPublication, Readiness, serve_readiness
+    from casestudies.topics import LossyPublication, connected
 
-    readiness = Readiness("a pair was published")
-    async with (
-        serve_readiness("disparity-cameras", readiness),
-        connect(uri, retry=True, on_state=report_connection(uri)) as ros,
-    ):
+    async with connected("disparity-cameras", "a pair was published", uri) as (ros, readiness):
         version = await ros.detect_ros_version()
         left, right, truth = [
             LossyPublication(await ros.advertise(topic, IMAGE_TYPE))
@@ -56,20 +49,16 @@ app = CommandLine()
 
 @app.command(epilog="`disparity-cameras --uri ws://127.0.0.1:9090 --seed 7 --rate 2`")
 def disparity_cameras(
+    seed: Seed,
     uri: Uri = DEFAULT_URI,
-    seed: Annotated[
-        int | None,
-        typer.Option(min=0, help="Seed of scene and noise.", show_default="one is chosen and printed"),
-    ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=1000, help="Pairs per second.")] = 2.0,
     width: Annotated[int, typer.Option(min=16, max=1024, help="Pixels across.")] = 160,
     height: Annotated[int, typer.Option(min=16, max=1024, help="Pixels down.")] = 120,
     count: Annotated[int | None, typer.Option(min=1, help="Exit after this many pairs.")] = None,
 ) -> int:
     """Publish stereo pairs of a simulated scene, and the true disparity."""
-    chosen = random.SystemRandom().randrange(1_000_000) if seed is None else seed
-    say(f"disparity-cameras: seed {chosen}, {rate:g} pairs of {width} x {height} pixels a second, {uri}")
-    return run_async(publish_pairs(uri, seed=chosen, rate=rate, width=width, height=height, count=count))
+    say(f"disparity-cameras: seed {seed}, {rate:g} pairs of {width} x {height} pixels a second, {uri}")
+    return run_async(publish_pairs(uri, seed=seed, rate=rate, width=width, height=height, count=count))
 
 
 if __name__ == "__main__":

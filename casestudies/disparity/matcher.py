@@ -43,7 +43,7 @@ from casestudies.disparity.model import (
     TRUTH_TOPIC,
 )
 from casestudies.disparity.scene import BASELINE
-from casestudies.topics import LossyPublication, Readiness, report_refused, run_viewer, serve_readiness
+from casestudies.topics import LossyPublication, connected, report_refused, run_viewer
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.listening import Posteriors, posteriors
 from posteriors.posterior import Posterior
@@ -241,10 +241,8 @@ class Matcher:
             BadResultError: A message was not a result.
             BridgeError: No rosbridge server answers at a URI.
         """
-        readiness = Readiness("a pair was matched")
         async with (
-            serve_readiness("disparity-matcher", readiness),
-            connect(uri, retry=True, on_state=report_connection(uri)) as ros,
+            connected("disparity-matcher", "a pair was matched", uri) as (ros, readiness),
             connect(stack_uri, retry=True, on_state=report_connection(stack_uri)) as boards,
             posteriors(boards, queue_size=256, compression="cbor") as heard,
         ):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from statistics import median
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import typer
 
@@ -43,7 +43,7 @@ SIGHTINGS_MSG: Final = (
     + "".join(f"float64 range_{number}\nfloat64 bearing_{number}\n" for number in LANDMARKS)
 )
 
-_REFERENCE_COLUMNS: Final = ("time_s", "ref_x_m", "ref_y_m")
+_REFERENCE_COLUMNS: Final = ("ref_x_m", "ref_y_m")
 
 
 def area_grid(width: int = 32, height: int = 32) -> Grid:
@@ -52,23 +52,14 @@ def area_grid(width: int = 32, height: int = 32) -> Grid:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Sighting:
-    """A sighting of one landmark: its range in metres, its absolute bearing in radians."""
-
-    landmark: int
-    range_m: float
-    bearing_rad: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedFrame:
     """The sightings of one second, and the robot's reference position in metres."""
 
     number: int
-    time_s: float
     x: float
     y: float
-    sightings: tuple[Sighting, ...]
+    readings: Mapping[str, float]
+    """Ranges in metres and absolute bearings in radians, `range_6` and `bearing_6`, of the landmarks that were seen."""
 
 
 def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
@@ -83,27 +74,17 @@ def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
                 cells[column] = cell
             elif cell is not None or column in _REFERENCE_COLUMNS:
                 raise ModelError(f"{path}, row {number}: {column} must be a number, not {cell!r}")
-        sightings = []
+        readings: dict[str, float] = {}
         for landmark, pair in pairs.items():
             seen = [cells[column] for column in pair if column in cells]
             if len(seen) == 1:
                 raise ModelError(
                     f"{path}, row {number}: landmark {landmark} has a range or a bearing, but not both"
                 )
-            if seen:
-                sightings.append(Sighting(landmark=landmark, range_m=seen[0], bearing_rad=seen[1]))
-        time_s, x, y = (cells[column] for column in _REFERENCE_COLUMNS)
-        frames.append(RecordedFrame(number=number, time_s=time_s, x=x, y=y, sightings=tuple(sightings)))
+            readings |= zip((f"range_{landmark}", f"bearing_{landmark}"), seen, strict=False)
+        x, y = (cells[column] for column in _REFERENCE_COLUMNS)
+        frames.append(RecordedFrame(number=number, x=x, y=y, readings=readings))
     return tuple(frames)
-
-
-def sightings_message(frame: RecordedFrame, header: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a frame as a `mrclam_msgs/Sightings` message, without the landmarks that were not seen."""
-    message: dict[str, Any] = {"header": dict(header)}
-    for sighting in frame.sightings:
-        message[f"range_{sighting.landmark}"] = sighting.range_m
-        message[f"bearing_{sighting.landmark}"] = sighting.bearing_rad
-    return message
 
 
 LOST_DISTANCE: Final = 9.0
@@ -114,11 +95,11 @@ _REPEAT_S: Final = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlayedFrame:
-    """A recorded frame and its result: the published posterior, or None and the reason."""
+    """A recorded frame and its result: the published posterior, or the reason why there is none."""
 
     frame: RecordedFrame
-    posterior: Posterior | None
-    cycles: int | None
+    posterior: Posterior | None = None
+    cycles: int | None = None
     outcome: str
 
     def estimate(self) -> tuple[float, float] | None:
@@ -183,8 +164,13 @@ async def play(
                     f"the first frame on {topic} had no result from {uri} within {first_timeout_s:g} s: "
                     "is the master running, with the deployment of casestudies/mrclam?"
                 )
-            played.append(_played(frame, instance, timeout_s))
-            on_frame(played[-1])
+            outcome = PlayedFrame(frame=frame, outcome=f"no result within {timeout_s:g} s")
+            if instance is not None and (report := instance.report) is not None:
+                outcome = PlayedFrame(
+                    frame=frame, posterior=instance.posterior, cycles=report.cycles, outcome=report.outcome
+                )
+            played.append(outcome)
+            on_frame(outcome)
     return played
 
 
@@ -203,7 +189,7 @@ async def _take_turn(
     while (now := time.monotonic()) < end:
         stamp_ns = time.time_ns()
         stamps.add(stamp_ns)
-        await publication.publish(sightings_message(frame, header(stamp_ns, MAP_FRAME, version)))
+        await publication.publish({"header": header(stamp_ns, MAP_FRAME, version), **frame.readings})
         again = min(end, now + repeat_s)
         with contextlib.suppress(NoResultError):
             while True:
@@ -213,23 +199,10 @@ async def _take_turn(
     return None
 
 
-def _played(frame: RecordedFrame, instance: Instance | None, timeout_s: float) -> PlayedFrame:
-    if instance is None or instance.report is None:
-        return PlayedFrame(
-            frame=frame, posterior=None, cycles=None, outcome=f"no result within {timeout_s:g} s"
-        )
-    return PlayedFrame(
-        frame=frame,
-        posterior=instance.posterior,
-        cycles=instance.report.cycles,
-        outcome=instance.report.outcome,
-    )
-
-
 def _line(played: PlayedFrame) -> str:
     """Return the line to print for a frame."""
     frame = played.frame
-    seen = len(frame.sightings)
+    seen = len(frame.readings) // 2
     start = f"{frame.number:>5}  {seen:>4}  ({frame.x:6.3f}, {frame.y:6.3f})"
     estimate = played.estimate()
     if estimate is None:

@@ -9,10 +9,9 @@ from typing import Annotated
 
 import typer
 
-from casestudies import DEFAULT_URI, Uri
+from casestudies import DEFAULT_URI, Seed, Uri
 from casestudies.sprinkler.model import GRASS_TOPIC, ON, RAIN, TYPE, WET
 from terminal.command_line import CommandLine
-from terminal.connection import report_connection
 from terminal.output import say
 from terminal.signals import run_async
 
@@ -28,14 +27,9 @@ def mornings(seed: int) -> Iterator[tuple[int, int, int]]:
 
 async def publish_mornings(uri: str, *, seed: int, rate: float, count: int | None = None) -> None:
     """Publish the grass of `count` mornings, or of all until cancelled; a BridgeError if no server answers at the URI."""
-    from bridge.client import connect
-    from casestudies.topics import LossyPublication, Readiness, serve_readiness
+    from casestudies.topics import LossyPublication, connected
 
-    readiness = Readiness("the grass was published")
-    async with (
-        serve_readiness("sprinkler-garden", readiness),
-        connect(uri, retry=True, on_state=report_connection(uri)) as ros,
-    ):
+    async with connected("sprinkler-garden", "the grass was published", uri) as (ros, readiness):
         grass = LossyPublication(await ros.advertise(GRASS_TOPIC, TYPE))
         begin = time.monotonic()
         for step, (*_, wet) in enumerate(islice(mornings(seed), count), start=1):
@@ -49,18 +43,14 @@ app = CommandLine()
 
 @app.command(epilog="`sprinkler-garden --uri ws://127.0.0.1:9090 --seed 7 --rate 10`")
 def sprinkler_garden(
+    seed: Seed,
     uri: Uri = DEFAULT_URI,
-    seed: Annotated[
-        int | None,
-        typer.Option(min=0, help="Seed of the mornings.", show_default="one is chosen and printed"),
-    ] = None,
     rate: Annotated[float, typer.Option(min=0.01, max=10_000, help="Mornings per second.")] = 10.0,
     count: Annotated[int | None, typer.Option(min=1, help="Exit after this many mornings.")] = None,
 ) -> int:
     """Publish whether the grass is wet, morning after morning."""
-    chosen = random.SystemRandom().randrange(1_000_000) if seed is None else seed
-    say(f"sprinkler-garden: seed {chosen}, {rate:g} mornings a second on {GRASS_TOPIC}, {uri}")
-    return run_async(publish_mornings(uri, seed=chosen, rate=rate, count=count))
+    say(f"sprinkler-garden: seed {seed}, {rate:g} mornings a second on {GRASS_TOPIC}, {uri}")
+    return run_async(publish_mornings(uri, seed=seed, rate=rate, count=count))
 
 
 if __name__ == "__main__":

@@ -12,16 +12,15 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from bridge.client import Subscription, connect
+from bridge.client import Subscription
 from bridge.errors import NoMessageError
 from casestudies import DEFAULT_URI, KEPT, Count, FirstTimeout, Timeout, Uri
 from casestudies.sprinkler.model import exact_rain
-from casestudies.topics import Readiness, run_viewer, serve_readiness
+from casestudies.topics import connected, run_viewer
 from posteriors.errors import NoResultError
 from posteriors.listening import posteriors
 from posteriors.posterior import SAMPLES_TOPIC, SAMPLES_TYPE, Posterior, read_samples
 from terminal.command_line import CommandLine
-from terminal.connection import report_connection
 from terminal.output import check_writable, say, warn
 from terminal.pictures import new_figure, save_figure
 from toolchain.errors import counted
@@ -130,10 +129,8 @@ class Viewer:
             BadResultError: A message was not a result.
             BridgeError: No rosbridge server answers at the URI.
         """
-        readiness = Readiness("a result was shown")
         async with (
-            serve_readiness("sprinkler-viewer", readiness),
-            connect(uri, retry=True, on_state=report_connection(uri)) as ros,
+            connected("sprinkler-viewer", "a result was shown", uri) as (ros, readiness),
             posteriors(ros) as heard,
             ros.subscribe(SAMPLES_TOPIC, SAMPLES_TYPE) as samples,
         ):

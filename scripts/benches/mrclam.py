@@ -80,15 +80,13 @@ def exact_distance(
     frame: RecordedFrame, landmarks: tuple[Landmark, ...], cells: int, fitted: Model | None
 ) -> float:
     """Return the distance from the reference to the mean of exact inference (float64, without quantising)."""
-    seen = {sighting.landmark: sighting for sighting in frame.sightings}
-    posterior: NDArray[np.float64]
+    values, posterior = frame.readings, np.empty(0)
     if fitted is None:
-        found = [seen.get(each.number) for each in landmarks]
-        readings = [(each.range_m, each.bearing_rad) if each else (None, None) for each in found]
+        readings = [
+            (values.get(f"range_{each.number}"), values.get(f"bearing_{each.number}")) for each in landmarks
+        ]
         posterior = unquantised_posterior(landmarks, readings, width=cells, height=cells)
     else:
-        values = {f"range_{number}": each.range_m for number, each in seen.items()}
-        values |= {f"bearing_{number}": each.bearing_rad for number, each in seen.items()}
         addresses = [to_address(known.as_variable(), values.get(known.name)) for known in fitted.known]
         posterior = exact_posterior(fitted, addresses)
     return math.dist(area_grid(cells, cells).mean(posterior.tolist()), (frame.x, frame.y))

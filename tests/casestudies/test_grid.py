@@ -47,17 +47,3 @@ def test_points_outside_belong_to_the_border():
 def test_the_mean_of_two_cells_lies_between_them_by_weight():
     grid = Grid(x_low=0, x_high=2, y_low=0, y_high=1, width=2, height=1)
     assert grid.mean([3.0, 1.0]) == pytest.approx((0.75, 0.5))
-
-
-def test_no_mean_of_nothing_nor_of_another_length():
-    with pytest.raises(ValueError, match="mean"):
-        BOAT.mean([0.0] * 1024)
-    with pytest.raises(ValueError, match="1024"):
-        BOAT.mean([1.0] * 7)
-
-
-def test_a_grid_needs_cells_and_an_area():
-    with pytest.raises(ValueError, match="grid"):
-        Grid(x_low=0, x_high=1, y_low=0, y_high=1, width=0, height=1)
-    with pytest.raises(ValueError, match="grid"):
-        Grid(x_low=1, x_high=1, y_low=0, y_high=1, width=1, height=1)

@@ -16,9 +16,10 @@ from casestudies.boat.viewer import app as viewer
 from casestudies.mrclam.player import app as player
 from casestudies.sprinkler.garden import app as garden
 from casestudies.sprinkler.viewer import app as sprinkler_viewer
-from casestudies.topics import LossyPublication, Readiness, serve_readiness
+from casestudies.topics import LossyPublication, connected
 from terminal.health import is_ready, read_status, status_socket
 from tests.command_runner import invoke
+from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 
 WORK = "a result was shown"
@@ -27,8 +28,7 @@ WORK = "a result was shown"
 @pytest.fixture
 async def readiness(tmp_path, monkeypatch):
     monkeypatch.setenv("BM_RUN_DIRECTORY", str(tmp_path))
-    readiness = Readiness(WORK)
-    async with serve_readiness("boat-viewer", readiness):
+    async with FakeRosbridge() as fake, connected("boat-viewer", WORK, fake.uri) as (_, readiness):
         yield readiness
 
 

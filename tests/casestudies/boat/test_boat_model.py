@@ -49,7 +49,7 @@ def test_just_below_the_axis_is_not_a_full_turn():
 
 BOAT = model().model()
 GRID = map_grid()
-LINES = st.integers(0, GRID.cells - 1)
+LINES = st.integers(0, GRID.width * GRID.height - 1)
 
 
 def test_shape_order_and_widths():
@@ -71,7 +71,7 @@ def test_lines_are_the_grids_cells(line):
 
 
 def test_tables_are_normals_around_distance_and_bearing():
-    centres = [centre(GRID, line) for line in range(GRID.cells)]
+    centres = [centre(GRID, line) for line in range(GRID.width * GRID.height)]
     for away, around, beacon in zip(BOAT.known[:3], BOAT.known[3:], BEACONS, strict=True):
         means = np.array([distance(x, y, beacon) for x, y in centres])
         assert away.normal.mean == pytest.approx(means)

@@ -75,7 +75,7 @@ def test_columns_alternate_and_may_all_be_missing(robot):
 @pytest.mark.parametrize("outlier", [None, 1])
 def test_bins_and_codes_are_as_accurate_as_raw_float64(robot, codes, outlier):
     random = np.random.default_rng(7)
-    cells = np.array([centre(GRID, line) for line in range(GRID.cells)])
+    cells = np.array([centre(GRID, line) for line in range(GRID.width * GRID.height)])
     raw, binned, coded = [], [], []
     for _ in range(60):
         truth = random.uniform((-1, -6), (6, 6))
@@ -85,7 +85,7 @@ def test_bins_and_codes_are_as_accurate_as_raw_float64(robot, codes, outlier):
         posteriors = (
             unquantised_posterior(LANDMARKS, readings),
             exact_posterior(robot, places),
-            fuse(np.ones(GRID.cells), codes_here),
+            fuse(np.ones(GRID.width * GRID.height), codes_here),
         )
         for errors, posterior in zip((raw, binned, coded), posteriors, strict=True):
             errors.append(math.dist(posterior @ cells, truth))

@@ -13,13 +13,11 @@ from casestudies.mrclam.player import (
     SIGHTINGS_TOPIC,
     PlayedFrame,
     RecordedFrame,
-    Sighting,
     app,
     area_grid,
     median_distance,
     play,
     read_recording,
-    sightings_message,
 )
 from posteriors.errors import BadResultError, NoResultError
 from posteriors.posterior import Posterior
@@ -46,23 +44,16 @@ def file(tmp_path, *lines):
 
 def test_frames_are_read_with_what_was_seen(tmp_path):
     first, second = read_recording(file(tmp_path, HEADING, FIRST, SECOND))
-    seen = (Sighting(landmark=20, range_m=6.712, bearing_rad=-1.8623),)
-    assert first == RecordedFrame(number=1, time_s=1248272277.018, x=4.392, y=2.407, sightings=seen)
-    seen = (Sighting(landmark=6, range_m=6.794, bearing_rad=-2.2450),)
-    assert second == RecordedFrame(number=2, time_s=1248272278.018, x=-1.5, y=-6.25, sightings=seen)
-
-
-def test_what_was_not_seen_is_absent_from_the_message(tmp_path):
-    first, second = read_recording(file(tmp_path, HEADING, FIRST, SECOND))
-    header = {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}
-    assert sightings_message(first, header) == {"header": header, "range_20": 6.712, "bearing_20": -1.8623}
-    assert set(sightings_message(second, header)) == {"header", "range_6", "bearing_6"}
+    seen = {"range_20": 6.712, "bearing_20": -1.8623}
+    assert first == RecordedFrame(number=1, x=4.392, y=2.407, readings=seen)
+    seen = {"range_6": 6.794, "bearing_6": -2.2450}
+    assert second == RecordedFrame(number=2, x=-1.5, y=-6.25, readings=seen)
 
 
 @pytest.mark.parametrize(
     ("lines", "place"),
     [
-        (["landmark,x_m,y_m", "6,5.7093,4.9640"], "time_s"),
+        (["landmark,x_m,y_m", "6,5.7093,4.9640"], "ref_x_m"),
         (["time_s,ref_x_m,ref_y_m,ref_std_m,heading_rad", "1,2,3,4,5"], "range_6_m"),
         ([HEADING.replace(",bearing_20_rad", ""), FIRST], "bearing_20_rad"),
         ([HEADING.replace("_6_", "_3_"), FIRST], "range_6_m"),
@@ -94,8 +85,7 @@ GRID = area_grid()
 def recorded(number, line):
     """A frame whose reference position is the centre of a cell."""
     x, y = centre(GRID, line)
-    seen = (Sighting(landmark=6, range_m=float(line), bearing_rad=0.5),)
-    return RecordedFrame(number=number, time_s=float(number), x=x, y=y, sightings=seen)
+    return RecordedFrame(number=number, x=x, y=y, readings={"range_6": float(line), "bearing_6": 0.5})
 
 
 FRAMES = [recorded(n, 40 * n) for n in range(1, 9)]
@@ -180,7 +170,7 @@ async def test_something_else_on_the_result_topic():
 def test_the_median_counts_frames_without_a_result():
     result = Posterior(probabilities=tuple(certain(40)), labels=("y", "x"), sizes=(32, 32), heard_ns=0)
     good = PlayedFrame(frame=FRAMES[0], posterior=result, cycles=1, outcome="")
-    lost = PlayedFrame(frame=FRAMES[0], posterior=None, cycles=None, outcome="")
+    lost = PlayedFrame(frame=FRAMES[0], outcome="")
     assert median_distance([good, lost, lost]) == LOST_DISTANCE
     assert median_distance([good, good, lost]) == pytest.approx(0, abs=1e-9)
 
@@ -189,7 +179,7 @@ def test_the_median_counts_frames_without_a_result():
 async def test_the_command_prints_a_line_a_frame_and_a_sum(tmp_path):
     path = tmp_path / "robot.csv"
     lines = [HEADING]
-    lines += [f"{f.number},{f.x!r},{f.y!r},0.04,0.1,{f.sightings[0].range_m},0.5{UNSEEN}" for f in FRAMES]
+    lines += [f"{f.number},{f.x!r},{f.y!r},0.04,0.1,{f.readings['range_6']},0.5{UNSEEN}" for f in FRAMES]
     path.write_text("\n".join(lines) + "\n")
 
     def answer(number, message):
