@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -107,8 +107,7 @@ class EmulatedPosterior(Posterior):
             return network.exact(self.addresses)
         fusion = source.model() if isinstance(source, Question) else source
         bits = {variable.name: variable.bits for variable in deployment.variables}
-        known_bits = [replace(known, bits=bits.get(known.name, known.bits)) for known in fusion.known]
-        losses_of(deployment, joined(self.machines), replace(fusion, known=tuple(known_bits)))
+        losses_of(deployment, joined(self.machines), fusion.with_bits(bits))
         addresses, _ = deployment.machine_addresses(self.addresses)
         row = None if select is None else self.addresses[deployment.variables.index(select)]
         return exact_posterior(fusion, addresses, prior_address=row)

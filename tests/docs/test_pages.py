@@ -32,7 +32,7 @@ from tests.bridge.hub.broker_harness import Harness
 from tests.bridge.hub.sockets import running_hub
 from tests.patience import PATIENCE
 from tests.toolchain.running import TARGET, assert_refused, toolchain
-from toolchain.building.options import read_sources
+from toolchain.building.sources import read_sources
 from toolchain.checks.findings import Check
 from toolchain.deployment import BM1Section, BM2Section, DeploymentFile, Variable, load_deployment
 from toolchain.models.case_study import load_model

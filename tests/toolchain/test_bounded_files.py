@@ -9,7 +9,7 @@ import pytest
 
 from tests.toolchain.running import refused_within
 from toolchain.bounded_files import read_bounded
-from toolchain.building.options import read_sources
+from toolchain.building.sources import read_sources
 from toolchain.deployment import load_deployment
 from toolchain.errors import BuildError, DeploymentError, MifError, ModelError, NetworkFileError
 from toolchain.learning.fitted import read_fit

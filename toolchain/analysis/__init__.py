@@ -21,8 +21,11 @@ from toolchain.errors import BuildError
 from toolchain.flags import MaxCycles, Partitions, ReadingColumns, StopWhen
 
 MAX_POINTS: Final = 10_000
-CLOCK_MAX_HZ: Final = 1e12
 
+Clock: TypeAlias = Annotated[
+    float, typer.Option("--clock", help="Clock frequency of the boards.", metavar="HERTZ", min=1, max=1e12)
+]
+DeviceName: TypeAlias = Annotated[str, typer.Option(help="FPGA of the boards.", metavar="proce-v-d8")]
 Progress: TypeAlias = Callable[[int], AbstractContextManager[Callable[[str], None]]]
 """A bar for a number of steps, whose function is called with a text after each."""
 
@@ -42,7 +45,7 @@ class ReadingOptions:
     ] = None
     reading: ReadingColumns = None
     seed: Annotated[int, typer.Option(help="Seed of drawn readings.", min=0)] = 1
-    device: Annotated[str, typer.Option(help="FPGA of the boards.", metavar="proce-v-d8")] = "proce-v-d8"
+    device: DeviceName = "proce-v-d8"
 
     def __post_init__(self) -> None:
         if self.readings is None and self.reading:
@@ -68,20 +71,11 @@ class InspectOptions(ReadingOptions):
     ] = None
     banks: Annotated[
         int | None,
-        typer.Option(help="Number of seed sets for each frame.", show_default="4, or 1 for a slow machine"),
+        typer.Option(
+            help="Number of seed sets for each frame.", min=1, show_default="4, or 1 for a slow machine"
+        ),
     ] = None
-    clock_hz: Annotated[
-        float, typer.Option("--clock", help="Clock frequency of the boards.", metavar="HERTZ")
-    ] = 100e6
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 1.0 <= self.clock_hz <= CLOCK_MAX_HZ:
-            raise BuildError(
-                f"--clock is {self.clock_hz:g}, expected hertz from 1 to {CLOCK_MAX_HZ:g}, such as 100e6"
-            )
-        if self.banks is not None and self.banks < 1:
-            raise BuildError(f"--banks is {self.banks}, expected 1 or more")
+    clock_hz: Clock = 100e6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,12 +102,10 @@ class Sweep:
     partitions: Partitions = 1
     stop: StopWhen = Stop.SLICES
     max_cycles: MaxCycles = 2**17
-    banks: Annotated[int, typer.Option(help="Number of seed sets for each frame.")] = 2
+    banks: Annotated[int, typer.Option(help="Number of seed sets for each frame.", min=1)] = 2
 
     def __post_init__(self) -> None:
-        """Refuse malformed lists and numbers before a model is read."""
-        if self.partitions < 1 or self.max_cycles < 1 or self.banks < 1:
-            raise BuildError("--partitions, --max-cycles and --banks are numbers from 1")
+        """Refuse malformed lists before a model is read."""
         self._lists()
 
     def _lists(self) -> tuple[tuple[Scale, ...], tuple[RngKind, ...], _Numbers, _Numbers, _Numbers]:
@@ -135,9 +127,6 @@ class Sweep:
             if target < 1:
                 raise BuildError(f"a target count of {target} is too small; expected 1 or more")
             yield BuildOptions(
-                uri="ws://nowhere:9090",  # a sweep has no robot
-                topic="/readings",
-                type="std_msgs/Float64",
                 partitions=self.partitions,
                 scale=scale,
                 prob_bits=prob_bits,
@@ -160,11 +149,8 @@ class AdviceOptions:
     ] = 0.01
     frames: Annotated[int, typer.Option(help="Number of readings.", min=1, max=1000)] = 50
     seed: Annotated[int, typer.Option(help="Seed of the readings.", min=0)] = 1
-    clock_hz: Annotated[
-        float,
-        typer.Option("--clock", help="Clock frequency of the boards.", metavar="HERTZ", min=1, max=1e12),
-    ] = 100e6
-    device: Annotated[str, typer.Option(help="FPGA of the boards.", metavar="proce-v-d8")] = "proce-v-d8"
+    clock_hz: Clock = 100e6
+    device: DeviceName = "proce-v-d8"
 
 
 def _numbers(flag: str, text: str) -> _Numbers:

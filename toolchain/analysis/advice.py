@@ -14,7 +14,6 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from machines.bm1 import BM1Machine
-from machines.parameters import SensorMode
 from toolchain.analysis import AdviceOptions, with_unit
 from toolchain.analysis.accuracy import Accuracy, measure
 from toolchain.analysis.emulation import EmulatedBoards
@@ -26,8 +25,7 @@ from toolchain.building.bm2_machine import chain_machines, plan_bm2
 from toolchain.building.choice import network_for
 from toolchain.building.machine import partition_lines, plan_machine, whole_machine
 from toolchain.building.options import BuildOptions
-from toolchain.building.quantise import quantise
-from toolchain.deployment import Scale, Stop
+from toolchain.deployment import Stop
 from toolchain.errors import ToolchainError
 from toolchain.models.joint import Question
 from toolchain.models.model import Model
@@ -39,7 +37,6 @@ _NEAR: Final = 0.8
 """A machine is not much better than asked below this share of the accuracy."""
 _ATTEMPTS: Final = 8
 _WIDTHS: Final = (8, 12, 16)
-_NO_ROBOT: Final = BuildOptions(uri="ws://nowhere:9090", topic="/readings", type="std_msgs/Float64")
 
 
 _Run: TypeAlias = tuple[int, tuple[int, float, float], int, Estimate]
@@ -174,9 +171,8 @@ def _bm1(source: Model | Question, options: AdviceOptions, device: Device) -> _R
         return measure(boards, readings, model, banks=1)
 
     for prob_bits in _WIDTHS:
-        plan = plan_machine(model, replace(_NO_ROBOT, prob_bits=prob_bits, counter_bits=32))
-        codes = quantise(model, prob_bits=prob_bits, scale=Scale.ADDRESS, sensor_mode=SensorMode.COLUMN)
-        machine = whole_machine(plan, codes)
+        plan = plan_machine(model, BuildOptions(prob_bits=prob_bits, counter_bits=32))
+        machine = whole_machine(plan, plan.quantised())
         lost = measured(machine, 1).quantising
         if lost is not None and lost.total_variation.value <= options.accuracy / 2:
             break
@@ -196,7 +192,7 @@ def _bm2(
     network: NetworkModel, readings: Sequence[Addresses], options: AdviceOptions, device: Device
 ) -> _Run:
     """Run a BM2 with the default options on one board."""
-    plan = plan_bm2(network, _NO_ROBOT)
+    plan = plan_bm2(network, BuildOptions())
     machines = chain_machines(plan)
 
     def run(samples: int) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from toolchain.analysis.emulation import one_replica
 from toolchain.analysis.readings import Readings, readings_of_lines, sample_readings
 from toolchain.building.machine import MachinePlan, plan_machine, whole_machine
 from toolchain.building.options import BuildOptions
-from toolchain.building.quantise import Quantised, quantise
+from toolchain.building.quantise import Quantised
 from toolchain.deployment import Scale
 from toolchain.errors import BuildError
 
@@ -126,10 +126,7 @@ def _expected(
         own = plan_machine(model, options)
     except BuildError:  # such as codes that are wider than the random numbers
         return "", 1.0
-    quantised = quantise(
-        model, prob_bits=own.parameters.prob_bits, scale=options.scaling, sensor_mode=options.sensor_mode
-    )
-    chances = _chances(own, quantised, replace(drawn, addresses=drawn.addresses[:, :count]))
+    chances = _chances(own, own.quantised(), replace(drawn, addresses=drawn.addresses[:, :count]))
     cycles = own.max_cycles
     while longer and _share(chances, options, cycles) > TOLERATED and cycles < _MOST_CYCLES:
         cycles *= 4

@@ -17,7 +17,6 @@ from toolchain.building.bm2_machine import chain_machines, plan_bm2
 from toolchain.building.choice import model_for
 from toolchain.building.machine import plan_machine, whole_machine
 from toolchain.building.options import BuildOptions, MachineChoice
-from toolchain.building.quantise import quantise
 from toolchain.errors import BuildError
 from toolchain.models.distribution import Distribution, Symbol
 from toolchain.models.joint import JointDistribution, Question
@@ -140,8 +139,7 @@ def _machine_answer(
     question: Question, addresses: tuple[int, ...], exact: NDArray[np.float64], choice: MachineChoice
 ) -> MachineAnswer:
     """Run the machine that a build would make, as `inspect` runs it."""
-    # there is no robot
-    options = BuildOptions(uri="ws://no:1", topic="/readings", type="std_msgs/Float64", machine=choice)
+    options = BuildOptions(machine=choice)
     model, why = model_for(question, options)
     if isinstance(model, NetworkModel):
         chains = plan_bm2(model, options, why)
@@ -153,10 +151,8 @@ def _machine_answer(
         cycles, stopped = kernels[0].cycles, kernels[0].reason.name
     else:
         plan = plan_machine(model, options)
-        p = plan.parameters
-        codes = quantise(model, prob_bits=p.prob_bits, scale=options.scaling, sensor_mode=p.sensor_mode)
         run = EmulatedBoards(
-            [whole_machine(plan, codes)],
+            [whole_machine(plan, plan.quantised())],
             target_count=plan.target_count,
             max_cycles=plan.max_cycles,
             stop=options.stop,

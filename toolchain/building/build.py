@@ -33,9 +33,10 @@ from toolchain.building.machine import (
     split,
     whole_machine,
 )
-from toolchain.building.options import placed, refused_option
-from toolchain.building.quantise import Quantised, quantise
+from toolchain.building.options import refused_option
+from toolchain.building.quantise import Quantised
 from toolchain.building.report import bm2_report, build_report
+from toolchain.building.sources import placed
 from toolchain.deployment import (
     FILE_NAME,
     BM1Section,
@@ -46,7 +47,7 @@ from toolchain.deployment import (
     FilterSection,
     Output,
     Variable,
-    write_deployment,
+    deployment_text,
 )
 from toolchain.deployment.deployment import with_hash
 from toolchain.deployment.filter import Transition
@@ -101,12 +102,10 @@ def build_deployment(
         memory_files(built.deployment, built.images),
         quartus_files(built.deployment, built.images),
         text_file(REPORT_NAME, built.report),
+        text_file(FILE_NAME, deployment_text(built.deployment)),
     ):
         write_files(directory, part)
-    try:
-        return replace(built, deployment=write_deployment(directory, built.deployment))
-    except DeploymentError as reason:
-        raise BuildError(str(reason)) from None
+    return replace(built, deployment=built.deployment.replace(directory=directory))
 
 
 def assemble(
@@ -123,12 +122,7 @@ def assemble(
         report = partial(bm2_report, plan.model, machine=machines[0], why=plan.why)
     else:
         layout, lines = board_layout(plan.parameters, options.partitions, options.interface), model.lines
-        quantised = quantise(
-            plan.model,
-            prob_bits=plan.parameters.prob_bits,
-            scale=options.scaling,
-            sensor_mode=plan.parameters.sensor_mode,
-        )
+        quantised = plan.quantised()
         machine = whole_machine(plan, quantised)
         machines = split(machine, len(layout.blocks))
         identity = _model_hash(plan, [machine.prior, *machine.tables])

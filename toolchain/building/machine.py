@@ -16,7 +16,7 @@ from machines.kind import UsedRegisters
 from machines.parameters import ADDRESS_BITS_MAX, PROB_BITS_MAX, BM1Parameters, PriorMode, RngKind, SensorMode
 from pcie_shim.register_layout import interface_room
 from toolchain.building.options import BuildOptions, refused_parameter
-from toolchain.building.quantise import Quantised
+from toolchain.building.quantise import Quantised, quantise
 from toolchain.deployment import BM1Section, BM2Section, MachineSection, Scale
 from toolchain.errors import BuildError, counted
 from toolchain.flags import key_values
@@ -61,6 +61,13 @@ class MachinePlan:
     max_cycles: int
     """The maximum number of cycles."""
 
+    def quantised(self) -> Quantised:
+        """Return the codes of the model."""
+        p = self.parameters
+        return quantise(
+            self.model, prob_bits=p.prob_bits, scale=self.options.scaling, sensor_mode=p.sensor_mode
+        )
+
 
 def with_bits(model: Model, bits: Iterable[str]) -> Model:
     """Return the model with address bits of some columns, given as `NAME=BITS`, or raise a BuildError."""
@@ -73,12 +80,7 @@ def with_bits(model: Model, bits: Iterable[str]) -> Model:
             )
         if not re.fullmatch(r"\d{1,3}", text, re.ASCII) or not 1 <= int(text) <= ADDRESS_BITS_MAX:
             raise BuildError(f"--bits {name}={text}: expected 1 to {ADDRESS_BITS_MAX} bits")
-    select = model.prior_select
-    return replace(
-        model,
-        known=tuple(replace(known, bits=int(widths.get(known.name, known.bits))) for known in model.known),
-        prior_select=select and replace(select, bits=int(widths.get(select.name, select.bits))),
-    )
+    return model.with_bits({name: int(text) for name, text in widths.items()})
 
 
 def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:

@@ -13,7 +13,8 @@ from toolchain.building.bm2_machine import BM2_KEYS, BM2Plan, chain_layout, plan
 from toolchain.building.build import REPORT_NAME, assemble, check_agreement, read_images
 from toolchain.building.choice import model_for
 from toolchain.building.machine import MACHINE_KEYS, MachinePlan, board_layout, machine_options, plan_machine
-from toolchain.building.options import BuildOptions, DeploymentEdits, MachineChoice, placed, refused_option
+from toolchain.building.options import BuildOptions, DeploymentEdits, MachineChoice, refused_option
+from toolchain.building.sources import placed
 from toolchain.deployment import (
     FILE_NAME,
     BM2Section,
@@ -194,17 +195,11 @@ def _with_widths(model: Model, deployment: Deployment) -> Model:
     if kinds != built_kinds:
         raise BuildError("another variable now selects the prior: build it again with 'toolchain build'")
     bits = {name: variable.bits for name, variable in built.items()}
-    select = model.prior_select
-    if (
-        deployment.machine.sensor_mode is SensorMode.THRESHOLD
-    ):  # there is no memory whose width must not change
+    if deployment.machine.sensor_mode is SensorMode.THRESHOLD:
+        # there is no memory whose width must not change
         bits |= {known.name: known.bits for known in model.known}
     try:
-        return replace(
-            model,
-            known=tuple(replace(known, bits=bits[known.name]) for known in model.known),
-            prior_select=None if select is None else replace(select, bits=bits[select.name]),
-        )
+        return model.with_bits(bits)
     except ModelError as reason:
         raise BuildError(
             f"{reason}: its memory is that wide; build it again with 'toolchain build'"

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from toolchain.building.machine import MachinePlan
     from toolchain.checks.findings import Finding
 
-_NO_ROBOT = TargetOptions(uri="ws://127.0.0.1:9090", topic="/readings", type="std_msgs/Float64MultiArray")
-"""Placeholders for what a check may leave out of the options of a build."""
-
 SourcesFlag: TypeAlias = Annotated[
     Path | None,
     typer.Option(
@@ -155,11 +152,8 @@ def _of_model(path: Path, flags: BuildFlags, target: TargetOptions, sources: Pat
     from toolchain.building.choice import model_for
     from toolchain.checks.check import check_model, refusal
 
-    if sources is None:
-        given = {key: value for key, value in asdict(target).items() if value != ""}
-        target = TargetOptions(**asdict(_NO_ROBOT) | given)
     try:
-        options = build_options(flags, target, sources)
+        options = build_options(flags, target, sources, is_checked=True)
         model, _ = model_for(read_source(path, flags), options, flags.bits or (), flags.device)
     except ToolchainError as reason:
         return [refusal(reason, "the model")]

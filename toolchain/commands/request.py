@@ -3,20 +3,14 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 
 from machines.parameters import RngKind
 from toolchain.bounded_files import open_regular
-from toolchain.building.options import (
-    FILL,
-    BuildOptions,
-    MachineOptions,
-    OnMissing,
-    TargetOptions,
-    read_sources,
-)
+from toolchain.building.options import FILL, BuildOptions, MachineOptions, TargetOptions
+from toolchain.building.sources import read_sources
 from toolchain.deployment import ModelSection, parse_interface
 from toolchain.errors import BuildError, NetworkFileError, counted
 from toolchain.flags import Bits, Settings, key_values, names_in
@@ -58,7 +52,9 @@ class ModelFlags:
             help="For a filter: the searched variables one frame earlier, in the same order.", metavar="A0,B0"
         ),
     ] = ""
-    on_missing: Annotated[OnMissing, typer.Option(help="Meaning of an absent reading.")] = OnMissing.ERROR
+    on_missing: Annotated[Literal["error", "missing"], typer.Option(help="Meaning of an absent reading.")] = (
+        "error"
+    )
 
     def over(self, built: ModelSection) -> "ModelFlags":
         """Return the flags of a build, and in their place those that are given here."""
@@ -68,18 +64,13 @@ class ModelFlags:
         }
         settings = key_values(built.settings) | key_values(self.settings or ())
         found["settings"] = [f"{key}={value}" for key, value in settings.items()]
-        found["on_missing"] = OnMissing(found["on_missing"])
         return ModelFlags(**found)
 
     def section(self, bits: Iterable[str] = ()) -> ModelSection:
         """Return the flags as a deployment keeps them."""
         flags = {each.name: getattr(self, each.name) for each in fields(ModelFlags)}
-        lists = {
-            "settings": tuple(self.settings or ()),
-            "given": tuple(self.given or ()),
-            "bits": tuple(bits),
-        }
-        return ModelSection(**flags | lists | {"on_missing": str(self.on_missing)})
+        lists = {"settings": self.settings or (), "given": self.given or (), "bits": bits}
+        return ModelSection(**flags | {key: tuple(values) for key, values in lists.items()})
 
     @property
     def question(self) -> list[str]:
@@ -90,7 +81,7 @@ class ModelFlags:
             "--given": self.given,
             "--prior-select": self.prior_select,
             "--previous": self.previous,
-            "--on-missing": self.on_missing is not OnMissing.ERROR,
+            "--on-missing": self.on_missing != "error",
         }
         return [flag for flag, value in values.items() if value]
 
@@ -157,7 +148,7 @@ def _network_question(path: Path, flags: ModelFlags, settings: dict[str, str]) -
         raise BuildError(
             f"{path} is a network: give the searched and known variables, such as --searched A --known B,C"
         )
-    return read_network(path, on_missing=flags.on_missing.value).ask(
+    return read_network(path, on_missing=flags.on_missing).ask(
         names_in("--searched", flags.searched),
         names_in("--known", flags.known),
         given=key_values(flags.given or (), "--given", "smoke=yes"),
@@ -176,13 +167,18 @@ def _case_source(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Mo
     return load_question(path, settings)
 
 
-def build_options(flags: BuildFlags, target: TargetOptions, sources: Path | None = None) -> BuildOptions:
-    """Return the options of a build; `sources` is a file that assigns variables to topics, instead of one topic."""
+def build_options(
+    flags: BuildFlags, target: TargetOptions, sources: Path | None = None, *, is_checked: bool = False
+) -> BuildOptions:
+    """Return the options of a build; `sources` is a file that assigns variables to topics, instead of one topic.
+
+    If the model is only checked, a robot may be missing.
+    """
     from toolchain.outputs.mif import read_table
 
     place = {"--uri": target.uri, "--topic": target.topic, "--type": target.type}
     missing = [flag for flag, value in place.items() if not value]
-    if sources is None and missing:
+    if sources is None and missing and not is_checked:
         raise BuildError(
             f"{missing[0]} is missing: give the source of the readings with --uri, --topic and --type, or with "
             "--sources FILE for several topics"
@@ -196,7 +192,7 @@ def build_options(flags: BuildFlags, target: TargetOptions, sources: Path | None
     options = BuildOptions(
         model_flags=flags.section(flags.bits or ()),
         sources=None if sources is None else read_sources(sources, target.uri or None),
-        **{each.name: getattr(target, each.name) for each in fields(TargetOptions)},
+        **{each.name: given for each in fields(TargetOptions) if (given := getattr(target, each.name)) != ""},
         **{each.name: getattr(flags, each.name) for each in fields(MachineOptions)},
     )
     if flags.interface is not None:

@@ -8,7 +8,6 @@ from toolchain.deployment.deployment import (
     deployment_hash,
     deployment_text,
     load_deployment,
-    write_deployment,
 )
 from toolchain.deployment.sections import (
     BM1Section,
@@ -53,5 +52,4 @@ __all__ = [
     "deployment_text",
     "load_deployment",
     "parse_interface",
-    "write_deployment",
 ]

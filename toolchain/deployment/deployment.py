@@ -11,7 +11,7 @@ import tomli_w
 from pydantic import Field, model_validator
 
 from machines.parameters import PriorMode
-from toolchain.bounded_files import TomlFile, whole_file
+from toolchain.bounded_files import TomlFile
 from toolchain.deployment.sections import (
     BoardSection,
     Choice,
@@ -314,14 +314,6 @@ _TOML_HEADER: Final = """\
 # Written by `toolchain build`. URIs and endpoints may be changed here; the rest belongs to the boards' images
 # and is guarded by the hash: change the model and build again.
 """
-
-
-def write_deployment(directory: Path, deployment: Deployment) -> Deployment:
-    """Write `deployment.toml` with its hash atomically, and return the written deployment."""
-    written = with_hash(deployment.replace(directory=Path(directory)))
-    with whole_file(written.path, DeploymentError) as partial:
-        partial.write_text(deployment_text(written), encoding="utf-8")
-    return written
 
 
 def deployment_text(deployment: DeploymentFile) -> str:

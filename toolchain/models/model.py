@@ -7,9 +7,9 @@ model consists of the prior P(S) and a table P(K_i | S) for each known variable,
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Any, Final, Literal
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -221,6 +221,15 @@ class Model:
             f"Model({self.name!r}, P({searched} | {known}))"
             if known
             else f"Model({self.name!r}, P({searched}))"
+        )
+
+    def with_bits(self, bits: Mapping[str, int]) -> Self:
+        """Return the model with the address bits of some known variables, by name, or raise a ModelError."""
+        select = self.prior_select
+        return replace(
+            self,
+            known=tuple(replace(known, bits=bits.get(known.name, known.bits)) for known in self.known),
+            prior_select=select and replace(select, bits=bits.get(select.name, select.bits)),
         )
 
     def _all_known(self) -> tuple[Known | PriorSelect, ...]:

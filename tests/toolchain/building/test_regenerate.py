@@ -3,7 +3,7 @@
 import pytest
 
 from tests.toolchain.running import TARGET, assert_refused, contents, done, toolchain
-from toolchain.building import build as building
+from toolchain.building.machine import MachinePlan
 from toolchain.building.options import DeploymentEdits
 from toolchain.building.regenerate import edited
 from toolchain.deployment import load_deployment
@@ -170,7 +170,7 @@ def test_how_the_model_was_read_is_not_asked_again(case, network):
 @pytest.mark.parametrize("wrong", [("--order", "D1,D22"), ("--path", "D22=data[1]")])
 def test_a_misspelt_variable_is_named_with_the_nearest_one(case, built, wrong, monkeypatch):
     """Before the tables are computed, which may take minutes."""
-    monkeypatch.setattr(building, "quantise", None)
+    monkeypatch.setattr(MachinePlan, "quantised", None)
     for result in (
         toolchain("build", case, "-o", case.parent / "new", *TARGET, *wrong),
         regenerate("deployment", built, *wrong, code=2),

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from bridge.errors import PathError
 from bridge.fields import parse_path
 from tests.toolchain.running import assert_refused, done, toolchain
-from toolchain.building.options import read_sources
+from toolchain.building.sources import read_sources
 from toolchain.deployment import Variable, load_deployment
 from toolchain.deployment.sections import MESSAGE_PATH
 from toolchain.errors import BuildError

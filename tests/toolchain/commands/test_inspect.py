@@ -104,11 +104,11 @@ def test_deployments_of_other_machines(case):
     [
         (["--model", "{case}", "--set", "cells=13"], ["/out", "corridor", "--set"]),
         (["--model", "{case}", "--bits", "range=7"], ["/out", "corridor", "--bits"]),
-        (["--clock", "0"], ["--clock is 0"]),
-        (["--clock", "1e13"], ["--clock is 1e+13"]),
+        (["--clock", "0"], ["--clock", "greater"]),
+        (["--clock", "1e13"], ["--clock", "less"]),
         (["--device", "d9"], ["--device d9", "proce-v-d8"]),
         (["--reading", "range=a"], ["--reading range=a", "--readings FILE"]),
-        (["--banks", "0"], ["--banks is 0"]),
+        (["--banks", "0"], ["--banks", "greater"]),
         (["--frames", "9" * 30], ["1 to 100000"]),
     ],
 )
