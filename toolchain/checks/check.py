@@ -76,22 +76,13 @@ def check_deployment(directory: Path) -> list[Finding]:
         check_agreement(deployment, images)
     except (ToolchainError, PcieShimError) as reason:
         return [refusal(reason, "the deployment")]
-    edited = [
-        note(
-            Check.EDITED,
-            ", ".join(f"board {board}" for board in deployment.edited_boards),
-            "the image was made from memories or parameters that were edited since the build, so it may not be the model's",
-            "'toolchain regenerate memories --model' returns to the model's codes; undo edits of parameters by hand, then use "
-            "'toolchain regenerate images'",
-        )
-    ]
-    return _sorted(
-        [
-            *_files(directory, deployment, images),
-            *(edited if deployment.edited_boards else ()),
-            *_check(deployment, images, None),
-        ]
-    )
+    findings = [*_files(directory, deployment, images), *_check(deployment, images, None)]
+    if deployment.edited_boards:
+        boards = ", ".join(f"board {board}" for board in deployment.edited_boards)
+        what = "the image was made from memories or parameters that were edited since the build, so it may not be the model's"
+        advice = "'toolchain regenerate memories --model' returns to the model's codes; undo edits of parameters by hand, then "
+        findings.append(note(Check.EDITED, boards, what, advice + "use 'toolchain regenerate images'"))
+    return _sorted(findings)
 
 
 def refusal(reason: Exception, about: str) -> Finding:
@@ -130,19 +121,13 @@ def _files(directory: Path, deployment: Deployment, images: Sequence[Image]) -> 
         ("memories", memory_files(deployment, images)),
         ("project", quartus_files(deployment, images)),
     ):
-        wrong = [
-            (name, change)
-            for name, change in compare_files(directory, files)
-            if change is not Change.UNCHANGED
-        ]
+        wrong = [each for each in compare_files(directory, files) if each[1] is not Change.UNCHANGED]
         if wrong:
             name, change = wrong[0]
             more = f", and {counted(len(wrong) - 1, 'more file')}" if len(wrong) > 1 else ""
+            keep = f"to keep an edit, use 'toolchain regenerate images {directory}'; to undo it, "
             advice = f"use 'toolchain regenerate {part} {directory}'"
-            if part == "memories":
-                advice = (
-                    f"to keep an edit, use 'toolchain regenerate images {directory}'; to undo it, {advice}"
-                )
+            advice = keep + advice if part == "memories" else advice
             yield warning(Check.FILES, name, f"{words[change]}{more}", advice)
 
 
@@ -159,12 +144,8 @@ def _same_readings(deployment: Deployment) -> Iterator[Finding]:
         readers.setdefault((variable.source, variable.path or variable.name), []).append(variable.name)
     for (_, path), names in readers.items():
         if len(names) > 1:
-            yield warning(
-                Check.SAME_READING,
-                " and ".join(names),
-                f"they all have the path {path}",
-                "give each its own path, in the model or with --path",
-            )
+            advice = "give each its own path, in the model or with --path"
+            yield warning(Check.SAME_READING, " and ".join(names), f"they all have the path {path}", advice)
 
 
 def _ranges(deployment: Deployment) -> Iterator[Finding]:
@@ -172,35 +153,23 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
     for variable in deployment.variables:
         needed = variable.values.bit_length()
         if needed < variable.bits:
-            yield note(
-                Check.ADDRESS_BITS,
-                variable.name,
-                (
-                    f"its {variable.values} values and the missing reading fit {needed} address bits, but it has "
-                    f"{variable.bits}: its memory is {2 ** (variable.bits - needed)} times as deep as needed"
-                ),
-                f"use --bits {variable.name}={needed}",
+            what = (
+                f"its {variable.values} values and the missing reading fit {needed} address bits, but it has "
             )
+            what += f"{variable.bits}: its memory is {2 ** (variable.bits - needed)} times as deep as needed"
+            yield note(Check.ADDRESS_BITS, variable.name, what, f"use --bits {variable.name}={needed}")
         if variable.period is not None and variable.period != variable.values:
-            wrong = (
-                f"but only {variable.values} are served: those from "
-                f"{variable.offset + variable.values * variable.step:g} on are out of range"
-                if variable.period > variable.values
-                else f"so that the last {variable.values - variable.period} of its {variable.values} values never occur"
-            )
-            yield warning(
-                Check.RANGE,
-                variable.name,
-                f"its readings wrap around after {variable.period} steps, {wrong}",
-                f"give it {variable.period} values, or a period of {variable.values}",
-            )
+            end = variable.offset + variable.values * variable.step
+            what = f"but only {variable.values} are served: those from {end:g} on are out of range"
+            if variable.period < variable.values:
+                what = f"so that the last {variable.values - variable.period} of its {variable.values} values never occur"
+            what = f"its readings wrap around after {variable.period} steps, {what}"
+            advice = f"give it {variable.period} values, or a period of {variable.values}"
+            yield warning(Check.RANGE, variable.name, what, advice)
         if variable.on_range == "missing" and variable.on_missing == "error":
-            yield warning(
-                Check.RANGE,
-                variable.name,
-                "a reading out of range is a missing one (on_range), and a missing one is an error (on_missing)",
-                'use on_missing="missing", or on_range="clamp" or "error"',
-            )
+            what = "a reading out of range is a missing one (on_range), and a missing one is an error (on_missing)"
+            advice = 'use on_missing="missing", or on_range="clamp" or "error"'
+            yield warning(Check.RANGE, variable.name, what, advice)
 
 
 def state_findings(variable: Variable) -> Iterator[Finding]:
@@ -210,19 +179,19 @@ def state_findings(variable: Variable) -> Iterator[Finding]:
         number = variable.offset + at * variable.step
         if NUMBER.fullmatch(name) and abs(float(name) - number) > 1e-6 * abs(variable.step):
             what = f"a reading of {number:g} as a number selects the state '{name}' ({shown}), since numbers are in equal steps"
-            yield warning(
-                Check.STATES, variable.name, what, "publish names as strings, or give the states other names"
-            )
+            advice = "publish names as strings, or give the states other names"
+            yield warning(Check.STATES, variable.name, what, advice)
             break
     one = math.floor((1 - variable.offset) / variable.step + 0.5)  # the address of 1, and of true
     chosen = states[one].lower() if 0 <= one < len(states) else ""
     unclear = len(states) == 2 and one == 1 and chosen not in YES and not NUMBER.fullmatch(chosen)
     if chosen in NO or unclear:
         what = f"a reading of true selects the state '{chosen}' ({shown}), whose number is 1"
-        finding = warning if chosen in NO else note
-        yield finding(
-            Check.STATES, variable.name, what, "publish names as strings if a bool means the other one"
+        finding, advice = (
+            warning if chosen in NO else note,
+            "publish names as strings if a bool means the other one",
         )
+        yield finding(Check.STATES, variable.name, what, advice)
 
 
 _MOST_NAMES: Final = 6
@@ -249,19 +218,13 @@ def source_findings(deployment: Deployment) -> Iterator[Finding]:
     topics = " and ".join(bare)
     about = f"messages on {topics} have no header, so they are paired by time of receipt"
     if deployment.tolerance_s < _LEAST_TOLERANCE_S:
-        yield warning(
-            Check.PAIRING,
-            topics,
-            f"{about}; with a tolerance of {deployment.tolerance_s:g} s they rarely form a frame",
-            "build with a --tolerance of at least the network's delay, or publish types with a header",
-        )
+        what = f"{about}; with a tolerance of {deployment.tolerance_s:g} s they rarely form a frame"
+        advice = "build with a --tolerance of at least the network's delay, or publish types with a header"
+        yield warning(Check.PAIRING, topics, what, advice)
     elif len(bare) < len(deployment.sources):
-        yield note(
-            Check.PAIRING,
-            topics,
-            f"{about}, and the other topics by the robot's clock",
-            "synchronise both clocks to well within the tolerance (NTP, chrony), or publish types with a header",
-        )
+        what = f"{about}, and the other topics by the robot's clock"
+        advice = "synchronise both clocks to well within the tolerance (NTP, chrony), or publish types with a header"
+        yield note(Check.PAIRING, topics, what, advice)
 
 
 def _may_have_header(type_name: str) -> bool:

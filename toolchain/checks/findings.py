@@ -144,21 +144,11 @@ def loss_findings(quantised: Quantised, options: BuildOptions) -> Iterator[Findi
     mass = sum(loss.mass for loss in quantised.losses)
     if mass > _LOST_OFTEN:
         worst = max(quantised.losses, key=lambda loss: loss.mass)
-        yield warning(
-            Check.LOST_MASS,
-            "the codes",
-            (
-                f"in up to {min(mass, 1):.1%} of the model's own frames some reading has code 0 on the true line, most "
-                f"often one of {worst.name} ({worst.mass:.1%})"
-            ),
-            "use more --prob-bits"
-            + (
-                ""
-                if options.scaling is Scale.ADDRESS or options.sensor_mode is not SensorMode.COLUMN
-                else " or --scale address"
-            )
-            + ", or a floor for outliers",
-        )
+        what = f"in up to {min(mass, 1):.1%} of the model's own frames some reading has code 0 on the true line, most "
+        what += f"often one of {worst.name} ({worst.mass:.1%})"
+        may_scale = options.scaling is not Scale.ADDRESS and options.sensor_mode is SensorMode.COLUMN
+        advice = f"use more --prob-bits{' or --scale address' if may_scale else ''}, or a floor for outliers"
+        yield warning(Check.LOST_MASS, "the codes", what, advice)
 
 
 def line_name(searched: Sequence[Dimension], line: int) -> str:
@@ -194,32 +184,21 @@ def _lines(machine: CheckedMachine) -> Iterator[Finding]:
     deployment = machine.deployment
     dead = ~_alive(machine)
     if dead.all():
-        yield error(
-            Check.DEAD_LINES,
-            "the machine",
-            "no line can ever count, regardless of the readings: each has code 0 in the prior or in a whole column",
-            _wider(machine),
-        )
+        what = "no line can ever count, regardless of the readings: each has code 0 in the prior or in a whole column"
+        yield error(Check.DEAD_LINES, "the machine", what, _wider(machine))
         return
     if machine.parameters.prior_mode is PriorMode.TABLE:
         yield from _dead_prior(machine)
     for column, variable in enumerate(deployment.sensors[: len(machine.tables)]):
         lines = np.flatnonzero(~machine.addressable_rows(column).any(axis=0))
         if lines.size:
-            yield warning(
-                Check.DEAD_LINES,
-                variable.name,
-                f"every value of it has code 0 at {_some_lines(deployment, lines)}, which can never count",
-                _wider(machine),
-            )
+            what = f"every value of it has code 0 at {_some_lines(deployment, lines)}, which can never count"
+            yield warning(Check.DEAD_LINES, variable.name, what, _wider(machine))
     for index, board in enumerate(deployment.boards):
         if dead[board.line_offset : board.line_offset + board.lines].all():
-            yield warning(
-                Check.DEAD_BOARD,
-                f"board {index}",
-                "none of its lines can ever count, regardless of the readings",
-                "use fewer --partitions, or a model that searches only possible values",
-            )
+            what = "none of its lines can ever count, regardless of the readings"
+            advice = "use fewer --partitions, or a model that searches only possible values"
+            yield warning(Check.DEAD_BOARD, f"board {index}", what, advice)
 
 
 def _dead_prior(machine: CheckedMachine) -> Iterator[Finding]:
@@ -231,18 +210,11 @@ def _dead_prior(machine: CheckedMachine) -> Iterator[Finding]:
         if model.prior_select is not None:
             meant &= ~model.prior_select.table.any(axis=0)
     if (lines := np.flatnonzero(dead & meant)).size:
-        yield note(
-            Check.DEAD_LINES,
-            "the prior",
-            f"the model says that {_some_lines(deployment, lines)} is impossible, so it never counts",
-        )
+        what = f"the model says that {_some_lines(deployment, lines)} is impossible, so it never counts"
+        yield note(Check.DEAD_LINES, "the prior", what)
     if (lines := np.flatnonzero(dead & ~meant)).size:
-        yield warning(
-            Check.DEAD_LINES,
-            "the prior",
-            f"it has code 0 at {_some_lines(deployment, lines)}, which can never count",
-            "" if model is None else _wider(machine),
-        )
+        what = f"it has code 0 at {_some_lines(deployment, lines)}, which can never count"
+        yield warning(Check.DEAD_LINES, "the prior", what, "" if model is None else _wider(machine))
 
 
 def _readings(machine: CheckedMachine) -> Iterator[Finding]:
@@ -262,56 +234,34 @@ def _readings(machine: CheckedMachine) -> Iterator[Finding]:
         possible = np.ones_like(impossible) if probabilities is None else probabilities > 0
         if (addresses := np.flatnonzero(impossible & possible)).size:
             often = "" if probabilities is None else f", {probabilities[addresses].sum():.2g} of all readings"
-            yield warning(
-                Check.IMPOSSIBLE_READINGS,
-                variable.name,
-                (
-                    f"{addresses.size} of its {variable.values} values ({_values(variable, addresses)}{often}) have code "
-                    "0 on every line that can count, so such a frame gives no posterior"
-                ),
-                _wider(machine),
-            )
+            what = f"{addresses.size} of its {variable.values} values ({_values(variable, addresses)}{often}) have code "
+            what += "0 on every line that can count, so such a frame gives no posterior"
+            yield warning(Check.IMPOSSIBLE_READINGS, variable.name, what, _wider(machine))
         if (addresses := np.flatnonzero(impossible & ~possible)).size:
-            yield note(
-                Check.IMPOSSIBLE_READINGS,
-                variable.name,
-                (
-                    f"the model says that {addresses.size} of its {variable.values} values "
-                    f"({_values(variable, addresses)}) are impossible; a frame with one gives no posterior"
-                ),
-                "an outlier floor would accept such a reading",
-            )
+            what = f"the model says that {addresses.size} of its {variable.values} values ({_values(variable, addresses)}) "
+            what += "are impossible; a frame with one gives no posterior"
+            advice = "an outlier floor would accept such a reading"
+            yield note(Check.IMPOSSIBLE_READINGS, variable.name, what, advice)
 
 
 def _columns(machine: CheckedMachine) -> Iterator[Finding]:
     """Find columns whose readings have no effect."""
-    of_columns = machine.parameters.sensor_mode is SensorMode.COLUMN
-    for variable, table in zip(
-        machine.deployment.sensors, machine.tables if of_columns else (), strict=of_columns
-    ):
+    if machine.parameters.sensor_mode is not SensorMode.COLUMN:
+        return
+    more = ", or use more --prob-bits" if machine.parameters.prob_bits < PROB_BITS_MAX else ""
+    for variable, table in zip(machine.deployment.sensors, machine.tables, strict=True):
         served = table[: variable.values]
         if served.shape[1] > 1 and (served == served[:, :1]).all():
-            yield note(
-                Check.COLUMN_WITHOUT_EFFECT,
-                variable.name,
-                "each of its values has the same code on every line, so its readings have no effect",
-                "omit it"
-                + (", or use more --prob-bits" if machine.parameters.prob_bits < PROB_BITS_MAX else ""),
-            )
+            what = "each of its values has the same code on every line, so its readings have no effect"
+            yield note(Check.COLUMN_WITHOUT_EFFECT, variable.name, what, f"omit it{more}")
 
 
 def _stopping(machine: CheckedMachine) -> Iterator[Finding]:
     limits = machine.deployment.machine
     if limits.target_count > limits.max_cycles:
-        yield warning(
-            Check.STOPPING,
-            "the machine",
-            (
-                f"no counter can reach {limits.target_count} in {limits.max_cycles} cycles, so every frame takes all of "
-                "them"
-            ),
-            f"use --max-cycles above {limits.target_count}, or a smaller --target-count",
-        )
+        what = f"no counter can reach {limits.target_count} in {limits.max_cycles} cycles, so every frame takes all of them"
+        advice = f"use --max-cycles above {limits.target_count}, or a smaller --target-count"
+        yield warning(Check.STOPPING, "the machine", what, advice)
 
 
 def _wider(machine: CheckedMachine) -> str:

@@ -14,7 +14,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from machines.bm1 import BM1Machine
 from machines.bm2 import BM2Parameters
 from machines.parameters import BM1Parameters, RngKind, RngReset
 from machines.rng import LFSR
@@ -29,21 +28,16 @@ def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
     """Find random numbers that repeat, are shared, or are related between columns."""
     parameters = machine.parameters
     if parameters.rng is RngKind.IDEAL:
-        yield note(
-            Check.RNG,
-            "rng = ideal",
-            "these generators exist only in emulation, so there is no hardware project",
-            "use an LFSR for a board",
-        )
+        what = "these generators exist only in emulation, so there is no hardware project"
+        yield note(Check.RNG, "rng = ideal", what, "use an LFSR for a board")
         return
     yield from fresh_numbers(parameters, SHARED_BITS["BM1"])
-    width = parameters.rng.lfsr_bits
-    length = 2**width - 1 if width is not None else len(_table(machine.board))
-    yield from _period(machine, length)
-    if width is None:
-        yield from _table_numbers(machine)
-        return
-    yield from _relations(machine)
+    if (table := machine.board.rng_table) is not None:
+        yield from _period(machine, len(table))
+        yield from _table_numbers(machine, table & np.uint32(parameters.ones_code))
+    else:
+        yield from _period(machine, LFSR(parameters.rng).period)
+        yield from _relations(machine)
 
 
 def fresh_numbers(p: BM1Parameters | BM2Parameters, effect: str) -> Iterator[Finding]:
@@ -67,25 +61,20 @@ def _period(machine: CheckedMachine, length: int) -> Iterator[Finding]:
     if limits.max_cycles > period:
         ways = {RngKind.TABLE: ", or a longer --rng-table", RngKind.LFSR32: ""}
         longer = ways.get(parameters.rng, ", or a wider --rng")
-        shortened = (
+        steps = (
             ""
             if period == length
             else f" ({length} steps, of which a clock takes {parameters.steps_per_clock})"
         )
-        yield warning(
-            Check.RNG_PERIOD,
-            f"rng = {parameters.rng}",
-            (
-                f"the random numbers repeat after {period} cycles{shortened}, and a frame may run {limits.max_cycles}: "
-                "later cycles add no information"
-            ),
-            f"use --max-cycles {period}{longer}",
-        )
+        what = f"the random numbers repeat after {period} cycles{steps}, and a frame may run {limits.max_cycles}: later cycles "
+        what += "add no information"
+        advice = f"use --max-cycles {period}{longer}"
+        yield warning(Check.RNG_PERIOD, f"rng = {parameters.rng}", what, advice)
 
 
 def _relations(machine: CheckedMachine) -> Iterator[Finding]:
     """Find columns whose bits are related by XOR in a bank or, with one generator per cell, in a line."""
-    parameters, names = machine.parameters, machine.names
+    parameters, names, about = machine.parameters, machine.names, f"rng = {machine.parameters.rng}"
     seeds = seed_words(machine.board).reshape(-1, parameters.columns)
     found, groups = relations(parameters.rng, seeds, parameters.prob_bits)
     what_groups = "banks" if parameters.shared else "lines in a bank"
@@ -103,56 +92,37 @@ def _relations(machine: CheckedMachine) -> Iterator[Finding]:
         if not parameters.shared and not same:
             severity = Severity.WARNING if count < 4 else Severity.NOTE
         clean = first.group if parameters.shared else 0
-        yield Finding(
-            severity,
-            Check.RNG_RELATION,
-            f"rng = {parameters.rng}",
-            (
-                f"in {len(related)} of {groups} {what_groups} {count} random bits of {'different' if apart else 'several'} columns "
-                f"{'are the same' if count == 2 else 'XOR to 0'} in every cycle ({where}: {bits}), so these columns are not "
-                "independent"
-            ),
-            f"use {'' if parameters.rng is RngKind.LFSR32 else 'a wider --rng or '}fewer --prob-bits"
-            + (f", or --rng-banks {clean}, which excludes these banks" if clean > 1 else ""),
-        )
+        what = f"in {len(related)} of {groups} {what_groups} {count} random bits of {'different' if apart else 'several'} columns "
+        what += f"{'are the same' if count == 2 else 'XOR to 0'} in every cycle ({where}: {bits}), so these columns are not "
+        advice = f"use {'' if parameters.rng is RngKind.LFSR32 else 'a wider --rng or '}fewer --prob-bits"
+        advice += f", or --rng-banks {clean}, which excludes these banks" if clean > 1 else ""
+        yield Finding(severity, Check.RNG_RELATION, about, what + "independent", advice)
     if groups < len(seeds):
-        yield note(
-            Check.RNG_RELATION,
-            f"rng = {parameters.rng}",
-            f"relations were searched in {groups} of {len(seeds)} {what_groups}, to save time",
-        )
+        what = f"relations were searched in {groups} of {len(seeds)} {what_groups}, to save time"
+        yield note(Check.RNG_RELATION, about, what)
 
 
-def _table_numbers(machine: CheckedMachine) -> Iterator[Finding]:
+def _table_numbers(machine: CheckedMachine, numbers: NDArray[np.uint32]) -> Iterator[Finding]:
     """Find codes and pairs of columns that a table of random numbers distorts."""
     parameters, names = machine.parameters, machine.names
-    numbers = _table(machine.board) & np.uint32(parameters.ones_code)
     codes = 1 << parameters.prob_bits
     # codes 0 and all-ones don't depend on the numbers
     below = np.cumsum(np.bincount(numbers, minlength=codes))[: codes - 2] / len(numbers)
     errors = np.abs(below - np.arange(1, codes - 1) / codes)
     worst = int(errors.argmax()) if errors.size else 0
     if errors.size and errors[worst] > 0.5 / codes:
-        yield warning(
-            Check.RNG_TABLE,
-            "rng = table",
-            (
-                f"code {worst + 1} counts in {below[worst]:.4g} of the cycles instead of {(worst + 1) / codes:.4g}, "
-                "because the numbers are not equally frequent in the table"
-            ),
-            "use a table with equally frequent numbers, such as the one generated without --rng-table",
-        )
+        what = f"code {worst + 1} counts in {below[worst]:.4g} of the cycles instead of {(worst + 1) / codes:.4g}, because the "
+        what += "numbers are not equally frequent in the table"
+        advice = "use a table with equally frequent numbers, such as the one generated without --rng-table"
+        yield warning(Check.RNG_TABLE, "rng = table", what, advice)
     starts = seed_words(machine.board).reshape(-1, parameters.columns)
     for group, row in enumerate(starts):
         order = np.argsort(row, kind="stable")
         for one, other in pairwise(int(index) for index in order):
             if row[one] == row[other]:
-                yield error(
-                    Check.RNG_RELATION,
-                    f"{names[one]} and {names[other]}",
-                    f"they start at the same index of the table (index {row[one]}, group {group}), so they are the same",
-                    "use a longer --rng-table",
-                )
+                pair = f"{names[one]} and {names[other]}"
+                what = f"they start at the same index of the table (index {row[one]}, group {group}), so they are the same"
+                yield error(Check.RNG_RELATION, pair, what, "use a longer --rng-table")
                 return
     yield from _table_correlation(machine, numbers, starts)
 
@@ -173,20 +143,10 @@ def _table_correlation(
     found = np.abs(correlation[(first[one] - first[other]) % length])
     worst = int(found.argmax()) if found.size else 0
     if found.size and found[worst] > limit:
-        pair = [machine.names[one[worst]], machine.names[other[worst]]]
-        yield warning(
-            Check.RNG_RELATION,
-            " and ".join(pair),
-            (
-                f"their random numbers correlate by {found[worst]:.2g}; up to {limit:.2g} is due to chance in a "
-                f"table of {length}"
-            ),
-            "use a table in a more random order, such as the one generated without --rng-table",
-        )
-
-
-def _table(board: BM1Machine) -> NDArray[np.uint32]:
-    return np.zeros(0, dtype=np.uint32) if board.rng_table is None else board.rng_table
+        pair = f"{machine.names[one[worst]]} and {machine.names[other[worst]]}"
+        what = f"their random numbers correlate by {found[worst]:.2g}; up to {limit:.2g} is due to chance in a table of {length}"
+        advice = "use a table in a more random order, such as the one generated without --rng-table"
+        yield warning(Check.RNG_RELATION, pair, what, advice)
 
 
 Bit = tuple[int, int]
