@@ -19,12 +19,13 @@ from numba import types
 from machines import bm2_fast as fast
 from machines import make_bm2_kernel
 from machines.bm2 import BM2Machine, BM2Start, BM2StopReason, pack, unpack
-from machines.bm2_fast import CHUNK, VECTOR, Integers, Moves, Wiring, aligned, below, load, some, splat, store
+from machines.bm2_fast import CHUNK, Integers, Moves, Wiring
 from machines.bm2_kernel import BM2Kernel, check_bm2_start
 from machines.errors import ParameterError, StartError
 from machines.fast_code import jit
 from machines.parameters import RngReset, SampleEvery, Sequencer
 from machines.rng import LFSR, POLYNOMIALS, Words, generator_numbers
+from machines.vectors import VECTOR, aligned, below, first_one, first_ones, in_llvm, load, some, splat, store
 
 SLICE: Final = 512  # chains in a vector
 SLICED_MIN: Final = 64  # chains to be sliced; fewer are faster in step
@@ -403,7 +404,7 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
     return True
 
 
-@fast.in_llvm(VECTOR, None, types.int64, None, types.int64, None, types.int64, None, types.int64)
+@in_llvm(VECTOR, None, types.int64, None, types.int64, None, types.int64, None, types.int64)
 def _less_in_lanes(
     builder: Any, numbers: Any, row: Any, places: Any, lane: Any, codes: Any, base: Any, own: Any, first: Any
 ) -> Any:
@@ -450,7 +451,7 @@ def run_in_step(  # noqa: PLR0915 - vectors are not passed to functions
                     less = _less_in_lanes(numbers, row, clock, part * LANES, codes, base, addresses, address)
                     all_ones = all_ones & less
                     some_ones = some_ones | less
-                nth = fast.first_ones(~(all_ones ^ some_ones) | splat(_ALL + _1))
+                nth = first_ones(~(all_ones ^ some_ones) | splat(_ALL + _1))
                 before, value = load(clock, part), load(values, variable + part)
                 after = before + nth + one
                 made = (all_ones >> nth) & one
@@ -475,7 +476,7 @@ def run_in_step(  # noqa: PLR0915 - vectors are not passed to functions
                             cycles = min(end - at, CHUNK)
                             agree = (ones | ~any_ones) & (_ALL >> np.uint64(CHUNK - cycles))
                             if agree:
-                                cycles = np.int64(fast.first_one(agree)) + 1
+                                cycles = np.int64(first_one(agree)) + 1
                                 room[0, lane] = _0
                                 room[2, lane] = (ones >> np.uint64(cycles - 1)) & _1
                             at += cycles

@@ -9,17 +9,13 @@ and every 2**k-th bit of that sequence is the same sequence at another phase (`s
 For the same reason it is the XOR of those in the cycles t - 32 * e, which makes 32 numbers at a time.
 """
 
-import math
-import operator
-from collections.abc import Callable
-from functools import lru_cache, partial, wraps
+from functools import lru_cache, partial
 from itertools import accumulate
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from llvmlite import ir
-from numba import extending as untyped_extending
 from numba import types
 
 from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, pack, unpack
@@ -28,6 +24,7 @@ from machines.errors import MachineError
 from machines.fast_code import image, jit, jump
 from machines.parameters import CYCLES_MAX, RngKind, SampleEvery, Sequencer
 from machines.rng import LFSR, POLYNOMIALS, Words, jump_tables
+from machines.vectors import aligned, first_one, in_llvm, load, repeated, store
 
 CHUNK: Final = 32
 """Number of cycles that are looked at together: the bits of a mask."""
@@ -36,7 +33,6 @@ STREAM_ROOM: Final = 4096
 """Number of samples for which a stream's buffer has room at first; it grows when it must."""
 
 Integers = npt.NDArray[np.int64]
-extending: Any = untyped_extending
 
 # Fields of `Chain.control`. The next cycle is ORIGIN + AT; END and BEGAN (of the move) count from ORIGIN, too.
 AT, ORIGIN, END, BEGAN, PENDING, PLACE, BURN_IN, SAMPLES, UNUSED, STREAMED, ORDER, REASON, TIMED_OUT = range(
@@ -187,14 +183,6 @@ def warm_up() -> None:
     kernel.start(BM2Start(state=0, known=0, samples=1, burn_in=0, ops_timeout=1000, max_cycles=1000))
 
 
-def aligned(shape: tuple[int, ...], dtype: type[np.generic]) -> npt.NDArray[Any]:
-    """Return zeros that begin at a multiple of 64 bytes, as vectors must."""
-    size = math.prod(shape) * np.dtype(dtype).itemsize
-    room = np.zeros(size + 64, dtype=np.uint8)
-    first = -room.ctypes.data % 64
-    return room[first : first + size].view(dtype).reshape(shape)
-
-
 def row_size(parameters: BM2Parameters) -> int:
     """Return for how many numbers each CDE has room: a block of 32 times the LFSR's bits, and a chunk."""
     return (POLYNOMIALS[parameters.rng][0] + 1) * CHUNK
@@ -287,129 +275,18 @@ _32: Final = np.uint64(32)
 _LOW_WORD: Final = np.uint64(2**32 - 1)
 _ALL: Final = np.uint64(2**CHUNK - 1)
 
-_BITS: Final = ir.IntType(64)
-_VECTOR: Final = ir.VectorType(_BITS, 8)
 _NUMBERS: Final = ir.VectorType(ir.IntType(16), CHUNK)
-
-
-class _VectorType(types.Type):
-    """512 bits of an array that is `aligned`, as numba's type of a local variable; it has `&`, `|`, `^`, `~`, `+`, `<<`, `>>`."""
-
-
-VECTOR: Final = _VectorType("Vector")
-
-
-@extending.register_model(_VectorType)
-class _VectorModel(extending.models.PrimitiveModel):  # type: ignore[misc] # numba has no types
-    def __init__(self, manager: Any, type_: Any) -> None:
-        super().__init__(manager, type_, _VECTOR)
-
-
-def _define(operation: Callable[..., Any], name: str, operands: int) -> None:
-    """Define an operator of vectors as the LLVM instruction of that name."""
-    extending.type_callable(operation)(
-        lambda _context: lambda *given: VECTOR if given == (VECTOR,) * operands else None
-    )
-    extending.lower_builtin(operation, *(VECTOR,) * operands)(
-        lambda _context, builder, _signature, given: getattr(builder, name)(*given)
-    )
-
-
-_define(operator.and_, "and_", 2)
-_define(operator.or_, "or_", 2)
-_define(operator.xor, "xor", 2)
-_define(operator.invert, "not_", 1)
-_define(operator.add, "add", 2)
-_define(operator.lshift, "shl", 2)
-_define(operator.rshift, "lshr", 2)
-
-
-def in_llvm(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that makes a compiled function of one that writes its LLVM code.
-
-    `kinds` are the types of the arguments; None for any array, of which the code gets the address of the data.
-    """
-
-    def decorate(write: Callable[..., Any]) -> Any:
-        @wraps(write)  # numba counts the arguments of its signature
-        def typed(_context: Any, *given: Any) -> Any:
-            def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-                plain = [
-                    argument if kind else context.make_array(array)(context, builder, argument).data
-                    for kind, array, argument in zip(kinds, signature.args, arguments, strict=True)
-                ]
-                return write(builder, *plain) or context.get_dummy_value()
-
-            return result(*(kind or array for kind, array in zip(kinds, given, strict=True))), code
-
-        return extending.intrinsic(typed)
-
-    return decorate
-
-
-@in_llvm(VECTOR, None, types.int64)
-def load(builder: Any, data: Any, place: Any) -> Any:
-    """Return the vector at a place of an array, in vectors."""
-    vector = builder.load(builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [place]))
-    vector.align = 64
-    return vector
-
-
-@in_llvm(types.void, None, types.int64, VECTOR)
-def store(builder: Any, data: Any, place: Any, vector: Any) -> None:
-    """Write a vector at a place of an array, in vectors."""
-    builder.store(vector, builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [place])).align = 64
-
-
-def _repeated(builder: Any, value: Any, kind: Any) -> Any:
-    unset = ir.Constant(kind, ir.Undefined)
-    one = builder.insert_element(unset, value, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(one, unset, ir.Constant(ir.VectorType(ir.IntType(32), kind.count), None))
-
-
-@in_llvm(VECTOR, types.uint64)
-def splat(builder: Any, word: Any) -> Any:
-    """Return the vector that repeats a word."""
-    return _repeated(builder, word, _VECTOR)
 
 
 def compared(builder: Any, numbers: Any, place: Any, code: Any) -> Any:
     """Compare the numbers of a chunk with a code: bit i is 1 if number `place` + i is less."""
     chunk = builder.load(builder.bitcast(builder.gep(numbers, [place]), _NUMBERS.as_pointer()))
     chunk.align = 2
-    less = builder.icmp_unsigned("<", chunk, _repeated(builder, code, _NUMBERS))
-    return builder.zext(builder.bitcast(less, ir.IntType(CHUNK)), _BITS)
+    less = builder.icmp_unsigned("<", chunk, repeated(builder, code, _NUMBERS))
+    return builder.zext(builder.bitcast(less, ir.IntType(CHUNK)), ir.IntType(64))
 
 
 less_in_chunk: Final = in_llvm(types.uint64, None, types.int64, types.uint16)(compared)
-
-
-@in_llvm(types.uint64, types.uint64)
-def first_one(builder: Any, word: Any) -> Any:
-    """Return the place of the lowest 1 of a word that is not 0."""
-    return builder.cttz(word, ir.Constant(ir.IntType(1), 1))
-
-
-@in_llvm(VECTOR, VECTOR, VECTOR)
-def below(builder: Any, left: Any, right: Any) -> Any:
-    """Return all ones in each word of one vector that is less than that of another, else 0."""
-    return builder.sext(builder.icmp_unsigned("<", left, right), _VECTOR)
-
-
-@in_llvm(VECTOR, VECTOR)
-def first_ones(builder: Any, vector: Any) -> Any:
-    """Return the place of the lowest 1 of each word, none of which is 0."""
-    flag = ir.IntType(1)
-    kind = ir.FunctionType(_VECTOR, [_VECTOR, flag])
-    count = builder.module.declare_intrinsic("llvm.cttz.v8i64", (), kind)
-    return builder.call(count, [vector, ir.Constant(flag, 1)])
-
-
-@in_llvm(types.boolean, VECTOR)
-def some(builder: Any, vector: Any) -> Any:
-    """Return whether a vector has a 1."""
-    whole = builder.bitcast(vector, ir.IntType(512))
-    return builder.icmp_unsigned("!=", whole, ir.Constant(ir.IntType(512), 0))
 
 
 @jit

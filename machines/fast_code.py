@@ -9,13 +9,11 @@ from typing import Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
-from llvmlite import ir
-from numba import njit, types
-from numba.core import cgutils as untyped_cgutils
-from numba.extending import intrinsic
+from numba import njit
 
 from machines.parameters import BM1Parameters, RngKind
 from machines.rng import LFSR, Words, apply_map, jump_tables
+from machines.vectors import aligned, load, ones_in, ones_in_word, splat, store
 
 WORD_BITS: Final = 64
 BLOCK_WORDS: Final = 8  # one register of AVX-512, two of AVX2, four of NEON
@@ -25,7 +23,6 @@ LIVE, USED, CYCLES, OVERFLOWED = range(4)  # columns of a replica's outcome
 # a literal 0 has its own type: numba would compile `_select` twice
 _NO_ROWS: Final = cast("int", np.int64(0))
 
-cgutils: Any = untyped_cgutils
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -59,7 +56,7 @@ class _Frame(NamedTuple):
     """A frame of all replicas. Arrays by line contain the lines that can count, without gaps."""
 
     lines: npt.NDArray[np.int64]  # [replicas, lines]: number of the line in the machine
-    places: npt.NDArray[np.uint32]  # [replicas, lines, columns]: start of the words to AND in a slot
+    places: npt.NDArray[np.uint32]  # [replicas, lines, columns]: rows to AND
     widths: npt.NDArray[np.int64]  # [replicas, lines]: number of words to AND
     sums: npt.NDArray[np.int64]  # [replicas, lines]: the counters
     added: npt.NDArray[np.int64]  # [lines]: ones in a block
@@ -97,22 +94,13 @@ def _store(
     """Allocate words in `slots` slots and a scratch slot."""
     rows = len(row_code)
     return _Store(
-        words=_aligned((slots + 1, rows * BLOCK_WORDS)),
+        words=aligned((slots + 1, rows * BLOCK_WORDS), np.uint64),
         filled=np.zeros((slots + 1, rows), dtype=np.uint8),
         row_column=row_column.astype(np.int64),
         row_code=row_code.astype(np.int64),
         row_of_code=row_of_code,
         row_frame=np.zeros(rows, dtype=np.int64),
     )
-
-
-def _aligned(shape: tuple[int, int]) -> Words:
-    """Allocate uninitialised words aligned to a cache line, so that no block straddles two."""
-    count = shape[0] * shape[1]
-    line = 64 // np.dtype(np.uint64).itemsize
-    words = np.empty(count + line, dtype=np.uint64)
-    skip = -words.ctypes.data // words.itemsize % line
-    return words[skip : skip + count].reshape(shape)
 
 
 def make_frame(parameters: BM1Parameters, rows: int) -> _Frame:
@@ -127,8 +115,8 @@ def make_frame(parameters: BM1Parameters, rows: int) -> _Frame:
         used=np.zeros((replicas, min(rows, lines * columns)), dtype=np.int64),
         starts=np.zeros(columns, dtype=np.uint64),
         states=np.zeros(columns, dtype=np.uint64),
-        inverted=np.zeros((columns, parameters.prob_bits, BLOCK_WORDS), dtype=np.uint64),
-        mask=np.zeros(BLOCK_WORDS, dtype=np.uint64),
+        inverted=aligned((columns, parameters.prob_bits, BLOCK_WORDS), np.uint64),
+        mask=aligned((BLOCK_WORDS,), np.uint64),
         counts=np.zeros((replicas, lines), dtype=np.uint32),
         outcome=np.zeros((replicas, 4), dtype=np.int64),
     )
@@ -168,85 +156,6 @@ _8: Final = np.uint64(8)
 _DIGIT: Final = np.uint64(15)
 _BYTE: Final = np.uint64(255)
 _ALL: Final = np.uint64(2**64 - 1)
-
-# numba does not vectorise a loop as short as a block's 8 words (it was 2.5 times slower), so the two hot loops are
-# written in LLVM's terms, where a block's words are one vector on any processor.
-_I64: Final = ir.IntType(WORD_BITS)
-_BLOCK: Final = ir.VectorType(_I64, BLOCK_WORDS)
-
-
-def _block_pointer(builder: Any, data: Any, place: Any) -> Any:
-    """Return the address of the block of words that begins at an index of an array."""
-    return builder.bitcast(builder.gep(data, [place]), _BLOCK.as_pointer())
-
-
-def _load_block(builder: Any, data: Any, place: Any) -> Any:
-    block = builder.load(_block_pointer(builder, data, place))
-    block.align = WORD_BITS // 8  # arrays guarantee no more
-    return block
-
-
-def _call_on_block(builder: Any, name: str, result: Any, block: Any) -> Any:
-    """Call an LLVM intrinsic with a block of words."""
-    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, [_BLOCK]), name)
-    return builder.call(function, [block])
-
-
-def _count_code(_context: Any, words: Any, places: Any, _line: Any, _width: Any, mask: Any) -> Any:
-    """Count the ones of a line in a block, which are those in the AND of its rows and the mask."""
-
-    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        data, where, masks = (
-            context.make_array(signature.args[i])(context, builder, arguments[i]) for i in (0, 1, 4)
-        )
-        anded = cgutils.alloca_once_value(builder, _load_block(builder, masks.data, ir.Constant(_I64, 0)))
-        first = builder.mul(arguments[2], builder.extract_value(where.shape, 1))
-        with cgutils.for_range(builder, arguments[3]) as loop:
-            place = builder.load(builder.gep(where.data, [builder.add(first, loop.index)]))
-            row = _load_block(builder, data.data, builder.zext(place, _I64))
-            builder.store(builder.and_(builder.load(anded), row), anded)
-        ones = _call_on_block(builder, f"llvm.ctpop.v{BLOCK_WORDS}i64", _BLOCK, builder.load(anded))
-        return _call_on_block(builder, f"llvm.vector.reduce.add.v{BLOCK_WORDS}i64", _I64, ones)
-
-    return types.int64(words, places, types.int64, types.int64, mask), code
-
-
-_count = cast("Callable[[Words, npt.NDArray[np.uint32], int, int, Words], int]", intrinsic(_count_code))
-
-
-def _fill_code(_context: Any, _code: Any, inverted: Any, words: Any, _place: Any) -> Any:
-    """Compute a block of words for a code in a column: random number < code, from the lowest bit to the highest."""
-
-    def make(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        shown, into = (context.make_array(signature.args[i])(context, builder, arguments[i]) for i in (1, 2))
-        less = cgutils.alloca_once_value(builder, ir.Constant(_BLOCK, [ir.Constant(_I64, 0)] * BLOCK_WORDS))
-        with cgutils.for_range(builder, builder.extract_value(shown.shape, 0)) as loop:
-            first = builder.mul(loop.index, ir.Constant(_I64, BLOCK_WORDS))
-            zeros = _load_block(builder, shown.data, first)
-            bit = builder.trunc(builder.lshr(arguments[0], loop.index), ir.IntType(1))
-            # If this bit differs between number and code, it decides regardless of the lower bits.
-            before = builder.load(less)
-            builder.store(builder.select(bit, builder.or_(before, zeros), builder.and_(before, zeros)), less)
-        store = builder.store(builder.load(less), _block_pointer(builder, into.data, arguments[3]))
-        store.align = WORD_BITS // 8
-        return context.get_dummy_value()
-
-    return types.void(types.int64, inverted, words, types.int64), make
-
-
-_fill = cast("Callable[[int, Words, Words, int], None]", intrinsic(_fill_code))
-
-
-def _popcount_code(_context: Any, _word: Any) -> Any:
-    """Count the ones in a word."""
-
-    def code(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        return builder.ctpop(arguments[0])
-
-    return types.int64(types.uint64), code
-
-
-_popcount = cast("Callable[[np.uint64], int]", intrinsic(_popcount_code))
 
 
 @jit
@@ -313,7 +222,7 @@ def _select(
                 store.row_frame[row] = frame_number
                 used_rows[used] = row
                 used += 1
-            places[live, width] = row * BLOCK_WORDS
+            places[live, width] = row
             width += 1
         widths[live] = width
         numbers[live] = line
@@ -344,6 +253,26 @@ def _show(generators: Generators, frame: _Frame, clocks: int) -> None:
 
 
 @jit
+def _fill(code: int, inverted: Words, words: Words, row: int) -> None:
+    """Compute a row of a block for a code in a column: random number < code, from the lowest bit to the highest."""
+    less = splat(_0)
+    for bit in range(inverted.shape[0]):
+        zeros = load(inverted, bit)
+        # if this bit differs between number and code, it decides regardless of the lower bits
+        less = less | zeros if (code >> bit) & 1 else less & zeros
+    store(words, row, less)
+
+
+@jit
+def _count(words: Words, places: npt.NDArray[np.uint32], line: int, width: int, mask: Words) -> int:
+    """Count the ones of a line in a block, which are those in the AND of its rows and the mask."""
+    made = load(mask, 0)
+    for i in range(width):
+        made = made & load(words, places[line, i])
+    return int(ones_in(made))
+
+
+@jit
 def fill_blocks(
     generators: Generators, store: _Store, frame: _Frame, first_slot: int, blocks: int, period: int
 ) -> None:
@@ -354,7 +283,7 @@ def fill_blocks(
         _show(generators, frame, (block * BLOCK_CYCLES) % period)
         for row in range(filled.shape[0]):
             if not filled[row]:
-                _fill(store.row_code[row], frame.inverted[store.row_column[row]], words, row * BLOCK_WORDS)
+                _fill(store.row_code[row], frame.inverted[store.row_column[row]], words, row)
                 filled[row] = True
 
 
@@ -380,15 +309,15 @@ def _cycle_of(
     while True:
         made = mask[word]
         for i in range(width):
-            made &= words[places[line, i] + word]
-        ones = _popcount(made)
+            made &= words[np.int64(places[line, i]) * BLOCK_WORDS + word]
+        ones = ones_in_word(made)
         if nth <= ones:
             break
         nth -= ones
         word += 1
     for _ in range(nth - 1):
         made &= made - _1  # clears the lowest one
-    return word * WORD_BITS + _popcount(~made & (made - _1))
+    return word * WORD_BITS + ones_in_word(~made & (made - _1))
 
 
 @jit
@@ -422,7 +351,7 @@ def _run(
             if not shown:
                 _show(generators, frame, (block * BLOCK_CYCLES) % period)
                 shown = True
-            _fill(store.row_code[row], frame.inverted[store.row_column[row]], words, row * BLOCK_WORDS)
+            _fill(store.row_code[row], frame.inverted[store.row_column[row]], words, row)
             filled[row] = keep
         first = cycles - block * BLOCK_CYCLES
         end = min(limit - block * BLOCK_CYCLES, BLOCK_CYCLES)

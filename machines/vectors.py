@@ -1,0 +1,157 @@
+"""Vectors of 512 bits in compiled code: their type and operators for numba, and functions written in LLVM's terms.
+
+numba does not vectorise a loop as short as 8 words (it was 2.5 times slower), so hot loops use these vectors, which are
+values on any processor. They are not passed to functions.
+"""
+
+import math
+import operator
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from llvmlite import ir
+from numba import extending as untyped_extending
+from numba import types
+
+extending: Any = untyped_extending
+
+
+def aligned(shape: tuple[int, ...], dtype: type[np.generic]) -> npt.NDArray[Any]:
+    """Return zeros that begin at a multiple of 64 bytes, as vectors must."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    room = np.zeros(size + 64, dtype=np.uint8)
+    first = -room.ctypes.data % 64
+    return room[first : first + size].view(dtype).reshape(shape)
+
+
+_BITS: Final = ir.IntType(64)
+_VECTOR: Final = ir.VectorType(_BITS, 8)
+
+
+class _VectorType(types.Type):
+    """512 bits of an array that is `aligned`, as numba's type of a local variable; it has `&`, `|`, `^`, `~`, `+`, `<<`, `>>`."""
+
+
+VECTOR: Final = _VectorType("Vector")
+
+
+@extending.register_model(_VectorType)
+class _VectorModel(extending.models.PrimitiveModel):  # type: ignore[misc] # numba has no types
+    def __init__(self, manager: Any, type_: Any) -> None:
+        super().__init__(manager, type_, _VECTOR)
+
+
+def _define(operation: Callable[..., Any], name: str, operands: int) -> None:
+    """Define an operator of vectors as the LLVM instruction of that name."""
+    extending.type_callable(operation)(
+        lambda _context: lambda *given: VECTOR if given == (VECTOR,) * operands else None
+    )
+    extending.lower_builtin(operation, *(VECTOR,) * operands)(
+        lambda _context, builder, _signature, given: getattr(builder, name)(*given)
+    )
+
+
+_define(operator.and_, "and_", 2)
+_define(operator.or_, "or_", 2)
+_define(operator.xor, "xor", 2)
+_define(operator.invert, "not_", 1)
+_define(operator.add, "add", 2)
+_define(operator.lshift, "shl", 2)
+_define(operator.rshift, "lshr", 2)
+
+
+def in_llvm(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that makes a compiled function of one that writes its LLVM code.
+
+    `kinds` are the types of the arguments; None for any array, of which the code gets the address of the data.
+    """
+
+    def decorate(write: Callable[..., Any]) -> Any:
+        @wraps(write)  # numba counts the arguments of its signature
+        def typed(_context: Any, *given: Any) -> Any:
+            def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+                plain = [
+                    argument if kind else context.make_array(array)(context, builder, argument).data
+                    for kind, array, argument in zip(kinds, signature.args, arguments, strict=True)
+                ]
+                return write(builder, *plain) or context.get_dummy_value()
+
+            return result(*(kind or array for kind, array in zip(kinds, given, strict=True))), code
+
+        return extending.intrinsic(typed)
+
+    return decorate
+
+
+@in_llvm(VECTOR, None, types.int64)
+def load(builder: Any, data: Any, place: Any) -> Any:
+    """Return the vector at a place of an array, in vectors."""
+    vector = builder.load(builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [place]))
+    vector.align = 64
+    return vector
+
+
+@in_llvm(types.void, None, types.int64, VECTOR)
+def store(builder: Any, data: Any, place: Any, vector: Any) -> None:
+    """Write a vector at a place of an array, in vectors."""
+    builder.store(vector, builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [place])).align = 64
+
+
+def repeated(builder: Any, value: Any, kind: Any) -> Any:
+    """Return the vector of a kind that repeats a value."""
+    unset = ir.Constant(kind, ir.Undefined)
+    one = builder.insert_element(unset, value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(one, unset, ir.Constant(ir.VectorType(ir.IntType(32), kind.count), None))
+
+
+@in_llvm(VECTOR, types.uint64)
+def splat(builder: Any, word: Any) -> Any:
+    """Return the vector that repeats a word."""
+    return repeated(builder, word, _VECTOR)
+
+
+@in_llvm(types.uint64, types.uint64)
+def first_one(builder: Any, word: Any) -> Any:
+    """Return the place of the lowest 1 of a word that is not 0."""
+    return builder.cttz(word, ir.Constant(ir.IntType(1), 1))
+
+
+@in_llvm(VECTOR, VECTOR, VECTOR)
+def below(builder: Any, left: Any, right: Any) -> Any:
+    """Return all ones in each word of one vector that is less than that of another, else 0."""
+    return builder.sext(builder.icmp_unsigned("<", left, right), _VECTOR)
+
+
+def _called(builder: Any, name: str, result: Any, *given: Any) -> Any:
+    """Call one of LLVM's own functions."""
+    kind = ir.FunctionType(result, [each.type for each in given])
+    return builder.call(builder.module.declare_intrinsic(name, (), kind), given)
+
+
+@in_llvm(VECTOR, VECTOR)
+def first_ones(builder: Any, vector: Any) -> Any:
+    """Return the place of the lowest 1 of each word, none of which is 0."""
+    return _called(builder, "llvm.cttz.v8i64", _VECTOR, vector, ir.Constant(ir.IntType(1), 1))
+
+
+@in_llvm(types.int64, types.uint64)
+def ones_in_word(builder: Any, word: Any) -> Any:
+    """Return the number of ones of a word."""
+    return builder.ctpop(word)
+
+
+@in_llvm(types.int64, VECTOR)
+def ones_in(builder: Any, vector: Any) -> Any:
+    """Return the number of ones of a vector."""
+    counts = _called(builder, "llvm.ctpop.v8i64", _VECTOR, vector)
+    return _called(builder, "llvm.vector.reduce.add.v8i64", _BITS, counts)
+
+
+@in_llvm(types.boolean, VECTOR)
+def some(builder: Any, vector: Any) -> Any:
+    """Return whether a vector has a 1."""
+    whole = builder.bitcast(vector, ir.IntType(512))
+    return builder.icmp_unsigned("!=", whole, ir.Constant(ir.IntType(512), 0))
