@@ -42,12 +42,11 @@ _WRITE_BUFFER: Final = 64 * 1024
 # Bytes that wait in the kernel for one socket; with more, data would only arrive later.
 _SEND_BUFFER: Final = 256 * 1024
 # One client's share of a turn: what is read from it (see `WebSocketTransport`), and the queued messages or fragments
-# that are written to it. What is read has no limit of bytes besides that of the event loop (a quarter of a mebibyte),
-# because to stop and resume reading takes a tenth of the time of large messages.
+# that are written to it. A read has at most a quarter of a mebibyte, which is handled at once.
 _TURN_FRAMES: Final = 128
+_TURN_BYTES: Final = 64 * 1024
 _SLICE_BYTES: Final = 4 * 1024
 _TURN_MESSAGES: Final = 32
-_TURN_BYTES: Final = 64 * 1024
 # Seconds for which the hub polls its sockets after a prompt response; in which a response comes that waited for the end
 # of that; and for which the hub does not poll then, at first and at most (see `_Hub.stay_awake`).
 _AWAKE: Final = 200e-6
@@ -284,6 +283,7 @@ class _Connection(WebSocketTransport):
     """One client's WebSocket: messages in, messages out, and the deadlines of both."""
 
     turn_frames = _TURN_FRAMES
+    turn_bytes = _TURN_BYTES
     slice_bytes = _SLICE_BYTES
 
     def __init__(self, hub: _Hub) -> None:
@@ -414,16 +414,17 @@ class _Connection(WebSocketTransport):
 
     def _flush_backlog(self, outbox: Outbox) -> None:
         """Write one turn's share of the queue, and the rest after other tasks have had their turn."""
-        messages: list[bytes] = []
-        size = 0
-        while not self.paused and size < _TURN_BYTES and len(messages) < _TURN_MESSAGES:
-            message = outbox.pop()
-            if message is None:
-                break
-            messages.append(message)
-            size += len(message)
-        if messages:
-            self.send(messages)
+        left = _TURN_MESSAGES
+        while left and not self.paused and not outbox.empty:
+            # In portions, because what the socket does not accept can no longer be dropped.
+            messages: list[bytes] = []
+            size = 0
+            while left and size < _WRITE_BUFFER and (message := outbox.pop()) is not None:
+                messages.append(message)
+                size += len(message)
+                left -= 1
+            if messages:
+                self.send(messages)
         if self.paused:
             return
         if outbox.wire is None:

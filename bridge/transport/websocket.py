@@ -43,8 +43,10 @@ _DATA_OPCODES: Final = frozenset((Opcode.TEXT, Opcode.BINARY, Opcode.CONT))
 class WebSocketTransport(asyncio.Protocol):
     """A WebSocket connection; a subclass handles the handshake, the messages and the end."""
 
-    # A turn: after this much from one peer, other tasks get theirs. A client has one peer and needs none.
+    # A turn: after this much from one peer, other tasks get theirs. A client has one peer and needs none. The bytes are
+    # those of one read: uvloop would otherwise read from one socket up to 32 times before it looks at the others.
     turn_frames: ClassVar[int] = sys.maxsize
+    turn_bytes: ClassVar[int] = sys.maxsize
     # Bytes that the library reads in one turn once it reads everything, in which it is much slower.
     slice_bytes: ClassVar[int] = sys.maxsize
 
@@ -296,9 +298,9 @@ class WebSocketTransport(asyncio.Protocol):
 
     def _read_turn(self, data: bytes, at: int) -> None:
         """Handle as many bytes as one turn allows, and the rest after other tasks had their turn."""
-        at = self._read(data, at)
-        if at < len(data) or self._postponed or self.is_blocked:
-            self._interrupt(data, at)
+        end = self._read(data, at)
+        if end < len(data) or end - at >= self.turn_bytes or self._postponed or self.is_blocked:
+            self._interrupt(data, end)
 
     def postpone(self, messages: list[bytes]) -> None:
         """Handle these messages in a later turn, before all later data."""

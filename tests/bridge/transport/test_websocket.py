@@ -259,6 +259,19 @@ async def test_a_postponed_message_is_handled_before_later_data_is_read(together
     assert transport.reads
 
 
+async def test_after_a_large_read_others_have_their_turn(monkeypatch):
+    connection, transport = Postponing(), Ends()
+    connection.connection_made(transport)
+    monkeypatch.setattr(Postponing, "turn_bytes", 100)
+    monkeypatch.setattr(connection, "messages_received", connection.handled.extend)
+    message = Frame(Opcode.TEXT, b"{}").serialize(mask=True)
+    connection.data_received(20 * message)
+    assert len(connection.handled) == 20
+    assert not transport.reads  # uvloop would read on
+    await asyncio.sleep(0)
+    assert transport.reads
+
+
 @given(
     st.lists(
         st.sampled_from(["text", "binary", "pieces", "ping", "pong", "empty", "long"]),
