@@ -213,6 +213,19 @@ def test_the_first_of_several_reasons_in_one_cycle():
     assert kernel.resume(3, pause_at=2) is BM2StopReason.PAUSED
 
 
+def test_samples_of_unused_values_are_counted_apart():
+    """One variable of three values, which starts at the unused one: no bit leaves it soon."""
+    kernel = ReferenceBM2(uniform((3, 2), searched=(0, 1), stream=100, prob_bits=2))
+    reason = kernel.start(start_of(state=3, known=0, samples=100, burn_in=0))
+    assert reason is BM2StopReason.SAMPLES
+    unused = sum(row[0] & 3 == 3 for row in kernel.stream.tolist())
+    assert 0 < kernel.unused == unused < 100
+    histograms, joint = kernel.results[:6], kernel.results[6:].reshape(4, 2)
+    assert histograms[3] == 0
+    assert histograms[:4].sum() == histograms[4:].sum() == joint.sum() == 100 - unused
+    assert joint.sum(axis=1).tolist() == histograms[:4].tolist()
+
+
 @pytest.mark.parametrize(
     ("changes", "part"),
     [
