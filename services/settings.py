@@ -232,8 +232,5 @@ def metrics_endpoint(text: str) -> Endpoint:
 
 
 def endpoint_in(directory: Path, name: str) -> Endpoint:
-    """Return the endpoint of a named local socket in a directory, or raise a SettingsError for a long path."""
-    try:
-        return parse_endpoint(f"unix:{directory.absolute() / name}.sock")
-    except PcieShimError as error:
-        raise SettingsError(str(error)) from error
+    """Return the endpoint of a named local socket in a directory, or raise an EndpointError for a long path."""
+    return parse_endpoint(f"unix:{directory.absolute() / name}.sock")

@@ -17,7 +17,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Final
 
 from terminal.one_line import lines_of, one_line
 
@@ -106,39 +106,23 @@ def _is_record(line: str) -> bool:
 
 def write_line(text: str) -> None:
     """Print a text, already in the current format, on standard error."""
-    stream = SurvivingStream(sys.stderr)
-    stream.write(text + "\n")
-    stream.flush()
+    _write(text + "\n")
 
 
 def write_progress(text: str) -> None:
     """Show a text that the next line replaces."""
-    stream = SurvivingStream(sys.stderr)
-    stream.write(text)
-    stream.flush()
+    _write(text)
     _Process.shows_progress = True
 
 
-class SurvivingStream:
-    """Standard error that may disappear, because a closed terminal must not end a robot's run."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def write(self, text: str) -> int:
-        """Write a text in place of the progress, if the stream still accepts it."""
-        try:
-            if _Process.shows_progress:
-                _Process.shows_progress = False
-                self._stream.write(_CLEAR_LINE)
-            return self._stream.write(text)
-        except (OSError, ValueError):
-            return len(text)
-
-    def flush(self) -> None:
-        """Flush the stream, if it still exists."""
-        with suppress(OSError, ValueError):
-            self._stream.flush()
+def _write(text: str) -> None:
+    """Write in place of the progress, if standard error still exists: a closed terminal must not end a robot's run."""
+    with suppress(OSError, ValueError):
+        if _Process.shows_progress:
+            _Process.shows_progress = False
+            sys.stderr.write(_CLEAR_LINE)
+        sys.stderr.write(text)
+        sys.stderr.flush()
 
 
 # --- loggers ----------------------------------------------------------------------------------------

@@ -13,13 +13,11 @@ import typer
 from bridge.client.websocket import check_uri
 from bridge.hub.access import AccessPolicy, is_loopback
 from bridge.names import check_name
-from posteriors.posterior import RESULTS_TOPIC
 from services.commands import flags as options
 from services.commands.hub import access_policy
 from services.errors import SettingsError
 from services.settings import Settings
 from services.sockets.reporting import serve_status
-from services.sockets.serving import deployment_for
 from services.sockets.status import ProcessStatus
 from terminal.command_line import CommandLine
 from terminal.one_line import shown
@@ -43,12 +41,7 @@ app = CommandLine(
 @options.with_settings("deployment", "uri", "ca", "ros_version", "run_directory", "log_format")
 def dashboard(
     settings: Settings,
-    topic: Annotated[
-        str | None,
-        typer.Option(
-            help="Topic of the posteriors.", show_default="the deployment's, or /BMresults", metavar="TOPIC"
-        ),
-    ] = None,
+    topic: options.ResultsTopic = None,
     truth: Annotated[
         str, typer.Option(help="Topic of the true pose (PoseStamped).", metavar="TOPIC")
     ] = TRUTH_TOPIC,
@@ -82,11 +75,8 @@ def dashboard(
         insecure=insecure,
         danger="lets everybody on that network see the posteriors and move the boat",
     )
-    deployment = deployment_for(settings) if settings.deployment is not None else None
-    output = deployment.outputs[0] if deployment is not None else None
-    uri = settings.uri or (deployment.output_uri(output) if deployment and output else DEFAULT_URI)
-    check_uri(uri)
-    results = topic or (output.topic if output is not None else RESULTS_TOPIC)
+    deployment, server, results = options.results_of(settings, topic)
+    check_uri(uri := server or DEFAULT_URI)
     for name in (results, truth):
         check_name(name)
     with _listening(host, port) as listener:

@@ -11,7 +11,7 @@ from services.child import end_with_parent
 from services.errors import SettingsError
 from services.settings import ENV_PREFIX, Settings, load_settings
 from terminal.flags import Group, expanded, flags_of
-from toolchain.deployment import Source
+from toolchain.deployment import Deployment, Source
 
 
 def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
@@ -49,6 +49,26 @@ def source_of(uri: str, topic: str, type_: str) -> Source:
         ) from error
 
 
+def results_of(settings: Settings, topic: str | None) -> tuple[Deployment | None, str | None, str]:
+    """Return the deployment in the settings if any, and server and topic of its results: flags apply before it."""
+    # here, because boards and `status` start without the bridge and deployments
+    from posteriors.posterior import RESULTS_TOPIC
+    from services.sockets.serving import deployment_for
+
+    deployment = deployment_for(settings) if settings.deployment is not None else None
+    if deployment is None:
+        return None, settings.uri, topic or RESULTS_TOPIC
+    # the other outputs have the same posteriors
+    output = deployment.outputs[0]
+    return deployment, settings.uri or deployment.output_uri(output), topic or output.topic
+
+
+ResultsTopic: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        help="Topic of the posteriors.", show_default="the deployment's, or /BMresults", metavar="TOPIC"
+    ),
+]
 Listen: TypeAlias = Annotated[
     str | None,
     typer.Option(

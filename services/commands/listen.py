@@ -6,14 +6,12 @@ from typing import Annotated
 
 import typer
 
-from posteriors.posterior import RESULTS_TOPIC
 from services.commands import flags as options
 from services.errors import SettingsError
 from services.output.listener import show_frames
 from services.output.posterior_file import open_result_file
 from services.output.posterior_output import drawing, print_json, print_line
 from services.settings import LONGEST_S, Settings
-from services.sockets.serving import deployment_for
 from terminal.command_line import CommandLine
 from terminal.signals import run_async
 
@@ -31,12 +29,7 @@ app = CommandLine(
 )
 def listen(
     settings: Settings,
-    topic: Annotated[
-        str | None,
-        typer.Option(
-            help="Topic of the posteriors.", show_default="the deployment's, or /BMresults", metavar="TOPIC"
-        ),
-    ] = None,
+    topic: options.ResultsTopic = None,
     count: options.Count = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object per line, with the whole posterior.")
@@ -61,15 +54,9 @@ def listen(
     """Print, draw or save the posteriors of a running stack."""
     if as_json and plot:
         raise SettingsError("--json and --plot both use standard output: give one of them")
-    loaded = deployment_for(settings) if settings.deployment is not None else None
-    # the other outputs have the same posteriors
-    output = loaded.outputs[0] if loaded is not None else None
-    server = settings.uri or (
-        loaded.output_uri(output) if loaded is not None and output is not None else None
-    )
+    loaded, server, where = options.results_of(settings, topic)
     if server is None:
         raise SettingsError("give --uri ws://HOST:PORT, or --deployment DIR (listen --help shows examples)")
-    where = topic or (output.topic if output is not None else RESULTS_TOPIC)
     # opened before the connection: a run that cannot be saved would be lost
     with contextlib.ExitStack() as stack:
         file = open_result_file(save) if save is not None else None

@@ -8,7 +8,7 @@ import typer
 
 from services.commands import flags as options
 from services.errors import SettingsError
-from services.master.run import run_master
+from services.master.run import Master
 from services.settings import Settings, endpoint_in
 from services.sockets.reporting import check_metrics
 from services.sockets.serving import board_endpoints, deployment_for
@@ -106,19 +106,21 @@ def master(
     check_metrics(settings.metrics, insecure=insecure)
     # loaded before processes start, so that a damaged folder is reported at once
     loaded = deployment_for(settings)
-    page = page_port if dashboard else None
-    return run_async(
-        run_master(
+
+    async def run() -> int:
+        master = Master(
             settings,
             loaded,
             once=once,
             count=count,
             json=json,
             plot=plot,
-            page_port=page,
+            page_port=page_port if dashboard else None,
             start_each_message=start_each_message,
         )
-    )
+        return await master.run()
+
+    return run_async(run())
 
 
 def _check(settings: Settings) -> None:

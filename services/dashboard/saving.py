@@ -8,9 +8,7 @@ import numpy as np
 
 from posteriors.axes import Axis
 from services.dashboard.feed import Frame
-from services.output.posterior_file import cell_names
-
-_NOT_KNOWN = -1
+from services.output.posterior_file import cell_names, write_archive
 
 
 def same_shape(frames: Sequence[Frame], shown: Frame | None) -> list[Frame]:
@@ -23,19 +21,15 @@ def same_shape(frames: Sequence[Frame], shown: Frame | None) -> list[Frame]:
 
 def archive(frames: Sequence[Frame], axes: Sequence[Axis]) -> bytes:
     """Return an archive for `numpy.load`, with the names that `listen --save` uses; frames must not be empty."""
-    reports = [each.report for each in frames]
-    arrays = {
-        "probabilities": np.array([each.values for each in frames]),
-        "frame": np.array([_known(each.number if each else None) for each in reports]),
-        "stamp_ns": np.array([_known(each.stamp_ns if each else None) for each in reports]),
-        "cycles": np.array([_known(each.cycles if each else None) for each in reports]),
-        "heard_ns": np.array([each.heard_ns for each in frames]),
-        "labels": np.array(frames[0].labels),
-    }
-    for at, axis in enumerate(axes):
-        arrays[f"axis{at}"] = np.array([axis.value(index) for index in range(axis.size)])
     file = io.BytesIO()
-    np.savez(file, **arrays)  # type: ignore[arg-type]  # the stub takes the names for its own flag
+    write_archive(
+        file,
+        [each.report for each in frames],
+        axes,
+        probabilities=[each.values for each in frames],
+        heard_ns=[each.heard_ns for each in frames],
+        labels=frames[0].labels,
+    )
     return file.getvalue()
 
 
@@ -60,10 +54,6 @@ def table(frames: Sequence[Frame]) -> bytes:
             ]
         )
     return file.getvalue().encode()
-
-
-def _known(number: int | None) -> int:
-    return _NOT_KNOWN if number is None else number
 
 
 def _harmless(name: str) -> str:

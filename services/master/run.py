@@ -44,7 +44,7 @@ _GRACE_PERIOD = 2.0
 
 
 class Master:
-    """A run with a deployment, once or in a loop."""
+    """A run with a deployment, once or in a loop; made inside the event loop, to which its futures belong."""
 
     def __init__(
         self,
@@ -300,28 +300,3 @@ class ChildrenWatch:
             return (await read_process_status(status_socket(self._directory, role), _ANSWER_TIME)).alive
         except NoHealthError:
             return False
-
-
-async def run_master(
-    settings: Settings,
-    deployment: Deployment,
-    *,
-    once: bool,
-    count: int | None,
-    json: bool,
-    plot: bool,
-    page_port: int | None = None,
-    start_each_message: bool = False,
-) -> int:
-    """Create a master inside the event loop, to which its futures belong, and run it to its end (see `Master.run`)."""
-    master = Master(
-        settings,
-        deployment,
-        once=once,
-        count=count,
-        json=json,
-        plot=plot,
-        page_port=page_port,
-        start_each_message=start_each_message,
-    )
-    return await master.run()

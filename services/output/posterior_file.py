@@ -6,14 +6,15 @@ import io
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import orjson
 
 from posteriors.axes import Axis
+from posteriors.frame_report import FrameReport
 from posteriors.pairing import FrameOutcome
 from posteriors.posterior import Posterior
 from services.errors import SettingsError
@@ -100,6 +101,20 @@ def cell_names(labels: Sequence[str], sizes: Sequence[int]) -> list[str]:
     """Return the names of all cells of a posterior, such as `y=1 x=2`, in the order of its probabilities."""
     cells = product(*(range(size) for size in sizes))
     return [" ".join(f"{label}={at}" for label, at in zip(labels, cell, strict=True)) for cell in cells]
+
+
+def write_archive(
+    file: IO[bytes], frames: Sequence[FrameReport | Posterior | None], axes: Sequence[Axis], **arrays: Any
+) -> None:
+    """Write an archive for `numpy.load`: arrays, the numbers of frames as far as they are known, and values of axes."""
+    import numpy as np
+
+    for name in ("frame", "stamp_ns", "cycles"):
+        numbers = [getattr(each, "number" if name == "frame" else name, None) for each in frames]
+        arrays[name] = [_NOT_KNOWN if number is None else number for number in numbers]
+    for at, axis in enumerate(axes):
+        arrays[f"axis{at}"] = [axis.value(index) for index in range(axis.size)]
+    np.savez(file, **arrays)
 
 
 class _Lines(ResultFile):
@@ -238,26 +253,20 @@ class _Archive(ResultFile):
             return
         import numpy as np
 
-        def numbers(of: Iterable[int | None]) -> Any:
-            return np.array([_NOT_KNOWN if number is None else number for number in of])
-
         posteriors = self._posteriors
         values = np.array([each.probabilities for each in posteriors])
-        arrays: dict[str, Any] = {
-            "probabilities": values.reshape(-1, *posteriors[0].sizes),
-            "frame": numbers(each.number for each in posteriors),
-            "stamp_ns": numbers(each.stamp_ns for each in posteriors),
-            "cycles": numbers(each.cycles for each in posteriors),
-            "latency_us": np.array([each.latency_us for each in posteriors], np.float64),
-            "labels": np.array([axis.label for axis in self._axes]),
-        }
-        for at, axis in enumerate(self._axes):
-            arrays[f"axis{at}"] = np.array([axis.value(index) for index in range(axis.size)])
         # a reader, or an interrupted run, finds either the last archive or this one
         partial = self._path.with_name(f".{self._path.name}.part")
         try:
             with partial.open("wb") as file:
-                np.savez(file, **arrays)
+                write_archive(
+                    file,
+                    posteriors,
+                    self._axes,
+                    probabilities=values.reshape(-1, *posteriors[0].sizes),
+                    latency_us=np.array([each.latency_us for each in posteriors], np.float64),
+                    labels=[axis.label for axis in self._axes],
+                )
             partial.replace(self._path)
         except OSError as error:
             with contextlib.suppress(OSError):

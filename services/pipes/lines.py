@@ -1,18 +1,54 @@
-"""Lines of standard input, bounded in length (`terminal.output.print_json_line` writes lines of standard output)."""
+"""Lines of standard input, bounded in length, and what lines between the commands of a pipe contain.
+
+`terminal.output.print_json_line` writes lines of standard output.
+"""
 
 import asyncio
 import os
 import stat
 import sys
-from collections.abc import AsyncIterator, Iterator
-from typing import Any
+from collections.abc import AsyncIterator, Iterator, Sequence
+from typing import Annotated, Any
 
 import msgspec
 
 from services.errors import InputLineError, SettingsError
+from services.sockets.records import Addresses, Values
 
 LINE_LIMIT = 1 << 24
 """Maximum length of a line on standard input, in bytes."""
+_Unsigned = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]  # a record has no wider integers
+
+
+class LineReading(msgspec.Struct):
+    """A reading: from `subscriber --deployment` to `pcie-app`."""
+
+    addresses: Addresses
+    stamp_ns: int | None = None
+    values: Values = []
+    prior_codes: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 16)]] = []
+
+
+class LineBoard(msgspec.Struct, omit_defaults=True):
+    """The result of a board; `why` is the reason in words."""
+
+    counts: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]]
+    cycles: _Unsigned
+    reason: int
+    why: str = ""
+    replica_cycles: Sequence[_Unsigned] = ()
+    replica_reasons: Sequence[int] = ()
+    kept: bytes = b""
+
+
+class LineResult(msgspec.Struct, kw_only=True):
+    """A result with its reading, in which an array is one address, -1: from `pcie-app` to `publisher`."""
+
+    number: _Unsigned
+    stamp_ns: int | None = None
+    addresses: list[int | None] = []
+    values: Values = []
+    boards: list[LineBoard]
 
 
 def require_pipe(command: str, values: str) -> None:

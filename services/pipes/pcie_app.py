@@ -1,8 +1,6 @@
 """`pcie-app` without a master, which computes the readings of standard input and prints counts."""
 
-from base64 import b64encode
 from collections.abc import Mapping
-from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -13,18 +11,9 @@ from services.boards.deployed import DeployedBoards
 from services.boards.frames import result_record
 from services.errors import InputLineError
 from services.pipeline.inference import infer
-from services.pipes.lines import blocking_lines, decoded
-from services.sockets.records import Addresses, FrameRequest, Values
+from services.pipes.lines import LineBoard, LineReading, LineResult, blocking_lines, decoded
+from services.sockets.records import FrameRequest
 from terminal.output import print_json_line, say, say_if_slow
-
-
-class LineReading(msgspec.Struct):
-    """A reading as printed by `subscriber --deployment`."""
-
-    addresses: Addresses
-    stamp_ns: int | None = None
-    values: Values = []
-    prior_codes: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 16)]] = []
 
 
 def reading_from_line(line: bytes, number: int) -> LineReading:
@@ -61,32 +50,28 @@ def compute_lines(boards: DeployedBoards, banks: int) -> int:
                 raise InputLineError(f"line {number} of standard input: {error}") from error
             if own is not None:
                 own.update(infer(result_record(number, output), deployment).posterior)
-            print_json_line(_line(number, output, reading, reasons))
+            print_json_line(msgspec.to_builtins(_line(number, output, reading, reasons)))
     finally:
         boards.close()
     return 0
 
 
-def _line(
-    number: int, output: FrameOutput, reading: LineReading, reasons: Mapping[int, str]
-) -> dict[str, Any]:
-    boards = []
-    for board in output.boards:
-        values: dict[str, Any] = {
-            "counts": np.frombuffer(board.words, "<u4").tolist(),
-            "cycles": board.cycles,
-            "reason": board.reason,
-            "why": reasons[board.reason],
-        }
-        if board.replica_cycles:
-            values |= {"replica_cycles": board.replica_cycles, "replica_reasons": board.replica_reasons}
-        if board.kept:
-            values["kept"] = b64encode(board.kept).decode()
-        boards.append(values)
-    return {
-        "number": number,
-        "stamp_ns": reading.stamp_ns,
-        "addresses": [-1 if isinstance(each, list) else each for each in reading.addresses],
-        "values": reading.values,
-        "boards": boards,
-    }
+def _line(number: int, output: FrameOutput, reading: LineReading, reasons: Mapping[int, str]) -> LineResult:
+    return LineResult(
+        number=number,
+        stamp_ns=reading.stamp_ns,
+        addresses=[-1 if isinstance(each, list) else each for each in reading.addresses],
+        values=reading.values,
+        boards=[
+            LineBoard(
+                np.frombuffer(board.words, "<u4").tolist(),
+                board.cycles,
+                board.reason,
+                reasons[board.reason],
+                board.replica_cycles,
+                board.replica_reasons,
+                board.kept,
+            )
+            for board in output.boards
+        ],
+    )

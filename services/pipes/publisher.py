@@ -11,33 +11,13 @@ from machines.kind import BoardResult
 from services.boards.frames import encode_boards
 from services.errors import InputLineError
 from services.pipeline.result_topics import ResultTopics
-from services.pipes.lines import decoded, lines
+from services.pipes.lines import LineResult, decoded, lines
 from services.settings import Settings
-from services.sockets.records import FrameResult, Outcome, Publish, Values
+from services.sockets.records import FrameResult, Outcome, Publish
 from terminal.output import say
 from toolchain.deployment import Deployment, MachineSection
 
-Unsigned = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]  # a record has no wider integers
-
-
-class _LineBoard(msgspec.Struct):
-    counts: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]]
-    cycles: Unsigned
-    reason: int
-    replica_cycles: list[Unsigned] = []
-    replica_reasons: list[int] = []
-    kept: bytes = b""
-
-
-class _LineResult(msgspec.Struct):
-    number: Unsigned
-    boards: list[_LineBoard]
-    stamp_ns: int | None = None
-    addresses: list[int | None] = []
-    values: Values = []
-
-
-_Line = _LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # JSON has no infinity
+_Line = LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # JSON has no infinity
 
 
 def result_from_line(line: bytes, number: int, machine: MachineSection) -> Publish | list[float]:

@@ -3,6 +3,7 @@
 import pytest
 
 from pcie_shim.endpoint import parse_endpoint
+from pcie_shim.errors import EndpointError
 from services.commands import hub, pcie_app, publisher, subscriber
 from services.errors import SettingsError
 from services.master.command_lines import service_arguments
@@ -45,7 +46,7 @@ def test_a_wrong_variable_names_itself_and_its_value(monkeypatch, value):
 
 
 def test_a_path_too_long_for_a_socket_is_refused(tmp_path):
-    with pytest.raises(SettingsError):
+    with pytest.raises(EndpointError):
         endpoint_in(tmp_path / ("x" * 120), "board0")
 
 
