@@ -101,7 +101,7 @@ class Subscription(Handle):
         topic: Name of the topic.
         lost: Number of messages dropped because the queue was full.
         discarded: Number of messages above the topic's limit (`max_bytes`).
-        blind_seconds: Total time without a connection (see also `Message.blind_seconds`).
+        blind_seconds: Total time without a connection, from the last data to the next subscription.
     """
 
     def __init__(
@@ -117,10 +117,8 @@ class Subscription(Handle):
         self.lost = 0
         self.discarded = 0
 
-        # Time without a connection, in total and not yet reported in a message. `_begun` limits it: a new subscription
-        # has not missed what was lost before it existed.
+        # `_begun` limits it: a new subscription has not missed what was lost before it existed.
         self.blind_seconds = 0.0
-        self._blind = 0.0
         self._begun = time.monotonic()
 
         # The waiting reader, if any, and its deadline. The alarm rings at `_rings`, no later than the deadline; an
@@ -144,17 +142,10 @@ class Subscription(Handle):
     def receive(self, messages: list[Message]) -> None:
         """Queue messages."""
         queue = self._queue
-        if not self._blind and len(queue) + len(messages) <= self._size:
-            queue.extend(messages)  # the usual case
-        else:
-            for each in messages:
-                message = each._replace(blind_seconds=self._blind) if self._blind else each
-                self._blind = 0.0
-                if len(queue) == self._size:
-                    self.lost += 1
-                    if queue[0].blind_seconds:
-                        message = self._pass_on_blind_seconds(message)
-                queue.append(message)
+        over = len(queue) + len(messages) - self._size
+        if over > 0:
+            self.lost += over
+        queue.extend(messages)
         if self._waiter is not None:
             self._wake()
 
@@ -170,18 +161,7 @@ class Subscription(Handle):
 
     def add_blind_seconds(self, seconds: float) -> None:
         """Count time without a connection, after a reconnection."""
-        seconds = min(seconds, time.monotonic() - self._begun)
-        self._blind += seconds
-        self.blind_seconds += seconds
-
-    def _pass_on_blind_seconds(self, message: Message) -> Message:
-        """Add the blind seconds of a message that is about to be dropped to those of the next one."""
-        queue = self._queue
-        blind = queue[0].blind_seconds
-        if self._size == 1:
-            return message._replace(blind_seconds=message.blind_seconds + blind)
-        queue[1] = queue[1]._replace(blind_seconds=queue[1].blind_seconds + blind)
-        return message
+        self.blind_seconds += min(seconds, time.monotonic() - self._begun)
 
     def __aiter__(self) -> Self:
         return self

@@ -15,15 +15,12 @@ class Message(NamedTuple):
         msg: The ROS message; shared by all subscriptions of the topic, so do not modify it.
         received_ns: `time.time_ns()` at its arrival, the same for all messages that arrive together.
         received_monotonic_ns: `time.monotonic_ns()` at the same time.
-        blind_seconds: Time without a connection just before this message; 0 except in the first message after
-            a reconnection.
     """
 
     topic: str
     msg: dict[str, Any]
     received_ns: int
     received_monotonic_ns: int
-    blind_seconds: float = 0.0
 
     @property
     def raw(self) -> bytes:

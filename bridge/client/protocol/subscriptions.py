@@ -325,7 +325,7 @@ class Subscriptions:
                         msg = with_arrays(msg)
             except (orjson.JSONDecodeError, DecodeError):
                 break
-            received.append(new(Message, (topic, msg, received_ns, monotonic_ns, 0.0)))
+            received.append(new(Message, (topic, msg, received_ns, monotonic_ns)))
         return received, subscribed.numbers
 
     def discard_known(self, data: bytes) -> MessageDiscarded | None:

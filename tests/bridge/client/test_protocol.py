@@ -337,7 +337,7 @@ def test_messages_that_arrive_together_are_read_up_to_another_topic_or_an_unusab
     together = [a, a, b, a[:-1], a]
     for first, topic, count in (0, "/a", 2), (1, "/a", 1), (2, "/b", 1), (3, "/a", 0), (4, "/a", 1):
         messages, subscriptions = core.receive_known(together, first, 1, 2)
-        assert messages == [(topic, {}, 1, 2, 0.0)] * count
+        assert messages == [(topic, {}, 1, 2)] * count
         assert not count or subscriptions == (numbers[topic],)
 
 
