@@ -5,7 +5,7 @@ import pytest
 
 from machines.bm1 import StopReason
 from machines.kind import BoardResult
-from machines.parameters import SensorMode
+from machines.parameters import PriorMode, SensorMode
 from pcie_shim.errors import FrameInputError
 from services.boards.frames import encode_boards, machine_inputs
 from services.errors import VariableError
@@ -45,13 +45,13 @@ def test_a_message_becomes_rows():
 
 
 def test_a_written_prior_is_for_all_replicas_or_each():
-    of = deployment(written=True, replicas=2, prior_mode="written", prior_path="belief")
+    of = deployment(written=True, replicas=2, prior_mode=PriorMode.WRITTEN, prior_path="belief")
     for belief, codes in (([1, 2], [128, 255, 128, 255]), ([1, 2, 3, 0], [128, 255, 255, 0])):
         (reading,) = FrameAssembler(of).take(0, {"K": [0, 1], "belief": belief}, 5, 6)
         assert np.frombuffer(reading.prior_codes, "<u2").tolist() == codes
 
 
-WRITTEN = {"written": True, "replicas": 2, "prior_mode": "written", "prior_path": "belief"}
+WRITTEN = {"written": True, "replicas": 2, "prior_mode": PriorMode.WRITTEN, "prior_path": "belief"}
 
 
 @pytest.mark.parametrize(
