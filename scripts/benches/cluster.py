@@ -162,6 +162,8 @@ class Hosts:
             self._running.clear()
             for name in names:
                 with suppress(ProcessError):
+                    _ip("link", "delete", name)  # at once, while a namespace ends its own some time later
+                with suppress(ProcessError):
                     _ip("netns", "delete", name)
             if namespaces:
                 with suppress(ProcessError):
@@ -256,21 +258,8 @@ def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> fl
         for used in sorted({1, min(2, len(cores)), min(4, len(cores))})
     }
     works = {name: kind(folder) for name, kind in kinds.items()}
-    table = Table(
-        title="efficiency: time of the work in one process / (cores x time on the scheduler)",
-        title_justify="left",
-    )
-    for name in (
-        "work",
-        "workers",
-        "hosts",
-        "time, s",
-        "one core alone, s",
-        "efficiency",
-        "all cores busy, s",
-        "efficiency",
-        "bytes a batch",
-    ):
+    table = Table(title="efficiency: seconds in one process / (cores x seconds)", title_justify="left")
+    for name in ("work", "workers", "hosts", "seconds", "to one alone", "to all at once", "bytes a batch"):
         table.add_column(name, justify="right" if name != "work" else "left")
     lowest, rate = 2.0, 0.0
     for workers, namespaces in ((2, False), (1, True), (2, True), (4, True)):
@@ -287,23 +276,24 @@ def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> fl
                     with counted_batches() as batches:
                         took = seconds_of(work, run)
                     used = min(workers, len(cores))
-                    serial, busy = alone[name, 1], alone[name, used]
+                    serial, busy = (alone[name, count] / (used * took) for count in (1, used))
                     sent = "-"
                     if namespaces:
                         bytes_ = sum(_sent(f"rosbayes{at}") for at in range(workers)) - before
                         sent = f"{bytes_ / len(batches):,.0f}"
                     else:
-                        lowest = min(lowest, busy / (used * took))
+                        lowest = min(lowest, busy)
                     hosts = str(workers) if namespaces else "this one"
-                    row = [name, str(workers), hosts, f"{took:.1f}"]
-                    for seconds in (serial, busy):
-                        row += [f"{seconds:.1f}", f"{seconds / (used * took):.0%}"]
-                    table.add_row(*row, sent)
+                    table.add_row(
+                        name, str(workers), hosts, f"{took:.1f}", f"{serial:.0%}", f"{busy:.0%}", sent
+                    )
         except ProcessError as reason:
             if not namespaces:
                 raise
             console.print(f"no network namespaces here: {reason}")
             break
+    for (name, used), seconds in alone.items():
+        console.print(f"{name}: {seconds:.1f} s in one process{f', {used} of them at once' * (used > 1)}")
     console.print(table)
     console.print(f"The scheduler does {rate:,.0f} empty tasks/s.")
     return lowest
