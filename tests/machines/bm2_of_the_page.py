@@ -4,21 +4,51 @@ The state is a list of bits; codes are computed from the factors in every cycle,
 """
 
 import math
+from functools import cache
 from itertools import product
 
-import numpy as np
-
 from machines.bm2 import BM2StopReason
-from machines.parameters import RngKind
-from machines.rng import LFSR
-from tests.machines.test_rng import mix, step
 
+EXPONENTS = {"lfsr16": (16, 15, 13, 4), "lfsr24": (24, 23, 22, 17), "lfsr32": (32, 22, 2, 1)}
 WORD = 2**64 - 1
 
 
+def lfsr_step(kind, state):
+    exponents = EXPONENTS[kind]
+    return (state << 1 | sum(state >> exponent - 1 for exponent in exponents) & 1) & (1 << exponents[0]) - 1
+
+
+def times(columns, vector):
+    image = 0
+    for bit, column in enumerate(columns):
+        image ^= column if vector >> bit & 1 else 0
+    return image
+
+
+@cache
+def power(kind, doublings):
+    """The columns of the matrix of 2**doublings steps."""
+    if doublings == 0:
+        return [lfsr_step(kind, 1 << bit) for bit in range(EXPONENTS[kind][0])]
+    half = power(kind, doublings - 1)
+    return [times(half, column) for column in half]
+
+
 def lfsr_seed(kind, number):
-    """The seed with a number, of a generator that has tests of its own."""
-    return int(LFSR(RngKind(kind)).seeds(np.array([number], dtype=np.uint64))[0])
+    """The state after as many steps as the number says."""
+    width = EXPONENTS[kind][0]
+    state = (0x2545F4914F6CDD1D & (1 << width) - 1) or 1
+    steps = ((((number + 1) * 0x9E3779B97F4A7C15) >> 32) & 0xFFFFFFFF) % (2**width - 1)
+    for bit in range(width):
+        if steps >> bit & 1:
+            state = times(power(kind, bit), state)
+    return state
+
+
+def mixed(word):
+    word = (word ^ word >> 30) * 0xBF58476D1CE4E5B9 & WORD
+    word = (word ^ word >> 27) * 0x94D049BB133111EB & WORD
+    return word ^ word >> 31
 
 
 class PageBM2:
@@ -42,7 +72,7 @@ class PageBM2:
             self.rngs = [(m * sets + board) * len(self.rng_table) // (n * sets) for m in range(n)]
         elif p.rng == "ideal":
             self.rngs = [
-                mix(mix(p.ideal_seed) + (board * n + m + 1) * 0x9E3779B97F4A7C15 & WORD) for m in range(n)
+                mixed(mixed(p.ideal_seed) + (board * n + m + 1) * 0x9E3779B97F4A7C15 & WORD) for m in range(n)
             ]
         else:
             self.rngs = [lfsr_seed(p.rng, board * n + m) for m in range(n)]
@@ -55,11 +85,11 @@ class PageBM2:
             numbers = [int(self.rng_table[at]) for at in numbers]
             self.rngs = [(at + p.steps_per_clock) % len(self.rng_table) for at in self.rngs]
         elif p.rng == "ideal":
-            numbers = [mix(word) for word in numbers]
+            numbers = [mixed(word) for word in numbers]
             self.rngs = [word + p.steps_per_clock * 0x9E3779B97F4A7C15 & WORD for word in self.rngs]
         else:
             for _ in range(p.steps_per_clock):
-                self.rngs = [step(p.rng, state) for state in self.rngs]
+                self.rngs = [lfsr_step(p.rng, state) for state in self.rngs]
         return [number % 2**p.prob_bits for number in numbers]
 
     def code(self, m, name):
@@ -185,7 +215,7 @@ class PageBM2:
                 stop = self.sample()
             if self.registers.sequencer == "random":
                 for _ in range(16):
-                    self.order_rng = step(RngKind.LFSR16, self.order_rng)
+                    self.order_rng = lfsr_step("lfsr16", self.order_rng)
             self.point()
         elif self.tries == self.registers.ops_timeout:
             self.timed_out = min(self.names.index(name) for name in self.left)

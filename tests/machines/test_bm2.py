@@ -88,6 +88,50 @@ def equals_the_page(run):
         assert shown == expected
 
 
+def chances(machine, state, bit):
+    """The chances that the concerned CDEs all make a one, and all a zero, for a pointed bit."""
+    ones = zeros = 1.0
+    for cde, table in enumerate(machine.tables):
+        bits = machine.parameters.factor_bits(cde)
+        if bit in bits:
+            others = [state >> other & 1 for other in bits if other != bit]
+            address = bits.index(bit) << len(others) | sum(value << at for at, value in enumerate(others))
+            p = table[address] / 2**machine.parameters.prob_bits
+            ones, zeros = ones * p, zeros * (1 - p)
+    return ones, zeros
+
+
+@pytest.mark.parametrize(("prob_bits", "error"), [(16, 0.00015), (12, 0.0016), (8, 0.018)])
+def test_the_codes_have_the_sprinklers_posterior(prob_bits, error):
+    """Exactly, from the transition matrix of a sweep; and so have the cycles that a sweep takes."""
+    machine = sprinkler(prob_bits=prob_bits)
+    states = [WET | rest for rest in range(4)]
+    sweep = np.eye(4)
+    waits = {}
+    for bit in (RAIN, SPRINKLER):
+        move = np.zeros((4, 4))
+        for at, state in enumerate(states):
+            ones, zeros = chances(machine, state, bit)
+            waits[bit, at] = 1 / (ones + zeros)
+            move[at, states.index(state | 1 << bit)] += ones / (ones + zeros)
+            move[at, states.index(state & ~(1 << bit))] += zeros / (ones + zeros)
+        sweep = sweep @ move
+        if bit == RAIN:
+            after_rain = move
+    stationary = np.linalg.matrix_power(sweep, 2**14)[0]
+    exact = np.array([0, 0.2 * 0.99 * 0.8, 0.8 * 0.4 * 0.9, 0.2 * 0.01 * 0.99]) / 0.44838
+    assert np.abs(stationary - exact).sum() / 2 == pytest.approx(error, rel=0.05)
+    if prob_bits == 16:
+        in_between = stationary @ after_rain
+        cycles = [
+            sum(stationary[at] * waits[RAIN, at] for at in range(4)),
+            sum(in_between[at] * waits[SPRINKLER, at] for at in range(4)),
+        ]
+        assert sum(cycles) == pytest.approx(7.0, abs=0.05)
+        # in literal machines, the one CDE without the sprinkler has to agree, too
+        assert cycles[0] + 2 * cycles[1] == pytest.approx(9.4, abs=0.05)
+
+
 @pytest.mark.parametrize(
     ("changes", "order", "cycles"),
     [
@@ -146,7 +190,39 @@ def test_colours():
     assert parameters.moves(0b110, Sequencer.LINEAR) == ((0,), (3,), (4,), (5,), (6,), (7,), (8,))
 
 
+def test_no_two_boards_or_banks_share_a_seed():
+    starts = set()
+    for chain in range(3):
+        machine = sprinkler(chain=chain, chains=3, rng_banks=4)
+        kernel = ReferenceBM2(machine)
+        for bank in range(4):
+            kernel.start(start_of(samples=0, bank=bank))
+            starts |= {*kernel.rng_state.tolist(), ("order", kernel.sequencer_state)}
+            assert kernel.rng_state.tolist() == random_numbers(machine).restart(bank).tolist()
+    assert len(starts) == 3 * 4 * (3 + 1)
+
+
 # ---- starts and stops -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", Sequencer)
+@pytest.mark.parametrize("stream", [0, 7])
+def test_a_resumed_run_is_one_run(order, stream):
+    once, often = (ReferenceBM2(sprinkler(stream=size, sample_every="move")) for size in (2**20, stream))
+    once.start(start_of(samples=60, sequencer=order))
+    reason = often.start(start_of(samples=10, sequencer=order), pause_at=5)
+    streamed = []
+    while often.samples < 60 or reason is BM2StopReason.PAUSED:
+        if reason is BM2StopReason.PAUSED:
+            reason = often.step(often.cycles + 50)
+            continue
+        streamed += often.stream.tolist()
+        assert reason is (BM2StopReason.SAMPLES if often.samples % 10 == 0 else BM2StopReason.FULL)
+        reason = often.resume(min(60, often.samples // 10 * 10 + 10), pause_at=often.cycles + 3)
+    streamed += often.stream.tolist()
+    assert seen(often, reason) | {"stream": streamed} == seen(once, once.reason) | {
+        "stream": once.stream.tolist() if stream else []
+    }
 
 
 def test_a_bank_restarts_the_random_numbers_and_free_ones_go_on():
@@ -211,6 +287,17 @@ def test_the_first_of_several_reasons_in_one_cycle():
     assert kernel.resume(3, pause_at=2) is BM2StopReason.MAX_CYCLES
     assert kernel.start(replace(more, ops_timeout=5, max_cycles=99), pause_at=1) is BM2StopReason.FULL
     assert kernel.resume(3, pause_at=2) is BM2StopReason.PAUSED
+
+
+def test_samples_are_states_after_sweeps_or_moves():
+    states = {}
+    for every, count in (("sweep", 40), ("move", 80)):
+        kernel = ReferenceBM2(sprinkler(stream=100, sample_every=every))
+        kernel.start(start_of(samples=count, burn_in=3))
+        states[every] = kernel.stream.tolist()
+        cycles = kernel.cycles
+    assert states["sweep"] == states["move"][1::2]
+    assert kernel.cycles == cycles
 
 
 def test_samples_of_unused_values_are_counted_apart():

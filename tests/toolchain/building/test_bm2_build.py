@@ -5,12 +5,14 @@ network, flags ──▶ plan_bm2 ──▶ BM2Plan ──▶ one image per chai
 """
 
 import contextlib
+import itertools
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from machines.bm2 import cde_table, unpack
+from machines.bm2 import unpack
 from machines.parameters import RngKind, Sequencer
 from machines.rng import LFSR, random_numbers
 from posteriors import posterior
@@ -61,9 +63,50 @@ def build(path, *arguments, name="out"):
     return toolchain("build", path, "-o", path.parent / name, *TARGET, *arguments)
 
 
+def codes_of_the_page(term, sizes, prob_bits):
+    """Compute a CDE's table from the words of its description, code by code."""
+    widths = [math.ceil(math.log2(sizes[name])) for name in term.scope]
+    n = sum(widths)
+    table = np.zeros(n * 2**n // 2, dtype=np.uint16)
+
+    def values(code):
+        found = []
+        for width in widths:
+            found.append(code % 2**width)
+            code //= 2**width
+        return found
+
+    for j, others in itertools.product(range(n), range(2**n // 2)):
+        low, high = others % 2**j, others // 2**j
+        zero, one = (low + bit * 2**j + high * 2 ** (j + 1) for bit in (0, 1))
+        moved = next(at for at in range(len(widths)) if sum(widths[: at + 1]) > j)
+        legal = [
+            [value < sizes[name] for value, name in zip(values(x), term.scope, strict=True)]
+            for x in (zero, one)
+        ]
+        if not all(legal[0][at] for at in range(len(widths)) if at != moved) or not legal[0][moved]:
+            odds = 0.5
+        elif not legal[1][moved]:
+            odds = 0.0
+        else:
+            f0, f1 = term.table[tuple(values(zero))], term.table[tuple(values(one))]
+            odds = 0.5 if f1 + f0 == 0 else f1 / (f1 + f0)
+        table[j * 2**n // 2 + others] = min(max(math.floor(2**prob_bits * odds + 0.5), 1), 2**prob_bits - 1)
+    return table
+
+
 def test_a_network_becomes_chains_with_the_tables_of_its_factors(network):
-    arguments = (*GRASS, "--partitions", "3", "--prob-bits", "12", "--samples", "70")
-    arguments += ("--sequencer", "coloured")
+    arguments = (
+        *GRASS,
+        "--partitions",
+        "3",
+        "--prob-bits",
+        "12",
+        "--samples",
+        "70",
+        "--sequencer",
+        "coloured",
+    )
     result = done(build(network, *arguments, "--burn-in", "5", "--stream", "9", "--on-missing", "missing"))
     out = network.parent / "out"
     assert "Building a BM2, since sprinkler and grass are not independent given rain" in result.stderr
@@ -82,8 +125,9 @@ def test_a_network_becomes_chains_with_the_tables_of_its_factors(network):
     ]
     assert len({image.image_hash for image in images}) == 3
     question = read_network(network).ask(["rain"], ["sprinkler", "grass"]).network()
+    sizes = dict(zip(question.names, question.cardinalities, strict=True))
     for at, term in enumerate(question.factors):
-        expected = cde_table(term.table, 12)
+        expected = codes_of_the_page(term, sizes, 12)
         assert images[2].machine.tables[at].tolist() == expected.tolist()
         mif = read_mif(out / f"bm_arch/Memory_MIFs/cde{at}.mif")
         assert (mif.width, list(mif.words)) == (12, expected.tolist())
@@ -100,6 +144,17 @@ def test_seeds_are_those_of_each_board_and_bank(network):
         sequencer = read_mif(out / f"bm_arch/Memory_MIFs/board{board}_sequencer_seeds.mif")
         sets = np.array([bank * 2 + board for bank in range(3)], dtype=np.uint64)
         assert list(sequencer.words) == LFSR(RngKind.LFSR16).seeds(sets).tolist()
+
+
+def test_codes_of_values_that_are_no_power_of_two():
+    a, b = Symbol("A", IntegerType(0, 2)), Symbol("B", IntegerType(0, 4))
+    rng = np.random.default_rng(3)
+    factors = (potential([a, b], rng.random((3, 5)) * (rng.random((3, 5)) > 0.3)), uniform(a))
+    model = JointDistribution("n", factors).ask(["A"], ["B"]).network()
+    (machine,) = chain_machines(plan_bm2(model, OPTIONS))
+    sizes = {"A": 3, "B": 5}
+    for term, codes in zip(model.factors, machine.tables, strict=True):
+        assert codes.tolist() == codes_of_the_page(term, sizes, 16).tolist()
 
 
 def test_the_hash_of_a_model_covers_what_is_possible():

@@ -1,10 +1,12 @@
 """The preset `--thesis`: its options, what check and report say about it, and the cycles of its boat.
 
-The cycles of five frames on four boards, whose generators go on from frame to frame, were computed by another model.
+The cycles come from a model of the machine in this file alone: five frames on four
+boards, whose generators go on from frame to frame.
 """
 
 from functools import partial
 
+import numpy as np
 import pytest
 
 from machines import make_kernel
@@ -38,8 +40,19 @@ def test_it_is_a_set_of_options_that_check_does_not_mention(boat, tmp_path):
         assert done(toolchain("check", *checked)).stdout == ""
     assert "steps_per_clock = 1" in done(toolchain("check", "boat", "--steps-per-clock", "1")).stdout
     # the same options without the preset are the same deployment
-    flags = ["--stop", "own", "--rng-reset", "free", "--steps-per-clock", "1", "--interface", "20x1200"]
-    done(build("boat", "-o", tmp_path / "flags", *TARGET, *flags, "--partitions", "4"))
+    flags = [
+        "--stop",
+        "own",
+        "--rng-reset",
+        "free",
+        "--steps-per-clock",
+        "1",
+        "--interface",
+        "20x1200",
+        "--partitions",
+        "4",
+    ]
+    done(build("boat", "-o", tmp_path / "flags", *TARGET, *flags))
     assert (tmp_path / "flags/deployment.toml").read_bytes() == (folder / "deployment.toml").read_bytes()
 
 
@@ -73,9 +86,21 @@ def test_a_bm2(tmp_path):
 
 
 def test_a_sweep_starts_from_it(case, tmp_path):
-    lists = ["--prob-bits", "8", "--targets", "255", "--rngs", "lfsr32", "--scales", "address"]
-    frames = ("--frames", "1", "--partitions", "2")
-    found = done(toolchain("explore", case, "--thesis", *lists, *frames, "-o", tmp_path / "points.jsonl"))
+    lists = [
+        "--prob-bits",
+        "8",
+        "--targets",
+        "255",
+        "--rngs",
+        "lfsr32",
+        "--scales",
+        "address",
+        "--frames",
+        "1",
+        "--partitions",
+        "2",
+    ]
+    found = done(toolchain("explore", case, "--thesis", *lists, "-o", tmp_path / "points.jsonl"))
     row = found.stdout.splitlines()[1].split()
     assert row[1:4] == ["address", "lfsr32", "1"]
     (options,) = Sweep(thesis=True, prob_bits="8", targets="255", rngs="lfsr32", scales="address").options()
@@ -84,7 +109,65 @@ def test_a_sweep_starts_from_it(case, tmp_path):
 
 # --- the cycles ----------------------------------------------------------------------------------------------
 
-MOST_CYCLES, TARGET_COUNT = 2**17, 255
+BITS, MOST_CYCLES, TARGET_COUNT = 32, 2**17, 255
+FEEDBACK = (32, 22, 2, 1)
+"""Exponents of the polynomial of lfsr32."""
+
+
+def stepped(state):
+    """The state of an LFSR after a step: a shift to the left, and the parity of the tapped bits below."""
+    parity = sum(state >> exponent - 1 for exponent in FEEDBACK) & 1
+    return (state << 1 | parity) & 2**BITS - 1
+
+
+def times(matrix, state):
+    """The product of a matrix over two elements, its columns as numbers, and a state."""
+    product = 0
+    for bit, column in enumerate(matrix):
+        product ^= column * (state >> bit & 1)
+    return product
+
+
+def seed(column):
+    """The first state of a column of bank 0."""
+    state, steps = 0x4F6CDD1D, ((column + 1) * 0x9E3779B97F4A7C15 >> 32 & 2**32 - 1) % (2**BITS - 1)
+    matrix = [stepped(1 << bit) for bit in range(BITS)]
+    while steps:
+        state = times(matrix, state) if steps & 1 else state
+        matrix = [times(matrix, column) for column in matrix]
+        steps >>= 1
+    return state
+
+
+def numbers(columns, count):
+    """The low 8 bits of the states of some columns: uint8[columns, count]."""
+    found = np.zeros((columns, count), np.uint8)
+    for column in range(columns):
+        state, row = seed(column), bytearray(count)
+        for cycle in range(count):
+            row[cycle] = state & 0xFF
+            state = (state << 1 | (state >> 31 ^ state >> 21 ^ state >> 1 ^ state) & 1) & 0xFFFFFFFF
+        found[column] = np.frombuffer(row, np.uint8)
+    return found
+
+
+def cycles_of(codes, random):
+    """The cycles until a counter of 256 lines overflows, with their codes, uint16[columns, lines]."""
+    codes = codes[:, codes.all(axis=0)]  # a line with a code of 0 never counts
+    if not codes.shape[1]:
+        return 0
+    counts = np.zeros(codes.shape[1], int)
+    for begin in range(0, MOST_CYCLES, 1024):
+        bits = np.ones((1024, codes.shape[1]), bool)
+        for code, row in zip(codes, random[:, begin : begin + 1024], strict=True):
+            bits &= (row[:, None] < code) | (code == 255)
+        sums = counts + bits.cumsum(axis=0)
+        if (over := (sums == TARGET_COUNT).any(axis=1)).any():
+            return begin + int(over.argmax()) + 1
+        counts = sums[-1]
+    return MOST_CYCLES
+
+
 FRAMES = {  # the addresses of D1, D2, D3, B1, B2 and B3, and the cycles of the boards
     (71, 50, 50, 45, 0, 90): (131072, 257, 267, 131072),
     (100, 94, 77, 35, 9, 56): (131072, 1972, 321, 667),
@@ -98,9 +181,19 @@ def test_the_boat_takes_these_cycles(boat):
     folder, _ = boat
     machines = [read_image(load_deployment(folder).image_path(at)).machine for at in range(4)]
     kernels = [make_kernel(each) for each in machines]
-    limits = {0: StopReason.IMPOSSIBLE, MOST_CYCLES: StopReason.MAX_CYCLES}
-    for frame, (addresses, cycles) in enumerate(FRAMES.items()):
+    random, at = numbers(7, len(FRAMES) * MOST_CYCLES), [0] * 4
+    for frame, (addresses, pinned) in enumerate(FRAMES.items()):
+        found = []
+        for board, machine in enumerate(machines):
+            codes = np.stack(
+                [machine.prior[0], *(t[a] for t, a in zip(machine.tables, addresses, strict=True))]
+            )
+            took = cycles_of(codes, random[:, at[board] :])
+            at[board] += took
+            found.append(took)
         start = Start(addresses=addresses, target_count=TARGET_COUNT, max_cycles=MOST_CYCLES, bank=frame)
         reasons = [kernel.start(start) for kernel in kernels]
-        assert tuple(kernel.cycles for kernel in kernels) == cycles
-        assert reasons == [limits.get(each, StopReason.OVERFLOW) for each in cycles]
+        assert [kernel.cycles for kernel in kernels] == found
+        assert tuple(found) == pinned
+        limits = {0: StopReason.IMPOSSIBLE, MOST_CYCLES: StopReason.MAX_CYCLES}
+        assert reasons == [limits.get(each, StopReason.OVERFLOW) for each in found]
