@@ -317,7 +317,7 @@ def _cycle_of(
         word += 1
     for _ in range(nth - 1):
         made &= made - _1  # clears the lowest one
-    return word * WORD_BITS + ones_in_word(~made & (made - _1))
+    return int(word * WORD_BITS + ones_in_word(~made & (made - _1)))
 
 
 @jit

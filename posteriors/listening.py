@@ -49,11 +49,26 @@ class _RunInLoop(Protocol):
 
 
 class Posteriors:
-    """The posteriors of one stack, created by `posteriors` and read by one task with `async for`.
+    """A subscription to the posteriors of a stack that publishes on this server, read by one task with `async for`.
 
-    A lost connection does not end the iteration: it continues after the reconnection. Closing this object or
-    the client ends it. If the reader is too slow, the oldest posteriors are dropped; the connection is not
-    affected.
+    A lost connection does not end the iteration: it continues after the reconnection. Closing this object (`async
+    with`, before the client is closed) or the client ends it. If the reader is too slow, the oldest posteriors are
+    dropped; the connection is not affected.
+
+    Args:
+        ros: The open client.
+        topic: Topic of the posteriors (`toolchain build --output`).
+        frame_topic: Topic of their frames' reports.
+        deployment: The model's name, to ignore frames of other stacks on the same server.
+        queue_size: Maximum number of posteriors that wait for their reader; then the oldest is dropped and
+            counted.
+        compression: `cbor` transfers large posteriors faster if the server supports it.
+
+    Raises:
+        NameFormError: A topic's name is malformed.
+        TypeConflictError: This client already subscribes to one of the topics, with another type.
+        OptionError: `queue_size` is less than 1.
+        DisconnectedError: The client is closed.
 
     Attributes:
         without_posterior: Number of frames skipped because they had no posterior, usually due to impossible
@@ -64,13 +79,12 @@ class Posteriors:
         self,
         ros: Ros,
         *,
-        topic: str,
-        frame_topic: str,
-        deployment: str | None,
-        queue_size: int,
-        compression: Compression,
+        topic: str = RESULTS_TOPIC,
+        frame_topic: str = FRAME_TOPIC,
+        deployment: str | None = None,
+        queue_size: int = QUEUE_SIZE,
+        compression: Compression = "none",
     ) -> None:
-        """Subscribe (see `posteriors`)."""
         if queue_size < 1:
             raise OptionError(f"queue_size of {topic} must be at least 1, not {queue_size}")
         self.without_posterior = 0
@@ -146,7 +160,7 @@ class Posteriors:
             why = f"{self._topic} is {known[:80]} there, not {RESULTS_TYPE}: no master can publish on it"
         limit = "" if waited is None else f" within {waited:g} s"
         return NoResultError(
-            f"nothing arrived on {self._frame_topic} and {self._topic} from {ros.uri}{limit}: {why}"
+            f"nothing came on {self._frame_topic} and {self._topic} of {ros.uri}{limit}: {why}"
         )
 
     async def _take(self) -> FrameOutcome:
@@ -238,43 +252,8 @@ class Posteriors:
         self._put(self._pairing.flush())
 
 
-def posteriors(
-    ros: Ros,
-    *,
-    topic: str = RESULTS_TOPIC,
-    frame_topic: str = FRAME_TOPIC,
-    deployment: str | None = None,
-    queue_size: int = QUEUE_SIZE,
-    compression: Compression = "none",
-) -> Posteriors:
-    """Subscribe to the posteriors of a stack that publishes on this server.
-
-    Args:
-        ros: The open client.
-        topic: Topic of the posteriors (`toolchain build --output`).
-        frame_topic: Topic of their frames' reports.
-        deployment: The model's name, to ignore frames of other stacks on the same server.
-        queue_size: Maximum number of posteriors that wait for their reader; then the oldest is dropped and
-            counted.
-        compression: `cbor` transfers large posteriors faster if the server supports it.
-
-    Returns:
-        The posteriors from now on; `async with` closes them before the client is closed.
-
-    Raises:
-        NameFormError: A topic's name is malformed.
-        TypeConflictError: This client already subscribes to one of the topics, with another type.
-        OptionError: `queue_size` is less than 1.
-        DisconnectedError: The client is closed.
-    """
-    return Posteriors(
-        ros,
-        topic=topic,
-        frame_topic=frame_topic,
-        deployment=deployment,
-        queue_size=queue_size,
-        compression=compression,
-    )
+posteriors: Final = Posteriors
+"""Subscribe; reads as a verb where a client is at hand: `async for posterior in posteriors(ros)`."""
 
 
 def listen(

@@ -48,7 +48,7 @@ class EmulatedBoards:
         if not 1 <= target_count <= highest:
             bits = machines[0].parameters.counter_bits
             raise BuildError(
-                f"a target count of {target_count} does not fit counters of {bits} bits: expected 1 to {highest}"
+                f"counters of {bits} bits do not hold a target of {target_count}: expected 1 to {highest}"
             )
         if not 1 <= max_cycles <= CYCLES_MAX:
             raise BuildError(f"max_cycles is {max_cycles}, expected 1 to {CYCLES_MAX}")
@@ -129,12 +129,10 @@ class EmulatedBoards:
         return self._shown()
 
     def _start(self, start: Start, addresses: Inputs, prior: NDArray[np.uint16] | None) -> list[StopReason]:
-        inputs = inputs_of_boards(addresses, self.machines)
+        inputs, priors = inputs_of_boards(addresses, self.machines), priors_of_boards(prior, self.machines)
         return [
             kernel.start(replace(start, addresses=own, prior_codes=codes))
-            for kernel, own, codes in zip(
-                self._kernels, inputs, priors_of_boards(prior, self.machines), strict=True
-            )
+            for kernel, own, codes in zip(self._kernels, inputs, priors, strict=True)
         ]
 
     def _shown(self) -> FrameRun:
@@ -149,19 +147,18 @@ def inputs_of_boards(inputs: Inputs, machines: Sequence[BM1Machine]) -> list[Inp
     """Return each board's inputs of a frame: all inputs, or those of its lines."""
     if isinstance(inputs, tuple):
         return [inputs] * len(machines)
-    ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
-    return [
-        inputs[:, end - machine.parameters.lines : end] for end, machine in zip(ends, machines, strict=True)
-    ]
+    return [*np.split(inputs, _first_lines(machines), axis=1)]
 
 
 def priors_of_boards(
     prior: NDArray[np.uint16] | None, machines: Sequence[BM1Machine]
 ) -> Sequence[NDArray[np.uint16] | None]:
     """Return each board's part of a written prior, if there is one."""
-    if prior is None:
-        return [None] * len(machines)
-    return np.split(prior, np.cumsum([machine.parameters.lines for machine in machines])[:-1])
+    return [None] * len(machines) if prior is None else np.split(prior, _first_lines(machines))
+
+
+def _first_lines(machines: Sequence[BM1Machine]) -> NDArray[np.int64]:
+    return np.cumsum([machine.parameters.lines for machine in machines])[:-1]
 
 
 def one_replica(machine: BM1Machine) -> BM1Machine:

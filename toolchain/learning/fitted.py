@@ -3,6 +3,7 @@
 import json
 import math
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import tomli_w
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from toolchain.bounded_files import TomlFile, open_regular, whole_file
 from toolchain.deployment.sections import Section, Sequence
@@ -28,6 +29,8 @@ _HEADER: Final = "# Written by `toolchain fit`; read by toolchain.learning.fitte
 _META: Final = "fit.json"
 _PRIOR: Final = "prior.npy"
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
+_BAD: Final = (zipfile.BadZipFile, zlib.error, KeyError, ValueError, AttributeError, EOFError, RuntimeError)
+"""What the libraries raise for a damaged file."""
 
 
 class FittedRecording(Section):
@@ -69,7 +72,6 @@ class Fit:
     """Learnt parameters or tables."""
 
     file: FitFile
-    """Method, recordings and the numbers of variables."""
     tables: Mapping[str, NDArray[np.float64]]
     """With the method `counts`, P(K | S) of each variable, float64[values, lines]."""
     prior: NDArray[np.float64] | None = None
@@ -236,17 +238,7 @@ def _read_tables(path: Path) -> Fit:
             (prior,) = _array(archive, _PRIOR) if file.prior_rows else (None,)
     except OSError as reason:
         raise ModelError(f"{path} cannot be read: {reason.strerror or reason}") from None
-    except (
-        zipfile.BadZipFile,
-        KeyError,
-        ValueError,
-        ValidationError,
-        AttributeError,
-        RecursionError,
-        EOFError,
-        NotImplementedError,
-        RuntimeError,
-    ) as reason:
+    except _BAD as reason:
         raise ModelError(
             f"{path} was not written by `toolchain fit`, or is damaged: {type(reason).__name__}"
         ) from None

@@ -6,10 +6,11 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
-from enum import Enum
 from pathlib import Path
-from types import ModuleType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from types import ModuleType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from pydantic import PydanticUserError, TypeAdapter, ValidationError
 
 from toolchain.bounded_files import nearest_name
 from toolchain.errors import ModelError, ToolchainError
@@ -29,15 +30,11 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
 
 
 def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
-    """Return the model or the question of a folder with a `model.py`, or of that file itself.
+    """Return the model or the question of a folder with a `model.py`, or of that file itself, or raise a ModelError.
 
     It defines `model(...)`, which returns a `toolchain.models.Question` or a `toolchain.models.Model`, and can import
     modules in its folder. The settings are values for the parameters of `model()` as text; each is converted to the
     annotated type of its parameter (int, float, bool, str, Path, an Enum, a Literal).
-
-    Raises:
-        ModelError: The folder or file does not exist, a parameter or value is unknown or missing, `model.py`
-            contains an error, or the result is not a Model.
     """
     path = existing_model_path(case)
     folder = str(path.parent.resolve())
@@ -155,9 +152,7 @@ def _arguments(path: Path, function: Callable[..., object], settings: Mapping[st
         if key not in parameters:
             if not parameters:
                 raise ModelError(f"{path}: the model has no parameters, so --set {key} has no meaning")
-            raise ModelError(
-                f"{path}: the model has no parameter '{key}'; {nearest_name(key, list(parameters))}"
-            )
+            raise ModelError(f"{path}: it has no parameter '{key}'; {nearest_name(key, list(parameters))}")
         default = parameters[key].default
         fallback = str if default in {inspect.Parameter.empty, None} else type(default)
         arguments[key] = _value(key, text, hints.get(key, fallback))
@@ -169,25 +164,13 @@ def _arguments(path: Path, function: Callable[..., object], settings: Mapping[st
 
 def _value(key: str, text: str, wanted: Any) -> object:
     """Convert a value to the annotated type of its parameter."""
-    if get_origin(wanted) in {Union, UnionType}:
-        kinds = [kind for kind in get_args(wanted) if kind is not type(None)]
-        wanted = kinds[0] if len(kinds) == 1 else str
-    if get_origin(wanted) is Literal:
-        choices = {str(choice): choice for choice in get_args(wanted)}
-    elif isinstance(wanted, type) and issubclass(wanted, Enum):
-        choices = {str(member.value): member for member in wanted}
-    elif wanted is bool:
-        choices = {"true": True, "false": False, "1": True, "0": False, "yes": True, "no": False}
-        text = text.lower()
-    elif wanted in {int, float, str, Path}:
-        try:
-            return wanted(text)
-        except ValueError:
-            raise ModelError(
-                f"--set {key}={text}: expected {'an integer' if wanted is int else 'a number'}"
-            ) from None
-    else:
-        raise ModelError(f"--set {key}={text}: the model's {key} cannot be given on the command line")
-    if text not in choices:
-        raise ModelError(f"--set {key}={text}: expected one of {', '.join(choices)}")
-    return choices[text]
+    # pydantic would compare numbers of a Literal with the text
+    choices = get_args(wanted) if get_origin(wanted) is Literal else ()
+    value: object = next((choice for choice in choices if str(choice) == text), text)
+    try:
+        return TypeAdapter(wanted).validate_python(value, strict=False)
+    except ValidationError as reason:
+        expected = reason.errors()[0]["msg"].removeprefix("Input should be ")
+        raise ModelError(f"--set {key}={text}: expected {expected}") from None
+    except PydanticUserError:
+        raise ModelError(f"--set {key}={text}: it cannot be given on the command line") from None
