@@ -18,7 +18,7 @@ from casestudies.boat.sensors import (
     SENSORS_MSG,
     SENSORS_TOPIC,
     SENSORS_TYPE,
-    BadReadingError,
+    BadNumberError,
     read_raw,
     readings_message,
 )
@@ -66,7 +66,7 @@ async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) ->
         async for message in raw:
             try:
                 values, head = read_raw(message.msg, array=array)
-            except BadReadingError as error:
+            except BadNumberError as error:
                 if str(error) not in reported:
                     warn(f"a message on {raw_topic} is dropped: {error}")
                     reported.add(str(error))

@@ -45,22 +45,12 @@ def _reported(field: str) -> Callable[[Instance], float | None]:
     return lambda instance: getattr(instance.report.stages, field) if instance.report else None
 
 
-def _of_computing(instance: Instance) -> tuple[float, float] | None:
+def _of_computing(instance: Instance) -> tuple[float | None, float | None]:
     """Return the time of computing and that of the link, both before the boards' answers; None if not known."""
     if instance.report is None or (waited := instance.report.stages.compute) is None:
-        return None
+        return None, None
     own = instance.report.stages.boards_compute
     return (waited, 0.0) if own is None else (own, max(0.0, waited - own))
-
-
-def _computing(instance: Instance) -> float | None:
-    times = _of_computing(instance)
-    return None if times is None else times[0]
-
-
-def _answering(instance: Instance) -> float | None:
-    times = _of_computing(instance)
-    return None if times is None else times[1]
 
 
 _Stage: TypeAlias = "tuple[str, StageKind, Callable[[Instance], float | None]]"
@@ -70,8 +60,8 @@ _STAGES: Final[tuple[_Stage, ...]] = (
     ("rosbridge in", StageKind.ROSBRIDGE, _reported("rosbridge_in")),
     ("local hops", StageKind.HOST, _reported("local_hops")),
     ("register writes", StageKind.REGISTERS, _reported("register_writes")),
-    ("computing", StageKind.COMPUTING, _computing),
-    ("start and answer", StageKind.REGISTERS, _answering),
+    ("computing", StageKind.COMPUTING, lambda instance: _of_computing(instance)[0]),
+    ("start and answer", StageKind.REGISTERS, lambda instance: _of_computing(instance)[1]),
     ("register reads", StageKind.REGISTERS, _reported("reads")),
     (
         "rosbridge out",

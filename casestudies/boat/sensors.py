@@ -94,15 +94,11 @@ uint16 B3
 """
 
 
-class BadReadingError(Exception):
-    """A message on the raw topic holds something that is not a number."""
-
-
 class BadNumberError(Exception):
-    """A message that moves the boat lacks a number that it needs; `field` is the one that is wrong."""
+    """A message to the boat, or with its raw readings, lacks a number; `field` is the one that is wrong."""
 
-    def __init__(self, field: str, value: object) -> None:
-        super().__init__(f"{field} must be a finite number, not {shown(repr(value))}")
+    def __init__(self, field: str, value: object, wanted: str = "be a finite number") -> None:
+        super().__init__(f"{field} must {wanted}, not {shown(repr(value))}")
         self.field = field
 
 
@@ -117,9 +113,12 @@ def read_drive(message: dict[str, Any]) -> tuple[float, float]:
 
 
 def _number(message: dict[str, Any], path: str) -> float:
-    value = Field(path).value(message)[1]
+    return _finite(path, Field(path).value(message)[1])
+
+
+def _finite(field: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise BadNumberError(path, value)
+        raise BadNumberError(field, value)
     return float(value)
 
 
@@ -194,25 +193,21 @@ def readings_message(
 def read_raw(
     message: Mapping[str, Any], *, array: bool
 ) -> tuple[tuple[float | None, ...], Mapping[str, Any] | None]:
-    """Return the six raw readings of a message and its header, if any, or raise a BadReadingError.
+    """Return the six raw readings of a message and its header, if any, or raise a BadNumberError.
 
     A reading that is absent, null or NaN is missing: None.
     """
     if array:
         data = message.get("data")
         if not isinstance(data, list) or len(data) != len(SENSOR_NAMES):
-            raise BadReadingError(f"`data` must hold {len(SENSOR_NAMES)} numbers, not {data!r}")
+            raise BadNumberError("data", data, f"hold {len(SENSOR_NAMES)} numbers")
         named = dict(zip(SENSOR_NAMES, data, strict=True))
         head = None
     else:
         named = {name: message.get(name) for name in SENSOR_NAMES}
         head = message.get("header")
-    values: list[float | None] = []
-    for name, value in named.items():
-        if value is None or value != value:  # noqa: PLR0124 - NaN; math.isnan takes only numbers
-            values.append(None)
-            continue
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise BadReadingError(f"the raw reading {name} must be a finite number, or absent, not {value!r}")
-        values.append(float(value))
-    return tuple(values), head if isinstance(head, Mapping) else None
+    values = tuple(
+        None if value is None or value != value else _finite(name, value)  # noqa: PLR0124 - NaN; math.isnan takes only numbers
+        for name, value in named.items()
+    )
+    return values, head if isinstance(head, Mapping) else None

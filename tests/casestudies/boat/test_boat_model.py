@@ -16,7 +16,6 @@ from casestudies.boat.sensors import (
     LONGEST_DISTANCE,
     SENSOR_NAMES,
     BadNumberError,
-    BadReadingError,
     bearing,
     distance,
     distance_sigma,
@@ -310,7 +309,7 @@ def test_arrays_hold_the_numbers_in_the_columns_order():
 
 @pytest.mark.parametrize("bad", ["12", math.inf, True, [1.0]])
 def test_a_reading_that_is_not_a_number_is_refused_by_name(bad):
-    with pytest.raises(BadReadingError, match="B2"):
+    with pytest.raises(BadNumberError, match="B2"):
         read_raw(RAW | {"B2": bad}, array=False)
 
 
@@ -327,7 +326,7 @@ def test_a_missing_reading_stays_missing(missing):
 
 @pytest.mark.parametrize("data", [None, [], [1.0] * 5, "AAAA"])
 def test_an_array_needs_six_numbers(data):
-    with pytest.raises(BadReadingError):
+    with pytest.raises(BadNumberError):
         read_raw({"data": data}, array=True)
 
 
