@@ -9,6 +9,7 @@ A piece is a number, so that only the job has tables. Results depend on job and 
 order. Whoever keeps results on disk can begin again with the numbers that are missing.
 """
 
+import asyncio
 import logging
 import pickle
 import ssl
@@ -127,7 +128,7 @@ class SchedulerOptions:
         if parts.scheme == "tls":
             try:
                 ssl.create_default_context(cafile=self.tls_ca_file).load_cert_chain(
-                    str(self.tls_cert), self.tls_key
+                    str(self.tls_cert), self.tls_key, password=lambda: ""
                 )
             except OSError as reason:
                 names = ", ".join(str(file) for file in files.values())
@@ -189,7 +190,31 @@ def runner(options: SchedulerOptions) -> Iterator[Run]:
             tls_client_key=str(options.tls_key),
             require_encryption=True,
         )
-    yield _OnScheduler(address, lambda: Client(address, security=security, timeout=_CONNECT_S))
+    security = security or Security()
+
+    def connect() -> Any:
+        # first, because the client waits without a limit for the greeting of whatever listens there
+        asyncio.run(asyncio.wait_for(_greet(address, security.get_connection_args("client")), _CONNECT_S))
+        return Client(address, security=security, timeout=_CONNECT_S)
+
+    yield _OnScheduler(address, connect)
+
+
+async def _greet(address: str, arguments: dict[str, Any]) -> None:
+    """Raise an OSError if no scheduler answers at an address."""
+    from distributed.comm import connect
+
+    try:
+        comm = await connect(address, timeout=_CONNECT_S, **arguments)
+        try:
+            await comm.write({"op": "identity"})
+            is_scheduler = (await comm.read()).get("type") == "Scheduler"
+        finally:
+            comm.abort()
+    except Exception as reason:  # whatever dask makes of another protocol
+        raise OSError(str(reason)) from None
+    if not is_scheduler:
+        raise OSError("another part of dask")
 
 
 @cache
@@ -296,11 +321,13 @@ class _OnScheduler:
                     time.sleep(_POLL_S)
                     continue
                 if client is None:
-                    why = (
-                        "no scheduler answers there; start one with 'dask scheduler', or correct the address"
-                    )
+                    tls = "wants other certificates" if self._address.startswith("tls:") else "wants tls://"
+                    why = f"no scheduler answers there, or it {tls}; start one with 'dask scheduler', or correct the flags"
                 else:
-                    why = f"it has no worker; start one with 'dask worker {self._address} --nthreads 1'"
+                    why = (
+                        f"it has no worker; start one with 'dask worker {self._address} --nthreads 1', or read the log of one "
+                        "that has ended"
+                    )
                 raise ClusterError(f"--scheduler {self._address}: {why}") from None
             else:
                 return client
@@ -350,6 +377,7 @@ def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Ke
                 results, seconds = _results(address, batch)
                 numbers = batches.pop(batch)
                 done_lately.append((len(numbers), seconds))
+                batch.release()  # or dask would compute it again if its worker died now
                 for number, result in zip(numbers, results, strict=True):
                     keep(number, result)
     finally:

@@ -6,8 +6,10 @@ toolchain (a process) ──▶ dask scheduler (a process) ──▶ two dask wo
 import json
 import os
 import shutil
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +22,7 @@ from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.builders import corridor
 from tests.toolchain.running import build_model, done, toolchain
 from toolchain.analysis.replay import record_layout
-from toolchain.cluster import SchedulerOptions, in_this_process
+from toolchain.cluster import ClusterError, SchedulerOptions, in_this_process, runner
 from toolchain.deployment import load_deployment
 from toolchain.errors import BuildError
 
@@ -259,6 +261,27 @@ def test_a_worker_with_another_version_is_one_sentence(cluster, deployment, reco
         f"error: --scheduler {cluster.address}: no scheduler answers there"
     )
     assert not output.exists()
+
+
+def test_whatever_else_listens_there_is_one_sentence():
+    """An SSH server: dask takes its first bytes for the length of a message."""
+
+    def greet(listener):
+        with listener.accept()[0] as connection:
+            connection.sendall(b"SSH-2.0-OpenSSH_9.2\r\n")
+            while connection.recv(4096):
+                pass
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        server = threading.Thread(target=greet, args=(listener,))
+        server.start()
+        options = SchedulerOptions(scheduler=f"tcp://127.0.0.1:{listener.getsockname()[1]}")
+        with (
+            pytest.raises(ClusterError, match="no scheduler answers there, or it wants tls://"),
+            runner(options) as run,
+        ):
+            run(SimpleNamespace(), [1], lambda *_: None)
+        server.join(PROCESS_PATIENCE)
 
 
 @pytest.mark.parametrize(
