@@ -20,15 +20,15 @@ FAST_CODES_MAX: Final = 2**24
 """Maximum number of different codes, over all columns, for the fast kernel, which has a table of them."""
 
 
-def make_kernel(machine: "BM1Machine") -> "BM1Kernel":
-    """Return the fastest kernel that can run the machine in a bounded memory."""
+def make_kernel(machine: "BM1Machine", *, boards: int = 1) -> "BM1Kernel":
+    """Return the fastest kernel that can run the machine in a bounded memory, which several boards of a process share."""
     parameters = machine.parameters
     codes = parameters.columns << parameters.prob_bits
     if parameters.shared and parameters.rng.lfsr_bits is not None and codes <= FAST_CODES_MAX:
         # only a process that runs such machines imports numba
-        from machines.fast import FastBM1
+        from machines.fast import KEPT_BYTES, FastBM1
 
-        return FastBM1(machine)
+        return FastBM1(machine, kept_bytes=KEPT_BYTES // boards)
     from machines.reference import ReferenceBM1
 
     return ReferenceBM1(machine)

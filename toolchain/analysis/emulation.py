@@ -60,7 +60,8 @@ class EmulatedBoards:
         # do not change.
         self._kernels = [
             make_kernel(
-                replace(machine, parameters=replace(machine.parameters, counter_bits=COUNTER_BITS_MAX))
+                replace(machine, parameters=replace(machine.parameters, counter_bits=COUNTER_BITS_MAX)),
+                boards=len(machines),
             )
             for machine in machines
         ]

@@ -137,7 +137,8 @@ class PartFile:
     def __init__(self, path: Path, key: str, layout: "np.dtype[np.void]", frames: int) -> None:
         """Open or create the file with room for all, or raise a BuildError; one of other work is refused."""
         self.path = path
-        # Where the first record begins, and the length of each; `_file` is locked against other runs.
+        # Where the first record begins, and the length of each; `_file` is locked against other runs, and is new until
+        # it has a record.
         heading = json.dumps({"rosbayes": _FORMAT, "key": key}).encode() + b"\n"
         self._begin, self._size = len(heading), layout.itemsize
         with file_errors(path, "written", BuildError), ExitStack() as opened:
@@ -149,7 +150,9 @@ class PartFile:
                 raise BuildError(
                     f"another run is writing {path}; wait for it, or name another file with -o"
                 ) from None
-            if not heading.startswith(self._file.read(len(heading))):
+            found = self._file.read(len(heading))
+            self._is_new = not found
+            if not heading.startswith(found):
                 raise BuildError(
                     f"{path} belongs to another recording, deployment or version; delete it, or name another file with -o"
                 )
@@ -161,18 +164,19 @@ class PartFile:
 
     def missing(self) -> list[int]:
         """Return the rows without a record, in order."""
-        written = np.flatnonzero(self.records["crc"]).tolist()  # reads no more of a new file
-        done = {
+        if self._is_new:
+            return list(range(len(self.records)))
+        return [
             row
-            for row in written
-            if crc32(self.records[row].tobytes()[_CRC_BYTES:]) == self.records[row]["crc"]
-        }
-        return [row for row in range(len(self.records)) if row not in done]
+            for row, record in enumerate(self.records)
+            if crc32(record.tobytes()[_CRC_BYTES:]) != record["crc"]
+        ]
 
     def add(self, row: int, record: bytes) -> None:
         """Write the record of a row; a BuildError if the disk fails, which keeps the others."""
         with file_errors(self.path, "written", BuildError):
             os.pwrite(self._file.fileno(), record, self._begin + row * self._size)
+        self._is_new = False
 
     def posterior(self, row: int) -> _Posterior:
         """Return the posterior of a row that is done; None without one."""
