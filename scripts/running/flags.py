@@ -26,4 +26,6 @@ class ScriptParser(argparse.ArgumentParser):
             default = options.get("default")
             if text := shown or (f"{default:g}" if isinstance(default, float) else str(default or "")):
                 options["help"] = f"{options.get('help', '')} [default: {text}]".strip()
+        if "help" in options:
+            options["help"] = options["help"].replace("%", "%%")  # argparse formats it
         return super().add_argument(*names, **options)

@@ -177,7 +177,9 @@ def _sentence(path: Path, old: NDArray[Any], new: NDArray[Any], offset: int) -> 
     places = np.argwhere(old != new)
     shown = []
     for address, line in places[:_SHOWN].tolist():
-        where = f"address {address:#x}" + (f", line {offset + line}" if old.shape[1] > 1 else "")
+        where = f"address {address:#x}" + (
+            f" of the model's line {offset + line}" if old.shape[1] > 1 else ""
+        )
         shown.append(f"{where}: {old[address, line]:#x} -> {new[address, line]:#x}")
     more = f"; and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
     count = f"{len(places)} code{'s' if len(places) > 1 else ''}"

@@ -84,7 +84,7 @@ def test_an_edited_code_is_that_of_the_image_and_of_nothing_else(built):
     with_word(built / COLUMN, 3, lambda word: word & ~(0x7F << 7) | 0x55 << 7)
     printed = done(toolchain("regenerate", "images", built)).stdout
     old = int(before[1].machine.tables[1][3, 1])
-    assert f"edited     {COLUMN}: 1 code: address 0x3, line 5: {old:#x} -> 0x55\n" in printed
+    assert f"edited     {COLUMN}: 1 code: address 0x3 of the model's line 5: {old:#x} -> 0x55\n" in printed
     after = images(built)
     assert after[1].machine.tables[1][3, 1] == 0x55
     codes = [(old.machine, new.machine) for old, new in zip(before, after, strict=True)]
