@@ -323,5 +323,7 @@ def check_request(path: Path, deployment: Deployment) -> None:
             import rosbags  # noqa: F401 - only whether it is there
         except ImportError:
             raise BuildError(f"-o {path}: MCAP files need rosbags: pip install rosbags") from None
+    if path.is_dir():
+        raise BuildError(f"-o {path} is a folder; name a file")
     if not path.parent.is_dir():
         raise BuildError(f"-o {path}: {path.parent} is not a folder; create it first")

@@ -125,11 +125,13 @@ def test_the_command_writes_a_bag_that_rosbags_reads(tmp_path):
         ("range,loud\nx,no\n", "p.npz", ("has no row that fits this machine: row 0: ",)),
         ("range,loud\n3,1\n", "p.txt", ("must end with .npz or .mcap",)),
         ("range,loud\n3,1\n", "none/p.npz", ("is not a folder; create it first",)),
+        ("range,loud\n3,1\n", "folder.npz", ("folder.npz is a folder; name a file",)),
     ],
 )
 def test_what_cannot_be_inferred_is_one_sentence(tmp_path, recording, output, named):
     build_model(corridor(), tmp_path / "corridor")
     (tmp_path / "r.csv").write_text(recording)
+    (tmp_path / "folder.npz").mkdir()
     result = toolchain("infer", tmp_path / "r.csv", "-d", tmp_path / "corridor", "-o", tmp_path / output)
     assert_refused(result, *named)
 
