@@ -44,10 +44,12 @@ class Case:
     type: str
     boards: int
     options: Sequence[str] = ()
+    """Options of the build."""
     pointer: str = ""
     """The end of the line with the page's address: advice, if there is any."""
     viewer: str
     viewing: Sequence[str] = ()
+    """Options of the viewer."""
     publishers: Mapping[str, Sequence[str]]
     """The commands on the robot's side with their options, in the order of their start."""
     is_frame: bool = True
@@ -102,7 +104,11 @@ def disparity(rates: Sequence[str]) -> Case:
 async def build(
     case_study: str, deployment: Path, uri: str, topic: str, type_: str, *options: str, boards: int = 4
 ) -> None:
-    """Build a case study's deployment, or raise a ProcessError; the report goes to DEPLOYMENT.log."""
+    """Build a case study's deployment; the report goes to DEPLOYMENT.log.
+
+    Raises:
+        ProcessError: The toolchain failed.
+    """
     toolchain = Process("toolchain", deployment.with_name(deployment.name + ".log"), forks=True)
     await toolchain.start(
         *("toolchain", "build", str(Path(__file__).with_name(case_study)), "-o", str(deployment)),
@@ -160,7 +166,9 @@ def demo(
 ) -> int:
     """Run a case study from end to end, without a robot: the boat."""
     if dashboard and find_spec("nicegui") is None:
-        raise OutputError("--dashboard needs NiceGUI: pip install 'rosbayes[dashboard]', or leave it out")
+        raise OutputError(
+            "--dashboard needs NiceGUI, which is not installed: pip install 'rosbayes[dashboard]', or leave it out"
+        )
     if is_sprinkler and is_disparity:
         raise typer.BadParameter("choose one of --sprinkler and --disparity")
     stay |= dashboard
@@ -239,7 +247,9 @@ async def _run(
     try:
         screen.waits_for = "building the deployment, loading the kernels, which a first start compiles"
         if uri is None:
-            screen.show(f"starting the hub (a rosbridge server), building the {case.name}'s deployment ...")
+            screen.show(
+                f"starting the hub (the embedded rosbridge server), building the {case.name}'s deployment ..."
+            )
             await hub.start("hub", "--port", PORT if count is None else "0")
         else:
             from bridge.discovery import announced_uri

@@ -65,7 +65,7 @@ class BM1Machine(MachineContents):
         parameters = self.parameters
         if not parameters.has_tables and self.tables:
             raise ParameterError(
-                f"There are {len(self.tables)} sensor tables; sensor_mode = threshold has none."
+                f"There are {len(self.tables)} sensor tables; with sensor_mode = threshold there must be none."
             )
         if parameters.has_tables and len(self.tables) != parameters.sensors:
             raise ParameterError(
@@ -227,9 +227,13 @@ def checked_rng_table(given: npt.NDArray[np.uint32] | None, rng: RngKind) -> npt
         raise ParameterError("rng = table needs a table of random numbers (rng_table), and there is none.")
     array = np.asarray(given)
     if array.ndim != 1 or not array.size:
-        raise ParameterError(f"The table of random numbers has the shape {array.shape}; it must be one row.")
+        raise ParameterError(
+            f"The table of random numbers has the shape {array.shape}; it must be one row of 1 or more."
+        )
     if array.dtype.kind not in "ui" or not 0 <= int(array.min()) <= int(array.max()) < 2**32:
-        raise ParameterError("The table of random numbers holds more than integers from 0 to 2**32 - 1.")
+        raise ParameterError(
+            "The table of random numbers holds values that are not integers from 0 to 2**32 - 1."
+        )
     return frozen(array.astype(np.uint32, copy=False))
 
 

@@ -41,6 +41,7 @@ SAMPLES_MAX: Final = 2**32 - 1
 """Maximum number of samples of a frame; no 32-bit histogram overflows."""
 
 CDES_MAX: Final = 8192
+"""Maximum number of factors."""
 
 FACTOR_VARIABLES_MAX: Final = 32
 """Maximum number of variables of a factor: the axes of its array."""
@@ -135,14 +136,20 @@ class BM2Parameters:
             check_parameter(name, getattr(self, name), lowest, highest)
         self._check_variables()
         if self.literal and self.sequencer is Sequencer.COLOURED:
-            raise ParameterError("sequencer = coloured is not possible with literal = true; use linear.")
+            raise ParameterError(
+                "sequencer = coloured is not possible with literal = true; use linear or random."
+            )
         if self.rng in {RngKind.LFSR8, RngKind.LFSR16}:
-            raise ParameterError(f"{self.rng} biases a BM2's samples; use lfsr24, lfsr32, table or ideal.")
+            raise ParameterError(
+                f"{self.rng} biases the samples of a BM2; use lfsr24, lfsr32, table or ideal."
+            )
         if self.steps_per_clock == 0:
             steps = 1 if self.rng.lfsr_bits is None else 1 << (self.prob_bits - 1).bit_length()
             object.__setattr__(self, "steps_per_clock", steps)
         if self.steps_per_clock.bit_count() != 1:
-            raise ParameterError(f"steps_per_clock is {self.steps_per_clock}; a BM2 needs a power of two.")
+            raise ParameterError(
+                f"steps_per_clock is {self.steps_per_clock}; on a BM2 it must be a power of two."
+            )
 
     def _check_variables(self) -> None:
         """Check variables, factors, and the sizes that follow from them."""
@@ -163,7 +170,9 @@ class BM2Parameters:
                 raise ParameterError(f"A variable occurs twice in {name}.")
         for at, factor in enumerate(self.factors):
             if list(factor) != sorted(factor) or not factor:
-                raise ParameterError(f"Factor {at} has {factor}; give one or more variables in rising order.")
+                raise ParameterError(
+                    f"The variables of factor {at} are {factor}; give one or more in rising order."
+                )
             check_parameter(f"The number of variables of factor {at}", len(factor), 1, FACTOR_VARIABLES_MAX)
             width = sum(bits[variable] for variable in factor)
             check_parameter(f"The number of bits of factor {at}", width, 0, FACTOR_BITS_MAX)
@@ -314,7 +323,9 @@ class BM2Machine(MachineContents):
         for at, (table, support) in enumerate(zip(self.tables, self.supports, strict=True)):
             values = tuple(parameters.cardinalities[variable] for variable in parameters.factors[at])
             if support.shape != values:
-                raise ParameterError(f"Factor {at} has the shape {support.shape}; it must be {values}.")
+                raise ParameterError(
+                    f"Factor {at} has the shape {support.shape}; its variables have {values} values."
+                )
             supports.append(frozen(support.astype(np.bool_, copy=False)))
             bits = len(parameters.factor_bits(at))
             tables.append(

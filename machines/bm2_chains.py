@@ -79,7 +79,9 @@ class Chains:
         for machine in machines:
             parameters = replace(machine.parameters, chain=first.chain, chains=first.chains)
             if parameters != first or not all(map(np.array_equal, machine.tables, machines[0].tables)):
-                raise ParameterError("The machines of the chains differ in more than the chain.")
+                raise ParameterError(
+                    "The machines of the chains differ; all must have the same model and parameters."
+                )
         # Kernels of chains that run one by one; free generators go on in them.
         self._kernels: list[BM2Kernel] = []
 

@@ -99,7 +99,9 @@ class BM2Kernel(ABC):
             StartError: The frame cannot be continued, or a value does not fit; nothing has changed.
         """
         if self.reason not in {BM2StopReason.SAMPLES, BM2StopReason.FULL}:
-            raise StartError(f"Nothing to resume: it has stopped with reason {self.reason.name.lower()}.")
+            raise StartError(
+                f"There is nothing to resume: the machine has stopped with reason {self.reason.name.lower()}."
+            )
         check_start_value("samples", samples, self.samples + 1, SAMPLES_MAX)
         check_start_value("pause_at", pause_at or CYCLES_MAX, self.cycles + 1, CYCLES_MAX)
         self._samples_due = samples
@@ -109,7 +111,9 @@ class BM2Kernel(ABC):
     def step(self, pause_at: int = 0) -> BM2StopReason:
         """Continue after a pause; a StartError, and no change, without a pause or a later `pause_at`."""
         if self.reason is not BM2StopReason.PAUSED:
-            raise StartError(f"The machine is not paused: it stopped with reason {self.reason.name.lower()}.")
+            raise StartError(
+                f"The machine is not paused: it has stopped with reason {self.reason.name.lower()}."
+            )
         check_start_value("pause_at", pause_at or CYCLES_MAX, self.cycles + 1, CYCLES_MAX)
         return self._continue(pause_at)
 
@@ -155,4 +159,6 @@ def check_bm2_start(parameters: BM2Parameters, start: BM2Start) -> None:
         if start.known & mask and value >= cardinality:
             check_start_value(f"The value of variable {variable}", value, 0, cardinality - 1)
     if start.sequencer is Sequencer.COLOURED and parameters.literal:
-        raise StartError("The order coloured is impossible with literal = true; use linear or random.")
+        raise StartError(
+            "The order coloured is not possible on a machine with literal = true; use linear or random."
+        )

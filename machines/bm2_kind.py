@@ -452,7 +452,7 @@ class _OnHost(HostMachine):
         parameters = self._parameters
         if len(addresses) != len(parameters.known):
             raise StartError(
-                f"The frame has {len(addresses)} readings; this machine takes {len(parameters.known)}"
+                f"The frame has {len(addresses)} readings; this machine has {len(parameters.known)} known variables"
             )
         evidence: dict[int, int] = {}
         for at, (variable, address) in enumerate(zip(parameters.known, addresses, strict=True), start=1):

@@ -68,9 +68,12 @@ class BM1Kernel(ABC):
         self.reset()
 
     def start(self, start: Start) -> StopReason:
-        """Run a new frame to its end, or to the end of its first slice, or raise a StartError.
+        """Run a new frame to its end, or to the end of its first slice.
 
         Counters start at 0; generators restart from the start's bank (`rng_reset` = `bank`) or continue (`free`).
+
+        Raises:
+            StartError: The start does not fit the machine; nothing has changed.
         """
         check_start(self.machine.parameters, start)
         self._target_count = int(start.target_count)
@@ -149,7 +152,9 @@ def check_start(parameters: BM1Parameters, start: Start) -> None:
     check_start_value("run_until", start.run_until, 0, CYCLES_MAX)
     if start.prior_codes is not None:
         if parameters.prior_mode is not PriorMode.WRITTEN:
-            raise StartError("The start has prior codes, but the prior is a table (prior_mode = table).")
+            raise StartError(
+                "The start has prior codes, but this machine's prior is a table (prior_mode = table)."
+            )
         own = parameters.replicas > 1 and np.shape(start.prior_codes) == parameters.count_shape
         shape = parameters.count_shape if own else (parameters.lines,)
         try:

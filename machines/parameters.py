@@ -19,6 +19,7 @@ STEPS_PER_CLOCK_MAX: Final = 256
 """Maximum number of steps per clock: hardware unrolls them, and the reference kernel executes them one by one."""
 
 RNG_BANKS_MAX: Final = 65536
+"""Maximum number of seed sets."""
 
 REPLICAS_MAX: Final = 256
 """Maximum number of machines on a board: the register map has room for so many outcomes."""

@@ -112,7 +112,7 @@ def posterior(
     sets = [readings] if parameters.replicas == 1 else readings
     if len(sets) != parameters.replicas:
         raise StartError(
-            f"There are readings of {len(sets)} machines, not of {parameters.replicas} replicas."
+            f"There are readings of {len(sets)} machines; this machine has {parameters.replicas} replicas."
         )
     kernels = []
     for each in machines:
@@ -143,7 +143,9 @@ def posterior(
 def _inputs(parameters: BM1Parameters, readings: Sequence[Reading]) -> npt.NDArray[np.integer]:
     """Return the inputs of one replica: int64[sensors], or int64[sensors, lines]."""
     if len(readings) != parameters.sensors:
-        raise StartError(f"There are {len(readings)} readings for {parameters.sensors} sensor columns.")
+        raise StartError(
+            f"There are {len(readings)} readings; this machine has {parameters.sensors} sensor columns."
+        )
     per_cell = parameters.sensor_mode is not SensorMode.COLUMN
     shape = (parameters.lines,) if per_cell else ()
     inputs = np.empty((parameters.sensors, *shape), dtype=np.int64)
@@ -164,6 +166,8 @@ def _inputs(parameters: BM1Parameters, readings: Sequence[Reading]) -> npt.NDArr
             )
         # as a code, the top value is an ordinary probability: certainty
         if parameters.has_tables and (row == missing).any():
-            raise StartError(f"The reading of column {column} is {missing}, which means missing: use None.")
+            raise StartError(
+                f"The reading of column {column} is {missing}, the address of a missing reading: use None instead."
+            )
         inputs[column - 1] = row
     return inputs

@@ -50,7 +50,9 @@ class EmulatedPosterior(Posterior):
         if model is not None:
             values = self._of_model(model, settings)
         elif settings:
-            raise PosteriorError(f"{', '.join(settings)}: only a model has parameters, as in exact('boat')")
+            raise PosteriorError(
+                f"{', '.join(settings)}: only a model has parameters, so name it first, as in exact('boat')"
+            )
         elif self.deployment.machine.is_divided:
             values = self._of_codes(joined(self.machines))
         else:
@@ -144,7 +146,9 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
     names = [variable.name for variable in deployment.variables]
     for name in readings:
         if name not in names:
-            raise LabelError(f"the machine of {folder} has no variable {name!r}; {nearest_name(name, names)}")
+            raise LabelError(
+                f"the deployment of {folder} has no variable {name!r}; {nearest_name(name, names)}"
+            )
     if any(deployment.reading_shape(variable) for variable in deployment.variables):
         raise PosteriorError(
             f"the machine of {folder} has replicas or readings for each line: use machines.posterior with its image"

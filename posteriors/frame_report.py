@@ -69,7 +69,9 @@ class FrameReport:
     """A `/bm/frame` message; attributes that end in `_ns` are Unix times in nanoseconds."""
 
     stamp_ns: int
+    """Time of the reading."""
     heard_ns: int = 0
+    """Arrival of this message here."""
     outcome: str
     deployment: str = ""
     published: bool = True
@@ -82,11 +84,13 @@ class FrameReport:
     received_ns: int | None = None
     """Receipt of the reading by the subscriber."""
     sent_ns: int | None = None
+    """Sending of the posterior."""
     stages: StageTimes = StageTimes()
     boards: tuple[BoardReport, ...] = ()
     details: Mapping[str, str] = field(default_factory=dict)
     """Further values, whose keys depend on the kind of machine."""
     missing: tuple[str, ...] = ()
+    """Names of the variables without a reading."""
     readings: Mapping[str, VariableReading] = field(default_factory=dict)
     """Readings by the names of their variables, without arrays."""
 

@@ -52,6 +52,7 @@ class Posterior:
     labels: tuple[str, ...]
     """Names of the searched variables, in the order of the dimensions."""
     sizes: tuple[int, ...]
+    """Number of values of each dimension."""
     heard_ns: int
     """Time of arrival, Unix time in nanoseconds."""
     report: FrameReport | None = None
@@ -294,7 +295,9 @@ class Posterior:
         from posteriors.showing import draw
 
         if self.replicas > 1:
-            raise LabelError(f"these are {self.replicas} posteriors: draw one, such as replica(0).plot()")
+            raise LabelError(
+                f"these are the posteriors of {self.replicas} replicas: draw one, such as replica(0).plot()"
+            )
         return draw(self.axes, self.values, axes)
 
     def _dimension(self, label: str) -> int:
@@ -350,7 +353,9 @@ def read_samples(message: dict[str, Any], sizes: Sequence[int] = (), newest: int
         words = np.frombuffer(octets, "<u4").reshape(-1, size // 4)[-newest:]
         return unpack_all(tuple(sizes), words) if sizes else words.astype(np.int64)
     except (ArithmeticError, LookupError, TypeError, ValueError):
-        raise BadResultError(f"a message on {SAMPLES_TOPIC} holds no states of this machine") from None
+        raise BadResultError(
+            f"a message on {SAMPLES_TOPIC} does not hold the states of this machine"
+        ) from None
 
 
 class _Dimension(Part):

@@ -104,9 +104,13 @@ class TomlFile:
     """The content of a TOML file."""
 
     path: Path
+    """Its path."""
     error: type[ToolchainError]
+    """The type of its errors."""
     text: str
+    """Its text, to find the lines of mistakes."""
     tables: dict[str, Any]
+    """Its tables, not yet validated."""
 
     @classmethod
     def read(cls, path: Path, error: type[ToolchainError]) -> Self:

@@ -40,7 +40,9 @@ ReadingColumns: TypeAlias = Annotated[
 Settings: TypeAlias = Annotated[
     list[str] | None, typer.Option("--set", help="A parameter of the model; repeatable.", metavar="KEY=VALUE")
 ]
-STOP: Final = typer.Option(help="slices: all boards after the first overflow; own: each at its own.")
+STOP: Final = typer.Option(
+    help="slices: all boards shortly after the first overflow; own: each at its own overflow."
+)
 StopWhen: TypeAlias = Annotated[Stop, STOP]
 
 

@@ -192,7 +192,9 @@ class Compiled:
     """A compiled simulation, which executes requests from its standard input (docs/hardware/simulation.md)."""
 
     command: tuple[str, ...]
+    """Its command."""
     folder: Path
+    """The folder in which the command runs."""
 
 
 def check_tools(simulator: Simulator) -> None:
@@ -221,7 +223,9 @@ def compiled(image: Image, simulator: Simulator, folder: Path, on_compile: Calla
     """
     check_tools(simulator)
     if image.machine.parameters.rng is RngKind.IDEAL:
-        raise HardwareToolError("rng = ideal exists only emulated: build with an LFSR or a table")
+        raise HardwareToolError(
+            "rng = ideal exists only emulated: build the deployment with an LFSR or a table"
+        )
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         found = folder.stat()

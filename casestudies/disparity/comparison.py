@@ -37,6 +37,7 @@ class Matched:
     truth: NDArray[Any] | None
     """True disparities, float32[height, width], NaN where the right camera does not see the point; None if unknown."""
     exact: NDArray[np.float64]
+    """The posteriors of float64 fusion."""
     posterior: NDArray[np.float64]
     """Those of the machines; zeros for a pixel without one."""
     host_s: float

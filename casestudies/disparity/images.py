@@ -45,10 +45,12 @@ def read_image(message: Mapping[str, Any], *encodings: str) -> NDArray[Any]:
     except (binascii.Error, TypeError, ValueError):
         image = np.empty((0, 0))
     if image.size > _MOST_PIXELS:
-        raise BadImageError(f"it has {width} x {height} pixels, more than {_MOST_PIXELS}; scale it down")
+        raise BadImageError(
+            f"it has {width} x {height} pixels, expected at most {_MOST_PIXELS}; scale it down"
+        )
     if image.shape != (height, width) or not image.size:
         raise BadImageError(
-            f"its data are not {height} rows of {step} bytes with {width} pixels of {encoding}"
+            f"its data do not hold {height} rows of {step} bytes with {width} pixels of {encoding}"
         )
     return image
 
@@ -143,7 +145,9 @@ class ImagePairs:
         images = [read_image(each, "mono8", "8UC1") for each in (left, right)]
         if images[0].shape != images[1].shape:
             ours, theirs = (f"{each.shape[1]} x {each.shape[0]}" for each in images)
-            raise BadImageError(f"the left image has {ours} pixels and the right one {theirs}")
+            raise BadImageError(
+                f"the left image has {ours} pixels and the right one {theirs}, expected the same of both"
+            )
         return StereoImages(stamp_ns=stamp_ns, head=left["header"], left=images[0], right=images[1])
 
     def silence(self, left: str, right: str) -> str:

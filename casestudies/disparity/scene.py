@@ -31,6 +31,7 @@ class Pair:
     """A rectified pair of images, and the truth about the left one."""
 
     left: NDArray[np.uint8]
+    """uint8[height, width]: grey levels."""
     right: NDArray[np.uint8]
     disparity: Array
     """float64[height, width]: true disparity in pixels, that is, how much further left the right camera sees the point."""

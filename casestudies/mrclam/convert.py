@@ -113,7 +113,7 @@ def read_barcodes(folder: Path) -> dict[int, int]:
     for where, (subject, barcode) in read_columns(folder / "Barcodes.dat", ("subject", "barcode")):
         if subject not in _SUBJECTS or barcode != int(barcode):
             raise ModelError(
-                f"{where}: expected a subject, {_SUBJECTS[0]} to {_SUBJECTS[-1]}, and its barcode"
+                f"{where}: expected a subject from {_SUBJECTS[0]} to {_SUBJECTS[-1]} and its barcode"
             )
         subjects[int(barcode)] = int(subject)
     return subjects
@@ -237,7 +237,9 @@ def robots_in(folder: Path) -> list[int]:
         if (match := re.match(r"Robot(\d+)_", path.name))
     )
     if not found:
-        raise ModelError(f"{folder} does not hold a RobotN_Measurement.dat: name the unpacked folder")
+        raise ModelError(
+            f"{folder} does not hold a RobotN_Measurement.dat: name the folder that the data set was unpacked into"
+        )
     return found
 
 

@@ -81,7 +81,9 @@ def model(
         ModelError: The file does not contain landmarks, or a size is not positive.
     """
     if bearing_values < 1:
-        raise ModelError(f"bearing_values is {bearing_values}, expected bearings in a turn, from 1")
+        raise ModelError(
+            f"bearing_values is {bearing_values}, expected the number of bearings in a turn, from 1"
+        )
     y = Symbol("y", IntervalType(*Y_LIMITS, height, unit="m"))
     x = Symbol("x", IntervalType(*X_LIMITS, width, unit="m"))
     range_type = IntegerType(0, range_values - 1, scale=range_step, unit="m")

@@ -78,7 +78,9 @@ def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
         for landmark, pair in pairs.items():
             seen = [cells[column] for column in pair if column in cells]
             if len(seen) == 1:
-                raise ModelError(f"{path}, row {number}: landmark {landmark} has a range or a bearing alone")
+                raise ModelError(
+                    f"{path}, row {number}: landmark {landmark} has a range or a bearing, but not both"
+                )
             readings |= zip((f"range_{landmark}", f"bearing_{landmark}"), seen, strict=False)
         x, y = (cells[column] for column in _REFERENCE_COLUMNS)
         frames.append(RecordedFrame(number=number, x=x, y=y, readings=readings))

@@ -16,7 +16,9 @@ WET: Final = ((0.0, 0.8), (0.9, 0.99))
 """P(G = 1 | S, R), a row for S = 0 and one for S = 1, each for R = 0 and 1."""
 
 GRASS_TOPIC: Final = "/sprinkler/grass"
+"""Topic of G, the reading."""
 TYPE: Final = "std_msgs/UInt8"
+"""Its type, which every ROS server has installed."""
 
 
 def model() -> Question:

@@ -28,11 +28,13 @@ from toolchain.errors import counted
 PICTURE: Final = "sprinkler.png"
 HEADING: Final = "frame  grass  P(R = 1)   error   exact  effective samples"
 GRASS: Final = ("dry", "wet")
+"""The states of G."""
 _SIZES: Final = (2, 2, 2)
 """Numbers of values of the variables R, S, G of a sampled state."""
 _R, _G = 0, 2
 _COLOURS: Final = ("#aa7744", "#4477aa")
 _POINTS: Final = 200
+"""Number of points of a curve."""
 _WAITING: Final = 4
 """Number of messages of samples that wait for their frame; if none of them is the frame's, its own is lost."""
 
@@ -43,6 +45,7 @@ class Frame:
 
     number: int
     grass: int
+    """G."""
     share: float
     """P(R = 1) on `/BMresults`."""
     error: float
@@ -152,7 +155,9 @@ class Viewer:
         )
         digest = hash(samples.tobytes())
         if digest in self._seen:
-            warn(f"frame {frame.number} has samples of an earlier one, and is left out: use more --rng-banks")
+            warn(
+                f"frame {frame.number} has the samples of an earlier one, and is left out: use more --rng-banks"
+            )
         else:
             self._seen.add(digest)
             self.frames.append(frame)

@@ -82,7 +82,9 @@ class InspectOptions(ReadingOptions):
 class Sweep:
     """The options of a sweep: all combinations of the comma-separated lists; the other options are the same for all machines."""
 
-    prob_bits: Annotated[str, typer.Option(help="Bits of a code.", metavar="LIST")] = "4,6,8,10"
+    prob_bits: Annotated[str, typer.Option(help="Bits of a code, comma-separated.", metavar="LIST")] = (
+        "4,6,8,10"
+    )
     targets: Annotated[
         str, typer.Option(help="Target counts, each with the narrowest counter.", metavar="LIST")
     ] = "63,255,1023"
@@ -142,9 +144,9 @@ class Sweep:
 class AdviceOptions:
     """The options of advice on machines."""
 
-    accuracy: Annotated[float, typer.Option(help="Mean total variation from exact.", min=1e-4, max=0.5)] = (
-        0.01
-    )
+    accuracy: Annotated[
+        float, typer.Option(help="Mean total variation from exact inference.", min=1e-4, max=0.5)
+    ] = 0.01
     frames: Annotated[int, typer.Option(help="Number of readings.", min=1, max=1000)] = 50
     seed: Annotated[int, typer.Option(help="Seed of the readings.", min=0)] = 1
     clock_hz: Clock = 100e6
@@ -155,14 +157,18 @@ def _numbers(flag: str, text: str) -> _Numbers:
     try:
         return tuple(dict.fromkeys(int(part) for part in text.split(",")))
     except ValueError:
-        raise BuildError(f"{flag} {text}: expected whole numbers with commas, such as {flag} 4,8") from None
+        raise BuildError(
+            f"{flag} {text}: expected comma-separated whole numbers, such as {flag} 4,8"
+        ) from None
 
 
 def _members(flag: str, text: str, kind: type[_Member]) -> tuple[_Member, ...]:
     try:
         return tuple(dict.fromkeys(kind(part.strip()) for part in text.split(",")))
     except ValueError:
-        raise BuildError(f"{flag} {text}: expected some of {', '.join(kind)}, with commas") from None
+        raise BuildError(
+            f"{flag} {text}: expected some of {', '.join(kind)}, with commas between them"
+        ) from None
 
 
 def with_unit(value: float, unit: str) -> str:

@@ -43,6 +43,7 @@ DEVICES: Final = {
         ),
     )
 }
+"""The devices for `--device`."""
 
 
 def device_named(name: str) -> Device:
@@ -57,6 +58,7 @@ CYCLE_BITS: Final = 64
 """Width of a cycle counter."""
 
 WORD_BITS: Final = 32
+"""Width of a word that the host writes or reads."""
 
 _BOARD_REGISTERS: Final = 1032
 """Registers of bm1_axi, bm_register_block, bm1_registers and bm1_control, without target and replicas."""
@@ -232,6 +234,7 @@ def _index_bits(count: int) -> int:
 
 
 MLAB_ALMS: Final = 10
+"""Number of ALMs of a memory LAB."""
 MLAB_SHAPE: Final = (64, 10)
 """Words and bits of a memory LAB, in the deeper of its two shapes."""
 MLAB_SHARE: Final = 0.5

@@ -30,6 +30,7 @@ _WORK: Final = 2**26
 _MOST_FRAMES: Final = 1000
 _LEAST_FRAMES: Final = 10
 _POINTS: Final = 16
+"""Number of points for a frame."""
 _SEED: Final = 1
 _MOST_CYCLES: Final = 2**26
 """Cycles above which no more are advised: 0.7 s at 100 MHz."""

@@ -39,6 +39,7 @@ class MachineAnswer:
     """The reason for the kind, as a clause."""
     cycles: int
     stopped: str
+    """The reason why the board stopped."""
     posterior: NDArray[np.float64] | None
     """float64[lines]; None if there is none for these readings."""
     total_variation: float
@@ -52,6 +53,7 @@ class Answer:
     network: str
     searched: tuple[Symbol, ...]
     known: Mapping[str, str]
+    """The state of each known variable."""
     exact: NDArray[np.float64]
     machine: MachineAnswer | None
 

@@ -122,11 +122,14 @@ def sample_readings(
 def readings_of_lines(
     drawn: Readings, model: Model, machine: BM1Machine, *, scale: Scale, seed: int
 ) -> Readings:
-    """Convert drawn readings for a machine whose lines have their own readings, or raise a BuildError.
+    """Convert drawn readings for a machine whose lines have their own readings.
 
     The cell of the true line reads the drawn value. The model does not define the readings of the other
     lines, which are drawn from the mean of all lines. With sensor_mode `threshold`, the likelihoods are
     returned as codes.
+
+    Raises:
+        BuildError: The readings were not drawn, so their true line is unknown.
     """
     if drawn.lines is None:
         raise BuildError("the true line is known only for drawn readings")

@@ -159,6 +159,7 @@ def boards_needed(
 
 
 CORE_VOLTAGE: Final = 0.9
+"""Core voltage of a Stratix V in volts."""
 NET_CAPACITANCE: Final = 1.2e-12
 """Assumed capacitance of a net with its routing, in farads."""
 TOGGLE_J: Final = 0.5 * NET_CAPACITANCE * CORE_VOLTAGE**2

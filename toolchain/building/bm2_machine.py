@@ -44,6 +44,7 @@ class BM2Plan:
     parameters: BM2Parameters
     """The parameters of the first board; the others differ only in their number."""
     target_count: int
+    """The number of samples of each board."""
     max_cycles: int
     """The maximum number of cycles: a safety stop, and the limit of the wait for a board."""
 

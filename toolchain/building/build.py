@@ -67,11 +67,15 @@ class Built:
     """A deployment, the images of its boards, and a report about both."""
 
     deployment: Deployment
+    """The content of `deployment.toml`."""
     images: tuple[Image, ...]
+    """One per board."""
     quantised: Quantised | None
     """The codes of a BM1 before they were divided among boards, and the quantisation loss; None for a BM2."""
     report: str
+    """The content of `report.txt`."""
     transition: Transition | None = None
+    """The content of the file of `[filter]`, if there is one."""
 
 
 REPORT_NAME: Final = "report.txt"

@@ -29,7 +29,9 @@ def model_for(
         return with_bits(model, bits), why
     if source.previous if isinstance(source, Question) else source.transition:
         why = "--machine bm2" if refusal is None else str(refusal)
-        raise BuildError(f"a filter needs a BM1, whose prior is written, but this would be a BM2 ({why})")
+        raise BuildError(
+            f"a filter needs a BM1, whose prior the host writes, but this would be a BM2 ({why})"
+        )
     flags = given_flags(options, BM1Options)
     flags += [flag for flag, given in (("--bits", bits), ("--device", device)) if given]
     if options.written_prior is not None:

@@ -51,6 +51,7 @@ _PARAMETERS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
 The others are the sizes of memories and boards, and the generators, from which the seeds follow.
 """
 _SHOWN: Final = 3
+"""Number of codes of a memory that are listed."""
 
 
 def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Change]]]:
@@ -153,7 +154,9 @@ def _with_memory(path: Path, memory: Memory, images: Sequence[Image]) -> tuple[l
             continue
         before = dict(image.kind.sections(image.machine))[memory.section]
         if before.size != found.size:  # of another build, with another table of random numbers
-            raise BuildError(f"board {board} has {before.size} of these, not {found.size}", path=path)
+            raise BuildError(
+                f"the image of board {board} has {before.size} of these, not {found.size}", path=path
+            )
         old = before.reshape(found.shape) & (1 << bits) - 1
         if (found == old).all():
             continue

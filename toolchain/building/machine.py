@@ -57,7 +57,9 @@ class MachinePlan:
     parameters: BM1Parameters
     """The parameters of the whole machine, with the lines of all boards."""
     target_count: int
+    """The count that stops a machine."""
     max_cycles: int
+    """The maximum number of cycles."""
 
     def quantised(self) -> Quantised:
         """Return the codes of the model."""
@@ -73,7 +75,9 @@ def with_bits(model: Model, bits: Iterable[str]) -> Model:
     names = [variable.name for variable in model.variables]
     for name, text in widths.items():
         if name not in names:
-            raise BuildError(f"--bits {name}={text}: no such variable; it has {', '.join(names) or 'none'}")
+            raise BuildError(
+                f"--bits {name}={text}: the model has no such variable; it has {', '.join(names) or 'none'}"
+            )
         if not re.fullmatch(r"\d{1,3}", text, re.ASCII) or not 1 <= int(text) <= ADDRESS_BITS_MAX:
             raise BuildError(f"--bits {name}={text}: expected 1 to {ADDRESS_BITS_MAX} bits")
     return model.with_bits({name: int(text) for name, text in widths.items()})
@@ -99,7 +103,7 @@ def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
     codes = model.lines * sum(2**known.bits for known in model.known)
     if codes > _MOST_CODES and options.sensor_mode is not SensorMode.THRESHOLD:
         raise BuildError(
-            f"the tables have {codes} codes, the maximum is {_MOST_CODES}: use fewer lines or --bits"
+            f"the tables have {codes} codes, and a machine can have {_MOST_CODES}: use fewer lines, or fewer --bits"
         )
     prob_bits = option("prob_bits", options, BM1Section)
     per_line_codes = options.sensor_mode is SensorMode.THRESHOLD
@@ -136,7 +140,9 @@ def _filter_options(options: BuildOptions) -> BuildOptions:
         )
     if options.replicas != 1 or options.sensor_mode is not SensorMode.COLUMN:
         flag = "--replicas" if options.replicas != 1 else f"--sensor-mode {options.sensor_mode}"
-        raise BuildError(f"{flag} cannot be used with a filter, one machine with one reading per variable")
+        raise BuildError(
+            f"{flag} cannot be used with a filter, which is one machine with one reading per variable: leave it out"
+        )
     return replace(options, prior_mode=PriorMode.WRITTEN, prob_bits=options.prob_bits or PROB_BITS_MAX)
 
 
@@ -168,7 +174,7 @@ def partition_lines(lines: int, count: int) -> tuple[LineBlock, ...]:
     """Return the blocks of `lines` lines on `count` boards, in order; the first `lines` mod `count` are one longer."""
     if not 1 <= count <= lines:
         raise BuildError(
-            f"{lines} lines do not divide among {count} boards: expected 1 to {lines} partitions"
+            f"{lines} lines cannot be divided among {count} boards: expected 1 to {lines} partitions"
         )
     shorter, longer = divmod(lines, count)
     return tuple(
@@ -200,6 +206,7 @@ class BoardLayout:
     blocks: tuple[LineBlock, ...]
     """Blocks of lines by board; the first one is one of the largest."""
     interface: tuple[int, int]
+    """Inputs and results of the boards' registers."""
     reason: str
     """The reason for the interface, as a clause."""
 
@@ -207,10 +214,14 @@ class BoardLayout:
 def board_layout(
     parameters: BM1Parameters, partitions: int, interface: tuple[int, int] | None
 ) -> BoardLayout:
-    """Return the layout of a machine's boards, before any table is computed, or raise a BuildError.
+    """Return the layout of a machine's boards, before any table is computed.
 
     Without an `interface`, it has the inputs and results that the largest board needs, because every word of it takes
     resources (thesis 3.2); 20 x 1200 is the thesis's example.
+
+    Raises:
+        BuildError: There are more boards than lines, the machine is larger than the interface, the interface is
+            larger than the register map, or there are too many seeds.
     """
     blocks = partition_lines(parameters.lines, partitions)
     board = replace(parameters, lines=blocks[0].lines)
@@ -238,7 +249,9 @@ def fitted_layout(
         fitted = max(needed[0], 1), needed[1]  # an interface has at least one input
         return BoardLayout(blocks=blocks, interface=fitted, reason=", which is the size of the largest board")
     if not _is_within(asked, room):
-        raise BuildError(f"the interface {size_text(asked)} exceeds the register map's {size_text(room)}")
+        raise BuildError(
+            f"the interface {size_text(asked)} is larger than the register map's {size_text(room)}"
+        )
     if not _is_within(needed, asked):
         enough = (max(needed[0], asked[0]), max(needed[1], asked[1]))
         raise BuildError(

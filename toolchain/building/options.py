@@ -56,7 +56,9 @@ class TargetOptions:
     output: Annotated[str, OUTPUT] = "/BMresults"
     order: Annotated[str | None, ORDER] = None
     path: Annotated[list[str] | None, PATH] = None
-    prior_path: Annotated[str | None, typer.Option(help="Path of a written prior.", metavar="PATH")] = None
+    prior_path: Annotated[
+        str | None, typer.Option(help="Path of a written prior in the message.", metavar="PATH")
+    ] = None
     queue: Annotated[Queue, QUEUE] = Queue.LATEST
     tolerance_s: Annotated[float, TOLERANCE] = 0.05
 
@@ -190,7 +192,7 @@ class BM1Options:
     counter_bits: Annotated[int, typer.Option(help="Bits of a line's counter.", min=1, max=32)] = 8
     stop: StopWhen = Stop.SLICES
     shared: Annotated[
-        bool, typer.Option("--shared/--per-cell", help="A generator per column or per cell.")
+        bool, typer.Option("--shared/--per-cell", help="One generator per column, or one per cell.")
     ] = True
     sensor_mode: Annotated[
         SensorMode,
@@ -227,7 +229,7 @@ class BM2Options:
     burn_in: Annotated[int, typer.Option(help="Sweeps of a BM2 before its first sample.", min=0)] = 1000
     ops_timeout: Annotated[int, typer.Option(help="Maximum number of cycles of a BM2's move.", min=1)] = 2**20
     stream: Annotated[
-        int, typer.Option(help="Samples in a BM2's buffer for /bm/samples; 0: none.", min=0)
+        int, typer.Option(help="Samples in the buffer of a BM2's board for /bm/samples; 0: none.", min=0)
     ] = 0
 
 
@@ -261,6 +263,7 @@ class BuildOptions(MachineOptions, TargetOptions):
     sources: SourcesFile | None = None
     """Several topics and their variables, in place of `uri`, `topic` and `type`; or None."""
     model_flags: ModelSection = field(default_factory=ModelSection)
+    """The flags with which the model was read."""
     build_date: str = ""
     """The date of the build, ISO 8601: part of the images' manifests, but not of their hashes."""
 

@@ -32,7 +32,9 @@ class ColumnLoss:
     name: str
     """The known variable's name, or `prior`."""
     bits: int
+    """Address bits."""
     values: int
+    """Number of supported addresses."""
     mass: float
     """Share of P(S, K) in cells whose code became 0: the probability that a reading selects such a cell on the true line."""
     kl_bits: float
@@ -65,8 +67,11 @@ class Quantised:
     missing reading, all-ones codes. Empty with `threshold`.
     """
     losses: tuple[ColumnLoss, ...]
+    """The loss of the prior, and one per known variable."""
     floors: tuple[VanishedFloor, ...]
+    """Outlier floors that are too low for the codes."""
     warnings: tuple[str, ...]
+    """Warnings for the user, one sentence each."""
 
 
 def quantise(

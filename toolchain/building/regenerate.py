@@ -173,7 +173,9 @@ def _plan(
             if model.transition is None
             else "a filter, but the deployment none"
         )
-        raise BuildError(f"the model has {found}: give the same --previous, or build it again")
+        raise BuildError(
+            f"the model has {found}: give the same --previous as for the build, or build it again"
+        )
     if isinstance(model, Model):
         return plan_machine(_with_widths(model, deployment), options)
     plan = plan_bm2(model, options, why)
@@ -199,7 +201,9 @@ def _with_widths(model: Model, deployment: Deployment) -> Model:
     try:
         return model.with_bits(bits)
     except ModelError as reason:
-        raise BuildError(f"{reason}: its memory is that wide; use 'toolchain build' again") from None
+        raise BuildError(
+            f"{reason}: its memory is that wide; build it again with 'toolchain build'"
+        ) from None
 
 
 def _listed(values: Sequence[object]) -> str:

@@ -106,7 +106,7 @@ def read_sources(path: Path, uri: str | None) -> SourcesFile:
             table.setdefault("uri", uri)
         elif isinstance(table, dict) and "uri" not in table:
             raise toml.mistake(
-                ("source", at, "topic"), f"[[source]] {at + 1} has no uri, and there is no --uri"
+                ("source", at, "topic"), f"[[source]] {at + 1} has no uri, and no --uri was given"
             )
     file = SourcesFile(toml, toml.validated(SourcesTables).sources)
     file.check()
@@ -123,13 +123,19 @@ def placed(
     columns = {variable.name: variable for variable in variables if variable.kind == "sensor"}
     names = names_in("--order", order or "") or list(columns)
     if unknown := next((name for name in names if name not in columns), None):
-        raise BuildError(f"--order {order}: no sensor is '{unknown}'; {nearest_name(unknown, list(columns))}")
+        raise BuildError(
+            f"--order {order}: there is no sensor '{unknown}'; {nearest_name(unknown, list(columns))}"
+        )
     if sorted(names) != sorted(columns):
-        raise BuildError(f"--order {order}: expected each of {', '.join(columns)} once, in columns' order")
+        raise BuildError(
+            f"--order {order}: expected each of {', '.join(columns)} once, in the order of the columns"
+        )
     readings = dict(zip(columns, (columns[name] for name in names), strict=True))
     paths, known = key_values(path or (), "--path", "range=data[0]"), [each.name for each in variables]
     if unknown := next((name for name in paths if name not in known), None):
-        raise BuildError(f"--path: there is no variable '{unknown}'; {nearest_name(unknown, known)}")
+        raise BuildError(
+            f"--path {unknown}={paths[unknown]}: there is no variable '{unknown}'; {nearest_name(unknown, known)}"
+        )
     found = []
     for variable in variables:
         reading, table = readings.get(variable.name, variable), variable.table_of or variable.name

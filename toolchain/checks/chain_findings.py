@@ -129,7 +129,9 @@ def _error(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
         severity = Severity.WARNING if max(found.start, found.sampling / 5) > _LARGE_ERROR else Severity.NOTE
         what = f"{samples} of them are worth {max(1.0, samples * found.effective):.0f} independent ones at worst, so a total variation "
         what += f"of {found.sampling:.2g} is left in the mean"
-        what += f", and {p.burn_in} sweeps of burn-in leave {found.start:.2g} of the start" if stuck else ""
+        what += (
+            f", and {p.burn_in} sweeps of burn-in leave {found.start:.2g} of the start state" if stuck else ""
+        )
         advice = "use more --samples" + (" and a longer --burn-in" if stuck else "")
         yield Finding(severity, Check.MIXING, "the samples", what, advice)
 
@@ -273,7 +275,9 @@ def _limits(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
         advice = "use more --max-cycles, fewer --samples or a shorter --burn-in"
         yield finding(Check.STOPPING, f"max_cycles = {limits.max_cycles}", what, advice)
     if p.ops_timeout < mean * math.log(moves):
-        what = f"one of a frame's {moves:,} moves probably takes longer: the mean is {mean:.2g} cycles"
+        what = (
+            f"one of a frame's {moves:,} moves probably takes longer, as the mean is about {mean:.2g} cycles"
+        )
         yield warning(Check.STOPPING, f"ops_timeout = {p.ops_timeout}", what, "use a larger --ops-timeout")
 
 

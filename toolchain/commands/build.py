@@ -117,7 +117,9 @@ def check(
 
     if (checked / FILE_NAME).is_file() and not (checked / case_study.FILE_NAME).is_file():
         for flag in _model_flags(context):
-            raise BuildError(f"{flag} is for a model; {checked} is a deployment, built with its own")
+            raise BuildError(
+                f"{flag} is for a model; {checked} is a deployment, which was built with its own"
+            )
         findings = check_deployment(checked)
     elif is_network(checked) or case_study.model_path(checked).is_file():
         findings = _of_model(checked, flags, target, sources)

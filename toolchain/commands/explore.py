@@ -125,7 +125,9 @@ def explore(
     try:
         read = read_model(model, flags, bits)
     except NotFusionError as reason:
-        raise BuildError(f"explore is for a BM1, but {reason.why}; see 'toolchain advise'") from None
+        raise BuildError(
+            f"explore is for a BM1, but {reason.why}; 'toolchain advise' also tries a BM2"
+        ) from None
     if readings.readings is None:
         drawn = sample_readings(read, frames, seed=readings.seed)
     else:

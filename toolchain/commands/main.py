@@ -205,13 +205,15 @@ def new(
     model = name.name
     if not re.fullmatch(r"[A-Za-z]\w{0,60}", model, re.ASCII):
         raise BuildError(
-            f"{model or str(name)!r} is no model's name: expected a letter, then letters, digits, _"
+            f"{model or str(name)!r} is not a model's name: expected a letter, then letters, digits and _"
         )
     for file in _FILES:
         if (name / file).exists():
             raise BuildError(f"{name / file} already exists; choose another name")
     if not name.parent.is_dir():
-        raise BuildError(f"{name.parent} is not a folder: create it first, or correct the path")
+        raise BuildError(
+            f"{name.parent} is not a folder, so {model} cannot be created in it; create it first, or correct the path"
+        )
     with file_errors(name, "written", BuildError):
         name.mkdir(exist_ok=True)
         for file in _FILES:

@@ -36,14 +36,16 @@ class ModelFlags:
 
     settings: Settings = None
     searched: Annotated[str, typer.Option(help="Searched variables.", metavar="A,B")] = ""
-    known: Annotated[str, typer.Option(help="Variables with readings, in columns' order.", metavar="A,B")] = (
-        ""
-    )
+    known: Annotated[
+        str, typer.Option(help="Variables with readings, in the order of the columns.", metavar="A,B")
+    ] = ""
     given: Annotated[
         list[str] | None,
         typer.Option(help="A variable with a fixed state; repeatable.", metavar="NAME=STATE"),
     ] = None
-    prior_select: Annotated[str, typer.Option(help="Variable that selects the prior.", metavar="NAME")] = ""
+    prior_select: Annotated[
+        str, typer.Option(help="Variable whose readings select the prior.", metavar="NAME")
+    ] = ""
     previous: Annotated[
         str,
         typer.Option(
@@ -140,11 +142,11 @@ def read_model(path: Path, flags: ModelFlags, bits: Iterable[str] | None = None)
 def _network_question(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Question":
     if settings:
         raise BuildError(
-            f"--set {next(iter(settings))}: a network has no parameters; --given fixes a variable"
+            f"--set {next(iter(settings))}: a network file has no parameters; --given NAME=STATE fixes a variable"
         )
     if not flags.searched:
         raise BuildError(
-            f"{path} is a network: give the searched and known variables: --searched A --known B"
+            f"{path} is a network: give the searched and known variables, such as --searched A --known B,C"
         )
     return read_network(path, on_missing=flags.on_missing).ask(
         names_in("--searched", flags.searched),
@@ -159,7 +161,9 @@ def _case_source(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Mo
     from toolchain.models.case_study import load_question
 
     if flags.question:
-        raise BuildError(f"{flags.question[0]} is for a network file; {path} has its own question")
+        raise BuildError(
+            f"{flags.question[0]} is for a network file, but {path} is not one; model.py contains its own question"
+        )
     return load_question(path, settings)
 
 
@@ -182,7 +186,9 @@ def build_options(
     if sources is not None:
         for flag, value in (*place.items(), ("--prior-path", target.prior_path)):
             if value and flag != "--uri":
-                raise BuildError(f"{flag} {value}: the file of --sources sets that; omit the flag")
+                raise BuildError(
+                    f"{flag} {value}: the file of --sources sets that for each topic; omit the flag"
+                )
     options = BuildOptions(
         model_flags=flags.section(flags.bits or ()),
         sources=None if sources is None else read_sources(sources, target.uri or None),

@@ -51,7 +51,9 @@ def to_address(variable: Variable, value: object) -> int | None:
 
 def _missing(variable: Variable, what: str) -> int | None:
     if variable.on_missing == "error":
-        raise ReadingMissingError(f"variable {variable.name} {what}, but is needed (on_missing = error)")
+        raise ReadingMissingError(
+            f"variable {variable.name} {what}, and this deployment needs it (on_missing = error)"
+        )
     return None
 
 

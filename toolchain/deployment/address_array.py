@@ -37,7 +37,9 @@ def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Sc
     largest = likelihoods.max(axis=-1, keepdims=True)
     if scale is Scale.NONE:
         if float(largest.max()) > 1:
-            raise ReadingError(f"{float(largest.max()):g} is no probability, expected 0 to 1 (scale = none)")
+            raise ReadingError(
+                f"{float(largest.max()):g} is not a probability, expected 0 to 1 (scale = none)"
+            )
         return encode_probability(likelihoods, prob_bits)
     if not (largest > 0).all():
         raise ReadingError("it is 0 on all lines, so none is possible")
@@ -45,11 +47,14 @@ def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Sc
 
 
 def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int = 1) -> NDArray[np.uint16]:
-    """Return the codes of a written prior, uint16[lines], or raise a ReadingError; only the ratios of its numbers matter.
+    """Return the codes of a written prior, uint16[lines]; only the ratios of its numbers matter.
 
     The prior has one number per line of the machine, over all boards, such as a posterior of an earlier frame. With
     replicas, it is the prior of all of them, unless there are `replicas` times as many numbers, one prior for each;
     then uint16[replicas, lines] is returned.
+
+    Raises:
+        ReadingError: The number of values is wrong, a value is not a probability, or all values are 0.
     """
     try:
         numbers = np.asarray(prior, dtype=np.float64)
@@ -64,7 +69,9 @@ def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int
         raise ReadingError(message + (f", or for each of {replicas} replicas" if replicas > 1 else ""))
     largest = numbers.max(axis=-1, keepdims=True)
     if not np.all(np.isfinite(numbers)) or np.any(numbers < 0) or not np.all(largest > 0):
-        raise ReadingError("the written prior has a negative, infinite or NaN number, or only zeros")
+        raise ReadingError(
+            "the written prior is not a distribution: it contains a negative, infinite or NaN number, or only zeros"
+        )
     codes = encode_probability(numbers / largest, prob_bits)
     return codes if replicas == 1 else np.broadcast_to(codes, (replicas, lines)).copy()
 
@@ -125,11 +132,15 @@ def _numbers(variable: Variable, value: object, shape: tuple[int, ...]) -> NDArr
         return None
     if not isinstance(given, list | np.ndarray) or (isinstance(given, list) and _holds_text(given)):
         what = "an array with strings" if isinstance(given, list) else f"of type {type(value).__name__}"
-        raise NotANumberError(f"variable {variable.name} is {what}, expected {_length(shape)} numbers")
+        raise NotANumberError(
+            f"variable {variable.name} is {what}, expected an array of {_length(shape)} numbers"
+        )
     try:
         numbers = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        raise NotANumberError(f"variable {variable.name} is no array of {_length(shape)} numbers") from None
+        raise NotANumberError(
+            f"variable {variable.name} is not an array of {_length(shape)} numbers"
+        ) from None
     if numbers.size == 0:
         return None
     if numbers.shape != shape and numbers.shape != (math.prod(shape),):

@@ -79,10 +79,12 @@ class DeploymentFile(Section):
         cells = math.prod(dimension.size for dimension in self.searched)
         if cells != self.machine.lines:
             raise ValueError(
-                f"the searched variables have {cells} cells, the machine {self.machine.lines} lines"
+                f"the searched variables have {cells} cells, but the machine has {self.machine.lines} lines"
             )
         if self.machine.replicas > 1 and REPLICA in [dimension.label for dimension in self.searched]:
-            raise ValueError(f"a searched variable is called {REPLICA!r}, as is the dimension of replicas")
+            raise ValueError(
+                f"a searched variable is called {REPLICA!r}, which is the name of the dimension of replicas"
+            )
         offset = 0
         for index, board in enumerate(self.boards):
             if board.line_offset != offset:
@@ -91,7 +93,9 @@ class DeploymentFile(Section):
         if not self.machine.is_divided and offset != len(self.boards):
             raise ValueError("every board of this machine has lines = 1: it runs a whole machine")
         if self.machine.is_divided and offset != self.machine.lines:
-            raise ValueError(f"the boards have {offset} lines together, the machine {self.machine.lines}")
+            raise ValueError(
+                f"the boards have {offset} lines together, but the machine has {self.machine.lines}"
+            )
         return self
 
     def _prior_agrees(self) -> None:
@@ -115,7 +119,9 @@ class DeploymentFile(Section):
         if self.prior is None:
             return
         if not is_written:
-            raise ValueError("[prior] is for a written prior, but this one is a table (prior_mode)")
+            raise ValueError(
+                "[prior] is for a written prior, but the prior of the machine is a table (prior_mode)"
+            )
         if self.prior.source >= len(self.sources):
             raise ValueError(
                 f"the prior comes from source {self.prior.source}, but the last one is {len(self.sources) - 1}"

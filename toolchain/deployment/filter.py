@@ -46,7 +46,9 @@ class Transition:
         for name, rows in (("start", self.start), ("table", self.table)):
             own = np.array(rows, np.float64)
             if not (own >= 0).all() or not (abs(own.sum(axis=-1) - 1) <= _SUM_TOLERANCE).all():
-                raise ModelError(f"the {name} of the transition has a negative number, or does not sum to 1")
+                raise ModelError(
+                    f"the {name} of the transition has a negative number, or a distribution that does not sum to 1"
+                )
             object.__setattr__(self, name, own)
 
     def after(self, belief: NDArray[np.float64], steps: int = 1) -> NDArray[np.float64]:
@@ -84,7 +86,9 @@ class Transition:
                 return cls(rows[0], rows[1:])
             except ModelError as reason:
                 why = str(reason)
-        raise DamagedDeploymentError(f"{path} is not float64{list(shape)}, start and transition: {why}")
+        raise DamagedDeploymentError(
+            f"{path} is not float64{list(shape)}, the filter's start and transition: {why}"
+        )
 
 
 def _header(shape: tuple[int, int]) -> bytes:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from machines.kind import MachineKind
 
 NAME_MAX: Final = 200
+"""Maximum number of characters in a name."""
 
 _TYPE = re.compile(r"[A-Za-z]\w*/(?:msg/)?[A-Za-z]\w*")
 _SHA256 = re.compile(r"[0-9a-f]{64}")
@@ -67,7 +68,9 @@ def _topic(topic: str) -> str:
     if not _TOPIC.fullmatch(topic):
         raise ValueError(f"{topic!r} is not a topic name; expected one like '/boat/sensors'")
     if not topic.startswith("/"):
-        raise ValueError(f"{topic!r} does not begin with a slash; write '/{topic}'")
+        raise ValueError(
+            f"{topic!r} does not begin with a slash; write '/{topic}', which means the same on every server"
+        )
     return topic
 
 
@@ -101,7 +104,9 @@ def _printable(name: str) -> str:
 
 WebSocketUri = Annotated[str, AfterValidator(websocket_uri)]
 Topic = Annotated[str, AfterValidator(_topic)]
-MessageType = Annotated[str, _matching(_TYPE, "a message type; expected one like 'std_msgs/Float64'")]
+MessageType = Annotated[
+    str, _matching(_TYPE, "a message type; expected one like 'std_msgs/Float64' or 'std_msgs/msg/Float64'")
+]
 _A_PATH = "a path in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
 MessagePath = Annotated[str, _matching(MESSAGE_PATH, _A_PATH)]
 PathOrName = Annotated[str, _matching(re.compile(f"(?:{MESSAGE_PATH.pattern})?"), _A_PATH)]
@@ -110,6 +115,7 @@ Name = Annotated[str, Field(min_length=1, max_length=NAME_MAX), AfterValidator(_
 """One printable line, because names also come from network files."""
 Sha256 = Annotated[str, _matching(_SHA256, "a SHA-256 hash; expected 64 hexadecimal digits")]
 OwnPath = Annotated[str, AfterValidator(_inside)]
+"""A path in the folder of the deployment."""
 Step = Annotated[float, AfterValidator(_not_zero)]
 TOPIC_BYTES_MIN, TOPIC_BYTES_MAX = 1 << 10, 1 << 28
 """Smallest and largest limit of the size of a topic's messages, in bytes."""
@@ -141,6 +147,7 @@ def names_differ(kind: str, names: list[str]) -> None:
 
 
 _WORD_MAX: Final = 2**32 - 1
+"""Maximum value of a register."""
 _INTERFACE: Final = re.compile(r"([1-9]\d{0,4})x([1-9]\d{0,5})")
 _AN_INTERFACE: Final = "an interface; expected inputs x results, such as '20x1200'"
 
@@ -160,6 +167,7 @@ class Queue(StrEnum):
     LATEST = "latest"
     """Only the newest waits; the readings that it replaces are counted."""
     ALL = "all"
+    """All wait, in order."""
 
 
 class Scale(StrEnum):

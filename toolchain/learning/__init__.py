@@ -15,13 +15,16 @@ class FitMethod(StrEnum):
     NORMALS = "normals"
     """Sigma, share of outliers and bias of variables that are normal around a known mean."""
     COUNTS = "counts"
+    """Whole tables, by counting."""
 
 
 class FitPrior(StrEnum):
     """The table that counting starts from."""
 
     MODEL = "model"
+    """The table of the model."""
     UNIFORM = "uniform"
+    """All values equally probable."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +55,9 @@ class FitOptions:
             help="normals: minimum probability of an outlier, relative to the peak; codes must represent it."
         ),
     ] = 0.005
-    pseudo_count: Annotated[float, typer.Option(help="counts: weight of a cell's prior, in readings.")] = 1.0
+    pseudo_count: Annotated[
+        float, typer.Option(help="counts: weight of the Dirichlet prior of a cell, in readings.")
+    ] = 1.0
     prior: Annotated[
         FitPrior, typer.Option(help="counts: shape of the prior: the table of the model, or uniform.")
     ] = FitPrior.MODEL

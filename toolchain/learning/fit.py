@@ -65,6 +65,7 @@ class Support:
     """The amount of data behind a table."""
 
     name: str
+    """The variable."""
     readings: int
     """Number of its readings in rows with a true position."""
     cells: int
@@ -103,7 +104,9 @@ def fit_model(
 ) -> tuple[Fit, tuple[Support, ...]]:
     """Learn from the rows with a true position; return the fit, and the amount of data behind each table."""
     if not len(truth.rows):
-        raise ModelError("no row has a truth inside the searched dimensions: is --truth in the model's unit?")
+        raise ModelError(
+            "no row has a true value inside the searched dimensions: is --truth right, and in the model's unit?"
+        )
     known = {each.name: each for each in model.known}
     if options.method is FitMethod.NORMALS:
         supports, variables = _normals(
@@ -274,7 +277,9 @@ def _pools(names: Sequence[str], patterns: Sequence[str]) -> list[list[str]]:
     for pattern in patterns:
         pool = [name for name in left if fnmatchcase(name, pattern)]
         if not pool:
-            raise ModelError(f"--pool {pattern} is none of the fitted variables: {', '.join(names[:20])}")
+            raise ModelError(
+                f"--pool {pattern} is none of the variables that are fitted; they are {', '.join(names[:20])}"
+            )
         pools.append(pool)
         left = [name for name in left if name not in pool]
     return pools + [[name] for name in left]

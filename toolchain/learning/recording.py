@@ -31,7 +31,9 @@ class Recording:
     """Columns of a recording."""
 
     path: Path
+    """The file."""
     rows: int
+    """The number of rows."""
     columns: dict[str, list[object]]
     """Values by name, one per row: a number, a text, or None if missing."""
     stamps: tuple[int, ...] = ()

@@ -62,15 +62,21 @@ def _checked(
         raise ModelError(f"variable {name!r}: its mean must be one finite number for every line")
     spread = np.asarray(shape.sigma, dtype=np.float64)
     if spread.shape not in {(), mean.shape}:
-        raise ModelError(f"variable {name!r}: sigma has shape {spread.shape}, expected () or {mean.shape}")
+        raise ModelError(
+            f"variable {name!r}: sigma has shape {spread.shape}, expected one number or {mean.shape}"
+        )
     if not (np.all(spread > 0) and np.all(np.isfinite(spread))):
         raise ModelError(f"variable {name!r}: sigma must be positive on every line")
     if values < 1 or not step > 0 or not math.isfinite(step):
         raise ModelError(f"variable {name!r}: {values} bins of width {step:g}; both must be positive")
     if not 0 <= shape.floor < math.inf:
-        raise ModelError(f"variable {name!r}: a floor of {shape.floor:g}, expected a share from 0")
+        raise ModelError(
+            f"variable {name!r}: a floor of {shape.floor:g}, expected a share of the peak from 0"
+        )
     if not 0 <= shape.outliers <= 1:
-        raise ModelError(f"variable {name!r}: {shape.outliers:g} of its readings are outliers, not 0 to 1")
+        raise ModelError(
+            f"variable {name!r}: {shape.outliers:g} of its readings are outliers, expected 0 to 1"
+        )
     check_table(f"P({name} | S)", values, len(mean))
     return mean, np.broadcast_to(spread, mean.shape)
 

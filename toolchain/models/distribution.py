@@ -122,7 +122,7 @@ class LabelType:
     def __init__(self, *labels: str) -> None:
         if not labels or not all(labels) or len(set(labels)) < len(labels):
             raise ModelError(
-                f"a label type needs different names, not {', '.join(map(repr, labels)) or 'none'}"
+                f"a label type needs names that differ, not {', '.join(map(repr, labels)) or 'none'}"
             )
         object.__setattr__(self, "labels", labels)
 
@@ -163,6 +163,7 @@ class Symbol:
     name: str
     """Its name, which is also the field in the message unless `path` is given."""
     type: Type
+    """Its values."""
     path: str = ""
     """Its path in the message; empty to search the message for the name."""
     bits: int = 0
@@ -170,6 +171,7 @@ class Symbol:
     on_range: Literal["error", "clamp", "missing"] = "error"
     """Treatment of a reading out of range: an error, the nearest end, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
+    """`missing` if a reading may be missing."""
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -251,7 +253,9 @@ class Distribution:
     """P(symbol | given) as a table."""
 
     symbol: Symbol
+    """The symbol of the distribution."""
     given: tuple[Symbol, ...]
+    """The symbols that it depends on."""
     table: NDArray[np.float64]
     """float64[size of the symbol, size of each given], summing to 1 over the first axis."""
     normal: Normal | None = None
@@ -295,7 +299,11 @@ Factor: TypeAlias = Distribution | Potential
 
 
 def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) -> Distribution:
-    """Return P(symbol | given) from numbers, float64[size of the symbol, size of each given], or raise a ModelError."""
+    """Return P(symbol | given) from numbers, float64[size of the symbol, size of each given].
+
+    Raises:
+        ModelError: The shape is wrong, a number is not a probability, or a column does not sum to 1.
+    """
     given = tuple(given)
     scope = _scope(symbol, given)
     numbers = _numbers(_title(symbol, given), values, scope)
@@ -360,10 +368,13 @@ def conditional_normal(
 
 
 def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distribution:
-    """Return P(symbol | given) for a function of the given symbols: 1 at its value, 0 elsewhere, or raise a ModelError.
+    """Return P(symbol | given) for a function of the given symbols: 1 at its value, 0 elsewhere.
 
     The function gets the given symbols' values as numbers. With `on_range = clamp`, values beyond the ends of the
     symbol become the ends.
+
+    Raises:
+        ModelError: The function returns a value that the symbol does not have.
     """
     given = tuple(given)
     scope = _scope(symbol, given)

@@ -44,6 +44,7 @@ class JointDistribution:
     """A product of factors: a Bayesian network or, with potentials, a Markov network."""
 
     name: str
+    """The name for deployments."""
     factors: tuple[Factor, ...]
     """The distributions P(A | B, C) and potentials; every given symbol also has a factor."""
     symbols: tuple[Symbol, ...] = field(init=False, repr=False)
@@ -67,7 +68,7 @@ class JointDistribution:
                 bare.difference_update(each.name for each in factor.scope)
         if bare:
             raise ModelError(
-                f"{self.name}: {min(bare)} has no distribution; give it one: uniform({min(bare)})"
+                f"{self.name}: {min(bare)} has no distribution; give it one, such as uniform({min(bare)})"
             )
         try:
             TopologicalSorter(children).prepare()
@@ -135,12 +136,15 @@ class Question:
     """P(searched | known) of a joint distribution, created by `JointDistribution.ask`."""
 
     joint: JointDistribution
+    """The joint distribution."""
     searched: tuple[Symbol, ...]
     """The searched symbols, the slowest dimension first."""
     known: tuple[Symbol, ...]
+    """The known symbols, in the columns' order."""
     given: Mapping[str, int]
     """The index of each fixed value, by its symbol's name."""
     prior_select: Symbol | None
+    """The symbol that selects the prior, or None."""
     previous: tuple[Symbol, ...] = ()
     """The searched symbols one frame earlier, for a filter; or none."""
 
@@ -157,7 +161,13 @@ class Question:
         return self.known if self.prior_select is None else (*self.known, self.prior_select)
 
     def model(self) -> Model:
-        """Return the model that a BM1 computes, or raise a NotFusionError or ModelError."""
+        """Return the model that a BM1 computes.
+
+        Raises:
+            NotFusionError: The question is not naive fusion; the sentence contains the path that joins two known
+                symbols.
+            ModelError: It is impossible, or needs a table above the limit.
+        """
         observed = [symbol.name for symbol in self.observed]
         searched = [symbol.name for symbol in self.searched]
         sizes = {symbol.name: symbol.size for symbol in self.joint.symbols}
@@ -200,10 +210,14 @@ class Question:
             )
         for symbol, before in pairs:
             if symbol.type != before.type:
-                raise ModelError(f"{name}: {before.name}, the previous {symbol.name}, has other values")
+                raise ModelError(
+                    f"{name}: {before.name}, the previous {symbol.name}, does not have the same values"
+                )
         if self.given or self.prior_select:
             other = self.prior_select.name if self.prior_select else next(iter(self.given))
-            raise ModelError(f"{name}: a filter takes searched, known and previous ones: leave {other} out")
+            raise ModelError(
+                f"{name}: a filter has searched, known and previous variables alone: leave {other} out"
+            )
         advice = ": search fewer variables or values"
         check_size(f"{name}: the transition between {lines} lines", lines * lines, MAX_ENTRIES, advice)
         earlier = {symbol.name for symbol in self.previous}
@@ -215,7 +229,9 @@ class Question:
                 raise ModelError(f"{name}: a filter needs distributions, but {factor.title} is none")
             others = {symbol.name for symbol in factor.given} - earlier
             if factor.symbol.name in earlier and others:
-                raise ModelError(f"{name}: {factor.symbol.name} is previous, but depends on {min(others)}")
+                raise ModelError(
+                    f"{name}: {factor.symbol.name}, which is previous, depends on {min(others)}, which is not"
+                )
             terms = start if factor.symbol.name in earlier else moves
             terms.append(Term(tuple(symbol.name for symbol in factor.scope), factor.table))
         if not any(earlier.intersection(term.scope) for term in moves):

@@ -128,6 +128,7 @@ class Known(TabulatedVariable):
     Quantising warns if codes are too coarse for it.
     """
     normal: Normal | None = field(default=None, repr=False)
+    """The normals behind the table, or None."""
 
     def __post_init__(self) -> None:
         what = f"P({self.name} | S)"
@@ -154,6 +155,7 @@ class Model:
     """A naive Bayesian fusion, computed by a BM1."""
 
     name: str
+    """Name of the deployment."""
     searched: tuple[Dimension, ...]
     """The searched variable's dimensions, the slowest first; line = y * width + x for (y, x)."""
     known: tuple[Known, ...]
@@ -176,7 +178,7 @@ class Model:
         if self.lines > MAX_LINES:
             sizes = " x ".join(str(each.size) for each in self.searched)
             raise ModelError(
-                f"model {self.name!r} searches {sizes} = {self.lines} values, more than {MAX_LINES}"
+                f"model {self.name!r} searches {sizes} = {self.lines} values; the maximum is {MAX_LINES}"
             )
         for kind, names in (
             ("known variable", [known.name for known in self._all_known()]),
@@ -193,7 +195,7 @@ class Model:
                 )
         if self.transition is not None and self.prior_select is not None:
             raise ModelError(
-                f"model {self.name!r} has a transition: {self.prior_select.name} cannot select a prior"
+                f"model {self.name!r} has a transition, so {self.prior_select.name} cannot select its prior"
             )
         if self.transition is not None and self.transition.start.shape != (self.lines,):
             raise ModelError(
@@ -204,7 +206,9 @@ class Model:
         prior = self._default_prior() if self.prior is None else np.array(self.prior, float)
         _check_distribution("the prior P(S)", prior)
         if self.transition is not None and not np.array_equal(prior, self._default_prior()):
-            raise ModelError(f"the prior of model {self.name!r} is predicted from its transition")
+            raise ModelError(
+                f"the prior of model {self.name!r} is predicted from its transition: leave out another one"
+            )
         if self.prior_select is not None:
             self._default_prior()  # checks that its rows have the lines of this model
         prior.flags.writeable = False
@@ -295,7 +299,9 @@ def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:
 def check_table(what: str, values: int, lines: int) -> None:
     """Raise a ModelError for a known variable's table that would be too large."""
     if values > MAX_VALUES:
-        raise ModelError(f"{what} has {values} values; a column takes {MAX_VALUES}: use a larger step")
+        raise ModelError(
+            f"{what} has {values} values; a column supports at most {MAX_VALUES}: use a larger step"
+        )
     check_size(what, values * lines, MAX_TABLE_ENTRIES, ": use larger steps or fewer lines")
 
 
@@ -336,7 +342,9 @@ def exact_posterior(
             impossible on every line.
     """
     if len(addresses) != len(model.known):
-        raise ModelError(f"{len(addresses)} readings for the {len(model.known)} known variables")
+        raise ModelError(
+            f"{len(addresses)} readings for the {len(model.known)} known variables of {model.name!r}"
+        )
     factors = []
     for known, address in zip(model.known, addresses, strict=True):
         if address is None:

@@ -23,6 +23,7 @@ class NetworkModel:
     """P(searched | known) as a product of factors, computed by a BM2."""
 
     name: str
+    """Name of the deployment."""
     symbols: tuple[Symbol, ...]
     """The variables of the machine, in the order of the joint distribution."""
     factors: tuple[Term, ...]

@@ -48,7 +48,9 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
 
     path = Path(path)
     if not is_network(path):
-        raise NetworkFileError(f"expected one of {', '.join(SUFFIXES)}, with or without .gz", path=path)
+        raise NetworkFileError(
+            f"expected a name that ends in {', '.join(SUFFIXES)}, with or without .gz", path=path
+        )
     module, _, function = _READERS[_suffix(path)].partition(".")
     reader = getattr(import_module(f"{__name__}.{module}"), function)
     data = read_bounded(path, MAX_BYTES, NetworkFileError)
@@ -77,5 +79,7 @@ def _unpacked(path: Path, data: bytes) -> bytes:
     except (OSError, EOFError, zlib.error) as reason:
         raise NetworkFileError(f"not a gzip file, or damaged: {reason}", path=path) from None
     if len(content) > MAX_BYTES:
-        raise NetworkFileError(f"it has more than {MAX_BYTES} bytes, the maximum, unpacked", path=path)
+        raise NetworkFileError(
+            f"it has more than {MAX_BYTES} bytes, unpacked; this is the maximum", path=path
+        )
     return content

@@ -20,6 +20,7 @@ MAX_STATES: Final = 65_535
 MAX_PARENTS: Final = 30
 """Maximum number of parents: NumPy arrays have at most 64 axes, and no table of 2^24 entries needs as many."""
 MAX_TOTAL: Final = 2 * MAX_ENTRIES
+"""Maximum number of entries of all tables together."""
 MAX_NAME: Final = 200
 
 ROUNDING: Final = 0.02

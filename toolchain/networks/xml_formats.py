@@ -90,7 +90,9 @@ def read_xml(data: bytes, path: Path, root: str) -> Element:
         return XmlLine(path, parser.CurrentLineNumber)
 
     def refuse(name: str, *_rest: object) -> None:
-        raise here().error(f"the entity {name[:40]!r}: a network needs no entities, and they are refused")
+        raise here().error(
+            f"the entity {name[:40]!r}: a network does not need entities, and they are refused"
+        )
 
     def start(name: str, attributes: dict[str, str]) -> None:
         nonlocal count

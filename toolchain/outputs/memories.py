@@ -33,11 +33,15 @@ class Memory:
     """A memory of a board, or a memory shared by all boards."""
 
     name: str
+    """Its file name."""
     width: int
+    """Bits of a word."""
     depth: int
+    """The number of words."""
     words: Callable[[], Iterable[int]]
     """A function that returns every word, from address 0."""
     comments: tuple[str, ...]
+    """Comment lines for the beginning of the file."""
     board: int | None = None
     """The board that has it, or None if all have the same."""
     section: str = ""

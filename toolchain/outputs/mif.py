@@ -21,6 +21,7 @@ from toolchain.bounded_files import read_bounded
 from toolchain.errors import BuildError, MifError
 
 MOST_BYTES: Final = 1 << 30
+"""Maximum size of a file in bytes."""
 
 MOST_WORDS: Final = 1 << 24
 """Maximum depth of a memory, because a few bytes of a file could declare any depth."""
@@ -43,6 +44,7 @@ class Mif:
     """The contents of a memory."""
 
     width: int
+    """Bits of a word."""
     words: tuple[int, ...]
     """All words, from address 0; omitted addresses are 0, as in Quartus."""
 
@@ -164,7 +166,9 @@ class _Reader:
             self._refuse("a word after ':'")
         end = last if is_range else first + len(values) - 1
         if end >= len(words):
-            self._fail(f"the entry of line {line} goes on to address {end}, beyond {len(words) - 1}")
+            self._fail(
+                f"the entry of line {line} goes on to address {end}, but the last one is {len(words) - 1}"
+            )
         for place, address in enumerate(range(first, end + 1)):
             if words[address] is not None:
                 self._fail(f"address {address} is given twice, the second time by the entry of line {line}")
@@ -257,5 +261,7 @@ def read_table(path: Path) -> NDArray[np.uint32]:
     """Return the random numbers in a user's MIF, uint32[length], or raise a MifError or BuildError."""
     mif = read_mif(path)
     if mif.width > 32:
-        raise BuildError(f"{path} has words of {mif.width} bits; random numbers have at most 32")
+        raise BuildError(
+            f"{path} has words of {mif.width} bits; expected random numbers of at most 32, the codes' or more"
+        )
     return np.array(mif.words, dtype=np.uint32)

@@ -223,6 +223,7 @@ class PackageTokens:
     """
 
     name: str
+    """The file, for errors."""
     tokens: tuple[tuple[str, int], ...]
 
     @classmethod
@@ -247,7 +248,9 @@ class PackageTokens:
         for at in range(len(words) - 1):
             if words[at : at + 2] == ["constant", constant.lower()] and ":=" in words[at:]:
                 return self.tokens[min(words.index(":=", at) + 1, len(words) - 1)]
-        raise BuildError(f"there is no constant {constant}, as in the build's package", path=self.name)
+        raise BuildError(
+            f"there is no constant {constant}; expected the package of the build", path=self.name
+        )
 
     def check_same(self, expected: Self) -> None:
         """Raise a BuildError for the first token that is not the expected one."""
