@@ -33,7 +33,10 @@ def infer(
     tolerance_s: Annotated[
         float,
         typer.Option(
-            "--tolerance", help="bags: maximum time between readings that belong together.", metavar="SECONDS"
+            "--tolerance",
+            min=0,
+            help="bags: maximum time between readings that belong together.",
+            metavar="SECONDS",
         ),
     ] = 0.1,
 ) -> None:
