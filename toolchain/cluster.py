@@ -155,6 +155,7 @@ def runner(options: SchedulerOptions) -> Iterator[Run]:
         yield in_this_process
         return
     try:
+        import lz4.frame  # noqa: F401 - only whether it is there
         from distributed import Client, LocalCluster, Security
     except ImportError:
         raise ClusterError("--scheduler needs dask: pip install 'rosbayes[cluster]'") from None
@@ -182,7 +183,7 @@ def runner(options: SchedulerOptions) -> Iterator[Run]:
             with local:
                 yield _OnScheduler("local", lambda: Client(local))
         return
-    address, security = options.scheduler, None
+    address, security = options.scheduler, Security()
     if address.startswith("tls:"):
         security = Security(
             tls_ca_file=str(options.tls_ca_file),
@@ -190,7 +191,6 @@ def runner(options: SchedulerOptions) -> Iterator[Run]:
             tls_client_key=str(options.tls_key),
             require_encryption=True,
         )
-    security = security or Security()
 
     def connect() -> Any:
         # first, because the client waits without a limit for the greeting of whatever listens there
