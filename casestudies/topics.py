@@ -59,7 +59,7 @@ class Readiness:
 
 @contextlib.asynccontextmanager
 async def connected(name: str, work: str, uri: str) -> AsyncIterator[tuple[Ros, Readiness]]:
-    """Connect to a server within the context, and report the process's readiness for its `work` in the run directory."""
+    """Connect to a server in the context, and report the readiness for the `work` in the run directory."""
     started, readiness = time.monotonic(), Readiness(work)
 
     def answer() -> bytes:

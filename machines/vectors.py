@@ -32,7 +32,7 @@ _VECTOR: Final = ir.VectorType(_BITS, 8)
 
 
 class _VectorType(types.Type):
-    """512 bits of an array that is `aligned`, as numba's type of a local variable; it has `&`, `|`, `^`, `~`, `+`, `<<`, `>>`."""
+    """512 bits of an array that is `aligned`, as numba's type of a local variable, with the operators below."""
 
 
 VECTOR: Final = _VectorType("Vector")

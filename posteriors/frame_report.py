@@ -136,7 +136,7 @@ _times: Final = attrgetter(*_STAGES)
 # Every result is preceded by a report, so a template is formatted once and only filled in for each frame.
 @cache
 def _template(keys: tuple[str, ...]) -> str:
-    """Return a DiagnosticStatus as JSON with these keys, and `%` in place of level, name, message, hardware and values."""
+    """Return a DiagnosticStatus as JSON, with `%` for level, name, message, hardware and the values of these keys."""
     pairs = ",".join(f'{{"key":"{key}","value":"{_FORMS[key]}"}}' for key in keys)
     return f'{{"level":%d,"name":"rosbayes: %s","message":%s,"hardware_id":%s,"values":[{pairs}]}}'
 

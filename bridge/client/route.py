@@ -101,7 +101,7 @@ def _tls(uri: WebSocketURI, ca_file: Path | None, tls: ssl.SSLContext | None) ->
 
 
 async def connect_along(route: Route, uri: WebSocketURI, factory: Callable[[], _ConnectionT]) -> _ConnectionT:
-    """Open the transport of a WebSocket to the first address of a host that accepts; the OSError is that of the last."""
+    """Open the transport of a WebSocket to the first address of a host that accepts, or raise the last OSError."""
     loop = asyncio.get_running_loop()
     # not by `create_connection`, in which uvloop reports a look-up that fails after the attempt has timed out
     found: list[Any] = await loop.getaddrinfo(uri.host, uri.port, type=SOCK_STREAM)

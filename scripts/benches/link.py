@@ -48,7 +48,7 @@ BOARDS = (1, 2, 4)
 WORDS = (1, 16, 256, 1024, 4096, 8192)
 RESULTS = 4096
 WAYS = {"sent": (), "read": ("--read-results",)}
-"""How results reach the host: with the done message, or read from the registers as in the thesis. The flags are `board`'s."""
+"""Ways of the results to the host: in the done message, or by reads of the registers as in the thesis; flags of `board`."""
 SLOWER = 20
 """A measurement over JTAG for so many of the others, because each takes milliseconds."""
 TOLERANCE = 0.15

@@ -273,7 +273,7 @@ def test_whatever_else_listens_there_is_one_sentence():
                 pass
 
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        server = threading.Thread(target=greet, args=(listener,))
+        server = threading.Thread(target=greet, args=(listener,), daemon=True)
         server.start()
         options = SchedulerOptions(scheduler=f"tcp://127.0.0.1:{listener.getsockname()[1]}")
         with (

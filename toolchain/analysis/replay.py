@@ -79,7 +79,7 @@ class Replay:
 
     @property
     def is_sequence(self) -> bool:
-        """True if a frame depends on the frames before it, because of a filter or of generators that are never reset."""
+        """True if a frame depends on those before it, because of a filter or of generators that are never reset."""
         section = self.deployment.machine
         return self.deployment.filter is not None or section.rng_reset is RngReset.FREE
 
@@ -140,6 +140,8 @@ class PartFile:
         # Where the first record begins, and the length of each; `_file` is locked against other runs, and is new until
         # it has a record.
         heading = json.dumps({"rosbayes": _FORMAT, "key": key}).encode() + b"\n"
+        if path.exists() and not path.is_file():
+            raise BuildError(f"{path} is not a regular file; delete it, or name another file with -o")
         self._begin, self._size = len(heading), layout.itemsize
         with file_errors(path, "written", BuildError), ExitStack() as opened:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)

@@ -30,7 +30,7 @@ _META: Final = "fit.json"
 _PRIOR: Final = "prior.npy"
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 _BAD: Final = (zipfile.BadZipFile, zlib.error, KeyError, ValueError, AttributeError, EOFError, RuntimeError)
-"""What the libraries raise for a damaged file."""
+"""Errors of NumPy, zipfile and pydantic for a damaged file."""
 
 
 class FittedRecording(Section):

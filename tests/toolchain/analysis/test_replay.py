@@ -1,5 +1,6 @@
 """Recordings through the machines: an interrupted run goes on, also of a filter, and the file has the same bytes."""
 
+import os
 from zlib import crc32
 
 import numpy as np
@@ -179,6 +180,12 @@ def test_a_part_file_of_other_work_is_refused(tmp_path, content):
     with pytest.raises(BuildError, match="belongs to another recording, deployment or version; delete it"):
         PartFile(path, "key", LAYOUT, 4)
     assert path.read_bytes() == content
+
+
+def test_a_pipe_is_no_part_file(tmp_path):
+    os.mkfifo(tmp_path / "p.frames")
+    with pytest.raises(BuildError, match="is not a regular file; delete it"):
+        PartFile(tmp_path / "p.frames", "key", LAYOUT, 4)
 
 
 def test_a_full_disk_is_noticed_before_the_work(tmp_path):
