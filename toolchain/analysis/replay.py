@@ -293,14 +293,15 @@ def _write_bag(path: Path, deployment: Deployment, frames: Frames, records: _Rec
     with whole_file(path, BuildError) as partial:
         shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
         try:
-            with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            # rosbag2's metadata names the bag, so a fixed name gives the same bytes whatever the output is called
+            with Writer(folder / "BMresults", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
                 topic = writer.add_connection(_TOPIC, array.__msgtype__, typestore=store)
                 for record, stamp in zip(records, frames.stamps.tolist(), strict=True):
                     values = np.array(record["posterior"])
                     if not math.isnan(values[0]):
                         message = array(layout=layout(dim=dim, data_offset=0), data=values)
                         writer.write(topic, stamp, store.serialize_cdr(message, array.__msgtype__))
-            next(folder.glob("*.mcap")).replace(partial)
+            next(folder.glob("*/*.mcap")).replace(partial)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 

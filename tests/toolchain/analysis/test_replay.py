@@ -93,6 +93,18 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(deployment, recording, tmp
         ) == pytest.approx(1)
 
 
+def test_the_bytes_of_a_bag_do_not_depend_on_its_name(tmp_path):
+    build_model(corridor(), tmp_path / "corridor")
+    (tmp_path / "r.csv").write_text("range,loud\n3,1\n5,0\n")
+    deployment = load_deployment(tmp_path / "corridor")
+    frames = recorded_frames(tmp_path / "r.csv", deployment.variables, ())
+    for name in ("first.mcap", "second.mcap"):
+        replay(deployment, frames, tmp_path / name, in_this_process)
+    content = (tmp_path / "first.mcap").read_bytes()
+    assert (tmp_path / "second.mcap").read_bytes() == content
+    assert b"first" not in content
+
+
 def test_the_command_writes_a_bag_that_rosbags_reads(tmp_path):
     from rosbags.highlevel import AnyReader
 
