@@ -17,6 +17,7 @@ import statistics
 import sys
 import time
 from dataclasses import fields
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -28,7 +29,6 @@ from posteriors import BoardReport, FrameReport, StageTimes
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, VariableReading, write_frame_report
 from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
 from scripts.benches.cycle import Measured, add_seed, cpu_us, in_turns, quantile, readings, until_read
-from scripts.benches.load import mib_of
 from scripts.running.browser import Browser, Visit, browser
 from scripts.running.flags import ScriptParser, positive
 from scripts.running.script import print_table, run_script
@@ -107,6 +107,12 @@ async def display(stand: Stand, chromium: Browser, arguments: argparse.Namespace
         rows += await memory(visits[0], stand.pid("dashboard"), arguments.minutes)
         publishing.cancel()
     return rows
+
+
+def mib_of(pid: int) -> float:
+    """Return the resident memory of a process in MiB."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 async def memory(visit: Visit, pid: int, minutes: float) -> Rows:

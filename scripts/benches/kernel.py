@@ -1,52 +1,36 @@
-"""Speed of the fast kernels on one core: BM1, and BM2 as one chain and as many, beside other Gibbs samplers.
+"""Speed of the fast kernels on one core: BM1, and BM2 as one chain and as many.
 
-sprinkler (a text) ──┬──▶ our reader ──▶ BM2: one chain, many chains; a plain Gibbs sampler in numba
-alarm (pgmpy's) ─────┴──▶ pyagrum ─────▶ its Gibbs sampler; THRML's, with --thrml
+The networks of the BM2 are the sprinkler with wet grass, and pgmpy's alarm with nothing known.
 """
 
 from __future__ import annotations
 
 import argparse
-import gzip
 import os
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
-from typing import Any, Final, cast
+from typing import Final
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
+from casestudies.sprinkler.model import model as sprinkler
 from machines.bm1 import BM1Machine, Start
-from machines.bm2 import BM2Machine, BM2Start, start_state, unpack
+from machines.bm2 import BM2Machine, BM2Start, start_state
 from machines.bm2_chains import Chains
 from machines.bm2_fast import FastBM2
 from machines.fast import FastBM1
 from machines.parameters import BM1Parameters, Sequencer
-from scripts.benches.networks import Network
-from scripts.benches.samplers import CHAINS, THRML_LOCK, Factor, Known, pyagrum_gibbs, thrml_gibbs
+from scripts.benches.networks import machine_of
+from scripts.benches.samplers import Known
 from scripts.running.flags import ScriptParser, positive
 from scripts.running.script import print_table, reporting_errors
 from scripts.verifications.installation import use_packages
-from scripts.verifications.networks import LOCK
+from scripts.verifications.networks import EXAMPLES, LOCK
+from toolchain.models.network import NetworkModel
+from toolchain.networks import read_network
 
-SPRINKLER: Final = """network sprinkler { }
-variable R { type discrete [ 2 ] { no, yes }; }
-variable S { type discrete [ 2 ] { off, on }; }
-variable G { type discrete [ 2 ] { dry, wet }; }
-probability ( R ) { table 0.8, 0.2; }
-probability ( S | R ) { (no) 0.6, 0.4; (yes) 0.99, 0.01; }
-probability ( G | S, R ) {
-  (off, no) 1.0, 0.0; (on, no) 0.1, 0.9; (off, yes) 0.2, 0.8; (on, yes) 0.01, 0.99;
-}
-"""
-WET: Final = 2, 1
-"""The known variable of the sprinkler, and its value."""
 SINGLE_AIMS: Final = {"sprinkler": 6e7, "alarm": 2e7}
 """Cycles a second of one chain."""
 RATIO_AIMS: Final = {"sprinkler": 10, "alarm": 2}
@@ -55,7 +39,6 @@ MANY: Final = {"sprinkler": 512, "alarm": 32}
 """Number of chains."""
 TURNS: Final = 3
 """Times that each alternative is measured; the fastest counts, because other processes only slow it down."""
-BURN_IN: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,91 +66,24 @@ def bm1(cycles: int) -> Speed:
     return Speed(kernel.cycles, 0, time.process_time() - began)
 
 
-def _sweep(
-    values: NDArray[np.int64],
-    unknown: NDArray[np.int64],
-    sizes: NDArray[np.int64],
-    first: NDArray[np.int64],
-    held: NDArray[np.int64],
-    tables: NDArray[np.float64],
-    counts: NDArray[np.int64],
-    sweeps: int,
-) -> None:
-    """Draw each unknown variable in turn, from the product of its factors."""
-    weights = np.empty(sizes.max())
-    for _ in range(sweeps):
-        for variable in unknown:
-            total = 0.0
-            for value in range(sizes[variable]):
-                values[variable] = value
-                weight = 1.0
-                for factor in range(first[variable], first[variable + 1]):
-                    place = held[factor, 0]
-                    for i in range(held[factor, 1]):
-                        place += held[factor, 2 + 2 * i] * values[held[factor, 3 + 2 * i]]
-                    weight *= tables[place]
-                total += weight
-                weights[value] = total
-            drawn = np.random.random() * total  # noqa: NPY002 - numba's own generator
-            value = 0
-            while weights[value] <= drawn:
-                value += 1
-            values[variable] = value
-        for variable in unknown:
-            counts[variable, values[variable]] += 1
-
-
-_compiled_sweep = cast("Callable[..., None]", njit(_sweep))
-
-
-def numba_gibbs(factors: Sequence[Factor], start: Sequence[int], known: Known, sweeps: int) -> Speed:
-    """Run a plain Gibbs sampler over the variables' values, as one would write it in numba."""
-    sizes = {each: size for scope, table in factors for each, size in zip(scope, table.shape, strict=True)}
-    bases = np.cumsum([0, *(table.size for _, table in factors)])
-    first, held = [0], []
-    for variable in range(len(sizes)):
-        for base, (scope, table) in zip(bases, factors, strict=False):
-            if variable in scope:
-                steps = [np.prod(table.shape[axis + 1 :], dtype=int) for axis in range(table.ndim)]
-                held.append([base, len(scope), *(n for pair in zip(steps, scope, strict=True) for n in pair)])
-        first.append(len(held))
-    rows = np.zeros((len(held), max(map(len, held))), dtype=np.int64)
-    for at, row in enumerate(held):
-        rows[at, : len(row)] = row
-    arguments = (
-        np.array(start, dtype=np.int64),
-        np.array([variable for variable in range(len(sizes)) if variable not in known], dtype=np.int64),
-        np.array([sizes[variable] for variable in range(len(sizes))], dtype=np.int64),
-        np.array(first, dtype=np.int64),
-        rows,
-        np.concatenate([table.ravel() for _, table in factors]).astype(np.float64),
-        np.zeros((len(sizes), max(sizes.values())), dtype=np.int64),
-    )
-    _compiled_sweep(*arguments, 1)
-    began = time.process_time()
-    _compiled_sweep(*arguments, sweeps)
-    return Speed(0, sweeps, time.process_time() - began)
-
-
-def alternatives(
-    network: Network, known: Known, arguments: argparse.Namespace
+def chains_of(
+    model: NetworkModel, known: Known, arguments: argparse.Namespace
 ) -> dict[str, Callable[[], Speed]]:
-    """Return functions that run each alternative once."""
-    name, sweeps = network.model.name, arguments.sweeps
-    machine = network.machine(Sequencer.LINEAR)
+    """Return functions that run one chain, and many."""
+    machine = machine_of(model, Sequencer.LINEAR)
     parameters = machine.parameters
     state = start_state(machine, known)
     assert state is not None  # the evidence is possible
     start = BM2Start(
         state=state,
         known=sum(parameters.masks[variable] for variable in known),
-        samples=sweeps,
-        burn_in=BURN_IN,
+        samples=arguments.sweeps,
+        burn_in=100,
         ops_timeout=parameters.ops_timeout,
         max_cycles=2**40,
     )
     kernel = FastBM2(machine)
-    many = MANY[name]
+    many = MANY[model.name]
     chains = Chains(
         [
             BM2Machine(replace(parameters, chain=at, chains=many), machine.tables, machine.supports)
@@ -175,12 +91,8 @@ def alternatives(
         ]
     )
     # as many moves in all for both networks
-    short = replace(
-        start,
-        samples=1
-        + 2 * arguments.chain_sweeps // (many * len(parameters.moves(start.known, start.sequencer))),
-    )
-    values = unpack(parameters, state)
+    moves = many * len(parameters.moves(start.known, start.sequencer))
+    short = replace(start, samples=1 + 2 * arguments.chain_sweeps // moves)
 
     def single() -> Speed:
         began = time.process_time()
@@ -193,27 +105,7 @@ def alternatives(
         seconds = time.process_time() - began
         return Speed(sum(each.cycles for each in results), sum(each.samples for each in results), seconds)
 
-    def others(run: Callable[..., Any], *given: Any, **options: Any) -> Callable[[], Speed]:
-        @cache  # once is enough to tell, and THRML compiles in each run
-        def once() -> Speed:
-            began = time.process_time()
-            sampled = run(*given, burn_in=BURN_IN, **options)
-            # their seconds exclude compilation, and those of the processor what other processes took
-            return Speed(0, sampled.sweeps, min(sampled.seconds, time.process_time() - began))
-
-        return once
-
-    theirs = (network.pyagrum, network.theirs, network.model.names, known)
-    runs = {
-        "BM2, one chain": single,
-        f"BM2, {many} chains": together,
-        "Gibbs in numba": lambda: numba_gibbs(network.factors, values, known, sweeps),
-        "pyAgrum's Gibbs": others(pyagrum_gibbs, *theirs, sweeps=sweeps, limit=arguments.seconds),
-    }
-    if arguments.thrml:
-        blocks = (network.factors, values, known, parameters.colours)
-        runs[f"THRML, {CHAINS} chains"] = others(thrml_gibbs, *blocks, sweeps=sweeps)
-    return runs
+    return {f"BM2, {model.name}, one chain": single, f"BM2, {model.name}, {many} chains": together}
 
 
 def measure(runs: dict[str, Callable[[], Speed]]) -> dict[str, Speed]:
@@ -227,43 +119,31 @@ def measure(runs: dict[str, Callable[[], Speed]]) -> dict[str, Speed]:
     return best
 
 
-def show(title: str, speeds: dict[str, Speed]) -> None:
-    """Print a table; the ratios are those of sweeps a second to one chain."""
-    rows = []
-    single = next(iter(speeds.values()))
-    for name, each in speeds.items():
-        per_second = [f"{n / each.seconds:.2e}" if n else "" for n in (each.cycles, each.sweeps)]
-        ratio = each.sweeps / each.seconds * single.seconds / single.sweeps if single.sweeps else 0
-        rows.append((name, *per_second, f"{ratio:.3g}" if ratio else ""))
-    print_table(title, ("kernel or sampler", "cycles/s", "sweeps/s", "ratio"), rows)
-
-
 def bench(arguments: argparse.Namespace) -> int:
     """Measure everything on one core; return 1 if an aim is missed and --check is given."""
-    packages = use_packages("networks", LOCK)
-    if arguments.thrml:
-        use_packages("thrml", THRML_LOCK)
-    import pyagrum
-
+    archive = use_packages("networks", LOCK) / EXAMPLES / "alarm.bif.gz"
+    joint = read_network(archive, on_missing="missing")
+    alarm = joint.ask([symbol.name for symbol in joint.symbols], ()).network()
+    wet = sprinkler().network()
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    show("BM1, 1024 lines x 7 columns", measure({"BM1, nothing kept": lambda: bm1(arguments.sweeps)}))
-    missed = False
-    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as folder:
-        sprinkler = Path(folder, "sprinkler.bif.gz")
-        sprinkler.write_bytes(gzip.compress(SPRINKLER.encode()))
-        alarm = packages / "pgmpy" / "utils" / "example_models" / "alarm.bif.gz"
-        for archive, known in ((sprinkler, dict([WET])), (alarm, {})):
-            network = Network.read(pyagrum, archive)
-            name = network.model.name
-            speeds = measure(alternatives(network, known, arguments))
-            show(f"{name}, {len(known)} known", speeds)
-            single, many = (each.cycles / each.seconds for each in list(speeds.values())[:2])
-            single_aim, ratio_aim = SINGLE_AIMS[name], RATIO_AIMS[name]
-            missed |= single < single_aim or many < ratio_aim * single
-            print(
-                f"{name}: one chain {single:.2e} cycles/s (aim {single_aim:.0e}); many chains {many / single:.1f} times "
-                f"that (aim {ratio_aim})\n"
-            )
+    speeds = measure({"BM1, 1024 lines x 7 columns, nothing kept": lambda: bm1(arguments.sweeps)})
+    missed, verdicts = False, []
+    for model, known in ((wet, {wet.names.index("G"): 1}), (alarm, {})):
+        found = measure(chains_of(model, known, arguments))
+        speeds |= found
+        single, many = (each.cycles / each.seconds for each in found.values())
+        single_aim, ratio_aim = SINGLE_AIMS[model.name], RATIO_AIMS[model.name]
+        missed |= single < single_aim or many < ratio_aim * single
+        verdicts.append(
+            f"{model.name}: one chain {single:.2e} cycles/s (aim {single_aim:.0e}); many chains {many / single:.1f} times "
+            f"that (aim {ratio_aim})"
+        )
+    rows = [
+        (name, *(f"{n / each.seconds:.2e}" if n else "" for n in (each.cycles, each.sweeps)))
+        for name, each in speeds.items()
+    ]
+    print_table("one core", ("kernel", "cycles/s", "sweeps/s"), rows)
+    print(*verdicts, sep="\n")
     return int(missed and arguments.check)
 
 
@@ -278,12 +158,6 @@ def main() -> int:
         type=positive,
         default=80_000_000,
         help="samples of all of many chains, fewer if they are long",
-    )
-    parser.add_argument("--seconds", type=float, default=3.0, help="limit of each run of pyAgrum's sampler")
-    parser.add_argument(
-        "--thrml",
-        action="store_true",
-        help="also compare THRML; installs it, in a folder of its own (530 MB)",
     )
     parser.add_argument("--check", action="store_true", help="exit 1 if an aim is missed")
     arguments = parser.parse_args()

@@ -30,7 +30,7 @@ from scripts.benches.samplers import CHAINS, THRML_LOCK, Factor, Known, Sampled,
 from scripts.running.flags import ScriptParser
 from scripts.running.script import print_table, reporting_errors
 from scripts.verifications.installation import use_packages
-from scripts.verifications.networks import LOCK, load
+from scripts.verifications.networks import EXAMPLES, LOCK, load
 from toolchain.building.options import BuildOptions
 from toolchain.checks.check import check_model
 from toolchain.checks.findings import Finding, Severity
@@ -89,12 +89,6 @@ class Network:
             path.write_bytes(gzip.decompress(archive.read_bytes()))
             return cls(model, zeros, warnings, pyagrum, load(pyagrum, path))
 
-    @property
-    def factors(self) -> list[Factor]:
-        """The variables of each factor, and its table."""
-        number = {name: at for at, name in enumerate(self.model.names)}
-        return [(tuple(number[name] for name in term.scope), term.table) for term in self.model.factors]
-
     def exact(self, known: Known) -> Marginals:
         """Return the exact marginals of the unknown variables."""
         names = self.model.names
@@ -122,16 +116,23 @@ class Network:
             unlikely[leaf] = int(np.where(chances > POSSIBLE, chances, np.inf).argmin())
         return {"none": {}, "likely": likely, "unlikely": unlikely}
 
-    def machine(self, sequencer: Sequencer) -> BM2Machine:
-        """Return the machine that holds the network."""
-        factors = self.factors
-        parameters = BM2Parameters(
-            cardinalities=self.model.cardinalities,
-            factors=tuple(scope for scope, _ in factors),
-            sequencer=sequencer,
-            burn_in=BURN_IN,
-        )
-        return BM2Machine.from_factors(parameters, [table for _, table in factors])
+
+def factors_of(model: NetworkModel) -> list[Factor]:
+    """Return the variables of each factor, and its table."""
+    number = {name: at for at, name in enumerate(model.names)}
+    return [(tuple(number[name] for name in term.scope), term.table) for term in model.factors]
+
+
+def machine_of(model: NetworkModel, sequencer: Sequencer) -> BM2Machine:
+    """Return the machine that holds a network."""
+    factors = factors_of(model)
+    parameters = BM2Parameters(
+        cardinalities=model.cardinalities,
+        factors=tuple(scope for scope, _ in factors),
+        sequencer=sequencer,
+        burn_in=BURN_IN,
+    )
+    return BM2Machine.from_factors(parameters, [table for _, table in factors])
 
 
 def run(kernel: BM2Kernel, known: Known, sweeps: int, bank: int) -> Sampled:
@@ -177,7 +178,7 @@ def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, flo
     names, sweeps = network.model.names, arguments.sweeps
     zeros = f"{network.zeros} zeros, which limit Gibbs samplers" if network.zeros else "no zeros"
     rows: list[list[str] | None] = []
-    kernels = {f"BM2 {each}": make_bm2_kernel(network.machine(each)) for each in SEQUENCERS}
+    kernels = {f"BM2 {each}": make_bm2_kernel(machine_of(network.model, each)) for each in SEQUENCERS}
     median, largest = [], []
     for title, known in network.evidences().items():
         exact = network.exact(known)
@@ -195,7 +196,7 @@ def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, flo
         if arguments.thrml:
             machine = kernels["BM2 linear"].machine
             start = unpack(machine.parameters, start_state(machine, known) or 0)
-            blocks = (network.factors, start, known, machine.parameters.colours)
+            blocks = (factors_of(network.model), start, known, machine.parameters.colours)
             runs[f"THRML, {CHAINS} chains"] = thrml_gibbs(*blocks, sweeps=sweeps, burn_in=BURN_IN)
         for sampler, each in runs.items():
             off = variation(each.marginals, exact)
@@ -224,7 +225,7 @@ def bench(arguments: argparse.Namespace) -> int:
     warm_up()
     missed = False
     for name in arguments.network:
-        archive = packages / "pgmpy" / "utils" / "example_models" / f"{name}.bif.gz"
+        archive = packages / EXAMPLES / f"{name}.bif.gz"
         median, largest = compare(Network.read(pyagrum, archive), arguments)
         if arguments.check:
             missed |= median > AIM

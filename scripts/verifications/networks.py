@@ -33,6 +33,8 @@ from toolchain.models.model import Model, exact_posterior
 from toolchain.networks import read_network
 
 LOCK: Final = Path(__file__).with_name("networks.lock")
+EXAMPLES: Final = Path("pgmpy", "utils", "example_models")
+"""The networks' folder in pgmpy's wheel."""
 NETWORKS: Final = 24
 FORMATS: Final = (".bif", ".bifxml", ".net", ".uai")
 READ_TOLERANCE: Final = 1e-5
@@ -267,7 +269,7 @@ def verify(only: list[str]) -> int:
     import pyagrum
 
     tally, began = Tally(), time.monotonic()
-    archives = sorted((packages / "pgmpy" / "utils" / "example_models").glob("*.bif.gz"))
+    archives = sorted((packages / EXAMPLES).glob("*.bif.gz"))
     why = None if len(archives) == NETWORKS else f"there are {len(archives)}"
     tally.report(f"{NETWORKS} networks in pgmpy's wheel", began, why)
     with tempfile.TemporaryDirectory(prefix="networks-rosbayes-") as folder:
