@@ -10,8 +10,6 @@ explanations. PeakRDL writes the C header. The other files are the templates in 
   a VHDL package from its wheel.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re
@@ -197,9 +195,11 @@ def texts(register_map: RegisterMap) -> dict[str, str]:
 
 def main(arguments: Sequence[str] | None = None, *, root: Path = ROOT) -> int:
     """Write all files, or with `--check` compare the existing ones with what would be written."""
-    description = "Makes the constants module, the page, the VHDL and the C header from hdl/bm_registers.rdl."
-    parser = ScriptParser(prog="scripts/registers", description=description)
-    parser.add_argument("--check", action="store_true", help="write nothing; exit 1 if a file is out of date")
+    parser = ScriptParser(
+        "scripts/registers",
+        "Makes the constants module, the page, the VHDL and the C header from hdl/bm_registers.rdl.",
+    )
+    parser.switch("--check", "write nothing; exit 1 if a file is out of date")
     check = parser.parse_args(arguments).check
     stale = {name: text for name, text in texts(RegisterMap()).items() if not _is(root / name, text)}
     for name, text in stale.items():

@@ -1,7 +1,5 @@
 """A WebSocket client that costs almost nothing: frames are encoded once, and only counted when received."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json

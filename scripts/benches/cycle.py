@@ -5,8 +5,6 @@ fused      client --reading--> hub --> master --------------> 4 boards ---------
 floor      client --reading--> hub --> echo -----------------------------------------------------------------------> hub --> client
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import math
@@ -16,15 +14,16 @@ import statistics
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Awaitable, Sequence
 from pathlib import Path
 
 from bridge.client import Publication, Ros, Subscription, connect
 from bridge.stamps import header, header_stamp_ns
 from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
-from scripts.running.flags import ScriptParser, positive
-from scripts.running.script import print_table, run_script
+from scripts.running.flags import ScriptParser
+from scripts.running.script import print_table
 from scripts.running.stand import Stand, temporary_stand
+from services.errors import SettingsError
 
 STAGES = (
     *("wire_in", "rosbridge_in", "local_hops", "waited", "register_writes", "compute", "reads"),
@@ -257,30 +256,24 @@ def show(all_: dict[str, Measured], arguments: argparse.Namespace) -> None:
     )
 
 
-def main() -> int:
-    """Parse the flags and measure."""
-    parser = ScriptParser(
-        prog="scripts/bench cycle",
-        description="Compare the time from a reading to its result with that of an echo.",
-    )
-    parser.add_argument("--frames", type=positive, default=1000, help="number of readings")
-    add_seed(parser)
-    parser.add_argument(
-        "--sizes",
-        action="store_true",
-        help="vary lines, sensors and the message's size instead, without the echo",
-    )
-    parser.add_argument("--json", type=Path, help="with --sizes, write all numbers to this file")
-    parser.add_argument("--picture", type=Path, help="with --sizes, draw them into this PNG")
-    arguments = parser.parse_args()
+def bench_either(arguments: argparse.Namespace) -> Awaitable[int]:
+    """Compare with the echo, or measure by size."""
     if arguments.sizes:
         from scripts.benches.sizes import bench_sizes  # which needs this module
 
-        return run_script(lambda: bench_sizes(arguments), 900)
+        return bench_sizes(arguments)
     if arguments.json or arguments.picture:
-        parser.error("--json and --picture need --sizes")
-    return run_script(lambda: bench(arguments), 300)
+        raise SettingsError("--json and --picture need --sizes")
+    return bench(arguments)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser(
+        "scripts/bench cycle", "Compare the time from a reading to its result with that of an echo."
+    )
+    parser.flag("--frames", "number of readings", 1000)
+    add_seed(parser)
+    parser.switch("--sizes", "vary lines, sensors and the message's size instead, without the echo")
+    parser.flag("--json", "with --sizes, write all numbers to this file", type=Path)
+    parser.flag("--picture", "with --sizes, draw them into this PNG", type=Path)
+    parser.run(bench_either, 900)

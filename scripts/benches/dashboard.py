@@ -5,8 +5,6 @@ drag     mouse in Chromium --> dashboard --> hub --> boat-simulator --> ... --> 
 cycle    two stacks, one of them with a dashboard and a plain WebSocket reader, as Chromium takes a core of its own
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib
@@ -30,8 +28,8 @@ from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, VariableReading, wr
 from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
 from scripts.benches.cycle import Measured, add_seed, cpu_us, in_turns, quantile, readings, until_read
 from scripts.running.browser import Browser, Visit, browser
-from scripts.running.flags import ScriptParser, positive
-from scripts.running.script import print_table, run_script
+from scripts.running.flags import ScriptParser
+from scripts.running.script import print_table
 from scripts.running.stand import Stand, temporary_stand
 
 HZ: Final = 50
@@ -43,6 +41,8 @@ SAMPLES: Final = 10
 """Number of intervals in the measurement of memory."""
 TURN: Final = 10
 """Number of cycles in a turn, after which the other stack is measured."""
+LIMIT: Final = 24 * 3600.0
+"""Time limit in seconds, which any number of minutes of the measurement of memory should keep."""
 PARTS: Final = ("cycle", "drag", "display")
 
 Rows = list[tuple[str, str, str]]
@@ -187,24 +187,25 @@ async def cycles(plain: Stand, beside: Stand, frames: int, seed: int) -> Rows:
 async def bench(arguments: argparse.Namespace) -> int:
     """Measure part after part, and print the table."""
     rows: Rows = []
+    only = arguments.only or PARTS
     async with contextlib.AsyncExitStack() as stack:
-        if "cycle" in arguments.only:
+        if "cycle" in only:
             async with temporary_stand() as plain, temporary_stand() as beside:
                 for stand in (plain, beside):
                     await stand.start_hub()
                     await stand.start_boat_master()
                 await beside.start_dashboard()
                 rows += await cycles(plain, beside, arguments.frames, arguments.seed)
-        if set(arguments.only) - {"cycle"}:
+        if set(only) - {"cycle"}:
             chromium = await stack.enter_async_context(browser())
-        if "drag" in arguments.only:
+        if "drag" in only:
             async with temporary_stand() as boat:
                 await boat.start_hub()
                 await boat.start_boat_master()
                 await boat.start_boat()
                 await boat.start_dashboard()
                 rows += await drags(boat, chromium, random.Random(arguments.seed))
-        if "display" in arguments.only:
+        if "display" in only:
             async with temporary_stand() as source:
                 await source.start_hub()
                 await source.start_dashboard()
@@ -219,27 +220,13 @@ async def bench(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def main() -> int:
-    """Parse the flags and measure."""
-    parser = ScriptParser(
-        prog="scripts/bench dashboard",
-        description="Measure what the dashboard shows, how late, and what it costs the stack.",
-    )
-    parser.add_argument(
-        "--seconds", type=float, default=20.0, help="duration of each measurement of the display"
-    )
-    parser.add_argument("--minutes", type=float, default=2.0, help="duration of the measurement of memory")
-    parser.add_argument(
-        "--frames", type=positive, default=500, help="number of cycles with and without the dashboard"
-    )
-    add_seed(parser)
-    parser.add_argument(
-        "--only", choices=PARTS, action="append", shown="all", help="one part; repeat for more"
-    )
-    arguments = parser.parse_args()
-    arguments.only = arguments.only or PARTS
-    return run_script(lambda: bench(arguments), 1200 + 60 * arguments.minutes)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser(
+        "scripts/bench dashboard", "Measure what the dashboard shows, how late, and what it costs the stack."
+    )
+    parser.flag("--seconds", "duration of each measurement of the display", 20.0)
+    parser.flag("--minutes", "duration of the measurement of memory", 2.0)
+    parser.flag("--frames", "number of cycles with and without the dashboard", 500)
+    add_seed(parser)
+    parser.flag("--only", "one part; repeat for more", choices=PARTS, action="append", shown="all")
+    parser.run(bench, LIMIT)

@@ -1,7 +1,5 @@
 """An echo, the floor of a cycle: it answers every reading at once with a message of a result's size."""
 
-from __future__ import annotations
-
 import asyncio
 import sys
 

@@ -3,11 +3,8 @@
 The networks of the BM2 are the sprinkler with wet grass, and pgmpy's alarm with nothing known.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,8 +21,8 @@ from machines.fast import FastBM1
 from machines.parameters import BM1Parameters, Sequencer
 from scripts.benches.networks import machine_of
 from scripts.benches.samplers import Known
-from scripts.running.flags import ScriptParser, positive
-from scripts.running.script import print_table, reporting_errors
+from scripts.running.flags import ScriptParser
+from scripts.running.script import print_table
 from scripts.verifications.installation import use_packages
 from scripts.verifications.networks import EXAMPLES, LOCK
 from toolchain.models.network import NetworkModel
@@ -147,22 +144,9 @@ def bench(arguments: argparse.Namespace) -> int:
     return int(missed and arguments.check)
 
 
-def main() -> int:
-    """Parse the flags and measure."""
-    parser = ScriptParser(prog="scripts/bench kernel", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--sweeps", type=positive, default=200_000, help="samples of one chain, and cycles of the BM1"
-    )
-    parser.add_argument(
-        "--chain-sweeps",
-        type=positive,
-        default=80_000_000,
-        help="samples of all of many chains, fewer if they are long",
-    )
-    parser.add_argument("--check", action="store_true", help="exit 1 if an aim is missed")
-    arguments = parser.parse_args()
-    return reporting_errors(lambda: bench(arguments))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser("scripts/bench kernel", __doc__)
+    parser.flag("--sweeps", "samples of one chain, and cycles of the BM1", 200_000)
+    parser.flag("--chain-sweeps", "samples of all of many chains, fewer if they are long", 80_000_000)
+    parser.switch("--check", "exit 1 if an aim is missed")
+    parser.run_at_once(bench)

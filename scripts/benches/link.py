@@ -7,14 +7,11 @@ What the socket takes (`none`) is part of every measurement. The rate and the la
 difference from it, so that they come from the clock of the host and not from the model.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import itertools
 import math
 import os
-import sys
 import tempfile
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
@@ -39,7 +36,6 @@ from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import Image, Partition
 from pcie_shim.wires import WIRES, LinkRate
 from scripts.running.flags import ScriptParser
-from scripts.running.script import run_script
 from terminal.output import write_json
 from terminal.pictures import new_figure, save_figure
 from terminal.processes import Process
@@ -359,27 +355,13 @@ def draw(path: Path, transfers: Sequence[Transfer], frames: Sequence[FrameTime])
     save_figure(figure, path)
 
 
-def main() -> int:
-    """Parse the flags and measure."""
-    parser = ScriptParser(
-        prog="scripts/bench link",
-        description="Measure the link to the boards by size of a transfer and boards, for each --link-rate.",
-    )
-    parser.add_argument(
-        "--repeats", type=int, default=400, help=f"transfers of each size; over JTAG a {SLOWER}th"
-    )
-    parser.add_argument(
-        "--check",
-        action="store_true",
-        help=f"exit 1 if a rate differs from the model's by over {TOLERANCE:.0%}",
-    )
-    parser.add_argument("--json", type=Path, help="write all numbers to this file")
-    parser.add_argument("--picture", type=Path, help="draw them into this PNG")
-    arguments = parser.parse_args()
-    if arguments.repeats < 1:
-        parser.error("--repeats must be 1 or more")
-    return run_script(lambda: bench(arguments), 600)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser(
+        "scripts/bench link",
+        "Measure the link to the boards by size of a transfer and boards, for each --link-rate.",
+    )
+    parser.flag("--repeats", f"transfers of each size; over JTAG a {SLOWER}th", 400)
+    parser.switch("--check", f"exit 1 if a rate differs from the model's by over {TOLERANCE:.0%}")
+    parser.flag("--json", "write all numbers to this file", type=Path)
+    parser.flag("--picture", "draw them into this PNG", type=Path)
+    parser.run(bench, 600)

@@ -3,8 +3,6 @@
 recording --> player --> hub --> master and its processes, one deployment for both robots --> hub --> player
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import sys
@@ -20,7 +18,7 @@ from casestudies.demo import build
 from casestudies.mrclam.model import BEARING_SIGMA, FLOOR, RANGE_SIGMA, Landmark, model, read_landmarks
 from casestudies.mrclam.player import RecordedFrame, area_grid, median_distance, play, read_recording
 from scripts.running.flags import ScriptParser
-from scripts.running.script import ROOT, print_table, run_script
+from scripts.running.script import ROOT, print_table
 from scripts.running.stand import Stand, temporary_stand
 from terminal.processes import Process
 from toolchain.deployment.address import to_address
@@ -183,30 +181,32 @@ async def bench(arguments: argparse.Namespace) -> int:
     return 1 if beyond else 0
 
 
-def main() -> int:
-    """Parse the flags and play."""
-    parser = ScriptParser(
-        prog="scripts/bench mrclam",
-        description="Replay the data of recorded robots through the whole stack, and compare with float64.",
-    )
-    parser.add_argument(
-        "data", type=Path, help="folder with landmarks.csv and ds1_robot3.csv, ds1_robot5.csv"
-    )
-    parser.add_argument(
-        "--fit",
-        type=Path,
-        metavar="FILE",
-        help="on robot 5, compare tables set by hand with tables learnt on robot 3; if FILE does not exist, they are "
-        "learnt now and written to it",
-    )
-    parser.add_argument("--cells", type=int, default=32, help="number of cells along x, and along y")
-    arguments = parser.parse_args()
-    if not 1 <= arguments.cells <= 128:  # four boards hold 4096 lines each
-        parser.error("--cells must be 1 to 128")
-    arguments.data = arguments.data.resolve()
-    arguments.fit = None if arguments.fit is None else arguments.fit.resolve()
-    return run_script(lambda: bench(arguments), 600)
+def cells(text: str) -> int:
+    """Return the value of --cells; four boards hold 4096 lines each."""
+    if not 1 <= int(text) <= 128:
+        raise argparse.ArgumentTypeError("must be 1 to 128")
+    return int(text)
+
+
+def resolved(text: str) -> Path:
+    """Return an absolute path, which the processes of the run need."""
+    return Path(text).resolve()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser(
+        "scripts/bench mrclam",
+        "Replay the data of recorded robots through the whole stack, and compare with float64.",
+    )
+    parser.add_argument(
+        "data", type=resolved, help="folder with landmarks.csv and ds1_robot3.csv, ds1_robot5.csv"
+    )
+    parser.flag(
+        "--fit",
+        "on robot 5, compare tables set by hand with tables learnt on robot 3; if FILE does not exist, they are "
+        "learnt now and written to it",
+        type=resolved,
+        metavar="FILE",
+    )
+    parser.flag("--cells", "number of cells along x, and along y", 32, type=cells, metavar="NUMBER")
+    parser.run(bench, 600)

@@ -5,11 +5,8 @@ pgmpy's wheel --> *.bif.gz --> our reader --> BM2, linear and coloured --> margi
                                    └────────▶ its Gibbs sampler; THRML's, with --thrml ──────────┘
 """
 
-from __future__ import annotations
-
 import argparse
 import gzip
-import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -28,9 +25,10 @@ from machines.bm2_kernel import BM2Kernel
 from machines.parameters import Sequencer
 from scripts.benches.samplers import CHAINS, THRML_LOCK, Factor, Known, Sampled, pyagrum_gibbs, thrml_gibbs
 from scripts.running.flags import ScriptParser
-from scripts.running.script import print_table, reporting_errors
+from scripts.running.script import print_table
 from scripts.verifications.installation import use_packages
 from scripts.verifications.networks import EXAMPLES, LOCK, load
+from services.errors import SettingsError
 from toolchain.building.options import BuildOptions
 from toolchain.checks.check import check_model
 from toolchain.checks.findings import Finding, Severity
@@ -72,7 +70,7 @@ class Network:
     """The network in pyagrum."""
 
     @classmethod
-    def read(cls, pyagrum: Any, archive: Path) -> Network:
+    def read(cls, pyagrum: Any, archive: Path) -> "Network":
         """Read a compressed BIF file twice."""
         joint = read_network(archive, on_missing="missing")
         zeros = sum(int(np.count_nonzero(factor.table == 0)) for factor in joint.factors)
@@ -217,6 +215,11 @@ def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, flo
 
 def bench(arguments: argparse.Namespace) -> int:
     """Compare all networks; with --check, return 1 if one missed the aim."""
+    arguments.network = arguments.network or list(NO_ZEROS if arguments.check else NETWORKS)
+    arguments.sweeps = arguments.sweeps or (1_000_000 if arguments.check else 20_000)
+    arguments.banks = 5 if arguments.check else 1
+    if arguments.sweeps < BATCHES:
+        raise SettingsError(f"--sweeps must be {BATCHES} or more, not {arguments.sweeps}")
     packages = use_packages("networks", LOCK)
     if arguments.thrml:
         use_packages("thrml", THRML_LOCK)
@@ -236,40 +239,19 @@ def bench(arguments: argparse.Namespace) -> int:
     return int(missed)
 
 
-def main() -> int:
-    """Parse the flags and compare."""
-    parser = ScriptParser(prog="scripts/bench networks", description=__doc__.splitlines()[0])
-    parser.add_argument("--network", action="append", choices=NETWORKS, help="only this one; repeat for more")
-    parser.add_argument(
+if __name__ == "__main__":
+    parser = ScriptParser("scripts/bench networks", __doc__)
+    parser.flag("--network", "only this one; repeat for more", action="append", choices=NETWORKS)
+    parser.flag(
         "--sweeps",
+        f"samples, after {BURN_IN} sweeps of burn-in",
         type=int,
         shown="20000, with --check 1000000",
-        help=f"samples, after {BURN_IN} sweeps of burn-in",
     )
-    parser.add_argument(
-        "--seconds",
-        type=float,
-        default=5.0,
-        help="limit of each run of pyAgrum's sampler, which may do fewer sweeps",
-    )
-    parser.add_argument(
-        "--thrml",
-        action="store_true",
-        help="also compare THRML; installs it, in a folder of its own (530 MB)",
-    )
-    parser.add_argument(
+    parser.flag("--seconds", "limit of each run of pyAgrum's sampler, which may do fewer sweeps", 5.0)
+    parser.switch("--thrml", "also compare THRML; installs it, in a folder of its own (530 MB)")
+    parser.switch(
         "--check",
-        action="store_true",
-        help=f"run networks without zeros from 5 banks of seeds; exit 1 if a median total variation is above {AIM}",
+        f"run networks without zeros from 5 banks of seeds; exit 1 if a median total variation is above {AIM}",
     )
-    arguments = parser.parse_args()
-    arguments.network = arguments.network or list(NO_ZEROS if arguments.check else NETWORKS)
-    arguments.sweeps = arguments.sweeps or (1_000_000 if arguments.check else 20_000)
-    arguments.banks = 5 if arguments.check else 1
-    if arguments.sweeps < BATCHES:
-        parser.error(f"--sweeps must be {BATCHES} or more")
-    return reporting_errors(lambda: bench(arguments))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    parser.run_at_once(bench)

@@ -1,7 +1,5 @@
 """Gibbs samplers of other projects, for comparison: pyAgrum's, and THRML's blocks on JAX."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ One size varies at a time. The lines of a larger machine repeat those of the sma
 readings apart, so that frames of 30 sensors have a posterior too, and the machines differ in nothing but their size.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

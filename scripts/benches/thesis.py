@@ -4,19 +4,16 @@ client --reading--> hub --> subscriber -> master -> pcie-app -> 4 boards -> pcie
                             `-- started for each message, or once ------------------------------'
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
-import sys
 import time
 from collections import defaultdict
 
 from bridge.client import Publication, Ros, Subscription, connect
 from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
 from scripts.benches.cycle import ALL_READINGS, Times, add_seed, message, quantile, readings, until_read
-from scripts.running.flags import ScriptParser, positive
-from scripts.running.script import print_table, run_script
+from scripts.running.flags import ScriptParser
+from scripts.running.script import print_table
 from scripts.running.stand import temporary_stand
 
 RUNS = {"each message": ("--start-each-message",), "once": ()}
@@ -109,17 +106,11 @@ def show(runs: dict[str, Run], arguments: argparse.Namespace) -> None:
     )
 
 
-def main() -> int:
-    """Parse the flags and measure."""
-    parser = ScriptParser(
-        prog="scripts/bench thesis",
-        description="Compare a subscriber and a publisher for each message, as probably in the thesis, with those of a usual run.",
-    )
-    parser.add_argument("--messages", type=positive, default=25, help="number of messages")
-    add_seed(parser)
-    arguments = parser.parse_args()
-    return run_script(lambda: bench(arguments), 600)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser(
+        "scripts/bench thesis",
+        "Compare a subscriber and a publisher for each message, as probably in the thesis, with those of a usual run.",
+    )
+    parser.flag("--messages", "number of messages", 25)
+    add_seed(parser)
+    parser.run(bench, 600)

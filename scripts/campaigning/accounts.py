@@ -1,7 +1,5 @@
 """Accounts of readings: each reading that reached the stack has a result, or is counted under a reason that a fault explains."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -26,7 +24,7 @@ class Counters:
     completed: int = 0
     lost: Mapping[str, int] = field(default_factory=dict)
 
-    def since(self, former: Counters) -> Counters:
+    def since(self, former: "Counters") -> "Counters":
         """Return the increase since earlier counters of the same master."""
         lost = {reason: count - former.lost.get(reason, 0) for reason, count in self.lost.items()}
         return Counters(

@@ -1,7 +1,5 @@
 """The campaign: rounds of faults, until enough frames are judged (see scripts/campaign)."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import random
@@ -98,15 +96,14 @@ def growth(result: RoundResult) -> list[Finding]:
 def main() -> int:
     """Run the command."""
     parser = ScriptParser(
-        prog="scripts/campaign",
-        description="Run the stack, inject faults, and judge every result (docs/how-to/verify.md).",
+        "scripts/campaign", "Run the stack, inject faults, and judge every result (docs/how-to/verify.md)."
     )
-    parser.add_argument("--frames", type=int, default=100_000, help="number of results to judge")
-    parser.add_argument("--seed", type=int, default=1, help="seed of the first round")
+    parser.flag("--frames", "number of results to judge", 100_000)
+    parser.flag("--seed", "seed of the first round", 1, type=int)
     kinds, topologies = [str(kind) for kind in Kind], list(Topology.__members__)
-    parser.add_argument("--only", action="append", choices=kinds, help="only this kind of fault; repeatable")
-    parser.add_argument("--topology", action="append", choices=topologies, help="only this one; repeatable")
-    parser.add_argument("--short", action="store_true", help="run one fixed schedule, about a minute")
+    parser.flag("--only", "only this kind of fault; repeatable", action="append", choices=kinds)
+    parser.flag("--topology", "only this one; repeatable", action="append", choices=topologies)
+    parser.switch("--short", "run one fixed schedule, about a minute")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="bmc") as folder:
         return run_script(lambda: run(options, Path(folder)), LIMIT)

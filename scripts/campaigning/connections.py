@@ -6,8 +6,6 @@
 A proxy delays, holds, cuts, repeats and corrupts data. The client uses only `websockets` and `json`.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json

@@ -1,7 +1,5 @@
 """Correct results of the campaign's readings, from the reference kernel and the deployment's images."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """Faults of a campaign: kinds of faults, the losses that each explains, and seeded schedules."""
 
-from __future__ import annotations
-
 import random
 import sys
 from collections import Counter

@@ -1,7 +1,5 @@
 """Injection of faults into a stack: each begins, lasts for a while, and is undone."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os

@@ -4,8 +4,6 @@ Its caller reports published readings, readings that reached the stack, faults, 
 `/BMresults`. It records everything that is wrong. Counters are judged when nothing is in flight (`accounts.py`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -8,8 +8,6 @@ flight, and then judges the counters. `calm` requires results while there is no 
 excuses.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import random

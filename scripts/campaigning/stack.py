@@ -1,7 +1,5 @@
 """The stack under test: its processes, the proxies between them, and their status."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os

@@ -1,7 +1,5 @@
 """Debian's Chromium on the dashboard of a stand, for `verify dashboard` and `bench dashboard`."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import shutil
@@ -103,7 +101,7 @@ class Visit:
             state,
         )
 
-    async def picture(self, name: str = "") -> Image.Image:
+    async def picture(self, name: str = "") -> "Image.Image":
         """Return a picture of the page, or of the element with a test id."""
         from PIL import Image
 

@@ -1,8 +1,12 @@
 """The flags of the scripts; their help has the style of the commands: NUMBER, a|b, [default: 10]."""
 
 import argparse
+import sys
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
+
+from scripts.running.script import reporting_errors, run_script
 
 
 def positive(text: str) -> int:
@@ -16,10 +20,13 @@ _KINDS: dict[Any, str] = {int: "NUMBER", positive: "NUMBER", float: "NUMBER", Pa
 
 
 class ScriptParser(argparse.ArgumentParser):
-    """A parser that adds kinds of values and defaults to the help; `shown` is a default that the code computes."""
+    """A parser that adds kinds of values and defaults to the help; the description is the first line of a docstring."""
+
+    def __init__(self, prog: str, description: str) -> None:
+        super().__init__(prog, description=description.splitlines()[0])
 
     def add_argument(self, *names: str, shown: str = "", **options: Any) -> argparse.Action:
-        """Add a flag or an argument; see `argparse`."""
+        """Add a flag or an argument as argparse does; `shown` is a default that the code computes."""
         if options.get("action", "append") == "append" and names[0].startswith("-"):
             kind = "|".join(options.get("choices", ())) or _KINDS.get(options.get("type"), "TEXT")
             options.setdefault("metavar", kind)
@@ -29,3 +36,22 @@ class ScriptParser(argparse.ArgumentParser):
         if "help" in options:
             options["help"] = options["help"].replace("%", "%%")  # argparse formats it
         return super().add_argument(*names, **options)
+
+    def flag(self, name: str, text: str, default: Any = None, **options: Any) -> None:
+        """Add a flag whose value has the type of its default, a text without one; an integer must be 1 or more."""
+        kind = positive if isinstance(default, int) else str if default is None else type(default)
+        self.add_argument(name, **{"help": text, "default": default, "type": kind, **options})
+
+    def switch(self, name: str, text: str) -> None:
+        """Add a flag without a value."""
+        self.add_argument(name, action="store_true", help=text)
+
+    def run(self, work: Callable[[argparse.Namespace], Awaitable[int]], limit: float) -> NoReturn:
+        """Parse the flags, run a coroutine of them with a time limit in seconds, and exit."""
+        arguments = self.parse_args()
+        sys.exit(run_script(lambda: work(arguments), limit))
+
+    def run_at_once(self, work: Callable[[argparse.Namespace], int]) -> NoReturn:
+        """Parse the flags, run a function of them, and exit."""
+        arguments = self.parse_args()
+        sys.exit(reporting_errors(lambda: work(arguments)))

@@ -3,8 +3,6 @@
 No check judges how long something takes. A limit only ends a wait for an event that never comes, so all are generous.
 """
 
-from __future__ import annotations
-
 import os
 from typing import Final
 

@@ -1,7 +1,5 @@
 """The main function of a script: its coroutine within a time limit, an error in one sentence, and a table of results."""
 
-from __future__ import annotations
-
 import asyncio
 import sys
 from collections.abc import Awaitable, Callable, Iterable, Sequence

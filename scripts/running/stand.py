@@ -6,8 +6,6 @@ boat-simulator --> boat-normaliser --> hub <--> masters with 4 boards each
                                     dashboard
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os

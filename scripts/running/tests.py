@@ -1,7 +1,5 @@
 """The runs of all tests, one kind after the other (see scripts/test)."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

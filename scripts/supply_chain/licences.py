@@ -1,7 +1,5 @@
 """Check of the licences in a bill of materials against licences.toml (see scripts/bill-of-materials)."""
 
-from __future__ import annotations
-
 import json
 import sys
 import tomllib

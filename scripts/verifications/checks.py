@@ -1,7 +1,5 @@
 """Verdicts and counts, shared by the verifications."""
 
-from __future__ import annotations
-
 import contextlib
 import sys
 import time

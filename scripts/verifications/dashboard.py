@@ -4,8 +4,7 @@ Each check looks at pages in Debian's Chromium, and compares them with what a cl
 receives. No page may report an error or request anything from another computer.
 """
 
-from __future__ import annotations
-
+import argparse
 import asyncio
 import contextlib
 import csv
@@ -13,7 +12,6 @@ import io
 import logging
 import math
 import os
-import sys
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, fields, replace
@@ -37,7 +35,7 @@ from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
 from scripts.running.browser import Browser, Place, Visit, browser
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
-from scripts.running.script import ROOT, run_script
+from scripts.running.script import ROOT
 from scripts.running.stand import PATIENCE, Stand, temporary_stand
 from scripts.verifications.checks import CheckError, Tally, expect
 
@@ -347,7 +345,7 @@ CHECKS: Final[dict[str, Callable[[Scene], Awaitable[None]]]] = {
 }
 
 
-async def verify(only: str, *, pictures: bool) -> int:
+async def verify(arguments: argparse.Namespace) -> int:
     """Start the stack and Chromium, and run the checks."""
     logging.getLogger("bridge").setLevel(logging.CRITICAL)  # the hub is killed on purpose
     os.environ |= {name: f"{limit:g}" for name, limit in PRODUCT_LIMITS.items()}
@@ -362,7 +360,7 @@ async def verify(only: str, *, pictures: bool) -> int:
         for follow in (scene.follow_boat, scene.follow_posteriors):
             stack.callback(asyncio.create_task(follow()).cancel)
         for name, check in CHECKS.items():
-            if only in name and (pictures or check is not draw):
+            if arguments.only in name and (arguments.pictures or check is not draw):
                 await run_check(tally, name, check, scene)
         tally.report("no process has shown a traceback", time.monotonic(), stand.traceback())
     return tally.end()
@@ -382,14 +380,8 @@ async def run_check(tally: Tally, name: str, check: Callable[[Scene], Awaitable[
     tally.report(name, started, why, scene.stand.tails() if why else "")
 
 
-def main() -> int:
-    """Parse the flags and run the checks."""
-    parser = ScriptParser(prog="scripts/verify dashboard", description=__doc__.splitlines()[0])
-    parser.add_argument("--only", default="", help="checks with this in their names")
-    parser.add_argument("--pictures", action="store_true", help="also draw docs/pictures/dashboard*")
-    arguments = parser.parse_args()
-    return run_script(lambda: verify(arguments.only, pictures=arguments.pictures), LIMIT)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser("scripts/verify dashboard", __doc__)
+    parser.flag("--only", "checks with this in their names", "")
+    parser.switch("--pictures", "also draw docs/pictures/dashboard*")
+    parser.run(verify, LIMIT)

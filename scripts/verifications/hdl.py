@@ -6,8 +6,7 @@ units           --> GHDL                               --> values that no machin
 VHDL            --> Verilog (GHDL) --> yosys           --> properties for every input
 """
 
-from __future__ import annotations
-
+import argparse
 import contextlib
 import os
 import select
@@ -32,7 +31,6 @@ from scripts.running.flags import ScriptParser
 from scripts.running.script import ROOT
 from scripts.verifications.checks import Tally
 from scripts.verifications.installation import install_programs
-from services.errors import SettingsError
 from toolchain.hardware import Simulator
 
 SESSIONS: Final = 60
@@ -127,22 +125,11 @@ def mutant_failure(mutant: Mutant) -> str | None:
     return "not found" if found is None else None
 
 
-def main() -> int:
+def verify(arguments: argparse.Namespace) -> int:
     """Run the matrix or the mutants; exit 1 if a check fails or a mutant is not found."""
-    parser = ScriptParser(prog="scripts/verify hdl", description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--mutants", action="store_true", help="check that mistakes in the VHDL are found, one by one"
+    install_programs(
+        {"ghdl": "ghdl"} if arguments.mutants else {each: each for each in Simulator.VERILATOR.tools}
     )
-    parser.add_argument("--sessions", type=int, default=SESSIONS, metavar="N", help="random machines")
-    parser.add_argument("--only", default="", metavar="TEXT", help="what has this in its name")
-    arguments = parser.parse_args()
-    try:
-        install_programs(
-            {"ghdl": "ghdl"} if arguments.mutants else {each: each for each in Simulator.VERILATOR.tools}
-        )
-    except SettingsError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
     checks: dict[str, Callable[[], str | None]]
     if arguments.mutants:
         checks = {each.name: partial(mutant_failure, each) for each in MUTANTS}
@@ -168,4 +155,8 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser("scripts/verify hdl", __doc__)
+    parser.switch("--mutants", "check that mistakes in the VHDL are found, one by one")
+    parser.flag("--sessions", "random machines", SESSIONS, type=int, metavar="N")
+    parser.flag("--only", "what has this in its name", "")
+    parser.run_at_once(verify)

@@ -1,7 +1,5 @@
 """Installation of other software for verifications: packages of PyPI and npm, pinned by hash, and programs of Debian."""
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import os

@@ -4,12 +4,10 @@ pgmpy's wheel (pinned, hashed) --> *.bif --> pyagrum --> tables, the same networ
                                      └─────▶ our readers ──▶ the same tables? ──▶ questions ──▶ pyagrum's posteriors?
 """
 
-from __future__ import annotations
-
+import argparse
 import gzip
 import random
 import re
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -22,7 +20,6 @@ from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters, RngKind
 from machines.posterior import posterior
 from scripts.running.flags import ScriptParser
-from scripts.running.script import reporting_errors
 from scripts.verifications.checks import Tally
 from scripts.verifications.installation import use_packages
 from toolchain.building.quantise import quantise
@@ -263,7 +260,7 @@ def check(tally: Tally, pyagrum: Any, path: Path) -> None:
     tally.report(f"{path.stem}: {len(refused)} refused pairs", began, why)
 
 
-def verify(only: list[str]) -> int:
+def verify(arguments: argparse.Namespace) -> int:
     """Install the library, and check all networks."""
     packages = use_packages("networks", LOCK)
     import pyagrum
@@ -275,19 +272,13 @@ def verify(only: list[str]) -> int:
     with tempfile.TemporaryDirectory(prefix="networks-rosbayes-") as folder:
         for archive in archives:
             path = Path(folder, archive.name.removesuffix(".gz"))
-            if not only or path.stem in only:
+            if not arguments.network or path.stem in arguments.network:
                 path.write_bytes(gzip.decompress(archive.read_bytes()))
                 check(tally, pyagrum, path)
     return tally.end()
 
 
-def main() -> int:
-    """Parse the flags and verify."""
-    parser = ScriptParser(prog="scripts/verify networks", description=__doc__.splitlines()[0])
-    parser.add_argument("--network", action="append", metavar="NAME", help="only this one; repeat for more")
-    arguments = parser.parse_args()
-    return reporting_errors(lambda: verify(arguments.network or []))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser("scripts/verify networks", __doc__)
+    parser.flag("--network", "only this one; repeat for more", action="append", metavar="NAME")
+    parser.run_at_once(verify)

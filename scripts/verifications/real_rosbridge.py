@@ -4,8 +4,6 @@ The server (rosbridge-server-rs, in Rust) and ROS 2 Jazzy's shared libraries com
 real-rosbridge.lock. The libraries are extracted into a folder; Python environments are not changed.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import platform

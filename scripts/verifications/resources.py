@@ -3,8 +3,7 @@
 small machines --> VHDL --> Verilog (GHDL) --> yosys --> as many look-up tables, ALMs and registers as estimated?
 """
 
-from __future__ import annotations
-
+import argparse
 import statistics
 import sys
 import tempfile
@@ -82,14 +81,8 @@ CALIBRATION: Final = (
 """
 
 
-def main() -> int:
+def verify(arguments: argparse.Namespace) -> int:
     """Synthesise the machines one after the other; exit 1 if an error exceeds `WORST_ERROR`."""
-    parser = ScriptParser(prog="scripts/verify resources", description=__doc__.splitlines()[0])
-    parser.add_argument("--calibrate", action="store_true", help="fit the costs again to other machines")
-    parser.add_argument(
-        "--only", default="", metavar="TEXT", help="machines whose parameters have this in it"
-    )
-    arguments = parser.parse_args()
     machines = CALIBRATION if arguments.calibrate else HELD_OUT
     machines = tuple(each for each in machines if arguments.only in described(each))
     if not machines:
@@ -170,4 +163,7 @@ def _costs(relative: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser("scripts/verify resources", __doc__)
+    parser.switch("--calibrate", "fit the costs again to other machines")
+    parser.flag("--only", "machines whose parameters have this in it", "")
+    parser.run_at_once(verify)

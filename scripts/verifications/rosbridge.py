@@ -4,8 +4,6 @@ this project's client ──▶ server ──▶ this project's client: every op
 plain client (websockets and json) ──▶ server ──▶ master ──▶ server ──▶ plain client: a deployment's results
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hashlib
@@ -730,9 +728,9 @@ def _again_alone() -> int:
 
 def main() -> int:
     """Parse the flags and run the checks, with the real server in a network of its own."""
-    parser = ScriptParser(prog="scripts/verify rosbridge", description=__doc__.splitlines()[0])
-    parser.add_argument("--server", choices=["real", "hub", "both"], default="both", help="the servers")
-    parser.add_argument("--only", default="", help="checks with this in their names")
+    parser = ScriptParser("scripts/verify rosbridge", __doc__)
+    parser.flag("--server", "the servers", "both", choices=["real", "hub", "both"])
+    parser.flag("--only", "checks with this in their names", "")
     arguments = parser.parse_args()
     kinds = ["real", "hub"] if arguments.server == "both" else [arguments.server]
     if "real" in kinds and not real_rosbridge.network_is_alone():

@@ -3,8 +3,7 @@
 scripts/wheel --> pip install, with what it depends on --> commands in an empty folder, without PATH
 """
 
-from __future__ import annotations
-
+import argparse
 import subprocess
 import sys
 import tempfile
@@ -14,7 +13,7 @@ from typing import Final
 
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
-from scripts.running.script import ROOT, reporting_errors
+from scripts.running.script import ROOT
 from scripts.verifications.checks import Tally, expect
 from scripts.verifications.installation import pip, run
 
@@ -134,26 +133,20 @@ CHECKS: Final[dict[str, Callable[[Installed], None]]] = {
 }
 
 
-def verify(only: str) -> int:
+def verify(arguments: argparse.Namespace) -> int:
     """Install the wheel, and check it."""
     tally = Tally()
     with tempfile.TemporaryDirectory(prefix="wheel-rosbayes-") as folder:
         print("installing the wheel ...", flush=True)
         installed = Installed(Path(folder))
         for name, check in CHECKS.items():
-            if only in name:
+            if arguments.only in name:
                 with tally.check(name, OSError, subprocess.TimeoutExpired):
                     check(installed)
     return tally.end()
 
 
-def main() -> int:
-    """Parse the flags and verify."""
-    parser = ScriptParser(prog="scripts/verify wheel", description=__doc__.splitlines()[0])
-    parser.add_argument("--only", default="", metavar="TEXT", help="checks with this in their names")
-    arguments = parser.parse_args()
-    return reporting_errors(lambda: verify(arguments.only))
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser("scripts/verify wheel", __doc__)
+    parser.flag("--only", "checks with this in their names", "")
+    parser.run_at_once(verify)

@@ -1,13 +1,10 @@
 """Tests of other projects on the hub: roslibpy's own suites, and typical uses of roslib (scripts/verify conformance)."""
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import os
 import re
 import shutil
-import sys
 import time
 from collections.abc import Awaitable, Callable
 from functools import partial
@@ -18,7 +15,6 @@ from urllib.parse import urlsplit
 from bridge.client import GoalRequest, connect
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR
-from scripts.running.script import run_script
 from scripts.running.stand import Stand, temporary_stand
 from scripts.verifications.checks import Tally
 from scripts.verifications.installation import install_node_packages, install_roslibpy
@@ -123,13 +119,7 @@ async def verify(arguments: argparse.Namespace) -> int:
     return tally.end()
 
 
-def main() -> int:
-    """Parse the flags and run the tests."""
-    parser = ScriptParser(prog="scripts/verify conformance", description=__doc__.splitlines()[0])
-    parser.add_argument("--only", default="", help="runs with this in their names, such as roslibpy")
-    arguments = parser.parse_args()
-    return run_script(lambda: verify(arguments), 1800 * FACTOR)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser("scripts/verify conformance", __doc__)
+    parser.flag("--only", "runs with this in their names, such as roslibpy", "")
+    parser.run(verify, 1800 * FACTOR)

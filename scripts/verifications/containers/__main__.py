@@ -4,8 +4,6 @@ scripts/container-engine provides the engine, so a bare Debian machine suffices.
 the project. After each fault, a client container recomputes results with the reference kernel.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
@@ -434,14 +432,10 @@ def in_engine(arguments: list[str]) -> int:
 
 def main() -> int:
     """Check that this machine can run it, then run it with a time limit."""
-    parser = ScriptParser(prog="scripts/verify containers", description=__doc__)
-    parser.add_argument(
-        "--only", default="", help="only the checks with this in their names, and what they need"
-    )
-    parser.add_argument(
-        "--short", action="store_true", help="build, start, compare results, kill a service, stop"
-    )
-    parser.add_argument("--fetch", action="store_true", help="only download the wheels")
+    parser = ScriptParser("scripts/verify containers", __doc__)
+    parser.flag("--only", "only the checks with this in their names, and what they need", "")
+    parser.switch("--short", "build, start, compare results, kill a service, stop")
+    parser.switch("--fetch", "only download the wheels")
     options = parser.parse_args()
 
     try:

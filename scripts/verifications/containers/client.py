@@ -3,8 +3,6 @@
 client.py URI COUNT     compares cycles, counts and posteriors of COUNT results exactly, and prints a line for each
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 import sys

@@ -1,7 +1,5 @@
 """The sources of the image, with the wheels of the lock file, and time limits for this machine."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

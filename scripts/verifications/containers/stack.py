@@ -1,7 +1,5 @@
 """The compose project on the engine of scripts/container-engine, in which this process runs."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -5,15 +5,13 @@ boat-simulator --> boat-normaliser --> hub <--> master with 4 boards
                                         `--cbor-raw--> this --> a node of ROS 1 (ros_node.py) --> rviz on Xvfb
 """
 
-from __future__ import annotations
-
+import argparse
 import asyncio
 import base64
 import json
 import math
 import os
 import shutil
-import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -31,7 +29,7 @@ from posteriors.standard_messages import Level
 from scripts.running.browser import Place
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
-from scripts.running.script import ROOT, run_script
+from scripts.running.script import ROOT
 from scripts.running.stand import PATIENCE, Stand, free_port, temporary_stand
 from scripts.verifications.checks import CheckError, Tally
 from scripts.verifications.installation import install_node_packages, install_programs
@@ -131,7 +129,7 @@ async def rviz(scene: Scene) -> None:
         picture.quantize().save(PICTURES / "rviz.png", optimize=True)
 
 
-def flaw_of(picture: Image.Image, grid: dict[str, Any], pose: dict[str, Any]) -> str | None:
+def flaw_of(picture: "Image.Image", grid: dict[str, Any], pose: dict[str, Any]) -> str | None:
     """Return how the picture of rviz's window differs from grid and pose; None if it shows them."""
     pixels = np.asarray(picture.convert("RGB"), int)
     grey = (pixels == BACKGROUND).all(axis=2)
@@ -201,16 +199,20 @@ async def foxglove(scene: Scene) -> None:
 CHECKS: Final = {"1": {"Foxglove's readers": foxglove, "rviz": rviz}, "2": {"Foxglove's readers": foxglove}}
 
 
-async def verify(only: str, *, pictures: bool) -> int:
+async def verify(arguments: argparse.Namespace) -> int:
     """Run a stack for each version of ROS, and let the tools read its topics."""
     os.environ |= {name: f"{limit:g}" for name, limit in PRODUCT_LIMITS.items()}
     tally = Tally()
     for version, checks in CHECKS.items():
-        chosen = {name: check for tool, check in checks.items() if only in (name := f"{tool}, ROS {version}")}
+        chosen = {
+            name: check
+            for tool, check in checks.items()
+            if arguments.only in (name := f"{tool}, ROS {version}")
+        }
         if not chosen:
             continue
         async with temporary_stand() as stand:
-            scene = Scene(stand, version, pictures)
+            scene = Scene(stand, version, arguments.pictures)
             await stand.start_hub("--ros-version", version)
             await stand.start_boat_master()
             await stand.start_boat()
@@ -223,16 +225,8 @@ async def verify(only: str, *, pictures: bool) -> int:
     return tally.end()
 
 
-def main() -> int:
-    """Parse the flags and run the checks."""
-    parser = ScriptParser(prog="scripts/verify tools", description=__doc__.splitlines()[0])
-    parser.add_argument("--only", default="", help="checks with this in their names, such as rviz")
-    parser.add_argument(
-        "--pictures", action="store_true", help="also draw docs/pictures/rviz.png and topic-*"
-    )
-    arguments = parser.parse_args()
-    return run_script(lambda: verify(arguments.only, pictures=arguments.pictures), LIMIT)
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = ScriptParser("scripts/verify tools", __doc__)
+    parser.flag("--only", "checks with this in their names, such as rviz", "")
+    parser.switch("--pictures", "also draw docs/pictures/rviz.png and topic-*")
+    parser.run(verify, LIMIT)
