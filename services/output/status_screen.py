@@ -22,6 +22,7 @@ from services.sockets.status import (
     ask_stack,
 )
 from terminal.errors import ExitCode
+from toolchain.errors import counted
 
 _WATCH_INTERVAL = 1.0
 _PLAIN_WIDTH = 140
@@ -46,7 +47,10 @@ def screen(stack: StackStatus) -> RenderableType:
     if any(process.connections for process in stack.processes):
         parts += [Text(""), _connections(stack)]
     parts += [
-        Text(f"\n{plain(process.name)}: {hub.clients} clients, {hub.topics} topics, {hub.services} services")
+        Text(
+            f"\n{plain(process.name)}: {counted(hub.clients, 'client')}, {counted(hub.topics, 'topic')}, "
+            f"{counted(hub.services, 'service')}"
+        )
         for process in stack.processes
         if (hub := process.hub) is not None
     ]
@@ -58,7 +62,9 @@ def screen(stack: StackStatus) -> RenderableType:
 
 def _verdict(stack: StackStatus) -> Iterator[RenderableType]:
     if stack.ready:
-        yield Text(f"{stack.directory}: all {len(stack.processes)} processes are ready", "green")
+        names = [plain(process.name) for process in stack.processes]
+        ready = f"{names[0]} is ready" if len(names) == 1 else f"all {len(names)} processes are ready"
+        yield Text(f"{stack.directory}: {ready}", "green")
     else:
         yield Text(f"{stack.directory}: not ready", "bold red")
         more = max(0, len(stack.silent) - _SILENT_SHOWN)  # the sentences about them are the last ones
@@ -213,10 +219,14 @@ async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) 
             stack = await ask_stack(directory, shared=needs_master)
             if not stack.processes and not watch:
                 break
-            put(stack)
             names = [each.name for each in stack.processes] + [each.name for each in stack.silent]
             if needs_master and "master" not in names and not watch:
-                raise SettingsError(f"no master runs in {directory}; start one, or name its --run-directory")
+                # instead of a screen, which would say that all is ready
+                others = ", ".join(map(plain, names[:_SENTENCES])) + (", ..." if names[_SENTENCES:] else "")
+                raise SettingsError(
+                    f"no master runs in {directory}, only {others}; start one, or name its --run-directory"
+                )
+            put(stack)
             if not watch:
                 return ExitCode.DONE if stack.ready else ExitCode.CHILD
             await asyncio.sleep(_WATCH_INTERVAL)

@@ -185,8 +185,10 @@ async def test_what_a_process_says_can_not_write_over_the_terminal(tmp_path):
 async def test_a_user_s_own_run_needs_a_master(tmp_path, capsys):
     async with served(tmp_path, hub=process(hub=HubStatus(3, 5, 7))):
         assert await show(tmp_path, needs_master=False, watch=False, json=False) == 0
-        with pytest.raises(SettingsError):
+        assert f"{tmp_path}: hub is ready" in capsys.readouterr().out
+        with pytest.raises(SettingsError, match="no master runs in .*, only hub; start one"):
             await show(tmp_path, needs_master=True, watch=False, json=False)
+        assert not capsys.readouterr().out
         async with served(tmp_path, master=process()):
             assert await show(tmp_path, needs_master=True, watch=False, json=True) == 0
     assert '"clients":3' in capsys.readouterr().out
