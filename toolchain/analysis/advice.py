@@ -1,7 +1,7 @@
 """Advice on the machine for a question: BM1, BM2, and exact inference on this host, at one accuracy (thesis 5.2).
 
 Both machines are emulated on readings drawn from the model, and run longer until the mean total variation from exact
-inference is as asked. A machine that does not reach it within `MOST_CYCLES` says how near it came.
+inference is as asked. A machine that does not reach it within `MOST_CYCLES` says how near it came, and why.
 """
 
 import json
@@ -112,7 +112,7 @@ class Advice:
             if each.refused or each.unfit:
                 rows.append(f"{each.machine}: {each.refused or f'on a {self.device} {each.unfit}'}.")
             elif each.total_variation > self.accuracy:
-                rows.append(f"{each.machine}: it comes no nearer in {MOST_CYCLES:,} cycles.")
+                rows.append(_why_short(each, self.accuracy))
         heading = (
             f"{self.model}: {self.question}, to a mean total variation of {self.accuracy:g} over "
             f"{self.frames} readings"
@@ -120,10 +120,16 @@ class Advice:
         return "\n".join([heading, *rows, exact, self.recommendation]) + "\n"
 
 
-def advise(source: Model | Question, options: AdviceOptions) -> Advice:
-    """Compare the machines for a model or a question, or raise a ToolchainError if exact inference is impossible."""
+def advise(
+    source: Model | Question, options: AdviceOptions, begun: Callable[[str], None] = lambda _: None
+) -> Advice:
+    """Compare the machines for a model or a question, or raise a ToolchainError if exact inference is impossible.
+
+    `begun` is called at the beginning of each run, with a text about it.
+    """
     device = device_named(options.device)
     network = network_for(source)
+    begun("exact inference")
     readings = drawn_readings(network, options.frames, options.seed)
     times = []
     for addresses in readings:
@@ -131,8 +137,8 @@ def advise(source: Model | Question, options: AdviceOptions) -> Advice:
         network.exact(addresses)
         times.append(perf_counter() - began)
     machines = (
-        _candidate("BM1", options.clock_hz, lambda: _bm1(source, options, device)),
-        _candidate("BM2", options.clock_hz, lambda: _bm2(network, readings, options, device)),
+        _candidate("BM1", options.clock_hz, lambda: _bm1(source, options, device, begun)),
+        _candidate("BM2", options.clock_hz, lambda: _bm2(network, readings, options, device, begun)),
     )
     exact = median(times)
     known = f" | {', '.join(network.known)}" if network.known else ""
@@ -161,7 +167,9 @@ def _candidate(machine: str, clock_hz: float, run: Callable[[], _Run]) -> Candid
     )
 
 
-def _bm1(source: Model | Question, options: AdviceOptions, device: Device) -> _Run:
+def _bm1(
+    source: Model | Question, options: AdviceOptions, device: Device, begun: Callable[[str], None]
+) -> _Run:
     """Run a BM1 with the narrowest codes that are exact enough, on as many boards as its lines need."""
     model = source.model() if isinstance(source, Question) else source
     readings = sample_readings(model, options.frames, seed=options.seed)
@@ -171,6 +179,7 @@ def _bm1(source: Model | Question, options: AdviceOptions, device: Device) -> _R
         return measure(boards, readings, model, banks=1)
 
     for prob_bits in _WIDTHS:
+        begun(f"BM1, codes of {prob_bits} bits")
         plan = plan_machine(model, BuildOptions(prob_bits=prob_bits, counter_bits=32))
         machine = whole_machine(plan, plan.quantised())
         lost = measured(machine, 1).quantising
@@ -178,6 +187,7 @@ def _bm1(source: Model | Question, options: AdviceOptions, device: Device) -> _R
             break
 
     def run(target: int) -> tuple[float, float]:
+        begun(f"BM1, target count {target:,}")
         found = measured(machine, target)
         return found.machine.total_variation.value if found.machine else 1.0, found.cycles.median.value
 
@@ -189,13 +199,18 @@ def _bm1(source: Model | Question, options: AdviceOptions, device: Device) -> _R
 
 
 def _bm2(
-    network: NetworkModel, readings: Sequence[Addresses], options: AdviceOptions, device: Device
+    network: NetworkModel,
+    readings: Sequence[Addresses],
+    options: AdviceOptions,
+    device: Device,
+    begun: Callable[[str], None],
 ) -> _Run:
     """Run a BM2 with the default options on one board."""
     plan = plan_bm2(network, BuildOptions())
     machines = chain_machines(plan)
 
     def run(samples: int) -> tuple[float, float]:
+        begun(f"BM2, {samples:,} samples")
         found = run_chains(machines, readings, network, samples=samples, max_cycles=plan.max_cycles)
         return found.total_variation.value if found.total_variation else 1.0, found.cycles.median.value
 
@@ -220,6 +235,22 @@ def _run_until(
     enough = {each: tv for each, (tv, _) in tried.items() if tv <= accuracy}
     best = min(enough) if enough else min(tried, key=lambda each: tried[each][0])
     return (best, *tried[best])
+
+
+def _why_short(machine: Candidate, accuracy: float) -> str:
+    """Return the sentence about a machine that is less accurate than asked, with what to change."""
+    if machine.cycles < _NEAR * MOST_CYCLES:
+        return (
+            f"{machine.machine}: its codes of {machine.prob_bits} bits, not its cycles, limit its accuracy; ask for less with "
+            "--accuracy."
+        )
+    # the error falls with the root of the setting
+    enough = float(f"{machine.setting * (machine.total_variation / accuracy) ** 2:.1e}")
+    flag = "--samples" if machine.machine == "BM2" else "--target-count"
+    return (
+        f"{machine.machine}: frames end at the limit of {MOST_CYCLES:,} cycles; ask for less with --accuracy, or build it with "
+        f"about {flag} {enough:.0f}."
+    )
 
 
 def _recommendation(machines: Sequence[Candidate], exact: float, accuracy: float) -> str:

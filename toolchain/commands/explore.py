@@ -20,8 +20,11 @@ RESULTS = Path("build/explore.jsonl")
 
 
 @contextmanager
-def progress(total: int) -> Iterator[Callable[[str], None]]:
-    """Show a bar on a terminal, nothing elsewhere; yield a function to call with a text after each step."""
+def progress(total: int | None) -> Iterator[Callable[[str], None]]:
+    """Show a bar on a terminal, nothing elsewhere; yield a function to call with a text after each step.
+
+    Without a total, the bar only moves.
+    """
     if not sys.stderr.isatty():
         yield lambda _: None
         return
@@ -88,7 +91,8 @@ def advise(
     """
     from toolchain.analysis.advice import advise as compare
 
-    found = compare(read_source(model, flags), options)
+    with progress(None) as begun:
+        found = compare(read_source(model, flags), options, begun)
     typer.echo(found.as_json() if json else found.report(), nl=False)
 
 

@@ -5,7 +5,9 @@ import json
 import pytest
 
 from tests.toolchain.running import TARGET, assert_refused, done, toolchain
-from toolchain.analysis.advice import Candidate, _recommendation, _run_until
+from toolchain.analysis import AdviceOptions
+from toolchain.analysis.advice import Candidate, _recommendation, _run_until, _why_short, advise
+from toolchain.commands.request import ModelFlags, read_source
 
 QUESTION = ("--searched", "rain", "--known", "sprinkler,grass")
 """A BM1 cannot answer it: both are causes of the grass."""
@@ -100,6 +102,33 @@ def test_advice_says_why_a_bm1_cannot_answer(network):
     assert [each["cycles"] is None for each in found["machines"]] == [True, False]
     assert_refused(toolchain("advise", network), "give the searched and known variables")
     assert_refused(toolchain("advise", network, *QUESTION, "--device", "x"), "--device x")
+
+
+def test_advice_tells_what_it_runs(network):
+    begun = []
+    source = read_source(network, ModelFlags(searched="rain", known="grass"))
+    advise(source, AdviceOptions(accuracy=0.3, frames=2), begun.append)
+    assert begun[:3] == ["exact inference", "BM1, codes of 8 bits", "BM1, target count 255"]
+    assert "BM2, 1,000 samples" in begun[3:]
+
+
+@pytest.mark.parametrize(
+    ("machine", "words"),
+    [
+        (
+            Candidate("BM2", "", 16, 3_000_000, 0.002, 29_990_000),
+            ("limit of 30,000,000 cycles", "--accuracy", "with about --samples 12000000."),
+        ),
+        (
+            Candidate("BM1", "", 8, 1_000_000, 0.002, 30_100_000),
+            ("limit of 30,000,000 cycles", "--accuracy", "with about --target-count 4000000."),
+        ),
+        (Candidate("BM1", "", 16, 5000, 0.002, 9000), ("codes of 16 bits, not its cycles", "--accuracy")),
+    ],
+)
+def test_a_machine_that_is_less_accurate_says_why(machine, words):
+    said = _why_short(machine, 0.001)
+    assert [each for each in words if each not in said] == []
 
 
 FAST = Candidate(machine="BM1", total_variation=0.01, seconds=1e-6)
