@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Thread
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import typer
 
@@ -218,6 +218,14 @@ async def _load_kernels() -> None:
     await loaded.wait()
 
 
+def _ends(case: Case, count: int | None, master: Process, viewer: Process) -> list[asyncio.Future[Any]]:
+    """Return the ends of master and viewer; if that master has no count, also the viewer's line before it draws."""
+    ends: list[asyncio.Future[Any]] = [asyncio.ensure_future(each.succeed()) for each in (master, viewer)]
+    if count is not None and not case.is_frame:
+        ends.append(asyncio.ensure_future(viewer.line(rf"^ *{count} ")))
+    return ends
+
+
 async def _run(
     case: Case,
     uri: str | None,
@@ -243,7 +251,7 @@ async def _run(
     deployment = out / "deployment"
     saying = asyncio.create_task(screen.say_what_it_waits_for())
     building = None
-    ends: list[asyncio.Future[None]] = []
+    ends: list[asyncio.Future[Any]] = []
     try:
         screen.waits_for = "building the deployment, loading the kernels, which a first start compiles"
         if uri is None:
@@ -287,7 +295,7 @@ async def _run(
             address = await processes["dashboard"].line(r"http://\S+")
             saying.cancel()
             screen.show(f"open {address[0]} in a browser{case.pointer}")
-        ends = [asyncio.ensure_future(each.succeed()) for each in (master, viewer)]
+        ends = _ends(case, count, master, viewer)
         # a failure of one need not wait for the other's timeout; a master without a count ends only so
         await next(iter((await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED))[0]))
         if case.is_frame:
