@@ -126,13 +126,7 @@ class SchedulerOptions:
         if parts.scheme == "tls" and missing:
             raise BuildError(f"--scheduler {self.scheduler} needs {', '.join(missing)} too")
         if parts.scheme == "tls":
-            try:
-                ssl.create_default_context(cafile=self.tls_ca_file).load_cert_chain(
-                    str(self.tls_cert), self.tls_key, password=lambda: ""
-                )
-            except OSError as reason:
-                names = ", ".join(str(file) for file in files.values())
-                raise BuildError(f"one of {names} cannot be used: {reason.strerror or reason}") from None
+            _check_certificates(files)
         if parts.scheme == "tcp" and len(missing) < len(files):
             raise BuildError(f"--scheduler {self.scheduler} does not use TLS: write tls:// instead of tcp://")
         if parts.scheme == "tcp" and not self.insecure and not _is_loopback(parts.hostname or ""):
@@ -140,6 +134,23 @@ class SchedulerOptions:
                 f"--scheduler {self.scheduler}: without TLS, everybody on the way there can run programs as this user; use "
                 "tls:// with --tls-ca-file, --tls-cert and --tls-key, or --insecure"
             )
+
+
+def _check_certificates(files: dict[str, Path | None]) -> None:
+    """Raise a BuildError that names the flag and the file which cannot be used."""
+    context = ssl.create_default_context()
+    for flag, file in files.items():
+        try:
+            if flag == "--tls-key":
+                context.load_cert_chain(str(files["--tls-cert"]), file, password=lambda: "")
+            else:
+                context.load_verify_locations(file)
+        except OSError as reason:
+            if isinstance(reason, ssl.SSLError) and reason.reason == "KEY_VALUES_MISMATCH":
+                raise BuildError(
+                    f"{flag} {file} is not the key of --tls-cert {files['--tls-cert']}"
+                ) from None
+            raise BuildError(f"{flag} {file} cannot be used: {reason.strerror or reason}") from None
 
 
 def _is_loopback(host: str) -> bool:

@@ -296,10 +296,7 @@ def test_whatever_else_listens_there_is_one_sentence():
             {"scheduler": "tls://10.0.0.1:8786", "tls_cert": Path("own.pem")},
             "needs --tls-ca-file, --tls-key too",
         ),
-        (
-            {"scheduler": "tls://10.0.0.1:8786", **FILES},
-            "one of ca.pem, own.pem, key.pem cannot be used: No such file",
-        ),
+        ({"scheduler": "tls://10.0.0.1:8786", **FILES}, "^--tls-ca-file ca.pem cannot be used: No such file"),
         ({"scheduler": "local", "tls_key": Path("key.pem")}, "--tls-key is for --scheduler tls://HOST:PORT"),
         ({"tls_key": Path("key.pem")}, "--tls-key is for --scheduler tls://HOST:PORT"),
     ],
@@ -307,6 +304,38 @@ def test_whatever_else_listens_there_is_one_sentence():
 def test_wrong_flags_of_a_scheduler(options, sentence):
     with pytest.raises(BuildError, match=sentence):
         SchedulerOptions(**options)
+
+
+@pytest.mark.parametrize(
+    ("flag", "content", "sentence"),
+    [
+        ("tls_ca_file", "garbage", "--tls-ca-file {} cannot be used: "),
+        ("tls_cert", "garbage", "--tls-cert {} cannot be used: "),
+        ("tls_key", "garbage", "--tls-key {} cannot be used: "),
+        ("tls_key", None, "--tls-key {} cannot be used: No such file"),
+        ("tls_key", "another", "--tls-key {} is not the key of --tls-cert "),
+    ],
+)
+def test_the_file_of_tls_that_is_wrong_is_named(tmp_path, flag, content, sentence):
+    from distributed import Security
+
+    made, another = Security.temporary(), Security.temporary().tls_client_key
+    contents = {
+        "tls_ca_file": made.tls_ca_file,
+        "tls_cert": made.tls_client_cert,
+        "tls_key": made.tls_client_key,
+    }
+    files = {key: tmp_path / f"{key}.pem" for key in contents}
+    for key, text in contents.items():
+        files[key].write_text(text)
+    SchedulerOptions(scheduler="tls://10.0.0.1:8786", **files)
+    if content is None:
+        files[flag].unlink()
+    else:
+        files[flag].write_text(another if content == "another" else content)
+    with pytest.raises(BuildError) as caught:
+        SchedulerOptions(scheduler="tls://10.0.0.1:8786", **files)
+    assert str(caught.value).startswith(sentence.format(files[flag]))
 
 
 @pytest.mark.parametrize(
