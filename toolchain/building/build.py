@@ -109,11 +109,12 @@ def build_deployment(
 
 
 def assemble(
-    plan: MachinePlan | BM2Plan, place: Callable[[Deployment], Deployment] = lambda deployment: deployment
+    plan: MachinePlan | BM2Plan,
+    place: Callable[[Deployment, Sequence[Image]], Deployment] = lambda deployment, _: deployment,
 ) -> Built:
     """Return a deployment without writing anything, or raise a BuildError; `place` may change its topics and paths."""
     model, options, quantised = plan.model, plan.options, None
-    _variables(plan)  # refuses --order and --path before the tables are computed
+    known_variables(plan)  # refuses --order and --path before the tables are computed
     machines: Sequence[BM1Machine | BM2Machine]
     if isinstance(plan, BM2Plan):
         machines = chain_machines(plan)
@@ -139,7 +140,7 @@ def assemble(
         )
         for board, (machine, block) in enumerate(zip(machines, layout.blocks, strict=True))
     )
-    deployment = place(describe(plan, layout, images))
+    deployment = place(describe(plan, layout, images), images)
     return Built(
         deployment=deployment,
         images=images,
@@ -210,7 +211,7 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
             queue=options.queue,
             tolerance_s=options.tolerance_s,
             sources=options.all_sources,
-            variables=_variables(plan),
+            variables=known_variables(plan),
             searched=model.searched,
             hidden=hidden,
             machine=section(
@@ -239,8 +240,11 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
     return with_hash(deployment)
 
 
-def _variables(plan: MachinePlan | BM2Plan) -> tuple[Variable, ...]:
-    """Return the known variables; with `threshold`, the values of a sensor are the codes."""
+def known_variables(plan: MachinePlan | BM2Plan) -> tuple[Variable, ...]:
+    """Return the known variables; with `threshold`, the values of a sensor are the codes.
+
+    A BuildError if `--order`, `--path` or a sources file names what the model does not have.
+    """
     options, variables = plan.options, plan.model.variables
     variables = variables if options.sources is None else options.sources.place(variables)
     variables = placed(variables, options.order, options.path)

@@ -96,7 +96,13 @@ def regenerate_memories(
         _options(deployment, images[0]), model_flags=flags or ModelSection(), build_date=build_date
     )
     plan = _plan(model, options, deployment, images[0])
-    built = assemble(plan, lambda new: _with_places(new, deployment))
+
+    def place(new: Deployment, of: Sequence[Image]) -> Deployment:
+        # an image of the same model that is not the built one has edited parameters, which may be undone later
+        same_model = of[0].model_hash == images[0].model_hash
+        return _with_places(new, deployment, keeps_built=same_model)
+
+    built = assemble(plan, place)
     parts = [
         image_files(built.deployment, built.images),
         filter_file(built.transition),
@@ -212,8 +218,11 @@ def _listed(values: Sequence[object]) -> str:
     )
 
 
-def _with_places(new: Deployment, old: Deployment) -> Deployment:
-    """Return the new deployment with the servers, topics, order, paths and endpoints of the old one."""
+def _with_places(new: Deployment, old: Deployment, *, keeps_built: bool) -> Deployment:
+    """Return the new deployment with the servers, topics, order, paths and endpoints of the old one.
+
+    With `keeps_built`, an image that is not the one that was built keeps the hash of that one.
+    """
     before = {variable.table_of or variable.name: variable for variable in old.variables}
     kept = ("sources", "outputs", "topics", "queue", "tolerance_s", "prior", "directory")
     deployment = new.replace(
@@ -230,7 +239,10 @@ def _with_places(new: Deployment, old: Deployment) -> Deployment:
             for own in (before[variable.name],)
         ),
         boards=tuple(
-            board.replace(endpoint=other.endpoint)
+            board.replace(
+                endpoint=other.endpoint,
+                built_hash=other.built_hash if keeps_built and other.built_hash != board.image_hash else None,
+            )
             for board, other in zip(new.boards, old.boards, strict=True)
         ),
     )

@@ -56,7 +56,7 @@ def build(
     """
     from toolchain.analysis.lost_frames import lost_frames
     from toolchain.building.bm2_machine import plan_bm2
-    from toolchain.building.build import REPORT_NAME, Built, build_date, build_deployment
+    from toolchain.building.build import REPORT_NAME, Built, build_date, build_deployment, known_variables
     from toolchain.building.choice import model_for
     from toolchain.building.machine import MachinePlan, plan_machine
     from toolchain.models.network import NetworkModel
@@ -72,6 +72,7 @@ def build(
         plan, why = plan_bm2(chosen, dated, reason), ""
     else:
         plan, why = fit_to_device(plan_machine(chosen, dated), flags.device)
+    known_variables(plan)  # refuses --order and --path before it says that it builds
     typer.echo(f"Building a {plan.kind}, since {plan.why}", err=True)
     typer.echo(f"Quantising {plan.model.name} and writing its images", err=True)
 

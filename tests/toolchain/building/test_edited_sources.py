@@ -132,7 +132,7 @@ def test_every_form_of_a_memory_is_read(built):
 
 
 def test_edited_parameters_are_those_of_the_machine(case, built):
-    path = built / PARAMETERS
+    path, originals = built / PARAMETERS, contents(built)
     edit(path, "STEPS_PER_CLOCK   : positive := 8", "STEPS_PER_CLOCK : positive := 1 -- slower\n ")
     edit(path, "RNG_RESET_BANK    : boolean := true", "RNG_RESET_BANK : Boolean := FALSE")
     edit(path, 'x"0000007F"' if 'x"0000007F"' in path.read_text() else 'x"000000FF"', 'x"00000040"')
@@ -151,6 +151,20 @@ def test_edited_parameters_are_those_of_the_machine(case, built):
     # the model has no parameters, and the deployment only the edited ones
     assert PARAMETERS in done(toolchain("regenerate", "memories", built, "--model", case)).stderr
     assert load_deployment(built).machine == machine
+    assert load_deployment(built).edited_boards == (0, 1)
+    path.write_bytes(originals[PARAMETERS])  # undone: the deployment that was built
+    done(toolchain("regenerate", "images", built))
+    # whose report is that of the edited parameters
+    assert contents(built) | {"report.txt": originals["report.txt"]} == originals
+
+
+def test_another_model_is_no_edit(case, built):
+    """Its codes replace an edit of the codes, as a build would."""
+    with_word(built / COLUMN, 3, lambda word: word ^ 1)
+    done(toolchain("regenerate", "images", built))
+    edit(case / "model.py", "sigma=sigma", "sigma=2 * sigma")
+    done(toolchain("regenerate", "memories", built, "--model", case))
+    assert load_deployment(built).edited_boards == ()
 
 
 def interrupted(monkeypatch, folder, last):

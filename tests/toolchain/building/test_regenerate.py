@@ -176,6 +176,7 @@ def test_a_misspelt_variable_is_named_with_the_nearest_one(case, built, wrong, m
         regenerate("deployment", built, *wrong, code=2),
     ):
         assert_refused(result, wrong[0], "did you mean 'D2'?")
+        assert "Quantising" not in result.stderr
     assert not (case.parent / "new").exists()
 
 
