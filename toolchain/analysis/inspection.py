@@ -25,7 +25,7 @@ from toolchain.building.build import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
 from toolchain.building.report import edited_sentence, loss_heading, many_sentence
 from toolchain.cluster import Run, in_this_process
-from toolchain.deployment import Deployment, Scale
+from toolchain.deployment import Deployment, Scale, Stop
 from toolchain.errors import BuildError, counted
 from toolchain.models.model import Model
 from toolchain.outputs.mif import table_length
@@ -263,10 +263,20 @@ def _time_part(found: Inspection) -> str:
         row = f"  {name:6}  {count:10,.0f}  {with_unit(count / found.clock_hz, 's'):>10}"
         rows.append(row + (f"   {interval.low:,.0f}..{interval.high:,.0f}" if interval else ""))
     kept = "posteriors" if found.deployment.machine.replicas > 1 else "frames"
-    rows.append(
-        f"  {found.accuracy.overflow:.0%} of runs end with an overflow; without a posterior: {found.accuracy.without:.1%} of "
-        f"runs (in {found.accuracy.impossible:.1%} of {kept} no line can count)."
-    )
+    machine = found.deployment.machine
+    if machine.stop is Stop.OWN and len(found.deployment.boards) > 1:
+        rule = (
+            f"stops that board alone (stop = own); boards without one end after {machine.max_cycles} cycles"
+        )
+    else:
+        rule = f"is the stop rule; the other runs end after {machine.max_cycles} cycles"
+    rows += [
+        f"  In {found.accuracy.overflow:.0%} of runs a count reaches {machine.target_count}: this overflow {rule}.",
+        (
+            f"  Without a posterior: {found.accuracy.without:.1%} of runs (in {found.accuracy.impossible:.1%} of {kept} no line "
+            "can count)."
+        ),
+    ]
     if found.deployment.machine.replicas > 1:
         replicas = found.deployment.machine.replicas
         rows.append(

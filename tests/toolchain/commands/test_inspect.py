@@ -37,6 +37,13 @@ def test_with_the_model_and_without(case, deployment):
     assert "by quantising alone" not in text
 
 
+def test_the_overflow_is_explained_as_the_stop_rule(case, deployment):
+    assert "a count reaches 255: this overflow is the stop rule" in done(look(deployment)).stdout
+    own = case.parent / "own"
+    done(toolchain("build", case, "-o", own, *TARGET, "--partitions", 2, "--stop", "own"))
+    assert "this overflow stops that board alone (stop = own); boards without one end" in look(own).stdout
+
+
 def test_json(case, deployment):
     found = json.loads(look(deployment, "--model", str(case), "--json").stdout)
     assert (found["lines"], found["columns"], found["boards"], found["clock_hz"]) == (12, 3, 2, 100e6)
