@@ -242,7 +242,8 @@ class Frames:
     Attributes:
         readings: Those of all rows; a row that does not fit has none.
         fits: bool[rows], whether the readings are values that the machine takes; without, there is no posterior.
-        stamps: int64[rows], nanoseconds: of the messages of a bag, or else 0, 1, 2, ..., the numbers of the rows.
+        stamps: int64[rows], nanoseconds: of the messages of a bag or the column of a CSV file, or else 0, 1, 2, ..., the
+            numbers of the rows.
         why: What is wrong with the first row that does not fit; empty if all do.
     """
 
@@ -268,7 +269,9 @@ def recorded_frames(
     unnamed = [each.name for each in variables if each.name not in columns and each.on_missing == "error"]
     if unnamed:
         raise BuildError(f"{', '.join(unnamed)}: no column; add --reading {unnamed[0]}=COLUMN")
-    recording = read_recording(path, list(dict.fromkeys(columns.values())), tolerance_s=tolerance_s)
+    recording = read_recording(
+        path, list(dict.fromkeys(columns.values())), tolerance_s=tolerance_s, stamped=True
+    )
     return _rows_of(recording, variables, columns, range(recording.rows))
 
 

@@ -12,6 +12,7 @@ from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from decimal import Decimal
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, Final, TextIO
@@ -23,6 +24,8 @@ from toolchain.flags import key_values
 MAX_ROWS: Final = 2_000_000
 _LONGEST_LINE: Final = 1 << 20
 
+_STAMP_UNITS: Final = {"stamp_ns": 1, "time_s": 10**9}
+"""The columns of our own CSV files that have the time of a row, and their unit in nanoseconds."""
 _STEP: Final = re.compile(r"(\w+)((?:\[\d{1,9}\])*)")
 
 
@@ -37,13 +40,16 @@ class Recording:
     columns: dict[str, list[object]]
     """Values by name, one per row: a number, a text, or None if missing."""
     stamps: tuple[int, ...] = ()
-    """Nanoseconds of each row in a bag; none in a CSV file."""
+    """Nanoseconds of each row in a bag, or in a CSV file whose stamps were asked for and that has any."""
 
 
-def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0.1) -> Recording:
+def read_recording(
+    path: Path, columns: Sequence[str], *, tolerance_s: float = 0.1, stamped: bool = False
+) -> Recording:
     """Return the named columns of a recording: a CSV file (`.csv`), an MCAP file, a ROS 1 bag or a ROS 2 bag's folder.
 
     In a bag, the topic of the first column defines the rows; messages of other topics may be `tolerance_s` apart.
+    With `stamped`, the stamps of a CSV file are those of its column `stamp_ns` or `time_s`.
 
     Raises:
         ModelError: The recording is missing, damaged, lacks a column (the sentence lists its columns), or has
@@ -52,7 +58,7 @@ def read_recording(path: Path, columns: Sequence[str], *, tolerance_s: float = 0
     if not path.exists():
         raise ModelError(f"the recording {path} does not exist")
     if path.suffix.lower() == ".csv":
-        return _read_csv(path, columns)
+        return _read_csv(path, columns, stamped=stamped)
     return _read_bag(path, columns, round(tolerance_s * 1e9))
 
 
@@ -82,14 +88,16 @@ def reading_columns(names: Sequence[str], given: Sequence[str], flag: str = "--r
     return columns
 
 
-def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
+def _read_csv(path: Path, columns: Sequence[str], *, stamped: bool) -> Recording:
     found: dict[str, list[object]] = {column: [] for column in columns}
+    stamps: list[int] = []
     rows = 0
     try:
         with TextIOWrapper(open_regular(path, ModelError), encoding="utf-8-sig", newline="") as file:
             lines = csv.reader(_lines(path, file), strict=True)
             heading = [name.strip() for name in next(lines, [])]
             places = {column: _place(path, heading, column) for column in found}
+            stamp_column = next((name for name in _STAMP_UNITS if stamped and name in heading), None)
             for line in lines:
                 if not line:
                     continue
@@ -101,6 +109,9 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
                 _check_rows(path, rows)
                 for column, place in places.items():
                     found[column].append(_cell(line[place]))
+                if stamp_column is not None:
+                    text = line[_place(path, heading, stamp_column)]
+                    stamps.append(_stamp(text, stamp_column, f"{path}, line {lines.line_num}"))
             if not rows:
                 raise ModelError(f"{path} has a heading and no rows")
     except OSError as reason:
@@ -111,7 +122,20 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Recording:
         ) from None
     except csv.Error as reason:
         raise ModelError(f"{path} is not a CSV file: {reason}") from None
-    return Recording(path, rows, found)
+    return Recording(path, rows, found, tuple(stamps))
+
+
+def _stamp(text: str, column: str, where: str) -> int:
+    """Return a stamp in nanoseconds, exactly, which a float would not be."""
+    try:
+        stamp = Decimal(text.strip()) * _STAMP_UNITS[column]
+        if 0 <= stamp < 1 << 63:
+            return round(stamp)
+    except ArithmeticError:  # not a number, or NaN
+        pass
+    raise ModelError(
+        f"{where}: {column} is {text[:80]!r}, expected a time that is not negative; correct it, or rename the column"
+    )
 
 
 def _lines(path: Path, file: TextIO) -> Iterator[str]:

@@ -93,6 +93,31 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(deployment, recording, tmp
         ) == pytest.approx(1)
 
 
+@pytest.mark.parametrize(
+    ("rows", "stamps"),
+    [
+        ("range,loud\n3,1\n5,0\n", [0, 1]),
+        ("range,loud,stamp_ns\n3,1,1795348800099417765\n5,0, 0\n", [1795348800099417765, 0]),
+        ("time_s,range,loud\n1252437312.101,3,1\n1e3,5,0\n", [1252437312101000000, 10**12]),
+    ],
+)
+def test_stamps_of_a_csv_file(tmp_path, rows, stamps):
+    build_model(corridor(), tmp_path / "corridor")
+    deployment = load_deployment(tmp_path / "corridor")
+    (tmp_path / "r.csv").write_text(rows)
+    frames = recorded_frames(tmp_path / "r.csv", deployment.variables, ())
+    assert frames.stamps.tolist() == stamps
+
+
+@pytest.mark.parametrize("stamp", ["", "soon", "-1", "nan", "1e999999999", "9223372037"])
+def test_a_wrong_stamp_is_named(tmp_path, stamp):
+    build_model(corridor(), tmp_path / "corridor")
+    (tmp_path / "r.csv").write_text(f"range,loud,time_s\n3,1,7\n5,0,{stamp}\n")
+    output = tmp_path / "p.npz"
+    result = toolchain("infer", tmp_path / "r.csv", "-d", tmp_path / "corridor", "-o", output)
+    assert_refused(result, "r.csv, line 3: time_s is", f"{stamp!r}, expected a time")
+
+
 def test_the_bytes_of_a_bag_do_not_depend_on_its_name(tmp_path):
     build_model(corridor(), tmp_path / "corridor")
     (tmp_path / "r.csv").write_text("range,loud\n3,1\n5,0\n")
