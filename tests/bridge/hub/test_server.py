@@ -2,7 +2,11 @@
 
 import asyncio
 import dataclasses
+import json
+import platform
 import re
+import subprocess
+import sys
 from contextlib import AsyncExitStack
 from types import SimpleNamespace
 
@@ -15,7 +19,7 @@ from bridge.hub.access import AccessPolicy
 from bridge.hub.limits import HubError, HubLimits
 from bridge.hub.server import serve_hub
 from tests.bridge.hub.sockets import RawClient, client, running_hub
-from tests.patience import PATIENCE
+from tests.patience import PATIENCE, PROCESS_PATIENCE
 
 
 async def test_messages_of_every_length_arrive_whole():
@@ -121,6 +125,46 @@ async def test_what_is_no_websocket_request_ends_the_connection(data, answer):
         raw.writer.write_eof()
         assert re.match(answer, await raw.ended())
         await ears.sync()
+
+
+async def test_a_backlog_of_many_turns_arrives_in_order():
+    # more than the sockets hold, then small messages for several turns
+    sizes = [900_000] * 3 + [10] * (5 * server._TURN_MESSAGES)
+    async with running_hub() as port, client(port) as robot:
+        slow = await RawClient.connect(port, receive_buffer=4096)
+        slow.send_operation(op="subscribe", topic="/t", type="a/B", queue_length=1000)
+        await robot.wait_for("/rosapi/subscribers", bool, topic="/t")
+        for number, size in enumerate(sizes):
+            await robot.send(op="publish", topic="/t", type="a/B", msg={"i": number, "data": "x" * size})
+        await robot.sync()
+        assert [json.loads(await slow.message())["msg"]["i"] for _ in sizes] == list(range(len(sizes)))
+
+
+@pytest.mark.process
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have other rules")
+def test_the_memory_of_large_messages_is_retained():
+    code = """
+import asyncio, resource
+from tests.bridge.hub.sockets import RawClient, client, running_hub
+
+async def main():
+    async with running_hub() as port, client(port) as ears:
+        await ears.send(op="subscribe", topic="/t", type="a/B", queue_length=1000)
+        raw, faults = await RawClient.connect(port), []
+        for _ in range(20):
+            for _ in range(50):
+                raw.send_operation(op="publish", topic="/t", type="a/B", msg={"data": "x" * 17_000})
+            for _ in range(50):
+                await ears.receive()
+            faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt)
+        print(faults[-1] - faults[9])
+
+asyncio.run(main())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, check=True, timeout=PROCESS_PATIENCE
+    )
+    assert int(done.stdout) < 10 * 50  # pages; otherwise several for each of 500 messages
 
 
 async def test_a_delayed_hub_closes_no_client():
