@@ -1,9 +1,9 @@
-"""Connections of the campaign: proxies between the parts of the stack, its own rosbridge client, and status sockets.
+"""Connections of the campaign: proxies between the parts of the stack, and status sockets.
 
     robot side                                   stack
-    Client ── hub ── Proxy "rosbridge" ── subscriber, publisher ── Proxy ── master ── Proxy ── pcie-app ── Proxy ── boards
+    PlainClient ── hub ── Proxy "rosbridge" ── subscriber, publisher ── Proxy ── master ── Proxy ── pcie-app ── Proxy ── boards
 
-A proxy delays, holds, cuts, repeats and corrupts data. The client uses only `websockets` and `json`.
+A proxy delays, holds, cuts, repeats and corrupts data.
 """
 
 import asyncio
@@ -15,21 +15,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import WebSocketException
-
 from scripts.running.patience import FACTOR
 
 TOPIC, TYPE = "/campaign/readings", "campaign_msgs/Reading"
-RESULTS, REPORTS = "/BMresults", "/bm/frame"
-OUTPUT_TYPES = {REPORTS: "diagnostic_msgs/DiagnosticArray", RESULTS: "std_msgs/Float64MultiArray"}
-QUEUE = 1000
 CHUNK = 1 << 16
 _STAMP = re.compile(rb'"secs":\s*(\d+),\s*"nsecs":\s*(\d+)')
 _ANSWER = 1.0 * FACTOR
 """Seconds within which a process must answer with its status."""
-_AGAIN = 0.05
-"""Seconds between two attempts to connect."""
 
 
 @dataclass(slots=True)
@@ -193,61 +185,6 @@ async def _websocket_frame(reader: asyncio.StreamReader) -> bytes:
         head += extended
         size = int.from_bytes(extended, "big")
     return head + await reader.readexactly(size)
-
-
-class Client:
-    """A client of the hub that reconnects whenever its connection is lost."""
-
-    def __init__(self, port: int, take: Callable[[str, Any], None], lost: Callable[[], None]) -> None:
-        """Store the functions that take messages, by topic, and the one to call when the connection is lost."""
-        self._uri = f"ws://127.0.0.1:{port}"
-        self._take, self._lost = take, lost
-        self._connection: ClientConnection | None = None
-        self._task: asyncio.Task[None] | None = None
-        self.connected = asyncio.Event()
-
-    async def start(self) -> None:
-        """Start to connect."""
-        self._task = asyncio.create_task(self._keep())
-
-    async def end(self) -> None:
-        """Disconnect."""
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
-
-    async def publish(self, stamp: int, values: dict[str, object]) -> None:
-        """Publish a reading if there is a connection; otherwise drop it."""
-        secs, nsecs = divmod(stamp, 10**9)
-        message = {"header": {"stamp": {"secs": secs, "nsecs": nsecs}, "frame_id": ""}, **values}
-        if self._connection is not None:
-            with contextlib.suppress(OSError, WebSocketException):
-                await self._connection.send(json.dumps({"op": "publish", "topic": TOPIC, "msg": message}))
-
-    async def _keep(self) -> None:
-        while True:
-            with contextlib.suppress(OSError, WebSocketException, TimeoutError):
-                await self._converse()
-            self._connection = None
-            self.connected.clear()
-            self._lost()
-            await asyncio.sleep(_AGAIN)
-
-    async def _converse(self) -> None:
-        async with connect(
-            self._uri, compression=None, ping_interval=None, open_timeout=20 * FACTOR, max_size=1 << 24
-        ) as connection:
-            operations: list[dict[str, object]] = [{"op": "advertise", "topic": TOPIC, "type": TYPE}]
-            for topic, kind in OUTPUT_TYPES.items():
-                operations.append({"op": "subscribe", "topic": topic, "type": kind, "queue_length": QUEUE})
-            for operation in operations:
-                await connection.send(json.dumps(operation))
-            self._connection = connection
-            self.connected.set()
-            async for text in connection:
-                operation = json.loads(text)
-                if operation.get("op") == "publish":
-                    self._take(operation["topic"], operation["msg"])
 
 
 async def process_status(path: str) -> dict[str, Any] | None:

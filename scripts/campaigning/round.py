@@ -20,13 +20,14 @@ from pathlib import Path
 from typing import Any
 
 from scripts.campaigning.accounts import ROSBRIDGE_AWAY, Counters, Excuses, judge
-from scripts.campaigning.connections import REPORTS, Client
+from scripts.campaigning.connections import TOPIC, TYPE
 from scripts.campaigning.expected import POOL, Addresses, Outcome, addresses_of
 from scripts.campaigning.faults import Kind, Step, excuses_of
 from scripts.campaigning.injection import Injector
 from scripts.campaigning.observer import Finding, Flaw, Observer
 from scripts.campaigning.stack import NotThereError, Stack, Topology
 from scripts.running.patience import FACTOR
+from scripts.running.plain_client import REPORTS, PlainClient
 
 _ANSWER = 0.1 * FACTOR
 """Seconds to wait for a result during a fault before the next reading is published."""
@@ -79,7 +80,7 @@ class Round:
         self.stack = Stack(folder, topology, deployment, rng)
         self.observer = Observer(expected)
         self._injector = Injector(self.stack, topology, folder / "clock", self._special)
-        self._client = Client(self.stack.hub_port, self._take, self.observer.reconnected)
+        self._client = PlainClient(self.stack.hub_port, (TOPIC, TYPE), self._take, self.observer.reconnected)
         self._result = RoundResult()
         # The master's counters when they were last judged.
         self._base = Counters()
@@ -98,7 +99,9 @@ class Round:
 
     async def _publish(self, values: dict[str, object], stamp: int) -> None:
         self.observer.published(stamp, addresses_of(values), now())
-        await self._client.publish(stamp, values)
+        secs, nsecs = divmod(stamp, 10**9)
+        header = {"stamp": {"secs": secs, "nsecs": nsecs}, "frame_id": ""}
+        await self._client.publish({"header": header, **values})
 
     def _reading(self) -> dict[str, object]:
         self._last = self._rng.choice([each for each in POOL if each != self._last])

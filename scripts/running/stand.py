@@ -24,7 +24,7 @@ from terminal.processes import Process
 
 PATIENCE: Final = 60.0 * FACTOR
 """Time limit of each wait, in seconds."""
-TAIL: Final = 5
+TAIL: Final = 12
 """Number of the last lines of each log that are shown when a check fails."""
 
 
@@ -46,15 +46,23 @@ class Stand:
         # The processes that were started and their command lines, so that they can be started again.
         self._commands: dict[str, tuple[str, ...]] = {}
         self._processes: dict[str, Process] = {}
+        self.shown: list[str] = []
+        """The processes of which `tails` shows the logs."""
 
     def pid(self, name: str) -> int:
         """Return the number of a process."""
         return self._processes[name].pid
 
+    def log(self, name: str) -> Path:
+        """Return the log of a process."""
+        return self.folder / f"{name}.log"
+
     async def start(self, name: str, ready: str, *command: str) -> str:
         """Start a process, or start it again without a command, and return the text that shows its readiness."""
         self._commands[name] = command or self._commands[name]
-        self._processes[name] = process = Process(name, self.folder / f"{name}.log")
+        self._processes[name] = process = Process(name, self.log(name))
+        if name not in self.shown:
+            self.shown.append(name)
         await process.start(*self._commands[name])
         async with asyncio.timeout(2 * PATIENCE):
             return (await process.line(ready))[0]
@@ -62,7 +70,12 @@ class Stand:
     async def kill(self, name: str) -> None:
         """Kill a process as a crash would, and wait for its end."""
         os.kill(self.pid(name), signal.SIGKILL)
-        await self._processes[name].wait()
+        await self.wait(name)
+
+    async def wait(self, name: str) -> int:
+        """Wait for the end of a process, and return its exit code."""
+        # shielded, because a time limit around this would also end the reading of its lines
+        return await asyncio.shield(self._processes[name].wait())
 
     async def start_hub(self, *flags: str) -> None:
         """Start the hub on a free port, on which it will also start again."""
@@ -109,12 +122,14 @@ class Stand:
 
     def tails(self) -> str:
         """Return the last lines of the logs."""
-        logs = {name: (self.folder / f"{name}.log").read_text() for name in self._processes}
-        return "\n".join(f"    {name}: {line}" for name in logs for line in logs[name].splitlines()[-TAIL:])
+        lines = (
+            (name, line) for name in self.shown for line in self.log(name).read_text().splitlines()[-TAIL:]
+        )
+        return "\n".join(f"    {name}: {line}" for name, line in lines)
 
     def traceback(self) -> str | None:
         """Return which processes have shown a traceback; None if none has."""
-        names = [name for name in self._processes if "Traceback" in (self.folder / f"{name}.log").read_text()]
+        names = [name for name in self._processes if "Traceback" in self.log(name).read_text()]
         return f"there is one from {' and '.join(names)}" if names else None
 
     async def end(self, *names: str) -> None:

@@ -1,9 +1,10 @@
 """Verdicts and counts, shared by the verifications."""
 
+import asyncio
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass
 
 
@@ -23,6 +24,16 @@ def expect(condition: bool, otherwise: str) -> None:
     """
     if not condition:
         raise CheckError(otherwise)
+
+
+@contextlib.asynccontextmanager
+async def within(seconds: float, otherwise: str) -> AsyncIterator[None]:
+    """Raise a `CheckError` if the block does not end in time."""
+    try:
+        async with asyncio.timeout(seconds):
+            yield
+    except TimeoutError:
+        raise CheckError(f"{otherwise} within {seconds:g} s") from None
 
 
 @dataclass(slots=True)

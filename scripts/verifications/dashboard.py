@@ -37,7 +37,7 @@ from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
 from scripts.running.script import ROOT
 from scripts.running.stand import PATIENCE, Stand, temporary_stand
-from scripts.verifications.checks import CheckError, Tally, expect
+from scripts.verifications.checks import CheckError, Tally, expect, within
 
 LIMIT: Final = 1200.0 * FACTOR
 """Time limit of the verification, in seconds."""
@@ -99,11 +99,8 @@ class Scene:
 
     async def until(self, condition: Callable[[], bool], what: str) -> None:
         """Wait until a condition on the received messages holds, or raise a CheckError that says what did not happen."""
-        try:
-            async with asyncio.timeout(PATIENCE), self.news:
-                await self.news.wait_for(condition)
-        except TimeoutError:
-            raise CheckError(f"{what} within {PATIENCE:g} s") from None
+        async with within(PATIENCE, what), self.news:
+            await self.news.wait_for(condition)
 
     async def put(self, x: float, y: float) -> None:
         """Put the boat somewhere, where it lies still, and wait until it is there."""

@@ -60,12 +60,6 @@ def cached(name: str, locks: tuple[Path, ...], make: Callable[[Path], None]) -> 
     return folder
 
 
-def make_environment(folder: Path, lock: Path) -> None:
-    """Create a virtual environment, `folder`/venv, with the packages of a lock file."""
-    run(sys.executable, "-m", "venv", folder / "venv")
-    run(*pip(folder), "install", "--no-deps", "--only-binary", ":all:", "--require-hashes", "-r", lock)
-
-
 def pip(folder: Path) -> tuple[str | Path, ...]:
     """Return the command line of the pip in `folder`/venv, without its arguments."""
     return folder / "venv" / "bin" / "python", "-m", "pip", "-q", "--disable-pip-version-check"
@@ -91,7 +85,10 @@ def install_roslibpy() -> Path:
     """Return the folder with roslibpy's environment (venv) and its source package (source), after installing them once."""
 
     def make(folder: Path) -> None:
-        make_environment(folder, ROSLIBPY)
+        run(sys.executable, "-m", "venv", folder / "venv")
+        run(
+            *pip(folder), "install", "--no-deps", "--only-binary", ":all:", "--require-hashes", "-r", ROSLIBPY
+        )
         # only the block of roslibpy, whose hashes are those of the wheel and of the source package
         block = re.search(r"^roslibpy==(?:.*\\\n)+.*\n", ROSLIBPY.read_text(), re.MULTILINE)
         assert block is not None

@@ -7,25 +7,19 @@ plain client (websockets and json) ──▶ server ──▶ master ──▶ s
 import asyncio
 import contextlib
 import hashlib
-import json
 import logging
 import math
-import os
 import shutil
-import signal
 import sys
 import tempfile
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
-from websockets.asyncio.client import ClientConnection
-from websockets.asyncio.client import connect as connect_plainly
-from websockets.exceptions import ConnectionClosed
 
 from bridge import stamps
 from bridge.client import Message, Qos, Ros, State, connect
@@ -37,13 +31,13 @@ from casestudies.boat.sensors import SENSORS_TOPIC
 from casestudies.demo import build
 from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR
+from scripts.running.plain_client import REPORTS, RESULTS, PlainClient
 from scripts.running.script import ROOT, reporting_errors, run_script
-from scripts.running.stand import free_port
+from scripts.running.stand import Stand, free_port
 from scripts.verifications import real_rosbridge
-from scripts.verifications.checks import CheckError, Tally, expect
+from scripts.verifications.checks import CheckError, Tally, expect, within
 from services.errors import StackError
 from terminal.errors import ProcessError
-from terminal.processes import Process
 
 LIMIT: Final = 600.0 * FACTOR
 """Time limit of the verification, in seconds."""
@@ -54,7 +48,6 @@ SILENCE: Final = 1.0
 OUT: Final = ROOT / "out" / "verify"
 ARRAY: Final = "std_msgs/Float64MultiArray"
 ARRAY_TYPES: Final = {"ros1": ARRAY, "ros2": "std_msgs/msg/Float64MultiArray"}
-RESULT_TOPIC, FRAME_TOPIC = "/BMresults", "/bm/frame"
 ULP: Final = 1e-15
 """Relative tolerance, because the real server's JSON loses the last bit of some doubles."""
 COUNT: Final = 10
@@ -66,8 +59,6 @@ FIRST_DATA_TIMEOUT: Final = 2
 FARTHEST: Final = 1.5
 """Maximum distance of a posterior's mean from the true cell, in cells."""
 SIZE: Final = 32
-TAIL: Final = 12
-"""Number of log lines that are shown when a check fails."""
 
 
 # Servers and masters
@@ -80,63 +71,49 @@ SERVERS: Final = {
 READY: Final = rf"{real_rosbridge.READY}|ws://\S+"
 
 
-@contextlib.asynccontextmanager
-async def within(seconds: float, otherwise: str) -> AsyncIterator[None]:
-    """Raise a `CheckError` if the block does not end in time."""
-    try:
-        async with asyncio.timeout(seconds):
-            yield
-    except TimeoutError:
-        raise CheckError(f"{otherwise} within {seconds:g} s") from None
-
-
-class Stand:
-    """A server that can be restarted, its clients, and the masters on it."""
+class Server(Stand):
+    """A server that can be restarted, its clients, and the masters on it; each process has a log of its own."""
 
     def __init__(self, kind: str, port: int, deployments: dict[str, Path]) -> None:
+        super().__init__(OUT / kind)
         self.kind = kind
         self.real = kind == "real"
         self.port = port
         self.uri = f"ws://127.0.0.1:{port}"
         self.deployments = deployments
-        self.logs: list[Path] = []
-        """Logs of the current check, whose last lines are printed if it fails."""
-        self._server: Process | None = None
-        self._log = Path()
+        self._running = ""
+        """The name of the server's process; empty while there is none."""
         self._count = 0
+
+    def _new(self, what: str) -> str:
+        self._count += 1
+        return f"{what}_{self._count}"
 
     def topic(self) -> str:
         """Return the name of a topic that was not used before."""
-        self._count += 1
-        return f"/verify/topic_{self._count}"
+        return self._new("/verify/topic")
 
-    def _new_log(self, name: str) -> Path:
-        self._count += 1
-        self.logs.append(OUT / f"{self.kind}-{self._count}-{name}.log")
-        return self.logs[-1]
-
-    async def start(self) -> None:
+    async def serve(self) -> None:
         """Start the server if it does not run, and wait until it serves.
 
         Raises:
             CheckError: It is not ready in time.
         """
-        if self._server is not None:
-            self.logs.append(self._log)
-            return
-        self._log = self._new_log("server")
-        self._server = Process(self.kind, self._log)
-        await self._server.start(*(word.replace("PORT", str(self.port)) for word in SERVERS[self.kind]))
-        async with within(PATIENCE, "the server did not serve"):
-            await self._server.line(READY)
+        if not self._running:
+            self._running = self._new("server")
+            command = (word.replace("PORT", str(self.port)) for word in SERVERS[self.kind])
+            async with within(PATIENCE, "the server did not serve"):
+                await self.start(self._running, READY, *command)
 
     async def stop(self, *, kill: bool = False) -> None:
         """End the server, or kill it as a crash would."""
-        if self._server is not None:
-            if kill:
-                os.kill(self._server.pid, signal.SIGKILL)
-            await self._server.end()
-            self._server = None
+        if self._running:
+            await (self.kill if kill else self.end)(self._running)
+            self._running = ""
+
+    def begin_check(self) -> None:
+        """Let `tails` show only the server and what starts from now on."""
+        self.shown = [self._running] if self._running else []
 
     @contextlib.asynccontextmanager
     async def clients(self) -> AsyncIterator[tuple[Ros, Ros]]:
@@ -163,39 +140,29 @@ class Stand:
             return message
 
     @contextlib.asynccontextmanager
-    async def master(self, form: str, *flags: str) -> AsyncIterator[Process]:
-        """Run a master during the block."""
-        process = Process("master", self._new_log("master"))
+    async def master(self, form: str, *flags: str) -> AsyncIterator[str]:
+        """Run a master during the block, and return the name of its process."""
+        name = self._new("master")
         with tempfile.TemporaryDirectory(prefix="run-") as run:
-            await process.start(
-                *("master", "-d", str(self.deployments[form]), "--run-directory", run, *flags)
-            )
+            command = ("master", "-d", str(self.deployments[form]), "--run-directory", run, *flags)
             try:
-                yield process
+                await self.start(name, "", *command)
+                yield name
             finally:
-                await process.end()
+                await self.end(name)
 
-    async def ended(self, master: Process, code: int) -> str:
+    async def ended(self, master: str, code: int) -> str:
         """Wait until a master has ended with this exit code, and return its output.
 
         Raises:
             CheckError: It ends with another code, or not in time.
         """
         async with within(2 * PATIENCE, "the master did not end"):
-            got = await master.wait()
-        output = self.logs[-1].read_text()
+            got = await self.wait(master)
+        output = self.log(master).read_text()
         expect("Traceback" not in output, "the master shows a traceback")
         expect(got == code, f"the master's exit code is {got}, not {code}")
         return output
-
-    def tails(self) -> str:
-        """Return the last log lines of the current check."""
-        return "\n".join(
-            f"    {log.relative_to(ROOT)}: {line}"
-            for log in self.logs
-            if log.exists()
-            for line in log.read_text().splitlines()[-TAIL:]
-        )
 
 
 # Operations of the client
@@ -214,18 +181,41 @@ def same(found: Any, wanted: Any) -> None:
     expect(np.allclose(found, wanted, rtol=ULP, atol=0), f"{found} came of {wanted}")
 
 
-async def check_json(stand: Stand) -> None:
+async def check_passes(stand: Server, sent: Any, type_name: str = ARRAY, **options: Any) -> None:
+    """Check that data arrive with their values, as the kind of sequence that was asked for."""
+    found = (await stand.passed({"data": sent}, type_name, **options)).msg["data"]
+    is_array = options.get("arrays") == "numpy"
+    wanted = np.ndarray if is_array else list if isinstance(sent, np.ndarray) else type(sent)
+    expect(type(found) is wanted, f"{type_name}: {type(found).__name__} came, not {wanted.__name__}")
+    if isinstance(sent, str | bytes):
+        expect(found == sent, f"{type_name}: {found!r:.100} came")
+        return
+    if is_array and "compression" in options:
+        expect(found.dtype == sent.dtype, f"{type_name}: its elements are {found.dtype}")
+    same(found, sent)
+
+
+@contextlib.contextmanager
+def failing(error: type[Exception], otherwise: str, naming: str = "") -> Iterator[None]:
+    """Check that the block raises an error, whose text contains another one."""
+    try:
+        yield
+    except error as raised:
+        expect(naming in str(raised), f"the error does not name {naming}: {raised}")
+    else:
+        raise CheckError(otherwise)
+
+
+async def check_json(stand: Server) -> None:
     """Check JSON with both forms of type names, lists and arrays."""
     for type_name in ARRAY_TYPES.values():
-        same((await stand.passed({"data": [1, 2.5]}, type_name)).msg["data"], [1.0, 2.5])
+        await check_passes(stand, [1, 2.5], type_name)
     values = np.random.default_rng(1).normal(size=1024)
     for sent in (values, values[::-1], values.astype(">f8")):
-        message = await stand.passed({"data": sent}, arrays="numpy")
-        expect(isinstance(message.msg["data"], np.ndarray), "it is not an array")
-        same(message.msg["data"], sent)
+        await check_passes(stand, sent, arrays="numpy")
 
 
-async def check_cbor(stand: Stand) -> None:
+async def check_cbor(stand: Server) -> None:
     """Check CBOR with typed arrays of every element type, as lists and as arrays, and with bytes."""
     values = np.random.default_rng(2).normal(size=1024)
     arrays = [values, values.astype("f4")]
@@ -234,22 +224,10 @@ async def check_cbor(stand: Stand) -> None:
         limits = np.iinfo(kind)
         arrays.append(np.array([max(limits.min, -(2**50)), 5, min(limits.max, 2**50)], kind))
     for sent in arrays:
-        type_name = f"std_msgs/{sent.dtype.name.title().replace('int', 'Int')}MultiArray".replace(
-            "Uint", "UInt"
-        )
-        found = (await stand.passed({"data": sent}, type_name, compression="cbor", arrays="numpy")).msg[
-            "data"
-        ]
-        expect(isinstance(found, np.ndarray), f"{type_name}: {type(found).__name__} came, no array")
-        expect(found.dtype == sent.dtype, f"{type_name}: its elements are {found.dtype}")
-        same(found, sent)
-    found = (await stand.passed({"data": values}, compression="cbor")).msg["data"]
-    expect(type(found) is list, "no list came")
-    same(found, values)
-    found = (
-        await stand.passed({"data": b"\x00\x01\xff"}, "std_msgs/UInt8MultiArray", compression="cbor")
-    ).msg
-    expect(found["data"] == b"\x00\x01\xff", f"{found['data']!r} came")
+        element = sent.dtype.name.title().replace("int", "Int").replace("Uint", "UInt")
+        await check_passes(stand, sent, f"std_msgs/{element}MultiArray", compression="cbor", arrays="numpy")
+    await check_passes(stand, values, compression="cbor")
+    await check_passes(stand, b"\x00\x01\xff", "std_msgs/UInt8MultiArray", compression="cbor")
 
 
 def deserialised(raw: bytes, type_name: str) -> dict[str, Any]:
@@ -262,7 +240,7 @@ def deserialised(raw: bytes, type_name: str) -> dict[str, Any]:
     return asdict(message)
 
 
-async def check_raw(stand: Stand) -> None:
+async def check_raw(stand: Server) -> None:
     """Check the serialised message with rosbags."""
     values = np.random.default_rng(3).normal(size=100)
     message = await stand.passed({"data": values}, compression="cbor-raw")
@@ -276,17 +254,14 @@ async def check_raw(stand: Stand) -> None:
     expect(found["pose"]["position"]["x"] == 1.5, f"its pose is {found['pose']}")
 
 
-async def check_fragments(stand: Stand) -> None:
+async def check_fragments(stand: Server) -> None:
     """Check fragments from the server."""
-    text = "x\u00e4\U0001f600\n" * 500
-    found = (await stand.passed({"data": text}, "std_msgs/String", fragment_size=100)).msg["data"]
-    expect(found == text, "another text came")
+    await check_passes(stand, "x\u00e4\U0001f600\n" * 500, "std_msgs/String", fragment_size=100)
     values = np.random.default_rng(5).normal(size=500)
-    message = await stand.passed({"data": values}, compression="cbor", fragment_size=300)
-    same(message.msg["data"], values)
+    await check_passes(stand, values, compression="cbor", fragment_size=300)
 
 
-async def check_qos(stand: Stand) -> None:
+async def check_qos(stand: Server) -> None:
     """Check quality of service: a late subscriber gets latched messages, and an incompatible one gets none."""
     offer = Qos(reliability="best_effort", depth=5)
     same((await stand.passed({"data": [1.5]}, offer=offer)).msg["data"], [1.5])
@@ -315,12 +290,11 @@ async def check_qos(stand: Stand) -> None:
         publication = await publisher.advertise(topic, ARRAY, qos=Qos(reliability="best_effort"))
         await settled(subscriber, publisher)
         await publication.publish({"data": [1.5]})
-        with contextlib.suppress(NoMessageError):
+        with failing(NoMessageError, "a reliable reader received from a best-effort publisher"):
             await strict.next(SILENCE)
-            raise CheckError("a reliable reader received from a best-effort publisher")
 
 
-async def check_latch(stand: Stand) -> None:
+async def check_latch(stand: Server) -> None:
     """Check that a late subscriber gets the last message."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher):
@@ -331,7 +305,7 @@ async def check_latch(stand: Stand) -> None:
         same((await subscriber.subscribe(topic, ARRAY).next(PATIENCE)).msg["data"], [7.5])
 
 
-async def check_throttle(stand: Stand) -> None:
+async def check_throttle(stand: Server) -> None:
     """Check a throttle of one message per minute, requested by one of two subscribers to a topic."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher), connect(stand.uri) as other:
@@ -343,12 +317,11 @@ async def check_throttle(stand: Stand) -> None:
             await publication.publish({"data": [float(number)]})
             same((await fast.next(PATIENCE)).msg["data"], [float(number)])
         same((await slow.next(PATIENCE)).msg["data"], [0.0])
-        with contextlib.suppress(NoMessageError):
+        with failing(NoMessageError, "a throttled reader got a second message"):
             await slow.next(SILENCE)
-            raise CheckError("a throttled reader got a second message")
 
 
-async def check_services(stand: Stand) -> None:
+async def check_services(stand: Server) -> None:
     """Check calls of services that answer, refuse and do not exist."""
 
     async def serve(args: dict[str, Any]) -> dict[str, Any]:
@@ -367,55 +340,43 @@ async def check_services(stand: Stand) -> None:
 
         for number in range(20):
             await ask(number)
-        await asyncio.gather(
-            *map(ask, range(8))
-        )  # ROS 2 keeps ten requests of a service, and loses further ones
-        with contextlib.suppress(BridgeError):
+        # ROS 2 keeps ten requests of a service, and loses further ones
+        await asyncio.gather(*map(ask, range(8)))
+        with failing(BridgeError, "a refusal came as an answer"):
             await caller.call("/verify/list", {"prefixes": [], "depth": 99}, timeout=2)
-            raise CheckError("a refusal came as an answer")
         await service.close()
-        with contextlib.suppress(ServiceError):
+        with failing(ServiceError, "a service that is not there answered"):
             await caller.call("/verify/nowhere", timeout=PATIENCE)
-            raise CheckError("a service that is not there answered")
 
 
-async def check_goal(stand: Stand) -> None:
+async def check_goal(stand: Server) -> None:
     """Check that a goal for an action without a server ends with an error."""
     async with connect(stand.uri) as ros:
         goal = await ros.send_goal("/verify/fly", "example_interfaces/action/Fibonacci", {"order": 3})
-        with contextlib.suppress(GoalError):
+        with failing(GoalError, "it has a result"):
             await goal.result(PATIENCE)
-            raise CheckError("it has a result")
         expect([each async for each in goal] == [], "it has feedback")
 
 
-async def check_wrong_type(stand: Stand) -> None:
+async def check_wrong_type(stand: Server) -> None:
     """Check that the error of a subscriber that gets no message contains the server's message about a wrong type."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher):
         await publisher.advertise(topic, ARRAY)
         await settled(publisher)
-        try:
+        with failing(NoMessageError, "a message of another type came", "type" if stand.real else ""):
             await subscriber.subscribe(topic, "std_msgs/String").next(SILENCE)
-        except NoMessageError as error:
-            expect(not stand.real or "type" in str(error), f"the reason is missing: {error}")
-        else:
-            raise CheckError("a message of another type came")
 
 
-async def check_nan(stand: Stand) -> None:
+async def check_nan(stand: Server) -> None:
     """Check that a message that the server would drop silently (NaN) is refused, and that the error names the field."""
     async with stand.clients() as (_subscriber, publisher):
         publication = await publisher.advertise(stand.topic(), ARRAY)
-        try:
+        with failing(EncodeError, "a NaN left", "data[1]"):
             await publication.publish({"data": np.array([1.5, math.nan])})
-        except EncodeError as error:
-            expect("data[1]" in str(error), f"the place is not named: {error}")
-        else:
-            raise CheckError("a NaN left")
 
 
-async def check_killed(stand: Stand) -> None:
+async def check_killed(stand: Server) -> None:
     """Check that everything is restored after a server was killed, and that the length of the gap is reported."""
     forms: tuple[Compression, ...] = ("none", "cbor", "cbor-raw")
     topics = {form: stand.topic() for form in forms}
@@ -428,7 +389,7 @@ async def check_killed(stand: Stand) -> None:
         await stand.stop(kill=True)
         await subscriber.wait_for_state(State.RECONNECTING, PATIENCE)
         await asyncio.sleep(0.5)
-        await stand.start()
+        await stand.serve()
         for ros in (subscriber, publisher):
             await ros.wait_for_state(State.CONNECTED, 2 * PATIENCE)
         back = time.monotonic() - begun
@@ -443,6 +404,9 @@ async def check_killed(stand: Stand) -> None:
 # Deployments, seen by a client that shares no code with bridge/
 
 
+Waiting = Callable[[int], Awaitable[None]]
+
+
 @dataclass(frozen=True, slots=True)
 class Sent:
     """A published reading: the true cell, and the time of publication (Unix time, ns)."""
@@ -452,95 +416,53 @@ class Sent:
     at_ns: int
 
 
-class PlainClient:
-    """A WebSocket for JSON that stores received messages."""
-
-    def __init__(self, websocket: ClientConnection) -> None:
-        self._websocket = websocket
-        self.received: list[tuple[str, dict[str, Any]]] = []
-        self.refused: list[str] = []
-        self._news = asyncio.Event()
-
-    async def send(self, **operation: Any) -> None:
-        """Send one operation."""
-        await self._websocket.send(json.dumps(operation))
-
-    async def listen(self) -> None:
-        """Store received messages until the connection ends."""
-        with contextlib.suppress(ConnectionClosed):
-            async for text in self._websocket:
-                operation = json.loads(text)
-                if operation["op"] == "publish":
-                    self.received.append((operation["topic"], operation["msg"]))
-                elif operation["op"] == "status":
-                    self.refused.append(str(operation["msg"]))
-                self._news.set()
-
-    def count(self, topic: str) -> int:
-        """Return the number of messages received on a topic."""
-        return sum(1 for each, _msg in self.received if each == topic)
-
-    async def results(self, count: int) -> None:
-        """Wait until that many results and their frames have arrived.
-
-        Raises:
-            CheckError: They do not arrive in time.
-        """
-        async with within(
-            PATIENCE, f"fewer than {count} results and frames came; refused: {self.refused[-1:]}"
-        ):
-            while min(self.count(RESULT_TOPIC), self.count(FRAME_TOPIC)) < count:
-                self._news.clear()
-                await self._news.wait()
-
-
-@contextlib.asynccontextmanager
-async def plain_client(uri: str) -> AsyncIterator[PlainClient]:
-    """Connect a plain client."""
-    async with connect_plainly(uri, max_size=None) as websocket:
-        client = PlainClient(websocket)
-        listening = asyncio.create_task(client.listen())
-        try:
-            yield client
-        finally:
-            listening.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await listening
-
-
 Received = list[tuple[str, dict[str, Any]]]
 
 
-@contextlib.asynccontextmanager
-async def robot(stand: Stand, received: Received, sent: list[Sent]) -> AsyncIterator[PlainClient]:
-    """During the block, listen to the stack's topics, and publish the readings of one cell after the other."""
+def count_of(topic: str, received: Received) -> int:
+    """Return the number of messages of a topic."""
+    return sum(each == topic for each, _msg in received)
 
-    async def publish(client: PlainClient) -> None:
+
+@contextlib.asynccontextmanager
+async def robot(stand: Server, received: Received, sent: list[Sent]) -> AsyncIterator[Waiting]:
+    """During the block, listen to the stack's topics, and publish the readings of one cell after the other.
+
+    The block gets a function that waits until a number of results and their frames have been received in all.
+    """
+
+    def take(topic: str, msg: Any) -> None:
+        received.append((topic, msg))
+        news.set()
+
+    async def results(count: int) -> None:
+        async with within(
+            PATIENCE, f"fewer than {count} results and frames came; refused: {client.refused[-1:]}"
+        ):
+            while min(count_of(RESULTS, received), count_of(REPORTS, received)) < count:
+                news.clear()
+                await news.wait()
+
+    async def publish() -> None:
         while True:
             number = len(sent)
             # a walk over the map except its rim, where posteriors are cut off
             reading = Sent(5 + 7 * number % 23, 5 + 11 * number % 23, time.time_ns())
             sent.append(reading)
-            msg = {"data": readings_of(reading.column, reading.row)}
-            await client.send(op="publish", topic=SENSORS_TOPIC, msg=msg)
+            await client.publish({"data": readings_of(reading.column, reading.row)})
             await asyncio.sleep(EVERY)
 
-    async with plain_client(stand.uri) as listener, plain_client(stand.uri) as publisher:
-        types = {FRAME_TOPIC: "diagnostic_msgs/DiagnosticArray", RESULT_TOPIC: ARRAY}
-        for topic, type_ in types.items():
-            # without a given queue length, a server over DDS keeps ten messages
-            await listener.send(op="subscribe", topic=topic, type=type_, queue_length=1000)
-        await publisher.send(op="advertise", topic=SENSORS_TOPIC, type=ARRAY)
-        publishing = asyncio.create_task(publish(publisher))
-        try:
-            yield listener
-        finally:
-            publishing.cancel()
-            with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
-                await publishing
-            await asyncio.sleep(2 * EVERY)  # then a surplus result would have arrived
-            received.extend(listener.received)
-            expect(not publisher.refused, f"the server refused a reading: {publisher.refused[-1:]}")
+    client, news = PlainClient(stand.port, (SENSORS_TOPIC, ARRAY), take), asyncio.Event()
+    await client.start()
+    await client.connected.wait()
+    publishing = asyncio.create_task(publish())
+    try:
+        yield results
+    finally:
+        publishing.cancel()
+        await asyncio.sleep(2 * EVERY)  # then a surplus result would have arrived
+        await client.end()
+    expect(not client.refused, f"the server refused an operation: {client.refused[-1:]}")
 
 
 def readings_of(column: int, row: int) -> list[float]:
@@ -571,7 +493,7 @@ def check_result(msg: dict[str, Any], reading: Sent) -> None:
 def check_frame(msg: dict[str, Any], after: int, sent: list[Sent]) -> tuple[int, Sent]:
     """Check a `/bm/frame`, and return its number and the reading that was published before its stamp."""
     values = {pair["key"]: pair["value"] for pair in msg["status"][0]["values"]}
-    expect(values["published"] == "true", f"its {FRAME_TOPIC} says published = {values['published']}")
+    expect(values["published"] == "true", f"its {REPORTS} says published = {values['published']}")
     number = int(values["number"])
     expect(number > after and (after > 0 or number == 1), f"its number is {number}, after {after}")
     boards = [board["name"] for board in msg["status"][1:]]
@@ -583,20 +505,18 @@ def check_frame(msg: dict[str, Any], after: int, sent: list[Sent]) -> tuple[int,
     return number, before[-1]
 
 
-def check_received(stand: Stand, received: Received, sent: list[Sent], count: int) -> None:
+def check_received(stand: Server, received: Received, sent: list[Sent], count: int) -> None:
     """Check the number of results, and that each has a `/bm/frame` and belongs to the reading with its stamp.
 
     Raises:
         CheckError: A result is wrong; the text has its number.
     """
-    frames, results = (
-        [msg for each, msg in received if each == topic] for topic in (FRAME_TOPIC, RESULT_TOPIC)
-    )
-    for topic, messages in ((FRAME_TOPIC, frames), (RESULT_TOPIC, results)):
+    frames, results = ([msg for each, msg in received if each == topic] for topic in (REPORTS, RESULTS))
+    for topic, messages in ((REPORTS, frames), (RESULTS, results)):
         expect(len(messages) == count, f"{len(messages)} messages came on {topic}, not {count}")
     if not stand.real:  # DDS transports each topic separately
         order = [topic for topic, _msg in received]
-        expect(order == [FRAME_TOPIC, RESULT_TOPIC] * count, f"they came in the order {order}")
+        expect(order == [REPORTS, RESULTS] * count, f"they came in the order {order}")
     number, last = 0, -1
     for at, (frame, result) in enumerate(zip(frames, results, strict=True), start=1):
         try:
@@ -608,40 +528,37 @@ def check_received(stand: Stand, received: Received, sent: list[Sent], count: in
             raise CheckError(f"result {at} of {count}: {error}") from error
 
 
-async def check_run(stand: Stand, form: str, count: int, *flags: str) -> None:
+async def check_run(stand: Server, form: str, count: int, *flags: str) -> None:
     """Check that a run publishes this number of results, sees them on the wire, and ends with 0."""
     received: Received = []
     sent: list[Sent] = []
-    async with stand.master(form, *flags) as master, robot(stand, received, sent) as listener:
+    async with stand.master(form, *flags) as master, robot(stand, received, sent) as results:
         output = await stand.ended(master, 0)
-        await listener.results(count)
+        await results(count)
     if "--once" in flags:
         expect("frame 1: " in output, "the master does not print the frame's most probable cell")
     expect("not seen on the wire" not in output, "the master did not see its result on the wire")
     check_received(stand, received, sent, count)
 
 
-async def check_restart(stand: Stand) -> None:
+async def check_restart(stand: Server) -> None:
     """Check that a run waits for a server that ends or is killed, and then continues to publish results."""
     received: Received = []
     sent: list[Sent] = []
     async with stand.master("ros2", *LOOP) as master:
-        master_log = stand.logs[-1]
         for kill in (False, True):
-            async with robot(stand, received, sent) as listener:
-                await listener.results(COUNT // 4)
+            async with robot(stand, received, sent) as results:
+                await results(count_of(RESULTS, received) + COUNT // 4)
             await stand.stop(kill=kill)
             await asyncio.sleep(0.5)
-            await stand.start()
-        came = sum(1 for topic, _msg in received if topic == RESULT_TOPIC)
-        async with robot(stand, received, sent) as listener:
-            stand.logs.append(master_log)
+            await stand.serve()
+        async with robot(stand, received, sent) as results:
             await stand.ended(master, 0)
-            await listener.results(COUNT - came)
+            await results(COUNT)
     check_received(stand, received, sent, COUNT)
 
 
-async def check_silence(stand: Stand) -> None:
+async def check_silence(stand: Server) -> None:
     """Check that a topic without a publisher ends the run in time, with exit code 3 and the topic's name."""
     async with stand.master("ros1", "--once", "--first-data-timeout", str(FIRST_DATA_TIMEOUT)) as master:
         output = await stand.ended(master, 3)
@@ -652,7 +569,7 @@ async def check_silence(stand: Stand) -> None:
 
 # All of them
 
-Check = Callable[[Stand], Awaitable[None]]
+Check = Callable[[Server], Awaitable[None]]
 
 
 CHECKS: Final[dict[str, Check]] = {
@@ -697,16 +614,16 @@ async def verify(kinds: list[str], only: str) -> int:
     before = bytes_of(list(deployments.values()))
     tally = Tally()
     for kind in kinds:
-        stand = Stand(kind, port, deployments)
+        stand = Server(kind, port, deployments)
         try:
             for name, check in CHECKS.items():
                 if only not in name:
                     continue
-                stand.logs.clear()
+                stand.begin_check()
                 failed = tally.failed
-                errors = (ProcessError, StackError, BridgeError, OSError, ConnectionClosed)
+                errors = (ProcessError, StackError, BridgeError, OSError)
                 with tally.check(f"{stand.kind}: {name}", *errors, details=stand.tails):
-                    await stand.start()
+                    await stand.serve()
                     await check(stand)
                 if tally.failed > failed:
                     await stand.stop()  # the next check gets a new server

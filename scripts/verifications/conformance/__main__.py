@@ -67,39 +67,27 @@ async def roslibpy(ros_version: str, transport: str, stand: Stand) -> str | None
         pytest = (python, "-m", "pytest", "-q", "-rfE", "-p", "no:cacheprovider")
         flags = ("-c", os.devnull, "--rootdir", str(folder), "--timeout", str(60 * FACTOR))
         suites = (f"tests/{suite}" for suite in SUITES[ros_version])
-        return await failure_of(*pytest, *flags, *suites, folder=folder, ROSLIBPY_TRANSPORT=transport)
+        return await failure_of(stand, f"ROSLIBPY_TRANSPORT={transport}", *pytest, *flags, *suites)
 
 
 async def roslib(ros_version: str, stand: Stand) -> str | None:
     """Run the checks of roslib.mjs, and return what failed, or None."""
     module = install_node_packages("roslib", NODE_SCRIPT.parent) / "roslib" / "dist" / "RosLib.js"
-    command = ("node", str(NODE_SCRIPT), str(module), stand.uri, ros_version)
-    return await failure_of(*command, folder=stand.folder)
+    return await failure_of(stand, "node", str(NODE_SCRIPT), str(module), stand.uri, ros_version)
 
 
-async def failure_of(*command: str, folder: Path, **environment: str) -> str | None:
-    """Run a suite, print its last line, and if its exit code is not 0, return its lines about failures."""
-    process = await asyncio.create_subprocess_exec(
-        *command,
-        cwd=folder,
-        env=os.environ | environment,
-        stdin=asyncio.subprocess.DEVNULL,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.STDOUT,
-    )
+async def failure_of(stand: Stand, *command: str) -> str | None:
+    """Run a suite in the stand's folder, print its last line, and if it failed, return its lines about failures."""
+    await stand.start("suite", "", "/usr/bin/env", "-C", str(stand.folder), *command)
     try:
         async with asyncio.timeout(LIMIT):
-            printed = (await process.communicate())[0].decode("utf-8", "replace")
+            code = await stand.wait("suite")
     except TimeoutError:
         return f"it did not end within {LIMIT:g} s"
-    finally:
-        if process.returncode is None:
-            process.kill()
-            await process.wait()
-    lines = printed.strip().splitlines() or ["it said nothing"]
+    lines = stand.log("suite").read_text().strip().splitlines() or ["it said nothing"]
     print(f"     {lines[-1]}")
     failed = [line for line in lines if line.startswith(("FAIL", "ERROR"))]
-    return "\n     ".join(failed or lines[-1:]) if process.returncode else None
+    return "\n     ".join(failed or lines[-1:]) if code else None
 
 
 async def verify(arguments: argparse.Namespace) -> int:
