@@ -14,15 +14,13 @@ import math
 import os
 import tempfile
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import ExitStack, asynccontextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from machines.bm1 import BM1Machine
 from machines.bm1_kind import BM1
@@ -36,6 +34,7 @@ from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.programming_file import Image, Partition
 from pcie_shim.wires import WIRES, LinkRate
 from scripts.running.flags import ScriptParser
+from scripts.running.script import print_table
 from terminal.output import write_json
 from terminal.pictures import new_figure, save_figure
 from terminal.processes import Process
@@ -152,17 +151,6 @@ def timed(move: Move, links: Sequence[SocketLink], words: int) -> float:
     return (time.perf_counter_ns() - began) / 1e3
 
 
-@contextmanager
-def opened(folder: Path, boards: int) -> Iterator[dict[LinkRate, list[SocketLink]]]:
-    """Open links to so many boards of each kind."""
-    with ExitStack() as stack:
-        yield {
-            link: [stack.enter_context(SocketLink.open(place, timeout=LIMIT_S)) for place in places]
-            for link in LinkRate
-            for places in [[parse_endpoint(each) for each in endpoints(folder, link, boards)]]
-        }
-
-
 def endpoints(folder: Path, link: LinkRate, boards: int) -> list[str]:
     """Return where the boards of a kind listen."""
     return [f"unix:{folder / link}/board{at}.sock" for at in range(boards)]
@@ -171,9 +159,12 @@ def endpoints(folder: Path, link: LinkRate, boards: int) -> list[str]:
 def measure_transfers(folder: Path, boards: int, words: int, repeats: int) -> list[Transfer]:
     """Measure blocks of one size, in both directions, over every kind of link."""
     found = []
-    for place in (each for link in LinkRate for each in endpoints(folder, link, boards)):
-        program(parse_endpoint(place), image(1, 0, 1, replicas=2), timeout=LIMIT_S)
-    with opened(folder, boards) as links:
+    with ExitStack() as stack:
+        links: dict[LinkRate, list[SocketLink]] = {link: [] for link in LinkRate}
+        for link in LinkRate:
+            for place in map(parse_endpoint, endpoints(folder, link, boards)):
+                program(place, image(1, 0, 1, replicas=2), timeout=LIMIT_S)
+                links[link].append(stack.enter_context(SocketLink.open(place, timeout=LIMIT_S)))
         for direction, move in MOVES.items():
             works = {link: partial(timed, move, those, words) for link, those in links.items()}
             for link, us in times(works, repeats).items():
@@ -256,7 +247,14 @@ async def bench(arguments: argparse.Namespace) -> int:
     fitted = fits(transfers)
     show(transfers, frames, fitted)
     if arguments.json:
-        write_json(arguments.json, numbers(transfers, frames, fitted))
+        parts: dict[str, Sequence[Transfer | FrameTime | Fitted]] = {
+            "transfers": transfers,
+            "frames": frames,
+            "fitted": fitted,
+        }
+        write_json(
+            arguments.json, {name: [each._asdict() for each in those] for name, those in parts.items()}
+        )
     if arguments.picture:
         draw(arguments.picture, transfers, frames)
     return int(arguments.check and not all(each.is_right for each in fitted))
@@ -264,37 +262,24 @@ async def bench(arguments: argparse.Namespace) -> int:
 
 def show(transfers: Sequence[Transfer], frames: Sequence[FrameTime], fitted: Sequence[Fitted]) -> None:
     """Print the tables on standard output."""
-    table = Table(title="a block to or from each board: microseconds, and Mbps of payload over all boards")
-    for column in (
-        "boards",
-        "",
-        "bytes",
-        *(f"{link}\n{unit}" for link in LinkRate for unit in ("us", "Mbps")),
-    ):
-        table.add_column(column, justify="right")
+    rows: list[list[str] | None] = []
     for boards in BOARDS:
-        for direction in MOVES:
-            for words in WORDS:
-                row = [
-                    next(each for each in transfers if each[:4] == (link, direction, boards, 4 * words))
-                    for link in LinkRate
-                ]
-                cells = [
-                    text
-                    for each in row
-                    for text in (f"{each.us:,.0f}", f"{each.mbps:,.{int(each.mbps < 100)}f}")
-                ]
-                table.add_row(str(boards), direction, f"{4 * words:,}", *cells)
-            table.add_section()
-    console = Console(width=max(96, Console().width))  # also in a file
-    console.print(table)
-    table = Table(title=f"a frame of {RESULTS} results: microseconds besides computing")
-    for column in ("results", "partitions", *LinkRate):
-        table.add_column(column, justify="right")
+        for direction, words in itertools.product(MOVES, WORDS):
+            row = [str(boards), direction, f"{4 * words:,}"]
+            for link in LinkRate:
+                found = next(each for each in transfers if each[:4] == (link, direction, boards, 4 * words))
+                row += [f"{found.us:,.0f}", f"{found.mbps:,.{int(found.mbps < 100)}f}"]
+            rows.append(row)
+        rows.append(None)
+    units = (f"{link}\n{unit}" for link in LinkRate for unit in ("us", "Mbps"))
+    title = "a block to or from each board: microseconds, and Mbps of payload over all boards"
+    print_table(title, ("boards", "", "bytes", *units), rows, left=0)
+    rows = []
     for way, boards in itertools.product(WAYS, BOARDS):
         those = [next(each for each in frames if each[:3] == (link, way, boards)) for link in LinkRate]
-        table.add_row(way, str(boards), *(f"{each.us:,.0f}" for each in those))
-    console.print(table)
+        rows.append([way, str(boards), *(f"{each.us:,.0f}" for each in those)])
+    title = f"a frame of {RESULTS} results: microseconds besides computing"
+    print_table(title, ("results", "partitions", *LinkRate), rows, left=0)
     for each in fitted:
         wire = WIRES[each.link]
         verdict = "equal within" if each.is_right else "on a quiet computer, they differ by at most"
@@ -312,24 +297,6 @@ def show(transfers: Sequence[Transfer], frames: Sequence[FrameTime], fitted: Seq
         f"around 800); with the emulation's socket before it, {4 * WORDS[-1]:,} bytes are read {slow / fast:.0f} times as "
         f"fast; {len(os.sched_getaffinity(0))} cores"
     )
-
-
-def numbers(
-    transfers: Sequence[Transfer], frames: Sequence[FrameTime], fitted: Sequence[Fitted]
-) -> dict[str, Any]:
-    """Return everything as a JSON object."""
-    return {
-        "transfers": [{**each._asdict(), "mbps": each.mbps} for each in transfers],
-        "frames": [each._asdict() for each in frames],
-        "fitted": [
-            {
-                **each._asdict(),
-                "model_mbps": WIRES[each.link].mbps,
-                "model_latency_us": WIRES[each.link].latency_us,
-            }
-            for each in fitted
-        ],
-    }
 
 
 def draw(path: Path, transfers: Sequence[Transfer], frames: Sequence[FrameTime]) -> None:
