@@ -13,10 +13,7 @@ SCRIPTS = sorted(path for path in (ROOT / "scripts").iterdir() if path.is_file()
 
 
 PARTS = {
-    "bench": (
-        *("bridge", "cluster", "cycle", "dashboard", "kernel", "link", "load", "mrclam", "networks", "start"),
-        *("thesis", "topics"),
-    ),
+    "bench": ("bridge", "cluster", "cycle", "dashboard", "kernel", "link", "mrclam", "networks", "thesis"),
     "verify": ("conformance", "containers", "hdl", "networks", "resources", "rosbridge", "tools", "wheel"),
 }
 
