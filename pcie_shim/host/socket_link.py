@@ -209,13 +209,8 @@ class SocketLink:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    @property
-    def is_open(self) -> bool:
-        """True while the link can be used."""
-        return not self._closed
-
     def fileno(self) -> int:
-        """Return the socket's descriptor, for a poll over many links."""
+        """Return the socket's descriptor, for a poll over many links; -1 once the link has ended."""
         return self._socket.fileno()
 
     def close(self, reason: str = "it was closed") -> None:

@@ -33,7 +33,6 @@ POSE_TYPE: Final = "geometry_msgs/PoseStamped"
 SET_POSE_TOPIC: Final = "/boat/set_pose"
 LANDMARKS_TOPIC: Final = "/boat/beacons"
 LANDMARKS_TYPE: Final = "visualization_msgs/MarkerArray"
-SWITCH_TYPE: Final = "std_srvs/SetBool"
 _WORLD: Final = "/boat/"
 _SAIL: Final = "/boat/sail"
 _SWITCHES: Final = frozenset({"sail", "noise", "works", "plugged"})

@@ -259,7 +259,7 @@ def test_the_host_hears_why_its_link_was_closed(start_board):
         link._sequence += 1
         with pytest.raises(AccessError):
             link.read32(rm.ID)
-        assert not link.is_open
+        assert link.fileno() == -1
 
 
 # ---- starting and stopping ----
@@ -321,7 +321,7 @@ def test_a_link_over_tcp_waits_for_the_end_of_the_one_before(start_board, monkey
     clock = SimpleNamespace(monotonic=time.monotonic, sleep=lambda _: former.close())
     monkeypatch.setattr(socket_link, "time", clock)
     with open_link(board) as link:
-        assert not former.is_open
+        assert former.fileno() == -1
         assert link.read32(rm.ID) == rm.ID_VALUE
 
 
