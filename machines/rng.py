@@ -8,7 +8,7 @@ its code with the low `prob_bits` bits of the output.
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Final, Protocol, TypeAlias
 
 import numpy as np
@@ -66,9 +66,12 @@ def seed_set(parameters: RngParameters, bank: int) -> int:
 
 def generator_numbers(parameters: RngParameters, bank: int) -> Words:
     """Return the numbers of a bank's generators, in the parameters' `generator_shape`."""
-    count = math.prod(parameters.generator_shape)
-    first = seed_set(parameters, bank) * count
-    return np.arange(first, first + count, dtype=np.uint64).reshape(parameters.generator_shape)
+    return _numbers_of_set(parameters.generator_shape, seed_set(parameters, bank))
+
+
+def _numbers_of_set(shape: tuple[int, ...], own: int) -> Words:
+    count = math.prod(shape)
+    return np.arange(own * count, (own + 1) * count, dtype=np.uint64).reshape(shape)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +129,11 @@ def sequencer_seed(parameters: BM2Parameters, bank: int) -> int:
     return int(LFSR(RngKind.LFSR16).seeds(np.array([seed_set(parameters, bank)], dtype=np.uint64))[0])
 
 
+@lru_cache(1 << 12)  # 2 ms each, and the same for all boards of a deployment and most machines of a sweep
+def _seeds(kind: RngKind, shape: tuple[int, ...], own: int) -> Words:
+    return LFSR(kind).seeds(_numbers_of_set(shape, own))
+
+
 @dataclass(frozen=True, slots=True)
 class LFSRNumbers:
     """LFSRs, which output the low bits of their states."""
@@ -134,7 +142,8 @@ class LFSRNumbers:
 
     def restart(self, bank: int) -> Words:
         """Return the seeds of the bank's generators."""
-        return LFSR(self.parameters.rng).seeds(generator_numbers(self.parameters, bank))
+        own = seed_set(self.parameters, bank)
+        return _seeds(self.parameters.rng, self.parameters.generator_shape, own).copy()
 
     def show(self, states: Words) -> Words:
         """Return the low `prob_bits` bits of the states."""

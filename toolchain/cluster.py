@@ -37,14 +37,16 @@ from toolchain.errors import BuildError, ToolchainError
 Work: TypeAlias = Callable[[int], Any]
 Keep: TypeAlias = Callable[[int, Any], None]
 
-BATCH_S: Final = 0.8
+BATCH_S: Final = 2.0
 """Seconds of work in a batch, so that dask's share of about 4 ms for each is small."""
-_SMALLEST_S: Final = BATCH_S / 8
-"""The same at the end, so that the workers finish at about the same time."""
+_SMALLEST_S: Final = BATCH_S / 20
+"""The same at the end, so that the workers finish at about the same time, and until their speed is known."""
+_FIRST: Final = 100
+"""Maximum number of pieces in a batch until their speed is known."""
 _AHEAD: Final = 3
 """Batches on their way for each worker: one that is computed, one that waits there, and one at the scheduler."""
 _LATELY: Final = 4
-"""Batches whose speed decides on the size of the next."""
+"""Batches whose speed decides on the number of pieces in the next."""
 _PATIENCE_S: Final = 60.0
 """Seconds in which a scheduler must come back, or get a worker again."""
 _CONNECT_S: Final = 10.0
@@ -243,14 +245,14 @@ def software() -> str:
 
 
 @lru_cache(_JOBS)
-def _prepared(_key: str, _thread: int, pickled: bytes) -> Work:
+def _prepared(pickled: bytes, _thread: int) -> Work:
     """Return the work of a job, which each thread of a worker prepares once: two cannot share a kernel."""
     job: Job = pickle.loads(pickled)  # noqa: S301 - dask runs whatever its client sends anyway
     return job.prepare()
 
 
-def do_batch(key: str, pickled: bytes, numbers: Sequence[int], theirs: str) -> tuple[bytes, float]:
-    """Do some pieces on a worker; return their results, pickled and compressed, and the seconds that they took.
+def do_batch(pickled: bytes, numbers: Sequence[int], most_s: float, theirs: str) -> tuple[bytes, float]:
+    """Do pieces on a worker until so many seconds are over; return the results, pickled and compressed, and the seconds.
 
     A posterior is mostly zeros, and would pass through the scheduler as it is.
 
@@ -261,10 +263,12 @@ def do_batch(key: str, pickled: bytes, numbers: Sequence[int], theirs: str) -> t
         raise ClusterError("it has another version of rosbayes, NumPy or Numba")
     from lz4.frame import compress
 
-    work = _prepared(key, get_ident(), pickled)
-    begun = time.perf_counter()
-    results = compress(pickle.dumps([work(number) for number in numbers]))
-    return results, time.perf_counter() - begun
+    work, results, begun = _prepared(pickled, get_ident()), [], time.perf_counter()
+    for number in numbers:
+        results.append(work(number))
+        if (seconds := time.perf_counter() - begun) > most_s:
+            break
+    return compress(pickle.dumps(results)), seconds
 
 
 class _LostError(Exception):
@@ -348,7 +352,6 @@ def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Ke
     """Do the pieces of a job on the workers of one scheduler; a `_LostError` if that cannot go on here."""
     from distributed import wait
 
-    key = sha256(pickled).hexdigest()
     # Numbers that are not on their way yet, in order; and the numbers of each batch that is.
     waiting, batches = deque(left), dict[Any, list[int]]()
     # Pieces and seconds of the last batches; a worker's first pieces are slow, so larger batches count for more.
@@ -357,7 +360,7 @@ def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Ke
     threads, counted_at, served_at = 0, 0.0, time.monotonic()
     with _noticing_loss():
         # a copy for each worker, so that the job outlives each of them; one that comes later fetches it from these
-        [table] = client.scatter([pickled], broadcast=True)
+        table = client.scatter(pickled, broadcast=True, hash=False)
     try:
         while waiting or batches:
             now = time.monotonic()
@@ -369,14 +372,15 @@ def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Ke
             elif now > served_at + _PATIENCE_S:
                 raise _LostError
             while waiting and len(batches) < _AHEAD * max(1, threads):
-                size = 1  # until it is known how long a piece takes
+                share, most_s = len(waiting) / (2 * max(1, threads)), _SMALLEST_S
+                size = min(_FIRST, share)
                 if done_lately:
                     piece_s = sum(s for _, s in done_lately) / sum(pieces for pieces, _ in done_lately)
-                    share = max(_SMALLEST_S / piece_s, len(waiting) / (2 * max(1, threads)))
-                    size = max(1, round(min(BATCH_S / piece_s, share)))
-                numbers = [waiting.popleft() for _ in range(min(size, len(waiting)))]
+                    size, most_s = min(BATCH_S / piece_s, max(_SMALLEST_S / piece_s, share)), BATCH_S
+                numbers = [waiting.popleft() for _ in range(max(1, min(round(size), len(waiting))))]
                 with _noticing_loss():
-                    batches[client.submit(do_batch, key, table, numbers, software(), pure=False)] = numbers
+                    batch = client.submit(do_batch, table, numbers, most_s, software(), pure=False)
+                    batches[batch] = numbers
             with _noticing_loss():
                 try:
                     done = wait(list(batches), timeout=_POLL_S, return_when="FIRST_COMPLETED").done
@@ -387,9 +391,10 @@ def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Ke
             for batch in done:
                 results, seconds = _results(address, batch)
                 numbers = batches.pop(batch)
-                done_lately.append((len(numbers), seconds))
+                done_lately.append((len(results), seconds))
+                waiting.extendleft(reversed(numbers[len(results) :]))
                 batch.release()  # or dask would compute it again if its worker died now
-                for number, result in zip(numbers, results, strict=True):
+                for number, result in zip(numbers, results, strict=False):
                     keep(number, result)
     finally:
         with suppress(_LostError), _noticing_loss():

@@ -3,7 +3,7 @@
     recording ──rows──▶ addresses ──▶ Replay (a job: one piece per frame) ──▶ OUT.frames ──▶ OUT.npz or OUT.mcap
 
 `OUT.frames` has a place for the record of each frame, behind a line that names everything on which the results depend. A run
-that was killed goes on from it. `OUT` is written at the end, and has the same bytes whoever has computed the frames.
+that was killed goes on from it. `OUT` grows in the order of the rows, and has the same bytes whoever has computed them.
 """
 
 import fcntl
@@ -12,12 +12,12 @@ import math
 import os
 import shutil
 import zipfile
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import IO, Any, Final, NamedTuple, TypeAlias
 from zlib import crc32
 
 import numpy as np
@@ -37,7 +37,11 @@ from toolchain.errors import BuildError
 _FORMAT: Final = 1
 _TOPIC: Final = "/BMresults"
 
+_TOGETHER: Final = 64
+"""Records that are written to the output at once."""
+
 _Records: TypeAlias = "np.memmap[Any, np.dtype[np.void]]"
+_Write: TypeAlias = Callable[[_Records], None]
 _Posterior: TypeAlias = NDArray[np.float64] | None
 
 
@@ -192,6 +196,31 @@ class PartFile:
         self._file.close()
 
 
+class _InOrder:
+    """Writes records in the order of their rows, as soon as those before are there, so that the output grows with them."""
+
+    def __init__(self, records: _Records, missing: Sequence[int], write: _Write) -> None:
+        self._records, self._write = records, write
+        # A byte for each row, 1 if it has a record; and how many rows are written.
+        self._there, self._written = bytearray(b"\1" * len(records)), 0
+        for row in missing:
+            self._there[row] = 0
+        self._write_on()
+
+    def add(self, row: int) -> None:
+        """Note that a row has its record."""
+        self._there[row] = 1
+        self._write_on()
+
+    def _write_on(self) -> None:
+        rows = len(self._records)
+        gap = self._there.find(0, self._written) % (rows + 1)  # -1, for none, becomes the number of rows
+        while self._written + _TOGETHER <= gap or self._written < gap == rows:
+            end = min(self._written + _TOGETHER, rows)
+            self._write(self._records[self._written : end])
+            self._written = end
+
+
 class Summary(NamedTuple):
     """Numbers of frames of a recording: all, those that this run computed, and those without a posterior."""
 
@@ -231,15 +260,18 @@ def replay(
             missing = list(range(len(frames)))  # the state of the generators is not in the records
         begun(len(frames) - len(missing))
 
-        def keep(row: int, record: bytes) -> None:
-            part.add(row, record)
-            advance()
+        with _WRITERS[output.suffix](output, deployment, frames) as write:
+            ordered = _InOrder(part.records, missing, write)
 
-        if job.is_sequence:
-            in_this_process(replace(job, done=part.posterior), missing, keep)
-        else:
-            run(job, missing, keep)
-        _WRITERS[output.suffix](output, deployment, frames, part.records)
+            def keep(row: int, record: bytes) -> None:
+                part.add(row, record)
+                ordered.add(row)
+                advance()
+
+            if job.is_sequence:
+                in_this_process(replace(job, done=part.posterior), missing, keep)
+            else:
+                run(job, missing, keep)
         without = int(np.isnan(part.records["posterior"][:, 0]).sum())
         done = True
     finally:
@@ -257,27 +289,42 @@ def _key(deployment: Deployment, frames: Frames) -> str:
     return digest.hexdigest()
 
 
-def _write_archive(path: Path, deployment: Deployment, frames: Frames, records: _Records) -> None:
-    """Write the arrays of `listen --save FILE.npz`; posteriors pass through memory in parts."""
-    dimensions = deployment.searched
+@contextmanager
+def _archive(path: Path, deployment: Deployment, frames: Frames) -> Iterator[_Write]:
+    """Write the arrays of `listen --save FILE.npz`."""
+    dimensions, cycles = deployment.searched, list[NDArray[np.uint64]]()
     shape = (len(frames), *(each.size for each in dimensions))
-    arrays: dict[str, NDArray[Any]] = {
-        "probabilities": records["posterior"].reshape(shape),
-        "frame": np.where(frames.fits, np.cumsum(frames.fits), -1),
-        "stamp_ns": frames.stamps,
-        "cycles": records["cycles"],
-        "labels": np.array([each.label for each in dimensions]),
-    }
-    for at, each in enumerate(dimensions):
-        arrays[f"axis{at}"] = np.array(each.states or [each.value(index) for index in range(each.size)])
     with whole_file(path, BuildError) as partial, zipfile.ZipFile(partial, "w") as archive:
-        for name, array in arrays.items():
+
+        def member(name: str) -> IO[bytes]:
             # with a fixed date, so that the same posteriors are the same bytes
-            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as file:
+            return archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)
+
+        with member("probabilities") as file:
+            np.lib.format.write_array_header_1_0(
+                file, {"descr": "<f8", "fortran_order": False, "shape": shape}
+            )
+
+            def write(records: _Records) -> None:
+                file.write(records["posterior"].tobytes())
+                cycles.append(records["cycles"].copy())
+
+            yield write
+        arrays: dict[str, NDArray[Any]] = {
+            "frame": np.where(frames.fits, np.cumsum(frames.fits), -1),
+            "stamp_ns": frames.stamps,
+            "cycles": np.concatenate(cycles),
+            "labels": np.array([each.label for each in dimensions]),
+        }
+        for at, each in enumerate(dimensions):
+            arrays[f"axis{at}"] = np.array(each.states or [each.value(index) for index in range(each.size)])
+        for name, array in arrays.items():
+            with member(name) as file:
                 np.lib.format.write_array(file, array, allow_pickle=False)
 
 
-def _write_bag(path: Path, deployment: Deployment, frames: Frames, records: _Records) -> None:
+@contextmanager
+def _bag(path: Path, deployment: Deployment, frames: Frames) -> Iterator[_Write]:
     """Write a message of the topic of results for each frame with a posterior, at the stamp of its row."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -289,25 +336,28 @@ def _write_bag(path: Path, deployment: Deployment, frames: Frames, records: _Rec
     strides = [math.prod(sizes[at:]) for at in range(len(sizes))]
     labelled = zip(deployment.searched, sizes, strides, strict=True)
     dim = [dimension(label=each.label, size=size, stride=stride) for each, size, stride in labelled]
-    folder = path.with_name(path.name + ".bag")
+    folder, stamps = path.with_name(path.name + ".bag"), iter(frames.stamps.tolist())
     with whole_file(path, BuildError) as partial:
         shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
         try:
             # rosbag2's metadata names the bag, so a fixed name gives the same bytes whatever the output is called
             with Writer(folder / "BMresults", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
                 topic = writer.add_connection(_TOPIC, array.__msgtype__, typestore=store)
-                for record, stamp in zip(records, frames.stamps.tolist(), strict=True):
-                    values = np.array(record["posterior"])
-                    if not math.isnan(values[0]):
-                        message = array(layout=layout(dim=dim, data_offset=0), data=values)
-                        writer.write(topic, stamp, store.serialize_cdr(message, array.__msgtype__))
+
+                def write(records: _Records) -> None:
+                    for values, stamp in zip(records["posterior"], stamps, strict=False):
+                        if not math.isnan(values[0]):
+                            message = array(layout=layout(dim=dim, data_offset=0), data=np.array(values))
+                            writer.write(topic, stamp, store.serialize_cdr(message, array.__msgtype__))
+
+                yield write
             next(folder.glob("*/*.mcap")).replace(partial)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
 
 
 _TYPES: Final = ("Float64MultiArray", "MultiArrayLayout", "MultiArrayDimension")
-_WRITERS: Final = {".npz": _write_archive, ".mcap": _write_bag}
+_WRITERS: Final = {".npz": _archive, ".mcap": _bag}
 
 
 def check_request(path: Path, deployment: Deployment) -> None:
