@@ -1,9 +1,11 @@
 """Work on a dask scheduler against the same work in one process: a sweep of designs, and a recording.
 
-one core   ─▶ work(in_this_process)
-all cores  ─▶ the same in a process on each, at once: what the machine can do
+alone      ─▶ work(in_this_process)
+at once    ─▶ the same in a process on each core: what the machine can do
             this process ─▶ scheduler ─▶ a worker on each core                efficiency = alone / (cores * seconds)
 hosts 1-4  ─▶ the same, with a worker in each of several network namespaces   bytes on the wire
+
+These are measured one after the other, in rounds, whose medians are shown.
 """
 
 from __future__ import annotations
@@ -48,6 +50,11 @@ NETWORK: Final = "10.213.7"
 TASKS: Final = 2000
 """Empty tasks, to measure the scheduler."""
 START_S: Final = 60.0
+LEAN: Final = {
+    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
+}
+"""Settings of dask that the guide names."""
 
 
 class Designs:
@@ -100,8 +107,10 @@ class Hosts:
         self.address = ""
 
     def _start(self, *command: str) -> None:
+        settings = os.environ | LEAN
         with (self._folder / f"{len(self._running)}.log").open("wb") as log:
-            self._running.append(subprocess.Popen(command, stdout=log, stderr=log, cwd=self._folder))
+            started = subprocess.Popen(command, stdout=log, stderr=log, cwd=self._folder, env=settings)
+            self._running.append(started)
 
     @contextmanager
     def serving(self, workers: int, *, namespaces: bool) -> Iterator[str]:
@@ -251,18 +260,14 @@ def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> fl
     }
     load_kernels(arguments.designs)
     cores = sorted(os.sched_getaffinity(0))
-    # By work and number of cores: a core may be slower while others are in use.
-    alone = {
-        (name, used): seconds_at_once(kind, folder, cores[:used])
-        for name, kind in kinds.items()
-        for used in sorted({1, min(2, len(cores)), min(4, len(cores))})
-    }
     works = {name: kind(folder) for name, kind in kinds.items()}
     table = Table(title="efficiency: seconds in one process / (cores x seconds)", title_justify="left")
-    for name in ("work", "workers", "hosts", "seconds", "to one alone", "to all at once", "bytes a batch"):
+    columns = "work", "workers", "hosts", "alone", "at once", "seconds", "to one alone", "to all at once"
+    for name in (*columns, "bytes a batch"):
         table.add_column(name, justify="right" if name != "work" else "left")
     lowest, rate = 2.0, 0.0
     for workers, namespaces in ((2, False), (1, True), (2, True), (4, True)):
+        used, hosts = min(workers, len(cores)), str(workers) if namespaces else "this one"
         try:
             with (
                 Hosts(folder).serving(workers, namespaces=namespaces) as address,
@@ -272,28 +277,30 @@ def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> fl
                 rate = rate or done
                 Recording(folder / "first", 1)(run)  # the scheduler loads our modules, once in its life
                 for name, work in works.items():
-                    before = sum(_sent(f"rosbayes{at}") for at in range(workers)) if namespaces else 0
-                    with counted_batches() as batches:
-                        took = seconds_of(work, run)
-                    used = min(workers, len(cores))
-                    serial, busy = (alone[name, count] / (used * took) for count in (1, used))
-                    sent = "-"
-                    if namespaces:
-                        bytes_ = sum(_sent(f"rosbayes{at}") for at in range(workers)) - before
-                        sent = f"{bytes_ / len(batches):,.0f}"
-                    else:
-                        lowest = min(lowest, busy)
-                    hosts = str(workers) if namespaces else "this one"
-                    table.add_row(
-                        name, str(workers), hosts, f"{took:.1f}", f"{serial:.0%}", f"{busy:.0%}", sent
-                    )
+                    rounds, sent, batches = list[tuple[float, ...]](), 0, 0
+                    for _ in range(1 if namespaces else arguments.rounds):
+                        # one after the other, because the speed of a core changes; with others in use, too
+                        alone = seconds_at_once(kinds[name], folder, cores[:1])
+                        together = seconds_at_once(kinds[name], folder, cores[:used]) if used > 1 else alone
+                        before = sum(_sent(f"rosbayes{at}") for at in range(workers)) if namespaces else 0
+                        with counted_batches() as submitted:
+                            took = seconds_of(work, run)
+                        if namespaces:
+                            sent += sum(_sent(f"rosbayes{at}") for at in range(workers)) - before
+                            batches += len(submitted)
+                        rounds.append(
+                            (alone, together, took, alone / (used * took), together / (used * took))
+                        )
+                    *seconds, serial, busy = np.median(rounds, axis=0).tolist()
+                    lowest = lowest if namespaces else min(lowest, busy)
+                    cells = [f"{each:.1f}" for each in seconds]
+                    cells += [f"{serial:.0%}", f"{busy:.0%}", f"{sent / batches:,.0f}" if sent else "-"]
+                    table.add_row(name, str(workers), hosts, *cells)
         except ProcessError as reason:
             if not namespaces:
                 raise
             console.print(f"no network namespaces here: {reason}")
             break
-    for (name, used), seconds in alone.items():
-        console.print(f"{name}: {seconds:.1f} s in one process{f', {used} of them at once' * (used > 1)}")
     console.print(table)
     console.print(f"The scheduler does {rate:,.0f} empty tasks/s.")
     return lowest
@@ -326,6 +333,7 @@ def main() -> int:
     parser.add_argument("--designs", type=int, default=200, help="number of designs of the boat")
     parser.add_argument("--sweep-frames", type=int, default=20, help="number of frames of each design")
     parser.add_argument("--frames", type=int, default=20_000, help="number of frames of the recording")
+    parser.add_argument("--rounds", type=int, default=3, help="rounds on this host; one on namespaces")
     parser.add_argument(
         "--check", action="store_true", help=f"fail below {AIM:.0%} on two cores of this host"
     )

@@ -41,7 +41,7 @@ _TOGETHER: Final = 64
 """Records that are written to the output at once."""
 
 _Records: TypeAlias = "np.memmap[Any, np.dtype[np.void]]"
-_Write: TypeAlias = Callable[[_Records], None]
+_Write: TypeAlias = Callable[[NDArray[np.void]], None]
 _Posterior: TypeAlias = NDArray[np.float64] | None
 
 
@@ -305,7 +305,7 @@ def _archive(path: Path, deployment: Deployment, frames: Frames) -> Iterator[_Wr
                 file, {"descr": "<f8", "fortran_order": False, "shape": shape}
             )
 
-            def write(records: _Records) -> None:
+            def write(records: NDArray[np.void]) -> None:
                 file.write(records["posterior"].tobytes())
                 cycles.append(records["cycles"].copy())
 
@@ -344,7 +344,7 @@ def _bag(path: Path, deployment: Deployment, frames: Frames) -> Iterator[_Write]
             with Writer(folder / "BMresults", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
                 topic = writer.add_connection(_TOPIC, array.__msgtype__, typestore=store)
 
-                def write(records: _Records) -> None:
+                def write(records: NDArray[np.void]) -> None:
                     for values, stamp in zip(records["posterior"], stamps, strict=False):
                         if not math.isnan(values[0]):
                             message = array(layout=layout(dim=dim, data_offset=0), data=np.array(values))
