@@ -21,6 +21,7 @@ import pytest
 from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.builders import corridor
 from tests.toolchain.running import build_model, done, toolchain
+from toolchain import cluster as clusters
 from toolchain.analysis.replay import record_layout
 from toolchain.cluster import ClusterError, SchedulerOptions, in_this_process, runner
 from toolchain.deployment import load_deployment
@@ -350,6 +351,25 @@ def test_the_file_of_tls_that_is_wrong_is_named(tmp_path, flag, content, sentenc
 )
 def test_flags_of_a_scheduler(options):
     SchedulerOptions(**options)
+
+
+class Squares:
+    """A job whose tables are nothing."""
+
+    def prepare(self):
+        return lambda number: number * number
+
+
+@pytest.mark.process
+def test_what_a_batch_leaves_when_its_time_is_over_comes_again(cluster, monkeypatch):
+    rounds, found, do = [], [], clusters._do
+    monkeypatch.setattr(clusters, "_SMALLEST_S", 0.0)  # so the first batches end after one piece each
+    monkeypatch.setattr(clusters, "_do", lambda *given: rounds.append(do(*given)))
+    cluster.start_worker()
+    with runner(SchedulerOptions(scheduler=cluster.address)) as run:
+        run(Squares(), range(300), lambda *each: found.append(each))
+    assert len(rounds) == 1
+    assert sorted(found) == [(number, number * number) for number in range(300)]
 
 
 def test_work_in_this_process_is_in_order():
