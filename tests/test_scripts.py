@@ -13,7 +13,10 @@ SCRIPTS = sorted(path for path in (ROOT / "scripts").iterdir() if path.is_file()
 
 
 PARTS = {
-    "bench": ("bridge", "cluster", "cycle", "dashboard", "kernel", "link", "mrclam", "networks", "thesis"),
+    "bench": (
+        *("bridge", "cluster", "cycle", "dashboard", "kernel", "link", "load", "mrclam", "networks", "start"),
+        *("thesis", "topics"),
+    ),
     "verify": ("conformance", "containers", "hdl", "networks", "resources", "rosbridge", "tools", "wheel"),
 }
 

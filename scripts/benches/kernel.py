@@ -1,31 +1,36 @@
-"""Speed of the fast kernels on one core: BM1, and BM2 as one chain and as many.
+"""Speed of the fast kernels on one core: BM1, and BM2 as one chain and as many, beside other Gibbs samplers.
 
-The networks of the BM2 are the sprinkler with wet grass, and pgmpy's alarm with nothing known.
+sprinkler (the case study), wet grass ──┬──▶ BM2: one chain, many chains; a plain Gibbs sampler in numba
+alarm (pgmpy's), nothing known ─────────┴──▶ pyAgrum's Gibbs sampler; THRML's, with --thrml
 """
 
 import argparse
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from functools import cache
+from typing import Any, Final, cast
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
 from casestudies.sprinkler.model import model as sprinkler
 from machines.bm1 import BM1Machine, Start
-from machines.bm2 import BM2Machine, BM2Start, start_state
+from machines.bm2 import BM2Machine, BM2Start, start_state, unpack
 from machines.bm2_chains import Chains
 from machines.bm2_fast import FastBM2
 from machines.fast import FastBM1
 from machines.parameters import BM1Parameters, Sequencer
-from scripts.benches.networks import machine_of
-from scripts.benches.samplers import Known
+from scripts.benches.networks import factors_of, machine_of
+from scripts.benches.samplers import CHAINS, THRML_LOCK, Factor, Known, pyagrum_gibbs, thrml_gibbs
 from scripts.running.flags import ScriptParser
 from scripts.running.script import print_table
 from scripts.verifications.installation import use_packages
 from scripts.verifications.networks import EXAMPLES, LOCK
-from toolchain.models.network import NetworkModel
+from toolchain.models import JointDistribution
+from toolchain.models.distribution import Distribution
 from toolchain.networks import read_network
 
 SINGLE_AIMS: Final = {"sprinkler": 6e7, "alarm": 2e7}
@@ -36,6 +41,7 @@ MANY: Final = {"sprinkler": 512, "alarm": 32}
 """Number of chains."""
 TURNS: Final = 3
 """Times that each alternative is measured; the fastest counts, because other processes only slow it down."""
+BURN_IN: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +69,91 @@ def bm1(cycles: int) -> Speed:
     return Speed(kernel.cycles, 0, time.process_time() - began)
 
 
-def chains_of(
-    model: NetworkModel, known: Known, arguments: argparse.Namespace
+def _sweep(
+    values: NDArray[np.int64],
+    unknown: NDArray[np.int64],
+    sizes: NDArray[np.int64],
+    first: NDArray[np.int64],
+    held: NDArray[np.int64],
+    tables: NDArray[np.float64],
+    counts: NDArray[np.int64],
+    sweeps: int,
+) -> None:
+    """Draw each unknown variable in turn, from the product of its factors."""
+    weights = np.empty(sizes.max())
+    for _ in range(sweeps):
+        for variable in unknown:
+            total = 0.0
+            for value in range(sizes[variable]):
+                values[variable] = value
+                weight = 1.0
+                for factor in range(first[variable], first[variable + 1]):
+                    place = held[factor, 0]
+                    for i in range(held[factor, 1]):
+                        place += held[factor, 2 + 2 * i] * values[held[factor, 3 + 2 * i]]
+                    weight *= tables[place]
+                total += weight
+                weights[value] = total
+            drawn = np.random.random() * total  # noqa: NPY002 - numba's own generator
+            value = 0
+            while weights[value] <= drawn:
+                value += 1
+            values[variable] = value
+        for variable in unknown:
+            counts[variable, values[variable]] += 1
+
+
+_compiled_sweep = cast("Callable[..., None]", njit(_sweep))
+
+
+def numba_gibbs(factors: Sequence[Factor], start: Sequence[int], known: Known, sweeps: int) -> Speed:
+    """Run a plain Gibbs sampler over the variables' values, as one would write it in numba."""
+    sizes = {each: size for scope, table in factors for each, size in zip(scope, table.shape, strict=True)}
+    bases = np.cumsum([0, *(table.size for _, table in factors)])
+    first, held = [0], []
+    for variable in range(len(sizes)):
+        for base, (scope, table) in zip(bases, factors, strict=False):
+            if variable in scope:
+                steps = [np.prod(table.shape[axis + 1 :], dtype=int) for axis in range(table.ndim)]
+                held.append([base, len(scope), *(n for pair in zip(steps, scope, strict=True) for n in pair)])
+        first.append(len(held))
+    rows = np.zeros((len(held), max(map(len, held))), dtype=np.int64)
+    for at, row in enumerate(held):
+        rows[at, : len(row)] = row
+    arguments = (
+        np.array(start, dtype=np.int64),
+        np.array([variable for variable in range(len(sizes)) if variable not in known], dtype=np.int64),
+        np.array([sizes[variable] for variable in range(len(sizes))], dtype=np.int64),
+        np.array(first, dtype=np.int64),
+        rows,
+        np.concatenate([table.ravel() for _, table in factors]).astype(np.float64),
+        np.zeros((len(sizes), max(sizes.values())), dtype=np.int64),
+    )
+    _compiled_sweep(*arguments, 1)
+    began = time.process_time()
+    _compiled_sweep(*arguments, sweeps)
+    return Speed(0, sweeps, time.process_time() - began)
+
+
+def in_pyagrum(pyagrum: Any, joint: JointDistribution) -> Any:
+    """Return a network as one of pyAgrum, whose variables have the same names."""
+    network = pyagrum.BayesNet(joint.name)
+    for symbol in joint.symbols:
+        network.add(symbol.name, symbol.size)
+    for factor in joint.factors:
+        assert isinstance(factor, Distribution)
+        # its arrays have the axes in the reverse order of its arcs, and the child last
+        for parent in reversed(factor.given):
+            network.addArc(parent.name, factor.symbol.name)
+        network.cpt(factor.symbol.name)[:] = np.ascontiguousarray(np.moveaxis(factor.table, 0, -1))
+    return network
+
+
+def alternatives(
+    pyagrum: Any, joint: JointDistribution, known: Known, arguments: argparse.Namespace
 ) -> dict[str, Callable[[], Speed]]:
-    """Return functions that run one chain, and many."""
+    """Return functions that run each alternative once."""
+    model = joint.ask(joint.symbols).network()
     machine = machine_of(model, Sequencer.LINEAR)
     parameters = machine.parameters
     state = start_state(machine, known)
@@ -75,7 +162,7 @@ def chains_of(
         state=state,
         known=sum(parameters.masks[variable] for variable in known),
         samples=arguments.sweeps,
-        burn_in=100,
+        burn_in=BURN_IN,
         ops_timeout=parameters.ops_timeout,
         max_cycles=2**40,
     )
@@ -102,7 +189,28 @@ def chains_of(
         seconds = time.process_time() - began
         return Speed(sum(each.cycles for each in results), sum(each.samples for each in results), seconds)
 
-    return {f"BM2, {model.name}, one chain": single, f"BM2, {model.name}, {many} chains": together}
+    def others(run: Callable[..., Any], *given: Any, **options: Any) -> Callable[[], Speed]:
+        @cache  # once is enough to tell, and THRML compiles in each run
+        def once() -> Speed:
+            began = time.process_time()
+            sampled = run(*given, burn_in=BURN_IN, **options)
+            # their seconds exclude compilation, and those of the processor what other processes took
+            return Speed(0, sampled.sweeps, min(sampled.seconds, time.process_time() - began))
+
+        return once
+
+    sweeps, factors, values = arguments.sweeps, factors_of(model), unpack(parameters, state)
+    theirs = (pyagrum, in_pyagrum(pyagrum, joint), model.names, known)
+    runs = {
+        "BM2, one chain": single,
+        f"BM2, {many} chains": together,
+        "Gibbs in numba": lambda: numba_gibbs(factors, values, known, sweeps),
+        "pyAgrum's Gibbs": others(pyagrum_gibbs, *theirs, sweeps=sweeps, limit=arguments.seconds),
+    }
+    if arguments.thrml:
+        blocks = (factors, values, known, parameters.colours)
+        runs[f"THRML, {CHAINS} chains"] = others(thrml_gibbs, *blocks, sweeps=sweeps)
+    return runs
 
 
 def measure(runs: dict[str, Callable[[], Speed]]) -> dict[str, Speed]:
@@ -116,31 +224,38 @@ def measure(runs: dict[str, Callable[[], Speed]]) -> dict[str, Speed]:
     return best
 
 
+def show(title: str, speeds: dict[str, Speed]) -> None:
+    """Print a table; the ratios are those of sweeps a second to one chain."""
+    rows = []
+    single = next(iter(speeds.values()))
+    for name, each in speeds.items():
+        per_second = [f"{n / each.seconds:.2e}" if n else "" for n in (each.cycles, each.sweeps)]
+        ratio = each.sweeps / each.seconds * single.seconds / single.sweeps if single.sweeps else 0
+        rows.append((name, *per_second, f"{ratio:.3g}" if ratio else ""))
+    print_table(title, ("kernel or sampler", "cycles/s", "sweeps/s", "ratio"), rows)
+
+
 def bench(arguments: argparse.Namespace) -> int:
     """Measure everything on one core; return 1 if an aim is missed and --check is given."""
     archive = use_packages("networks", LOCK) / EXAMPLES / "alarm.bif.gz"
-    joint = read_network(archive, on_missing="missing")
-    alarm = joint.ask([symbol.name for symbol in joint.symbols], ()).network()
-    wet = sprinkler().network()
+    if arguments.thrml:
+        use_packages("thrml", THRML_LOCK)
+    import pyagrum
+
+    alarm, wet = read_network(archive, on_missing="missing"), sprinkler().joint
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    speeds = measure({"BM1, 1024 lines x 7 columns, nothing kept": lambda: bm1(arguments.sweeps)})
-    missed, verdicts = False, []
-    for model, known in ((wet, {wet.names.index("G"): 1}), (alarm, {})):
-        found = measure(chains_of(model, known, arguments))
-        speeds |= found
-        single, many = (each.cycles / each.seconds for each in found.values())
-        single_aim, ratio_aim = SINGLE_AIMS[model.name], RATIO_AIMS[model.name]
+    show("BM1, 1024 lines x 7 columns", measure({"BM1, nothing kept": lambda: bm1(arguments.sweeps)}))
+    missed = False
+    for joint, known in ((wet, {[each.name for each in wet.symbols].index("G"): 1}), (alarm, {})):
+        speeds = measure(alternatives(pyagrum, joint, known, arguments))
+        show(f"{joint.name}, {len(known)} known", speeds)
+        single, many = (each.cycles / each.seconds for each in list(speeds.values())[:2])
+        single_aim, ratio_aim = SINGLE_AIMS[joint.name], RATIO_AIMS[joint.name]
         missed |= single < single_aim or many < ratio_aim * single
-        verdicts.append(
-            f"{model.name}: one chain {single:.2e} cycles/s (aim {single_aim:.0e}); many chains {many / single:.1f} times "
-            f"that (aim {ratio_aim})"
+        print(
+            f"{joint.name}: one chain {single:.2e} cycles/s (aim {single_aim:.0e}); many chains {many / single:.1f} times "
+            f"that (aim {ratio_aim})\n"
         )
-    rows = [
-        (name, *(f"{n / each.seconds:.2e}" if n else "" for n in (each.cycles, each.sweeps)))
-        for name, each in speeds.items()
-    ]
-    print_table("one core", ("kernel", "cycles/s", "sweeps/s"), rows)
-    print(*verdicts, sep="\n")
     return int(missed and arguments.check)
 
 
@@ -148,5 +263,7 @@ if __name__ == "__main__":
     parser = ScriptParser("scripts/bench kernel", __doc__)
     parser.flag("--sweeps", "samples of one chain, and cycles of the BM1", 200_000)
     parser.flag("--chain-sweeps", "samples of all of many chains, fewer if they are long", 80_000_000)
+    parser.flag("--seconds", "limit of each run of pyAgrum's sampler", 3.0)
+    parser.switch("--thrml", "also compare THRML; installs it, in a folder of its own (530 MB)")
     parser.switch("--check", "exit 1 if an aim is missed")
     parser.run_at_once(bench)
