@@ -10,7 +10,7 @@ from tests.toolchain.builders import corridor
 from tests.toolchain.building.test_filter import ASKED, UMBRELLA
 from tests.toolchain.running import TARGET, assert_refused, build_model, done, toolchain
 from toolchain.analysis.readings import recorded_frames
-from toolchain.analysis.replay import PartFile, replay
+from toolchain.analysis.replay import PartFile, record_layout, replay
 from toolchain.cluster import in_this_process
 from toolchain.deployment import load_deployment
 from toolchain.errors import BuildError
@@ -110,12 +110,24 @@ def test_the_output_grows_while_frames_are_computed(tmp_path, name):
     if name.endswith(".npz"):  # the library of bags keeps a chunk of them in memory
         assert sizes[0] < sizes[1000] < sizes[-1]
 
+    records = {}
+
     def in_parts(job, numbers, keep):
+        def note(row, record):
+            records[row] = record
+            keep(row, record)
+
         for part in (1, 0, 2):
-            backwards(job, numbers[part::3], keep)
+            backwards(job, numbers[part::3], note)
 
     replay(deployment, frames, mixed, in_parts)
     assert mixed.read_bytes() == whole.read_bytes()
+    if name.endswith(".npz"):
+        expected = np.frombuffer(b"".join(records[row] for row in range(2000)), record_layout(deployment))
+        with np.load(mixed) as arrays:
+            assert (arrays["cycles"] == expected["cycles"]).all()
+            found = arrays["probabilities"].reshape(2000, -1)
+            assert np.array_equal(found, expected["posterior"], equal_nan=True)
 
 
 @pytest.mark.parametrize(
