@@ -255,9 +255,9 @@ def _prepared(pickled: bytes, _thread: int) -> Work:
 
 
 def do_batch(pickled: bytes, numbers: Sequence[int], most_s: float, theirs: str) -> tuple[bytes, float]:
-    """Do pieces on a worker until so many seconds are over; return the results, pickled and compressed, and the seconds.
+    """Do pieces on a worker for `most_s` seconds, but at least one; return their results and the seconds.
 
-    A posterior is mostly zeros, and would pass through the scheduler as it is.
+    The results are pickled and compressed: a posterior is mostly zeros, and would pass through the scheduler as it is.
 
     Raises:
         ClusterError: This worker has another version of our software than the client.

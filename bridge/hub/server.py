@@ -47,8 +47,8 @@ _TURN_FRAMES: Final = 128
 _TURN_BYTES: Final = 64 * 1024
 _SLICE_BYTES: Final = 4 * 1024
 _TURN_MESSAGES: Final = 32
-# Bytes of a block that the hub frees once, so that glibc retains up to twice as many bytes of freed memory. Otherwise it
-# returns them after each burst and gets them again page by page: a quarter of the hub's time with messages of 17 kB.
+# Bytes of a block that the hub frees once, so that glibc retains up to twice as many bytes of freed memory. Otherwise
+# it returns them after each burst and gets them again page by page: a quarter of the hub's time with messages of 17 kB.
 _RETAINED: Final = 4 * 1024 * 1024
 # Seconds for which the hub polls its sockets after a prompt response; in which a response comes that waited for the end
 # of that; and for which the hub does not poll then, at first and at most (see `_Hub.stay_awake`).

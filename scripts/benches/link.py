@@ -43,7 +43,7 @@ BOARDS = (1, 2, 4)
 WORDS = (1, 16, 256, 1024, 4096, 8192)
 RESULTS = 4096
 WAYS = {"sent": (), "read": ("--read-results",)}
-"""Ways of the results to the host: in the done message, or by reads of the registers as in the thesis; flags of `board`."""
+"""Flags of `board` for the way of the results: in the done message, or by reads of registers as in the thesis."""
 SLOWER = 20
 """A measurement over JTAG for so many of the others, because each takes milliseconds."""
 TOLERANCE = 0.15

@@ -1,7 +1,7 @@
 """Connections of the campaign: proxies between the parts of the stack, and status sockets.
 
     robot side                                   stack
-    PlainClient ── hub ── Proxy "rosbridge" ── subscriber, publisher ── Proxy ── master ── Proxy ── pcie-app ── Proxy ── boards
+    PlainClient ─ hub ─ Proxy "rosbridge" ─ subscriber, publisher ─ Proxy ─ master ─ Proxy ─ pcie-app ─ Proxy ─ boards
 
 A proxy delays, holds, cuts, repeats and corrupts data.
 """

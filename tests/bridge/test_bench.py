@@ -1,4 +1,4 @@
-"""What `scripts/bench bridge` says about messages that the hub dropped."""
+"""The sentence of `scripts/bench bridge` about messages that the hub dropped."""
 
 from collections import defaultdict
 

@@ -1,4 +1,4 @@
-"""The command demo: what it refuses before anything starts, and what it says that it does."""
+"""The command demo: requests that it refuses before anything starts, and its words while it works."""
 
 import asyncio
 import re

@@ -354,14 +354,14 @@ def test_flags_of_a_scheduler(options):
 
 
 class Squares:
-    """A job whose tables are nothing."""
+    """A job without tables."""
 
     def prepare(self):
         return lambda number: number * number
 
 
 @pytest.mark.process
-def test_what_a_batch_leaves_when_its_time_is_over_comes_again(cluster, monkeypatch):
+def test_pieces_left_at_the_end_of_a_batch_are_done_later(cluster, monkeypatch):
     rounds, found, do = [], [], clusters._do
     monkeypatch.setattr(clusters, "_SMALLEST_S", 0.0)  # so the first batches end after one piece each
     monkeypatch.setattr(clusters, "_do", lambda *given: rounds.append(do(*given)))

@@ -242,8 +242,8 @@ class Frames:
     Attributes:
         readings: Those of all rows; a row that does not fit has none.
         fits: bool[rows], whether the readings are values that the machine takes; without, there is no posterior.
-        stamps: int64[rows], nanoseconds: of the messages of a bag or the column of a CSV file, or else 0, 1, 2, ..., the
-            numbers of the rows.
+        stamps: int64[rows], nanoseconds: of the messages of a bag or the column of a CSV file, or else the numbers
+            of the rows, 0, 1, 2, ...
         why: What is wrong with the first row that does not fit; empty if all do.
     """
 

@@ -197,7 +197,7 @@ class PartFile:
 
 
 class _InOrder:
-    """Writes records in the order of their rows, as soon as those before are there, so that the output grows with them."""
+    """Writes records in the order of their rows, each as soon as those before it are there."""
 
     def __init__(self, records: _Records, missing: Sequence[int], write: _Write) -> None:
         self._records, self._write = records, write
