@@ -12,6 +12,7 @@ order. Whoever keeps results on disk can begin again with the numbers that are m
 import asyncio
 import logging
 import pickle
+import re
 import ssl
 import sys
 import time
@@ -20,7 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from hashlib import sha256
 from importlib import metadata
 from ipaddress import ip_address
@@ -28,7 +29,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import get_ident
 from typing import Annotated, Any, Final, Protocol, TypeAlias
-from urllib.parse import urlsplit
 
 import typer
 
@@ -41,22 +41,17 @@ BATCH_S: Final = 2.0
 """Maximum number of seconds of work in a batch, so that dask's share of about 15 ms of CPU time for each is small."""
 _SMALLEST_S: Final = BATCH_S / 20
 """The same at the end, so that the workers finish at about the same time, and until their speed is known."""
-_FIRST: Final = 100
-"""Maximum number of pieces in a batch until their speed is known."""
 _AHEAD: Final = 3
 """Batches on their way for each worker: one that is computed, one that waits there, and one at the scheduler."""
-_LATELY: Final = 4
-"""Batches whose speed decides on the number of pieces in the next."""
 _PATIENCE_S: Final = 60.0
 """Seconds in which a scheduler must come back, or get a worker again."""
 _CONNECT_S: Final = 10.0
 _POLL_S: Final = 1.0
-_COUNT_S: Final = 5.0
-"""Seconds between two counts of the workers."""
 _LEAN: Final = {"distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "1s"}
 """Settings of our own scheduler and workers: by dask's, each spends 3 to 5 % of a core on watching itself."""
 _JOBS: Final = 8
 """Jobs that a worker keeps prepared, for each of its threads."""
+_ADDRESS: Final = re.compile(r"(tcp|tls)://(?:\[([\da-fA-F:.]+)]|([^][:/]+)):\d{1,5}")
 
 
 class Job(Protocol):
@@ -66,18 +61,16 @@ class Job(Protocol):
         """Return the function that does the piece of a number."""
 
 
-class Run(Protocol):
-    """A way to do the pieces of a job."""
-
-    def __call__(self, job: Job, numbers: Sequence[int], keep: Keep) -> None:
-        """Do the pieces of these numbers, and call `keep` with each result as soon as it is there."""
+Run: TypeAlias = Callable[[Job, Sequence[int], Keep], None]
+"""A way to do the pieces of these numbers; it calls `keep` with each result as soon as it is there."""
 
 
 def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:
     """Do the pieces in this process, in order."""
-    work = job.prepare() if numbers else None
-    for number in numbers:
-        keep(number, work(number) if work else None)
+    if numbers:
+        work = job.prepare()
+        for number in numbers:
+            keep(number, work(number))
 
 
 class ClusterError(ToolchainError):
@@ -109,34 +102,24 @@ class SchedulerOptions:
     ] = False
 
     def __post_init__(self) -> None:
-        """Refuse flags that contradict each other."""
+        """Refuse flags that contradict each other, and files that cannot be used."""
         files = {"--tls-ca-file": self.tls_ca_file, "--tls-cert": self.tls_cert, "--tls-key": self.tls_key}
-        if self.scheduler in (None, "local"):
-            given = [flag for flag, file in files.items() if file is not None]
-            if given:
-                raise BuildError(f"{given[0]} is for --scheduler tls://HOST:PORT")
-            return
-        try:
-            parts = urlsplit(self.scheduler)
-            ok = parts.scheme in ("tcp", "tls") and bool(parts.hostname) and parts.port is not None
-        except ValueError:
-            ok = False
-        if not ok:
+        given = [flag for flag, file in files.items() if file is not None]
+        flag, address = f"--scheduler {self.scheduler}", _ADDRESS.fullmatch(self.scheduler or "")
+        if address is None and self.scheduler not in (None, "local"):
             raise BuildError(
-                f"--scheduler {self.scheduler}: expected tcp://HOST:PORT or tls://HOST:PORT, as the scheduler prints it, or "
-                "local"
+                f"{flag}: expected tcp://HOST:PORT or tls://HOST:PORT, as the scheduler prints it, or local"
             )
-        missing = [flag for flag, file in files.items() if file is None]
-        if parts.scheme == "tls" and missing:
-            raise BuildError(f"--scheduler {self.scheduler} needs {', '.join(missing)} too")
-        if parts.scheme == "tls":
+        if address is not None and address[1] == "tls":
+            if len(given) < len(files):
+                raise BuildError(f"{flag} needs {', '.join(each for each in files if each not in given)} too")
             _check_certificates(files)
-        if parts.scheme == "tcp" and len(missing) < len(files):
-            raise BuildError(f"--scheduler {self.scheduler} does not use TLS: write tls:// instead of tcp://")
-        if parts.scheme == "tcp" and not self.insecure and not _is_loopback(parts.hostname or ""):
+        elif given:
+            raise BuildError(f"{given[0]} is for --scheduler tls://HOST:PORT")
+        elif address is not None and not self.insecure and not _is_loopback(address[2] or address[3]):
             raise BuildError(
-                f"--scheduler {self.scheduler}: without TLS, everybody on the way there can run programs as this user; use "
-                "tls:// with --tls-ca-file, --tls-cert and --tls-key, or --insecure"
+                f"{flag}: without TLS, everybody on the way there can run programs as this user; use tls:// with "
+                "--tls-ca-file, --tls-cert and --tls-key, or --insecure"
             )
 
 
@@ -150,10 +133,6 @@ def _check_certificates(files: dict[str, Path | None]) -> None:
             else:
                 context.load_verify_locations(file)
         except OSError as reason:
-            if isinstance(reason, ssl.SSLError) and reason.reason == "KEY_VALUES_MISMATCH":
-                raise BuildError(
-                    f"{flag} {file} is not the key of --tls-cert {files['--tls-cert']}"
-                ) from None
             raise BuildError(f"{flag} {file} cannot be used: {reason.strerror or reason}") from None
 
 
@@ -166,23 +145,21 @@ def _is_loopback(host: str) -> bool:
 @contextmanager
 def runner(options: SchedulerOptions) -> Iterator[Run]:
     """Yield the way to do work that the options ask for, or raise a ClusterError."""
-    if options.scheduler is None:
+    address = options.scheduler
+    if address is None:
         yield in_this_process
         return
     try:
         import dask
         import lz4.frame  # noqa: F401 - only whether it is there
         from distributed import Client, LocalCluster, Security
-    except ImportError:
-        raise ClusterError("--scheduler needs dask: pip install 'rosbayes[cluster]'") from None
-    except ValueError as reason:
-        raise ClusterError(
-            f"dask cannot be used: {str(reason).splitlines()[0]}"
-        ) from None  # a damaged file of its settings
+    except (ImportError, ValueError) as reason:  # ValueError: a damaged file of dask's settings
+        why = str(reason).partition("\n")[0]
+        raise ClusterError(f"--scheduler needs dask: pip install 'rosbayes[cluster]' ({why})") from None
     # log lines of dask on standard error repeat what is said here
     for name in ("distributed", "distributed.client", "tornado.application"):
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    if options.scheduler == "local":
+    if address == "local":
         with TemporaryDirectory(prefix="rosbayes-") as folder, dask.config.set(_LEAN):
             try:
                 # with certificates of its own, because other users of this host could connect too
@@ -197,9 +174,9 @@ def runner(options: SchedulerOptions) -> Iterator[Run]:
             except (OSError, RuntimeError) as reason:
                 raise ClusterError(f"--scheduler local cannot start its workers: {reason}") from None
             with local:
-                yield _OnScheduler("local", lambda: Client(local))
+                yield partial(_run_on, address, lambda: Client(local))
         return
-    address, security = options.scheduler, Security()
+    security = Security()
     if address.startswith("tls:"):
         security = Security(
             tls_ca_file=str(options.tls_ca_file),
@@ -213,23 +190,19 @@ def runner(options: SchedulerOptions) -> Iterator[Run]:
         asyncio.run(asyncio.wait_for(_greet(address, security.get_connection_args("client")), _CONNECT_S))
         return Client(address, security=security, timeout=_CONNECT_S)
 
-    yield _OnScheduler(address, connect)
+    yield partial(_run_on, address, connect)
 
 
 async def _greet(address: str, arguments: dict[str, Any]) -> None:
     """Raise an OSError if no scheduler answers at an address."""
-    from distributed.comm import connect
+    from distributed.core import rpc
 
     try:
-        comm = await connect(address, timeout=_CONNECT_S, **arguments)
-        try:
-            await comm.write({"op": "identity"})
-            is_scheduler = (await comm.read()).get("type") == "Scheduler"
-        finally:
-            comm.abort()
+        async with rpc(address, timeout=_CONNECT_S, connection_args=arguments) as there:
+            identity = await there.identity()
     except Exception as reason:  # whatever dask makes of another protocol
         raise OSError(str(reason)) from None
-    if not is_scheduler:
+    if identity["type"] != "Scheduler":
         raise OSError("another part of dask")
 
 
@@ -287,99 +260,81 @@ def _noticing_loss() -> Iterator[None]:
         raise _LostError from None
 
 
-class _OnScheduler:
-    """Work on the workers of a scheduler; what was not done when it disappeared is given to the next one."""
+def _run_on(address: str, connect: Callable[[], Any], job: Job, numbers: Sequence[int], keep: Keep) -> None:
+    """Do the pieces on the workers of a scheduler; what was not done when it disappeared is given to the next one.
 
-    def __init__(self, address: str, connect: Callable[[], Any]) -> None:
-        self._address = address
-        self._connect = connect
+    Raises:
+        ClusterError: The workers cannot do them, or stay away for a minute.
+    """
+    left = dict.fromkeys(numbers)  # in order; those without a result
 
-    def __call__(self, job: Job, numbers: Sequence[int], keep: Keep) -> None:
-        """Do the pieces on the workers; a ClusterError if they cannot, or if they stay away for a minute."""
-        left = dict.fromkeys(numbers)  # in order; those without a result
+    def keep_once(number: int, result: Any) -> None:
+        keep(number, result)
+        del left[number]
 
-        def keep_once(number: int, result: Any) -> None:
-            keep(number, result)
-            del left[number]
-
-        pickled = pickle.dumps(job)
-        # Until when (monotonic) a scheduler may take to answer, 0 for the first time; and when a piece was last done.
-        until, progress_at = 0.0, time.monotonic()
-        while left:
-            before, client = len(left), self._client(until)
-            try:
-                _do(self._address, client, pickled, left, keep_once)
-            except _LostError:
+    pickled = pickle.dumps(job)
+    until = 0.0  # until when (monotonic) the work may stand still since the scheduler was lost; not at first
+    while left:
+        before, client = len(left), _client(address, connect, until)
+        try:
+            _do(address, client, pickled, left, keep_once)
+        except _LostError:
+            if not until or len(left) < before:
                 until = time.monotonic() + _PATIENCE_S
-                if len(left) < before:
-                    progress_at = time.monotonic()
-                if time.monotonic() > progress_at + _PATIENCE_S:
-                    raise ClusterError(
-                        f"--scheduler {self._address} lost this work again and again; read the logs of its workers"
-                    ) from None
-                print(
-                    f"{self._address} lost the work; waiting for it with {len(left)} pieces left",
-                    file=sys.stderr,
-                )
-            finally:
-                with suppress(_LostError), _noticing_loss():
-                    client.close(timeout=_POLL_S)
+            elif time.monotonic() > until:
+                raise ClusterError(
+                    f"--scheduler {address} lost this work again and again; read the logs of its workers"
+                ) from None
+            print(f"{address} lost the work; waiting for it with {len(left)} pieces left", file=sys.stderr)
+        finally:
+            with suppress(_LostError), _noticing_loss():
+                client.close(timeout=_POLL_S)
 
-    def _client(self, until: float = 0.0) -> Any:
-        """Return a client of a scheduler that has a worker; try until a monotonic time."""
-        while True:
-            client = None
-            try:
-                client = self._connect()
-                client.wait_for_workers(1, timeout=_CONNECT_S)
-            except (OSError, ValueError):
-                if client is not None:
-                    client.close(timeout=_POLL_S)
-                if time.monotonic() < until:
-                    time.sleep(_POLL_S)
-                    continue
-                if client is None:
-                    tls = "wants other certificates" if self._address.startswith("tls:") else "wants tls://"
-                    why = f"no scheduler answers there, or it {tls}; start one with 'dask scheduler', or correct the flags"
-                else:
-                    why = (
-                        f"it has no worker; start one with 'dask worker {self._address} --nthreads 1', or read the log of one "
-                        "that has ended"
-                    )
-                raise ClusterError(f"--scheduler {self._address}: {why}") from None
-            else:
-                return client
+
+def _client(address: str, connect: Callable[[], Any], until: float) -> Any:
+    """Return a client of a scheduler that has a worker; try until a monotonic time."""
+    while True:
+        client = None
+        try:
+            client = connect()
+            client.wait_for_workers(1, timeout=_CONNECT_S)
+        except (OSError, ValueError):
+            if client is not None:
+                client.close(timeout=_POLL_S)
+            if time.monotonic() < until:
+                time.sleep(_POLL_S)
+                continue
+            tls = "wants other certificates" if address.startswith("tls:") else "wants tls://"
+            why = f"no scheduler answers there, or it {tls}; start one with 'dask scheduler', or correct the flags"
+            if client is not None:
+                why = f"it has no worker; start one with 'dask worker {address} --nthreads 1', or read the log of one that has ended"
+            raise ClusterError(f"--scheduler {address}: {why}") from None
+        else:
+            return client
 
 
 def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Keep) -> None:
     """Do the pieces of a job on the workers of one scheduler; a `_LostError` if that cannot go on here."""
     from distributed import wait
 
-    # Numbers that are not on their way yet, in order; and the numbers of each batch that is.
-    waiting, batches = deque(left), dict[Any, list[int]]()
-    # Pieces and seconds of the last batches; a worker's first pieces are slow, so larger batches count for more.
-    done_lately = deque[tuple[int, float]](maxlen=_LATELY)
-    # Pieces that are done at the same time, and when that was counted; and when there was a worker (monotonic).
-    threads, counted_at, served_at = 0, 0.0, time.monotonic()
+    # Numbers that are not on their way yet, in order; the numbers of each batch that is; the seconds of a piece of the
+    # last batch, 0 before; and when there was a worker (monotonic).
+    waiting, batches, piece_s, served_at = deque(left), dict[Any, list[int]](), 0.0, time.monotonic()
     with _noticing_loss():
         # a copy for each worker, so that the job outlives each of them; one that comes later fetches it from these
         table = client.scatter(pickled, broadcast=True, hash=False)
     try:
         while waiting or batches:
-            now = time.monotonic()
-            if not threads or now > counted_at + _COUNT_S:
-                with _noticing_loss():
-                    threads, counted_at = sum(client.nthreads().values()), now
+            with _noticing_loss():
+                threads = sum(client.nthreads().values())
             if threads:
-                served_at = now
-            elif now > served_at + _PATIENCE_S:
+                served_at = time.monotonic()
+            elif time.monotonic() > served_at + _PATIENCE_S:
                 raise _LostError
             while waiting and len(batches) < _AHEAD * max(1, threads):
-                share, most_s = len(waiting) / (2 * max(1, threads)), _SMALLEST_S
-                size = min(_FIRST, share)
-                if done_lately:
-                    piece_s = sum(s for _, s in done_lately) / sum(pieces for pieces, _ in done_lately)
-                    size, most_s = min(BATCH_S / piece_s, max(_SMALLEST_S / piece_s, share)), BATCH_S
+                size, most_s = len(waiting) / (2 * max(1, threads)), _SMALLEST_S
+                if piece_s:
+                    size, most_s = min(BATCH_S / piece_s, max(_SMALLEST_S / piece_s, size)), BATCH_S
                 numbers = [waiting.popleft() for _ in range(max(1, min(round(size), len(waiting))))]
                 with _noticing_loss():
                     batch = client.submit(do_batch, table, numbers, most_s, software(), pure=False)
@@ -393,8 +348,7 @@ def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Ke
                     continue
             for batch in done:
                 results, seconds = _results(address, batch)
-                numbers = batches.pop(batch)
-                done_lately.append((len(results), seconds))
+                numbers, piece_s = batches.pop(batch), seconds / len(results)
                 waiting.extendleft(reversed(numbers[len(results) :]))
                 batch.release()  # or dask would compute it again if its worker died now
                 for number, result in zip(numbers, results, strict=False):

@@ -13,11 +13,11 @@ import os
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import IO, Any, Final, NamedTuple, TypeAlias
+from typing import IO, Any, Final, TypeAlias
 from zlib import crc32
 
 import numpy as np
@@ -34,19 +34,15 @@ from toolchain.cluster import Run, Work, in_this_process, software
 from toolchain.deployment import Deployment
 from toolchain.errors import BuildError
 
-_FORMAT: Final = 1
 _TOPIC: Final = "/BMresults"
-
 _TOGETHER: Final = 64
 """Records that are written to the output at once."""
+_CRC_BYTES: Final = 8
 
-_Records: TypeAlias = "np.memmap[Any, np.dtype[np.void]]"
-_Write: TypeAlias = Callable[[NDArray[np.void]], None]
 _Posterior: TypeAlias = NDArray[np.float64] | None
-
-
 _Row: TypeAlias = Callable[[int, int, NDArray[np.uint16] | None], tuple[_Posterior, int]]
 """A row, the bank of its frame, and its written prior, to posterior and cycles."""
+_Write: TypeAlias = Callable[[NDArray[np.void]], None]
 
 
 def _run_on(deployment: Deployment, machines: Sequence[Any], readings: Readings) -> _Row:
@@ -78,8 +74,8 @@ class Replay:
     deployment: Deployment
     machines: Sequence[Any]
     frames: Frames
-    done: Callable[[int], _Posterior] | None = None
-    """Of a filter that goes on after an interruption: returns the posterior of an earlier row."""
+    earlier: Callable[[int], tuple[_Posterior, int] | None] | None = None
+    """Of a filter, which goes through all rows: returns what an interrupted run has found for a row, if anything."""
 
     @property
     def is_sequence(self) -> bool:
@@ -89,42 +85,28 @@ class Replay:
 
     def prepare(self) -> Work:
         """Return the function that computes the record of a row."""
-        deployment, frames = self.deployment, self.frames
-        run = _run_on(deployment, self.machines, frames.readings)
-        numbers, layout = np.cumsum(frames.fits), record_layout(deployment)
-        own, at, steps = deployment.new_filter(), 0, 0
-
-        def prior_of(row: int) -> NDArray[np.uint16] | None:
-            nonlocal at, steps
-            if own is None:
-                return None
-            prior = None
-            for each in range(at, row + 1):  # first those of an interrupted run
-                steps += 1  # as a master predicts: also for the rows before that do not fit
-                if frames.fits[each]:
-                    prior, steps = own.predict(steps), 0
-                    if each < row:
-                        own.update(self.done(each) if self.done else None)
-            at = row + 1
-            return prior
+        deployment, fits = self.deployment, self.frames.fits
+        run = _run_on(deployment, self.machines, self.frames.readings)
+        numbers, layout = np.cumsum(fits), record_layout(deployment)
+        own, steps = deployment.new_filter(), 0
 
         def compute(row: int) -> bytes:
-            prior, record = prior_of(row), np.zeros((), layout)
-            record["posterior"] = np.nan
-            if frames.fits[row]:
+            nonlocal steps
+            steps += 1  # as a master predicts: also for rows before that do not fit
+            record, posterior, prior = np.zeros((), layout), None, None
+            if fits[row]:
+                if own is not None:
+                    prior, steps = own.predict(steps), 0
+                found = None if self.earlier is None else self.earlier(row)
                 bank = int(numbers[row]) % deployment.machine.rng_banks
-                posterior, record["cycles"] = run(row, bank, prior)
-                if posterior is not None:
-                    record["posterior"] = posterior
+                posterior, record["cycles"] = found or run(row, bank, prior)
                 if own is not None:
                     own.update(posterior)
+            record["posterior"] = np.nan if posterior is None else posterior
             record["crc"] = crc32(record.tobytes()[_CRC_BYTES:])
             return record.tobytes()
 
         return compute
-
-
-_CRC_BYTES: Final = 8
 
 
 def record_layout(deployment: Deployment) -> "np.dtype[np.void]":
@@ -132,101 +114,73 @@ def record_layout(deployment: Deployment) -> "np.dtype[np.void]":
     return np.dtype([("crc", "<u8"), ("cycles", "<u8"), ("posterior", "<f8", deployment.machine.results)])
 
 
+@dataclass(slots=True)
 class PartFile:
-    """The records so far, each at the place of its row, behind a line with the key of the work.
+    """The records of a run, each at the place of its row in a file; some may be those of a run that was interrupted."""
 
-    A place that was not written, or only in part, has a wrong checksum, so its row counts as missing.
-    """
+    file: int
+    """The descriptor of the file."""
+    begin: int
+    """Where the first record begins."""
+    records: NDArray[np.void]
+    """All of them as they are in the file, also those that `add` writes later."""
+    there: bytearray
+    """For each row, 1 if it has its record."""
+    written: int = 0
+    """Rows that were taken for the output."""
 
-    def __init__(self, path: Path, key: str, layout: "np.dtype[np.void]", frames: int) -> None:
-        """Open or create the file with room for all, or raise a BuildError; one of other work is refused."""
-        self.path = path
-        # Where the first record begins, and the length of each; `_file` is locked against other runs, and is new until
-        # it has a record.
-        heading = json.dumps({"rosbayes": _FORMAT, "key": key}).encode() + b"\n"
-        if path.exists() and not path.is_file():
-            raise BuildError(f"{path} is not a regular file; delete it, or name another file with -o")
-        self._begin, self._size = len(heading), layout.itemsize
-        with file_errors(path, "written", BuildError), ExitStack() as opened:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-            self._file = opened.enter_context(os.fdopen(descriptor, "r+b", buffering=0))
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise BuildError(
-                    f"another run is writing {path}; wait for it, or name another file with -o"
-                ) from None
-            found = self._file.read(len(heading))
-            self._is_new = not found
-            if not heading.startswith(found):
-                raise BuildError(
-                    f"{path} belongs to another recording, deployment or version; delete it, or name another file with -o"
-                )
-            os.pwrite(descriptor, heading, 0)
-            os.posix_fallocate(descriptor, 0, self._begin + frames * self._size)
-            # All records as they are in the file, also those that `add` writes later.
-            self.records = np.memmap(path, layout, "r", self._begin, (frames,))
-            opened.pop_all()
+    @classmethod
+    @contextmanager
+    def opened(cls, path: Path, key: str, layout: "np.dtype[np.void]", frames: int) -> Iterator["PartFile"]:
+        """Open or create the file, locked, and with room for all; remove it if the block ends without an error.
 
-    def missing(self) -> list[int]:
-        """Return the rows without a record, in order."""
-        if self._is_new:
-            return list(range(len(self.records)))
-        return [
-            row
-            for row, record in enumerate(self.records)
-            if crc32(record.tobytes()[_CRC_BYTES:]) != record["crc"]
-        ]
+        It begins with the key of the work. A place that was not written, or only in part, has a wrong checksum.
+
+        Raises:
+            BuildError: It cannot be written, or another run has it, or it is of other work.
+        """
+        heading, elsewhere = f"rosbayes infer {key}\n".encode(), "or name another file with -o"
+        with file_errors(path, "written", BuildError, f"; delete it, {elsewhere}"):
+            path.touch()
+            with path.open("r+b", buffering=0) as file:
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise BuildError(f"another run is writing {path}; wait for it, {elsewhere}") from None
+                found = os.pread(file.fileno(), len(heading), 0)
+                if not heading.startswith(found):
+                    raise BuildError(
+                        f"{path} belongs to another recording, deployment or version; delete it, {elsewhere}"
+                    )
+                os.pwrite(file.fileno(), heading, 0)
+                os.posix_fallocate(file.fileno(), 0, len(heading) + frames * layout.itemsize)
+                records = np.memmap(
+                    path, layout, "r", len(heading), (frames,)
+                )  # of `file`, it would keep the lock
+                whole = (crc32(each.tobytes()[_CRC_BYTES:]) == int(each["crc"]) for each in records)
+                there = bytearray(whole if found else frames)
+                yield cls(file.fileno(), len(heading), records, there)
+            path.unlink(missing_ok=True)
 
     def add(self, row: int, record: bytes) -> None:
-        """Write the record of a row; a BuildError if the disk fails, which keeps the others."""
-        with file_errors(self.path, "written", BuildError):
-            os.pwrite(self._file.fileno(), record, self._begin + row * self._size)
-        self._is_new = False
+        """Write the record of a row."""
+        os.pwrite(self.file, record, self.begin + row * len(record))
+        self.there[row] = 1
 
-    def posterior(self, row: int) -> _Posterior:
-        """Return the posterior of a row that is done; None without one."""
-        found: NDArray[np.float64] = self.records[row]["posterior"]
-        return None if math.isnan(found[0]) else np.array(found)
+    def earlier(self, row: int) -> tuple[_Posterior, int] | None:
+        """Return posterior and cycles of a row if it has its record."""
+        if not self.there[row]:
+            return None
+        posterior: NDArray[np.float64] = np.array(self.records[row]["posterior"])
+        return None if math.isnan(posterior[0]) else posterior, int(self.records[row]["cycles"])
 
-    def close(self, *, remove: bool) -> None:
-        """Close the file, and remove it if its work is done."""
-        if remove:
-            self.path.unlink(missing_ok=True)
-        self._file.close()
-
-
-class _InOrder:
-    """Writes records in the order of their rows, each as soon as those before it are there."""
-
-    def __init__(self, records: _Records, missing: Sequence[int], write: _Write) -> None:
-        self._records, self._write = records, write
-        # A byte for each row, 1 if it has a record; and how many rows are written.
-        self._there, self._written = bytearray(b"\1" * len(records)), 0
-        for row in missing:
-            self._there[row] = 0
-        self._write_on()
-
-    def add(self, row: int) -> None:
-        """Note that a row has its record."""
-        self._there[row] = 1
-        self._write_on()
-
-    def _write_on(self) -> None:
-        rows = len(self._records)
-        gap = self._there.find(0, self._written) % (rows + 1)  # -1, for none, becomes the number of rows
-        while self._written + _TOGETHER <= gap or self._written < gap == rows:
-            end = min(self._written + _TOGETHER, rows)
-            self._write(self._records[self._written : end])
-            self._written = end
-
-
-class Summary(NamedTuple):
-    """Numbers of frames of a recording: all, those that this run computed, and those without a posterior."""
-
-    frames: int
-    computed: int
-    without: int
+    def ready(self) -> Iterator[NDArray[np.void]]:
+        """Yield the records after those that were yielded before, in order, as far as each has those before it."""
+        rows = len(self.records)
+        gap = self.there.find(0, self.written) % (rows + 1)  # -1, for none, becomes the number of rows
+        while self.written + _TOGETHER <= gap or self.written < gap == rows:
+            begin, self.written = self.written, min(self.written + _TOGETHER, rows)
+            yield self.records[begin : self.written]
 
 
 def replay(
@@ -237,46 +191,41 @@ def replay(
     *,
     advance: Callable[[], None] = lambda: None,
     begun: Callable[[int], None] = lambda _: None,
-) -> Summary:
+) -> tuple[int, int]:
     """Compute all frames that are not done, and write the output.
 
     `begun` is called with the number of frames that an earlier run has left, `advance` after each other one. The frames
-    of a sequence are computed in this process.
+    of a sequence are computed in this process. Return the numbers of frames that were computed, and of those without a
+    posterior.
 
     Raises:
         BuildError: A file cannot be written, or belongs to other work.
     """
     job = Replay(deployment, [image.machine for image in read_images(deployment)], frames)
-    part = PartFile(
-        output.with_name(output.name + ".frames"),
-        _key(deployment, frames),
-        record_layout(deployment),
-        len(frames),
-    )
-    done = False
-    try:
-        missing = part.missing()
-        if missing and deployment.machine.rng_reset is RngReset.FREE:
-            missing = list(range(len(frames)))  # the state of the generators is not in the records
+    path, layout = output.with_name(output.name + ".frames"), record_layout(deployment)
+    with (
+        PartFile.opened(path, _key(deployment, frames), layout, len(frames)) as part,
+        _WRITERS[output.suffix](output, deployment, frames) as write,
+    ):
+        if deployment.machine.rng_reset is RngReset.FREE:
+            part.there[:] = bytes(len(frames))  # the state of the generators is not in the records
+        missing = [row for row, there in enumerate(part.there) if not there]
         begun(len(frames) - len(missing))
 
-        with _WRITERS[output.suffix](output, deployment, frames) as write:
-            ordered = _InOrder(part.records, missing, write)
-
-            def keep(row: int, record: bytes) -> None:
+        def keep(row: int, record: bytes) -> None:
+            if not part.there[row]:
                 part.add(row, record)
-                ordered.add(row)
                 advance()
+            for records in part.ready():
+                write(records)
 
-            if job.is_sequence:
-                in_this_process(replace(job, done=part.posterior), missing, keep)
-            else:
-                run(job, missing, keep)
-        without = int(np.isnan(part.records["posterior"][:, 0]).sum())
-        done = True
-    finally:
-        part.close(remove=done)
-    return Summary(len(frames), len(missing), without)
+        if job.is_sequence:
+            in_this_process(replace(job, earlier=part.earlier), range(len(frames)) if missing else (), keep)
+        else:
+            run(job, missing, keep)
+        for records in part.ready():
+            write(records)
+        return len(missing), int(np.isnan(part.records["posterior"][:, 0]).sum())
 
 
 def _key(deployment: Deployment, frames: Frames) -> str:

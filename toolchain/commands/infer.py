@@ -61,13 +61,10 @@ def infer(
 
     with runner(where) as run, progress(len(frames)) as step:
         started = time.perf_counter()
-        found = replay(deployment, frames, output, run, begun=begun, advance=lambda: step(""))
+        computed, without = replay(deployment, frames, output, run, begun=begun, advance=lambda: step(""))
         seconds = time.perf_counter() - started
-    print(f"{output}: {found.frames} frames, {found.without} without a posterior", file=sys.stderr)
+    print(f"{output}: {len(frames)} frames, {without} without a posterior", file=sys.stderr)
     if unfit := int((~frames.fits).sum()):
         print(f"{unfit} rows have no posterior because they do not fit: {frames.why}", file=sys.stderr)
-    if found.computed:
-        print(
-            f"{found.computed} frames in {seconds:.1f} s: {found.computed / seconds:,.0f} frames/s",
-            file=sys.stderr,
-        )
+    if computed:
+        print(f"{computed} frames in {seconds:.1f} s: {computed / seconds:,.0f} frames/s", file=sys.stderr)
