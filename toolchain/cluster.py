@@ -90,16 +90,11 @@ class SchedulerOptions:
         ),
     ] = None
     tls_ca_file: Annotated[
-        Path | None,
-        typer.Option(help="Of tls://: certificates (PEM) that sign the scheduler's.", metavar="FILE"),
+        Path | None, typer.Option(help="Of tls://: trusted certificates.", metavar="PEM")
     ] = None
-    tls_cert: Annotated[
-        Path | None, typer.Option(help="Of tls://: our certificate (PEM).", metavar="FILE")
-    ] = None
-    tls_key: Annotated[Path | None, typer.Option(help="Of tls://: its key (PEM).", metavar="FILE")] = None
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Permit tcp:// to a scheduler on another host.")
-    ] = False
+    tls_cert: Annotated[Path | None, typer.Option(help="Of tls://: our certificate.", metavar="PEM")] = None
+    tls_key: Annotated[Path | None, typer.Option(help="Of tls://: its key.", metavar="PEM")] = None
+    insecure: Annotated[bool, typer.Option("--insecure", help="Permit tcp:// to another host.")] = False
 
     def __post_init__(self) -> None:
         """Refuse flags that contradict each other, and files that cannot be used."""

@@ -37,6 +37,15 @@ ReadingColumns: TypeAlias = Annotated[
         metavar="NAME=COLUMN",
     ),
 ]
+BagTolerance: TypeAlias = Annotated[
+    float,
+    typer.Option(
+        "--tolerance",
+        min=0,
+        help="bags: maximum time between messages that belong together.",
+        metavar="SECONDS",
+    ),
+]
 Settings: TypeAlias = Annotated[
     list[str] | None, typer.Option("--set", help="A parameter of the model; repeatable.", metavar="KEY=VALUE")
 ]

@@ -18,7 +18,7 @@ from machines.parameters import RngKind, RngReset
 from toolchain.building.options import BuildOptions, Thesis
 from toolchain.deployment import Scale, Stop
 from toolchain.errors import BuildError
-from toolchain.flags import MaxCycles, Partitions, ReadingColumns, StopWhen
+from toolchain.flags import BagTolerance, MaxCycles, Partitions, ReadingColumns, StopWhen
 
 MAX_POINTS: Final = 10_000
 
@@ -56,12 +56,7 @@ class ReadingOptions:
 class InspectOptions(ReadingOptions):
     """The options of an inspection of a deployment."""
 
-    tolerance_s: Annotated[
-        float,
-        typer.Option(
-            "--tolerance", help="bags: maximum time between readings that belong together.", metavar="SECONDS"
-        ),
-    ] = 0.1
+    tolerance_s: BagTolerance = 0.1
     frames: Annotated[
         int | None,
         typer.Option(

@@ -9,7 +9,7 @@ import typer
 
 from toolchain.cluster import SchedulerOptions, runner
 from toolchain.commands.explore import progress
-from toolchain.flags import ReadingColumns
+from toolchain.flags import BagTolerance, ReadingColumns
 
 
 def infer(
@@ -22,23 +22,12 @@ def infer(
     output: Annotated[
         Path,
         typer.Option(
-            "--output",
-            "-o",
-            help="Posteriors: .npz, or .mcap with a message on /BMresults for each.",
-            metavar="FILE",
+            "--output", "-o", help="Posteriors: .npz, or .mcap with messages on /BMresults.", metavar="FILE"
         ),
     ],
     where: SchedulerOptions,
     reading: ReadingColumns = None,
-    tolerance_s: Annotated[
-        float,
-        typer.Option(
-            "--tolerance",
-            min=0,
-            help="bags: maximum time between readings that belong together.",
-            metavar="SECONDS",
-        ),
-    ] = 0.1,
+    tolerance_s: BagTolerance = 0.1,
 ) -> None:
     """Compute the posterior of every row of a recording, as the boards would.
 

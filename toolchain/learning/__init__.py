@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from toolchain.flags import ReadingColumns
+from toolchain.flags import BagTolerance, ReadingColumns
 
 
 class FitMethod(StrEnum):
@@ -64,9 +64,4 @@ class FitOptions:
     learn_prior: Annotated[
         bool, typer.Option("--learn-prior", help="counts: also count how often each cell is the true one.")
     ] = False
-    tolerance_s: Annotated[
-        float,
-        typer.Option(
-            "--tolerance", help="bags: maximum time between a reading and its truth.", metavar="SECONDS"
-        ),
-    ] = 0.1
+    tolerance_s: BagTolerance = 0.1
