@@ -17,14 +17,13 @@ import ssl
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from hashlib import sha256
 from importlib import metadata
-from ipaddress import ip_address
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import get_ident
@@ -49,9 +48,8 @@ _CONNECT_S: Final = 10.0
 _POLL_S: Final = 1.0
 _LEAN: Final = {"distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "1s"}
 """Settings of our own scheduler and workers: by dask's, each spends 3 to 5 % of a core on watching itself."""
-_JOBS: Final = 8
-"""Jobs that a worker keeps prepared, for each of its threads."""
-_ADDRESS: Final = re.compile(r"(tcp|tls)://(?:\[([\da-fA-F:.]+)]|([^][:/]+)):\d{1,5}")
+_ADDRESS: Final = re.compile(r"(tcp|tls)://(\[[\da-fA-F:.]+]|[^][:/]+):\d{1,5}")
+_LOOPBACK: Final = re.compile(r"127(\.\d+){3}|\[::1]|localhost")
 
 
 class Job(Protocol):
@@ -111,7 +109,7 @@ class SchedulerOptions:
             _check_certificates(files)
         elif given:
             raise BuildError(f"{given[0]} is for --scheduler tls://HOST:PORT")
-        elif address is not None and not self.insecure and not _is_loopback(address[2] or address[3]):
+        elif address is not None and not self.insecure and not _LOOPBACK.fullmatch(address[2]):
             raise BuildError(
                 f"{flag}: without TLS, everybody on the way there can run programs as this user; use tls:// with "
                 "--tls-ca-file, --tls-cert and --tls-key, or --insecure"
@@ -129,12 +127,6 @@ def _check_certificates(files: dict[str, Path | None]) -> None:
                 context.load_verify_locations(file)
         except OSError as reason:
             raise BuildError(f"{flag} {file} cannot be used: {reason.strerror or reason}") from None
-
-
-def _is_loopback(host: str) -> bool:
-    with suppress(ValueError):
-        return ip_address(host).is_loopback
-    return host == "localhost"
 
 
 @contextmanager
@@ -215,7 +207,7 @@ def software() -> str:
     return digest.hexdigest()
 
 
-@lru_cache(_JOBS)
+@lru_cache(8)
 def _prepared(pickled: bytes, _thread: int) -> Work:
     """Return the work of a job, which each thread of a worker prepares once: two cannot share a kernel."""
     job: Job = pickle.loads(pickled)  # noqa: S301 - dask runs whatever its client sends anyway
@@ -262,17 +254,11 @@ def _run_on(address: str, connect: Callable[[], Any], job: Job, numbers: Sequenc
         ClusterError: The workers cannot do them, or stay away for a minute.
     """
     left = dict.fromkeys(numbers)  # in order; those without a result
-
-    def keep_once(number: int, result: Any) -> None:
-        keep(number, result)
-        del left[number]
-
-    pickled = pickle.dumps(job)
     until = 0.0  # until when (monotonic) the work may stand still since the scheduler was lost; not at first
     while left:
         before, client = len(left), _client(address, connect, until)
         try:
-            _do(address, client, pickled, left, keep_once)
+            _do(address, client, pickle.dumps(job), left, keep)
         except _LostError:
             if not until or len(left) < before:
                 until = time.monotonic() + _PATIENCE_S
@@ -308,7 +294,7 @@ def _client(address: str, connect: Callable[[], Any], until: float) -> Any:
             return client
 
 
-def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Keep) -> None:
+def _do(address: str, client: Any, pickled: bytes, left: dict[int, None], keep: Keep) -> None:
     """Do the pieces of a job on the workers of one scheduler; a `_LostError` if that cannot go on here."""
     from distributed import wait
 
@@ -348,6 +334,7 @@ def _do(address: str, client: Any, pickled: bytes, left: Iterable[int], keep: Ke
                 batch.release()  # or dask would compute it again if its worker died now
                 for number, result in zip(numbers, results, strict=False):
                     keep(number, result)
+                    del left[number]
     finally:
         with suppress(_LostError), _noticing_loss():
             client.cancel(list(batches))
