@@ -20,7 +20,7 @@ Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
+class BoardSamples:
     """The samples that one board has drawn in a frame.
 
     Attributes:
@@ -35,7 +35,7 @@ class Chain:
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class ChainEstimate:
     """The estimate of a frame from the chains of all boards.
 
     Attributes:
@@ -80,7 +80,7 @@ def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -
     return np.where((codes >= parameters.cardinalities).any(axis=1), -1, values)
 
 
-def estimate(chains: Sequence[Chain]) -> Estimate:
+def estimate(chains: Sequence[BoardSamples]) -> ChainEstimate:
     """Return the estimate from the chains of all boards.
 
     A board that timed out or has no sample is left out. The counts of the others are added, because all have drawn
@@ -93,7 +93,7 @@ def estimate(chains: Sequence[Chain]) -> Estimate:
     )
     counted = [chain for board, chain in enumerate(chains) if board not in left_out]
     if not counted:
-        return Estimate(None, None, math.nan, math.nan, left_out)
+        return ChainEstimate(None, None, math.nan, math.nan, left_out)
     weights = [chain.counts[-1].astype(np.float64) for chain in counted]
     if any(chain.reason is BM2StopReason.MAX_CYCLES for chain in chains):
         weights = [own / own.sum() for own in weights]
@@ -110,7 +110,7 @@ def estimate(chains: Sequence[Chain]) -> Estimate:
         # chains that have not mixed know no error of their own
         means = [chain.counts[-1] / chain.counts[-1].sum() for chain in counted]
         error = np.fmax(error, np.sqrt(np.var(means, axis=0, ddof=1) / len(means)))
-    return Estimate(posterior, error, float(effective.min()), r_hat, left_out)
+    return ChainEstimate(posterior, error, float(effective.min()), r_hat, left_out)
 
 
 def standard_error(probabilities: Floats, effective: Floats | float) -> Floats:
@@ -179,7 +179,7 @@ def split_r_hat(counts: npt.NDArray[np.integer]) -> Floats:
     return r_hat
 
 
-def _effective_samples_of(chain: Chain) -> Floats:
+def _effective_samples_of(chain: BoardSamples) -> Floats:
     if np.count_nonzero(chain.counts[-1]) == 1:
         # a chain that is stuck looks the same as a certain answer
         return np.full(chain.counts.shape[1], np.nan)
@@ -188,7 +188,7 @@ def _effective_samples_of(chain: Chain) -> Floats:
     return effective_samples(chain.values[chain.values >= 0], chain.counts.shape[1])
 
 
-def _halves(chain: Chain) -> npt.NDArray[np.integer]:
+def _halves(chain: BoardSamples) -> npt.NDArray[np.integer]:
     """Return the counts of a chain's two halves: of its samples, or of its batches without a stream."""
     counts = chain.counts
     if chain.values is not None:

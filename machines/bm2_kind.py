@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from machines import make_bm2_kernel
 from machines.bm2 import SAMPLES_MAX, BM2Machine, BM2Parameters, BM2Start, BM2StopReason, start_state
-from machines.bm2_estimate import Chain, estimate, searched_counts, searched_values
+from machines.bm2_estimate import BoardSamples, estimate, searched_counts, searched_values
 from machines.bm2_kernel import BM2Kernel
 from machines.errors import MachineError, NoPosteriorError, ParameterError, StartError
 from machines.kind import (
@@ -146,7 +146,7 @@ class BM2Kind(MachineKind):
             if parameters.stream:
                 stream = np.frombuffer(kept.stream, "<u4").reshape(-1, parameters.state_words)
                 values = searched_values(parameters, stream)
-            chains.append(Chain(BM2StopReason(board.reason), counts, values))
+            chains.append(BoardSamples(BM2StopReason(board.reason), counts, values))
         totals = [kept.samples - kept.unused for kept in every]
         found = estimate(chains)
         left_out = "; ".join(

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from pcie_shim.wires import WIRES, LinkRate, Wire
+from pcie_shim.wires import WIRES, LinkFigures, LinkRate
 
 _SPIN_NS: Final = 150_000
 """The last nanoseconds of a wait, which are not slept, because Linux wakes a process some 60 us late."""
@@ -29,7 +29,7 @@ def wait_until(tick_ns: int) -> None:
 class LinkModel:
     """The wire to a board or, if it is shared, to all boards that are forked after its creation."""
 
-    def __init__(self, wire: Wire, wait: Callable[[int], None] = wait_until) -> None:
+    def __init__(self, wire: LinkFigures, wait: Callable[[int], None] = wait_until) -> None:
         self._wire = wire
         self._wait = wait
 

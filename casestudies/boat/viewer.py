@@ -100,7 +100,7 @@ def line(numbers: Numbers) -> str:
     return f"{start}  {shown('mean_value', '.1f'):>12}  {shown('distance_cells', '.2f'):>8}  {times}"
 
 
-class Viewer:
+class BoatViewer:
     """The frames of a run and their numbers, from which the pictures are drawn.
 
     Attributes:
@@ -259,7 +259,7 @@ def boat_viewer(
     """
     from casestudies.topics import run_viewer
 
-    viewer = Viewer(count, clock)
+    viewer = BoatViewer(count, clock)
     if out is not None:
         check_writable(out)
     if numbers is not None:
@@ -274,7 +274,7 @@ def boat_viewer(
     run_viewer(watching, partial(_finish, viewer, out, numbers))
 
 
-def _finish(viewer: Viewer, out: Path | None, numbers: Path | None) -> None:
+def _finish(viewer: BoatViewer, out: Path | None, numbers: Path | None) -> None:
     """Print the summary, and write numbers and pictures."""
     if not viewer.results:
         return

@@ -40,7 +40,7 @@ _WAITING: Final = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Frame:
+class FrameSummary:
     """The samples of a frame in summary."""
 
     number: int
@@ -56,12 +56,12 @@ class Frame:
     """int64[points, 2]: the number of samples so far, and of those with R = 1; the last point is the whole frame."""
 
 
-def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> Frame:
+def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> FrameSummary:
     """Return a frame from its posterior and its samples, int64[samples, variables]."""
     rained = np.cumsum(samples[:, _R])
     at = np.unique(np.geomspace(1, len(samples), _POINTS).astype(np.int64))
     details = posterior.report.details if posterior.report else {}
-    return Frame(
+    return FrameSummary(
         number=posterior.number or 0,
         grass=int(samples[0, _G]),
         share=float(posterior.marginal("R")[1]),
@@ -71,13 +71,13 @@ def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> Frame:
     )
 
 
-def mean_and_error(frames: Sequence[Frame]) -> tuple[float, float]:
+def mean_and_error(frames: Sequence[FrameSummary]) -> tuple[float, float]:
     """Return the mean share of some frames, at least one, and its standard error."""
     mean = math.fsum(frame.share for frame in frames) / len(frames)
     return mean, math.sqrt(math.fsum(frame.error**2 for frame in frames)) / len(frames)
 
 
-def draw(path: Path, frames: Sequence[Frame]) -> None:
+def draw(path: Path, frames: Sequence[FrameSummary]) -> None:
     """Draw the running estimates over the samples, next to the exact answers, or raise an OutputError."""
     figure = new_figure(8, 4.6)
     axes = figure.subplots()
@@ -105,7 +105,7 @@ def draw(path: Path, frames: Sequence[Frame]) -> None:
     save_figure(figure, path)
 
 
-class Viewer:
+class SamplesViewer:
     """The frames of a run, from which estimates and picture are made.
 
     Attributes:
@@ -115,7 +115,7 @@ class Viewer:
 
     def __init__(self, count: int | None) -> None:
         """Start without frames; `count` is the number of results to wait for, None to run until Ctrl-C."""
-        self.frames: deque[Frame] = deque(maxlen=KEPT if count is None else None)
+        self.frames: deque[FrameSummary] = deque(maxlen=KEPT if count is None else None)
         self.results = 0
         self._count = count
         self._seen: set[int] = set()
@@ -211,7 +211,7 @@ def sprinkler_viewer(
 
     It subscribes to /BMresults, /bm/frame and /bm/samples, and needs nothing else.
     """
-    viewer = Viewer(count)
+    viewer = SamplesViewer(count)
     if out is not None:
         check_writable(out)
     run_viewer(viewer.watch(uri, first_limit_s=first_timeout, limit_s=timeout), partial(viewer.finish, out))

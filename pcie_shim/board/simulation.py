@@ -32,7 +32,7 @@ _LONGEST_ANSWER: Final = 8 * MOST_WORDS + 64
 _LAST_OUTPUT: Final = 400  # bytes
 
 
-class Answer(NamedTuple):
+class SimulatorAnswer(NamedTuple):
     """The answer to one request."""
 
     response: int
@@ -96,11 +96,11 @@ class Simulation:
         """Reset the hardware with its pin."""
         self._execute("z", 0, 0, 2, START_S)
 
-    def run(self, clocks: int) -> Answer:
+    def run(self, clocks: int) -> SimulatorAnswer:
         """Run until an interrupt, at most this number of clocks."""
         return self._execute("c", clocks, 0, clocks)
 
-    def read(self, address: int, count: int) -> Answer:
+    def read(self, address: int, count: int) -> SimulatorAnswer:
         """Read up to MOST_WORDS words, ending with the first that is refused."""
         answer = self._execute("r", address, count, ACCESS_CLOCKS * count)
         if len(answer.words) != 4 * count and not (answer.response and len(answer.words) < 4 * count):
@@ -113,7 +113,9 @@ class Simulation:
 
     # ---- requests -------------------------------------------------------------------------------------
 
-    def _execute(self, operation: str, first: int, second: int, clocks: int, limit: float = 0.0) -> Answer:
+    def _execute(
+        self, operation: str, first: int, second: int, clocks: int, limit: float = 0.0
+    ) -> SimulatorAnswer:
         """Send a request that takes about this number of clocks, and return its answer."""
         # a busy computer must not look like a simulator that hangs
         limit = limit or ANSWER_S + (10 * clocks / self.speed if self.speed else 0)
@@ -128,7 +130,7 @@ class Simulation:
         response, ran, text = match.groups()
         numbers = bytes.fromhex(text.decode())  # each with the highest digit first
         words = b"".join(numbers[at : at + 4][::-1] for at in range(0, len(numbers), 4))
-        return Answer(int(response, 16), int(ran, 16), words)
+        return SimulatorAnswer(int(response, 16), int(ran, 16), words)
 
     def _next_line(self, deadline: float, limit: float) -> bytes:
         output = self._answers.fileno()

@@ -12,9 +12,9 @@ from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
 from scripts.benches.cycle import Measured, in_turns, readings, until_read
 from scripts.running.flags import ScriptParser
 from scripts.running.stand import temporary_stand
-from toolchain.deployment import Topics
+from toolchain.deployment import TopicsSection
 
-OFF: Final = "\n[topics]\n" + "".join(f"{key} = false\n" for key in Topics.model_fields)
+OFF: Final = "\n[topics]\n" + "".join(f"{key} = false\n" for key in TopicsSection.model_fields)
 LIMIT: Final = 24 * 3600.0
 """Time limit in seconds, which any number of rounds should keep."""
 TOPICS: Final = ("/bm/counts", "/bm/posterior", "/bm/pose", "/bm/decision", "/diagnostics")

@@ -120,11 +120,11 @@ async def _serve(
         with suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     from services.dashboard.feed import Feed
-    from services.dashboard.robot import Robot
+    from services.dashboard.robot import WatchedRobot
     from services.dashboard.server import PageServer
 
     feed = Feed()
-    robot = Robot(feed, settings, deployment, uri=uri, topic=topic, truth=truth)
+    robot = WatchedRobot(feed, settings, deployment, uri=uri, topic=topic, truth=truth)
     server = PageServer(feed, robot, listener, policy, loopback=is_loopback(host))
     scheme, address = "https" if policy.tls else "http", f"[{host}]" if ":" in host else host
     where = f"{scheme}://{address}:{listener.getsockname()[1]}"

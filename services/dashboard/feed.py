@@ -33,7 +33,7 @@ _MAX_REASONS: Final = 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Frame:
+class KeptFrame:
     """A frame as it is kept, equal only to itself; `values` is None if it has no posterior."""
 
     at: int
@@ -106,7 +106,7 @@ class Feed:
     """
 
     def __init__(self) -> None:
-        self.frames: deque[Frame] = deque(maxlen=KEPT_FRAMES)
+        self.frames: deque[KeptFrame] = deque(maxlen=KEPT_FRAMES)
         self.truth: tuple[float, float] | None = None
         self.watchers: set[Callable[[], None]] = set()
         self.lost: Counter[str] = Counter()
@@ -118,17 +118,17 @@ class Feed:
         self._seconds: deque[_Second] = deque()
 
     @property
-    def newest(self) -> Frame | None:
+    def newest(self) -> KeptFrame | None:
         """The newest frame; None before the first one."""
         return self.frames[-1] if self.frames else None
 
-    def frame(self, at: int) -> Frame | None:
+    def frame(self, at: int) -> KeptFrame | None:
         """Return the frame at a place, or the nearest one that is kept; None before the first frame."""
         if not self.frames:
             return None
         return self.frames[min(max(at - self.frames[0].at, 0), len(self.frames) - 1)]
 
-    def add(self, outcome: FrameOutcome, now_s: float) -> Frame:
+    def add(self, outcome: FrameOutcome, now_s: float) -> KeptFrame:
         """Add a frame at a time of a monotonic clock in seconds, and tell the watchers."""
         report = outcome.report if isinstance(outcome, Posterior) else outcome
         details = report.details if report else outcome.details
@@ -140,7 +140,7 @@ class Feed:
         else:
             self.add_loss(outcome.outcome or "no reason given")
         self._count += 1
-        frame = Frame(
+        frame = KeptFrame(
             at=self._count,
             heard_ns=outcome.heard_ns,
             values=values,
@@ -181,7 +181,7 @@ class Feed:
                 rows.append((age, [round(mean, 1) for mean in means]))
         return rows
 
-    def _keep(self, frame: Frame) -> None:
+    def _keep(self, frame: KeptFrame) -> None:
         if len(self.frames) == KEPT_FRAMES:
             self._forget()
         self.frames.append(frame)

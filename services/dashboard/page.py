@@ -20,7 +20,7 @@ from nicegui.element import Element
 
 from posteriors.axes import printable
 from services.dashboard.feed import STAGES, Feed
-from services.dashboard.robot import Robot
+from services.dashboard.robot import WatchedRobot
 from services.dashboard.saving import archive, same_shape, table
 from services.dashboard.view import View, choices, packed
 from terminal.signals import until_one_ends
@@ -55,7 +55,7 @@ class Wish(msgspec.Struct, frozen=True):
 class Dashboard:
     """The page for any number of browsers."""
 
-    def __init__(self, feed: Feed, robot: Robot) -> None:
+    def __init__(self, feed: Feed, robot: WatchedRobot) -> None:
         self._feed = feed
         self._robot = robot
         # The choices of each browser, by its number with the framework, which is also in the address of its socket.

@@ -20,7 +20,7 @@ from posteriors.errors import BadResultError
 from posteriors.listening import posteriors
 from posteriors.posterior import MAX_RESULT, SAMPLES_TOPIC, SAMPLES_TYPE, Posterior, read_samples
 from posteriors.standard_messages import pose_at
-from services.dashboard.feed import Feed, Frame
+from services.dashboard.feed import Feed, KeptFrame
 from services.settings import Settings
 from services.sockets.records import Outcome
 from services.sockets.status import ask_stack
@@ -52,7 +52,7 @@ _MAX_WARNINGS: Final = 20
 _QUEUE_SIZE: Final = 64
 
 
-class Robot:
+class WatchedRobot:
     """Everything that the page reads and asks over rosbridge and status sockets.
 
     Attributes:
@@ -243,14 +243,14 @@ class Robot:
         self._deployment, self._axes = deployment, tuple(deployment_axes(deployment))
         self._feed.changed()
 
-    def axes_for(self, frame: Frame) -> tuple[Axis, ...]:
+    def axes_for(self, frame: KeptFrame) -> tuple[Axis, ...]:
         """Return the axes of a frame's posterior; none if it is another deployment's, whose units would mislead."""
         if self._deployment_of(frame) is None or frame.values is None:
             return ()
         ours = [(axis.label, axis.size) for axis in self._axes]
         return self._axes if ours == list(zip(frame.labels, frame.values.shape, strict=True)) else ()
 
-    def words_for(self, frame: Frame) -> dict[str, tuple[str, tuple[str, ...]]]:
+    def words_for(self, frame: KeptFrame) -> dict[str, tuple[str, tuple[str, ...]]]:
         """Return the unit and the states of each variable of a frame, as far as they are known."""
         deployment = self._deployment_of(frame)
         known = deployment.variables if deployment is not None else ()
@@ -267,7 +267,7 @@ class Robot:
             states = (found if dimensions else found[:, -_MAX_LINE:]).tolist()
         self.samples = "\n".join(state_in_words(dimensions, state)[:_MAX_LINE] for state in states)
 
-    def _deployment_of(self, frame: Frame | None) -> Deployment | None:
+    def _deployment_of(self, frame: KeptFrame | None) -> Deployment | None:
         deployment, report = self._deployment, frame.report if frame is not None else None
         same = deployment is None or report is None or report.deployment == deployment.name
         return deployment if same else None

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from posteriors.axes import Axis
-from services.dashboard.feed import Frame
+from services.dashboard.feed import KeptFrame
 from services.output.posterior_file import cell_names, write_archive
 
 
-def same_shape(frames: Sequence[Frame], shown: Frame | None) -> list[Frame]:
+def same_shape(frames: Sequence[KeptFrame], shown: KeptFrame | None) -> list[KeptFrame]:
     """Return the frames whose posteriors have the variables of the one that is shown, or of the newest one."""
     with_posterior = [each for each in frames if each.values is not None]
     if shown is None or shown.values is None:
@@ -19,7 +19,7 @@ def same_shape(frames: Sequence[Frame], shown: Frame | None) -> list[Frame]:
     return [each for each in with_posterior if shown is not None and each.form == shown.form]
 
 
-def archive(frames: Sequence[Frame], axes: Sequence[Axis]) -> bytes:
+def archive(frames: Sequence[KeptFrame], axes: Sequence[Axis]) -> bytes:
     """Return an archive for `numpy.load`, with the names that `listen --save` uses; frames must not be empty."""
     file = io.BytesIO()
     write_archive(
@@ -33,7 +33,7 @@ def archive(frames: Sequence[Frame], axes: Sequence[Axis]) -> bytes:
     return file.getvalue()
 
 
-def table(frames: Sequence[Frame]) -> bytes:
+def table(frames: Sequence[KeptFrame]) -> bytes:
     """Return a table as CSV: a row a frame, with its most probable cell; frames must not be empty."""
     labels, first = frames[0].labels, frames[0].values
     cells = cell_names(labels, first.shape) if first is not None else ()

@@ -17,7 +17,7 @@ from bridge.hub.access import AccessPolicy
 from services.dashboard.doors import App, Doors
 from services.dashboard.feed import Feed
 from services.dashboard.page import Dashboard
-from services.dashboard.robot import Robot
+from services.dashboard.robot import WatchedRobot
 
 _SHUTDOWN_S: Final = 1
 _MESSAGE_BYTES: Final = 1 << 20
@@ -40,7 +40,13 @@ class PageServer:
     """
 
     def __init__(
-        self, feed: Feed, robot: Robot, listener: socket.socket, policy: AccessPolicy, *, loopback: bool
+        self,
+        feed: Feed,
+        robot: WatchedRobot,
+        listener: socket.socket,
+        policy: AccessPolicy,
+        *,
+        loopback: bool,
     ) -> None:
         self.ready = asyncio.Event()
         self._listener = listener

@@ -19,7 +19,7 @@ import orjson
 from posteriors.axes import Axis
 from posteriors.frame_report import FrameReport
 from posteriors.standard_messages import moments
-from services.dashboard.feed import Feed, Frame
+from services.dashboard.feed import Feed, KeptFrame
 
 _LENGTH: Final = struct.Struct("<I")
 _NO_REPORT: Final = FrameReport(stamp_ns=0, outcome="posterior without a report")
@@ -43,7 +43,7 @@ class View:
         self.chosen: tuple[str, ...] = ()
 
     @property
-    def frame(self) -> Frame | None:
+    def frame(self) -> KeptFrame | None:
         """The frame that is shown; None before the first one."""
         return self._feed.newest if self.at is None else self._feed.frame(self.at)
 
@@ -65,14 +65,14 @@ class View:
         self.chosen = labels
         self._feed.changed()
 
-    def labels(self, frame: Frame) -> tuple[str, ...]:
+    def labels(self, frame: KeptFrame) -> tuple[str, ...]:
         """Return the labels that are shown of a frame, the vertical one first."""
         if self.chosen and set(self.chosen) <= set(frame.labels):
             return self.chosen
         return default_labels(frame)
 
     def message(
-        self, frame: Frame, axes: Sequence[Axis], words: Mapping[str, tuple[str, tuple[str, ...]]]
+        self, frame: KeptFrame, axes: Sequence[Axis], words: Mapping[str, tuple[str, tuple[str, ...]]]
     ) -> bytes:
         """Return the message for the frame that is shown; `words` are the unit and the states of each variable."""
         head, picture = _encoded(frame, self.labels(frame), tuple(axes))
@@ -105,7 +105,7 @@ def packed(head: dict[str, Any], picture: bytes = b"") -> bytes:
     return b"".join((_LENGTH.pack(len(text)), text, picture))
 
 
-def default_labels(frame: Frame) -> tuple[str, ...]:
+def default_labels(frame: KeptFrame) -> tuple[str, ...]:
     """Return the first two searched variables, or the only one; `x` is the second, which goes across."""
     first = frame.searched[:2]
     return first[::-1] if first[:1] == (_ACROSS,) and len(first) == 2 else first
@@ -121,7 +121,9 @@ def choices(labels: tuple[str, ...]) -> list[tuple[str, ...]]:
 
 # Several browsers show the same frame, so that it is encoded once. Frames are compared by identity.
 @lru_cache(maxsize=4)
-def _encoded(frame: Frame, labels: tuple[str, ...], axes: tuple[Axis, ...]) -> tuple[dict[str, Any], bytes]:
+def _encoded(
+    frame: KeptFrame, labels: tuple[str, ...], axes: tuple[Axis, ...]
+) -> tuple[dict[str, Any], bytes]:
     report = frame.report or _NO_REPORT
     head: dict[str, Any] = {
         "kind": "frame",

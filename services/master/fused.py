@@ -18,7 +18,7 @@ from services.pipeline.subscriber import Subscriber
 from services.settings import Settings
 from services.sockets.records import AnyRecord, Record
 from services.sockets.reporting import shifted
-from services.sockets.serving import Link, MakeLink, Service, board_endpoints
+from services.sockets.serving import Link, MakeLink, RunService, board_endpoints
 from toolchain.deployment import Deployment
 
 TakeRecord = Callable[[AnyRecord], None]
@@ -86,7 +86,7 @@ def fused_services(
         return settings.model_copy(update={"metrics": shifted(settings.metrics, METRICS_PORTS[role])})
 
     boards = DeployedBoards(settings, deployment, board_endpoints(settings, deployment))
-    services: list[Service] = [
+    services: list[RunService] = [
         Subscriber(settings_of(Subscriber.role), deployment, link_of(Subscriber.role)),
         Publisher(settings_of(Publisher.role), deployment, link_of(Publisher.role)),
         PcieApp(settings_of(PcieApp.role), boards, link_of(PcieApp.role)),

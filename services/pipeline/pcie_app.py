@@ -20,14 +20,14 @@ from services.boards.deployed import TICK, DeployedBoards
 from services.boards.frames import frame_failed, result_record
 from services.settings import Settings
 from services.sockets.records import AnyRecord, FrameRequest, LossReason, Notice, Ready, Record
-from services.sockets.serving import MakeLink, Service
+from services.sockets.serving import MakeLink, RunService
 from services.sockets.status import FrameCounts, ProcessStatus
 
 ROLE = "pcie-app"
 Result = TypeVar("Result")
 
 
-class PcieApp(Service):
+class PcieApp(RunService):
     """Service that computes the frames of a master."""
 
     role = ROLE

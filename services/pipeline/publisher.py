@@ -24,13 +24,13 @@ from services.pipeline.connections import (
 from services.pipeline.result_topics import RESULTS_DEPTH, ROLE, ResultTopics
 from services.settings import Settings
 from services.sockets.records import AnyRecord, Begin, Outcome, Publish, Published, Ready, Rosbridge, Seen
-from services.sockets.serving import MakeLink, Service
+from services.sockets.serving import MakeLink, RunService
 from services.sockets.status import FrameCounts, ProcessStatus, connections, why_not_connected
 from terminal.signals import until_one_ends
 from toolchain.deployment import Deployment
 
 
-class Publisher(Service):
+class Publisher(RunService):
     """Service that publishes the results of a master."""
 
     role = ROLE

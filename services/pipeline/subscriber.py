@@ -28,7 +28,7 @@ from services.pipeline.frames import FrameAssembler
 from services.settings import Settings
 from services.sockets.local_socket import MAX_RECORD
 from services.sockets.records import AnyRecord, Begin, LossReason, Notice, Reading, Ready, Rosbridge, Unusable
-from services.sockets.serving import MakeLink, Service
+from services.sockets.serving import MakeLink, RunService
 from services.sockets.status import FrameCounts, ProcessStatus, connections, why_not_connected
 from toolchain.deployment import Deployment, Source
 
@@ -58,7 +58,7 @@ async def newest_message(subscription: Subscription, message: Message) -> tuple[
     return message, older
 
 
-class Subscriber(Service):
+class Subscriber(RunService):
     """Service that sends readings of a deployment's topics to a master, as addresses of columns."""
 
     role = ROLE

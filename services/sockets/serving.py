@@ -220,7 +220,7 @@ def listening(
     return lambda on_record: MasterLink(endpoint, role, deployment, on_record)
 
 
-class Service(ABC):
+class RunService(ABC):
     """A service of a run, which works for one master at a time through its link, and reports its status."""
 
     role: ClassVar[str]

@@ -23,7 +23,7 @@ from machines.bm2 import (
     start_state,
     unpack,
 )
-from machines.bm2_estimate import Chain, estimate, searched_values
+from machines.bm2_estimate import BoardSamples, estimate, searched_values
 from machines.bm2_fast import FastBM2
 from machines.bm2_reference import ReferenceBM2
 from machines.errors import ParameterError, StartError
@@ -147,7 +147,7 @@ def test_samples_of_the_sprinkler(changes, order, cycles):
     assert kernel.start(start_of(samples=400_000, burn_in=1000, sequencer=order)) is BM2StopReason.SAMPLES
     assert kernel.cycles / 401_000 == pytest.approx(cycles, abs=0.12)
     values = searched_values(kernel.machine.parameters, kernel.stream)
-    result = estimate([Chain(kernel.reason, kernel.results[np.newaxis, :2], values)])
+    result = estimate([BoardSamples(kernel.reason, kernel.results[np.newaxis, :2], values)])
     assert result.posterior[1] == pytest.approx(EXACT, abs=3 * result.error[1])
     assert 0 < result.error[1] < 0.02
 

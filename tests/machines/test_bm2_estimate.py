@@ -8,7 +8,7 @@ import pytest
 from machines.bm2 import BM2Machine, BM2Parameters, BM2Start, BM2StopReason, start_state, unpack
 from machines.bm2_estimate import (
     BATCHES_MIN,
-    Chain,
+    BoardSamples,
     batch_effective_samples,
     effective_samples,
     estimate,
@@ -34,7 +34,7 @@ def cumulative(values, batches, size=2):
 
 def ended(reason, *counts):
     """The chain of a board that ended with these counts."""
-    return Chain(reason, np.array([counts]))
+    return BoardSamples(reason, np.array([counts]))
 
 
 @pytest.mark.parametrize("stay", [0.5, 0.7, 0.9, 0.97])
@@ -104,9 +104,9 @@ def test_r_hat_of_chains_that_stand_still():
 
 
 def test_r_hat_sees_boards_that_disagree():
-    chains = [Chain(SAMPLES, cumulative(sticky(0.5, 2000, seed), 20)) for seed in range(2)]
+    chains = [BoardSamples(SAMPLES, cumulative(sticky(0.5, 2000, seed), 20)) for seed in range(2)]
     assert estimate(chains).r_hat == pytest.approx(1, abs=0.01)
-    apart = [*chains, Chain(SAMPLES, cumulative(np.ones(2000, dtype=np.int64), 20))]
+    apart = [*chains, BoardSamples(SAMPLES, cumulative(np.ones(2000, dtype=np.int64), 20))]
     assert estimate(apart).r_hat > 1.1
     assert math.isnan(estimate(chains[:1]).r_hat)
 
@@ -114,7 +114,7 @@ def test_r_hat_sees_boards_that_disagree():
 @pytest.mark.parametrize("samples", [1, 2])
 def test_halves_of_one_sample_have_no_r_hat(samples):
     half = np.array([samples - 1, 1])
-    result = estimate([Chain(SAMPLES, np.stack([half, 2 * half]))] * 2)
+    result = estimate([BoardSamples(SAMPLES, np.stack([half, 2 * half]))] * 2)
     assert math.isnan(result.r_hat) is (samples == 1)
 
 
@@ -122,7 +122,10 @@ def test_a_board_that_drifts_disagrees_with_itself():
     """Both boards have the same mean, but their halves differ: only split chains show it."""
     drifting = np.repeat([0, 1], 1000)
     drifting[::10] ^= 1
-    chains = [Chain(SAMPLES, cumulative(drifting, 20)), Chain(SAMPLES, cumulative(drifting, 20), drifting)]
+    chains = [
+        BoardSamples(SAMPLES, cumulative(drifting, 20)),
+        BoardSamples(SAMPLES, cumulative(drifting, 20), drifting),
+    ]
     assert estimate(chains).r_hat > 1.3
 
 
@@ -150,11 +153,11 @@ def test_boards_have_equal_weights_if_one_ran_out_of_cycles():
 
 def test_nothing_to_estimate():
     nothing = np.zeros((1, 2), dtype=np.uint32)
-    none = estimate([Chain(BM2StopReason.IMPOSSIBLE, nothing)] * 2)
+    none = estimate([BoardSamples(BM2StopReason.IMPOSSIBLE, nothing)] * 2)
     assert none.posterior is None
     assert none.left_out == (0, 1)
     # one sample each: no error, no R-hat, but a posterior
-    one = estimate([Chain(SAMPLES, np.array([[1, 0]]))] * 2)
+    one = estimate([BoardSamples(SAMPLES, np.array([[1, 0]]))] * 2)
     assert one.posterior.tolist() == [1, 0]
     assert math.isnan(one.effective_samples)
     assert math.isnan(one.r_hat)
@@ -166,7 +169,7 @@ def test_the_error_is_that_of_the_posterior(streamed):
     errors, stated = [], []
     for frame in range(40):
         values = [sticky(0.9, 4000, 100 * frame + board) for board in range(2)]
-        chains = [Chain(SAMPLES, cumulative(own, 20), own if streamed else None) for own in values]
+        chains = [BoardSamples(SAMPLES, cumulative(own, 20), own if streamed else None) for own in values]
         result = estimate(chains)
         assert result.effective_samples == pytest.approx(2 * 4000 * 0.2 / 1.8, rel=0.8)
         errors.append(result.posterior[1] - 0.5)
@@ -175,7 +178,7 @@ def test_the_error_is_that_of_the_posterior(streamed):
 
 
 def test_a_value_that_was_never_seen_has_an_error():
-    result = estimate([Chain(SAMPLES, cumulative(sticky(0.5, 1000), 20, 3))])
+    result = estimate([BoardSamples(SAMPLES, cumulative(sticky(0.5, 1000), 20, 3))])
     assert result.posterior[2] == 0
     assert 0 < result.error[2] < 0.01
 
@@ -184,7 +187,7 @@ def test_a_value_that_was_never_seen_has_an_error():
 def test_chains_that_never_change(streamed):
     """Such a chain may be stuck: it tells nothing of its error, but two of them that disagree do."""
     zeros, ones = (
-        Chain(SAMPLES, cumulative(values, 20), values if streamed else None)
+        BoardSamples(SAMPLES, cumulative(values, 20), values if streamed else None)
         for values in (np.zeros(1000, dtype=np.int64), np.ones(1000, dtype=np.int64))
     )
     for same in ([zeros], [zeros, zeros]):
@@ -201,7 +204,7 @@ def test_boards_that_disagree_have_the_error_between_them():
     """Each chain mixes well, but around another mean."""
     random = np.random.default_rng(1)
     values = [(random.random(4000) < chance).astype(np.int64) for chance in (0.2, 0.8)]
-    result = estimate([Chain(SAMPLES, cumulative(own, 20)) for own in values])
+    result = estimate([BoardSamples(SAMPLES, cumulative(own, 20)) for own in values])
     due = np.std([own.mean() for own in values], ddof=1) / math.sqrt(2)
     assert result.r_hat > 1.1
     assert result.effective_samples > 4000
@@ -213,7 +216,7 @@ def test_boards_disagree_from_an_r_hat_of_1_1_on(share, disagrees):
     """Until then, their error is that of as many independent samples."""
     random = np.random.default_rng(1)
     chains = [
-        Chain(SAMPLES, cumulative((random.random(4000) < chance).astype(np.int64), 20))
+        BoardSamples(SAMPLES, cumulative((random.random(4000) < chance).astype(np.int64), 20))
         for chance in (share, 1 - share)
     ]
     result = estimate(chains)

@@ -9,10 +9,10 @@ from pcie_shim.board.server import BoardServer
 from pcie_shim.framing import HEADER_BYTES
 from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.link_rate import LinkModel, link_model
-from pcie_shim.wires import WIRES, LinkRate, Wire
+from pcie_shim.wires import WIRES, LinkFigures, LinkRate
 from tests.pcie_shim.boards import images
 
-SLOW = Wire(8, 125, shared=False)
+SLOW = LinkFigures(8, 125, shared=False)
 """A byte takes a microsecond."""
 
 
@@ -44,7 +44,7 @@ def test_two_transfers_one_after_another():
 @pytest.mark.parametrize(("shared", "left_ns"), [(True, 3_000_000), (False, 2_000_000)])
 def test_only_a_shared_wire_is_that_of_other_processes(shared, left_ns):
     arrivals = []
-    link = LinkModel(Wire(8, 0, shared=shared), arrivals.append)
+    link = LinkModel(LinkFigures(8, 0, shared=shared), arrivals.append)
     child = os.fork()
     if not child:
         link.carry(1000, 1_000_000)

@@ -25,7 +25,7 @@ from toolchain.deployment.sections import (
     Section,
     Sequence,
     Source,
-    Topics,
+    TopicsSection,
     Variable,
     WrittenPrior,
     names_differ,
@@ -61,7 +61,9 @@ class DeploymentFile(Section):
     boards: Sequence[BoardSection] = Field(validation_alias="board", min_length=1)
     model: ModelSection = Field(default=ModelSection(), exclude_if=lambda model: model == ModelSection())
     outputs: Sequence[Output] = Field(default=(Output(),), validation_alias="output")
-    topics: Topics = Field(default=Topics(), exclude_if=lambda topics: topics == Topics())
+    topics: TopicsSection = Field(
+        default=TopicsSection(), exclude_if=lambda topics: topics == TopicsSection()
+    )
 
     @model_validator(mode="after")
     def _parts_agree(self) -> Self:

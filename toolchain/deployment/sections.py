@@ -439,7 +439,7 @@ class Output(Section):
     uri: Annotated[str, AfterValidator(lambda uri: uri and websocket_uri(uri))] = ""
 
 
-class Topics(Section):
+class TopicsSection(Section):
     """`[topics]`: whether each topic for robot tools is published; None leaves it to the deployment."""
 
     counts: bool | None = None

@@ -15,7 +15,7 @@ from matplotlib.image import imread
 from casestudies.sprinkler import viewer as viewer_module
 from casestudies.sprinkler.garden import mornings, publish_mornings
 from casestudies.sprinkler.model import exact_rain, model
-from casestudies.sprinkler.viewer import Frame, Viewer, draw, frame_of, mean_and_error
+from casestudies.sprinkler.viewer import FrameSummary, SamplesViewer, draw, frame_of, mean_and_error
 from posteriors.errors import NoResultError
 from posteriors.frame_report import FrameReport
 from posteriors.posterior import Posterior
@@ -112,9 +112,13 @@ def test_the_picture_shows_the_estimates_at_their_heights(tmp_path):
         """The mean row of the pixels of wet grass: curve, marks, and what does not depend on the share."""
         curve = np.array([[n, share * n] for n in (10, 100, 1000)])
         frames = [
-            Frame(number=n, grass=WET, share=share, error=0.1, effective=50, curve=curve) for n in (1, 2)
+            FrameSummary(number=n, grass=WET, share=share, error=0.1, effective=50, curve=curve)
+            for n in (1, 2)
         ]
-        draw(path, [*frames, Frame(number=3, grass=DRY, share=0.1, error=0.1, effective=50, curve=curve)])
+        draw(
+            path,
+            [*frames, FrameSummary(number=3, grass=DRY, share=0.1, error=0.1, effective=50, curve=curve)],
+        )
         picture = imread(path)[..., :3]
         assert picture.shape[1] > 800
         blue = np.abs(picture - (0x44 / 255, 0x77 / 255, 0xAA / 255)).max(axis=2) < 0.02
@@ -171,7 +175,7 @@ async def watched(tmp_path, monkeypatch):
     monkeypatch.setenv("BM_RUN_DIRECTORY", str(tmp_path))
 
     async def watch(count, publish, limit_s=PATIENCE):
-        viewer = Viewer(count)
+        viewer = SamplesViewer(count)
         async with FakeRosbridge() as fake:
             watching = asyncio.create_task(viewer.watch(fake.uri, first_limit_s=PATIENCE, limit_s=limit_s))
             for topic in ("/bm/frame", "/bm/samples", "/BMresults"):

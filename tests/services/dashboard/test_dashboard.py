@@ -28,7 +28,7 @@ from services.commands.dashboard import app
 from services.commands.master import app as master
 from services.dashboard.feed import Feed
 from services.dashboard.page import Dashboard
-from services.dashboard.robot import Robot, read_landmarks
+from services.dashboard.robot import WatchedRobot, read_landmarks
 from services.master.command_lines import dashboard_command
 from services.settings import Settings
 from tests.casestudies.pretend_stack import certain, frame_message
@@ -126,7 +126,9 @@ def chain():
 async def samples_shown(monkeypatch, deployment, *messages, of="boat"):
     feed = Feed()
     feed.add(report(1, deployment=of), 0.0)
-    robot = Robot(feed, Settings(), deployment, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
+    robot = WatchedRobot(
+        feed, Settings(), deployment, uri="ws://robot:9090", topic="/BMresults", truth="/truth"
+    )
     for other in ("_follow_frames", "_ask_about_world"):
         monkeypatch.setattr(robot, other, nothing)
     await robot._follow(SamplesServer(*messages))
@@ -154,7 +156,7 @@ async def test_states_of_other_machines_are_hexadecimal_words(monkeypatch, chain
 
 def test_units_are_those_of_the_deployment_of_a_frame(chain):
     feed = Feed()
-    robot = Robot(feed, Settings(), chain, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
+    robot = WatchedRobot(feed, Settings(), chain, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
     assert robot.words_for(feed.add(report(1, deployment="boat"), 0.0)) == {"D1": ("m", ()), "B1": ("", ())}
     assert robot.words_for(feed.add(report(1, deployment="garden"), 0.0)) == {}
 
@@ -202,7 +204,7 @@ async def test_a_topic_with_too_large_messages_does_not_end_the_page(monkeypatch
             raise TopicLeftOutError(f"{topic} is left out")
             yield
 
-    robot = Robot(Feed(), Settings(), None, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
+    robot = WatchedRobot(Feed(), Settings(), None, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
     for other in ("_follow_frames", "_ask_about_world"):
         monkeypatch.setattr(robot, other, nothing)
     await robot._follow(Server())
@@ -222,7 +224,7 @@ async def test_each_reason_of_unreadable_messages_is_reported_once(monkeypatch, 
         "services.dashboard.robot.posteriors", lambda *_, **__: contextlib.nullcontext(Frames())
     )
     feed = Feed()
-    robot = Robot(feed, Settings(), None, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
+    robot = WatchedRobot(feed, Settings(), None, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
     with pytest.raises(DisconnectedError):
         await robot._follow_frames(None)
     said = capsys.readouterr().err.splitlines()
@@ -249,7 +251,7 @@ async def test_frames_of_another_deployment_are_not_shown(monkeypatch, boat):
         "services.dashboard.robot.posteriors", lambda *_, **__: contextlib.nullcontext(Frames())
     )
     feed = Feed()
-    robot = Robot(feed, Settings(), boat, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
+    robot = WatchedRobot(feed, Settings(), boat, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
     with pytest.raises(DisconnectedError):
         await robot._follow_frames(None)
     assert [each.report.number for each in feed.frames] == [1]

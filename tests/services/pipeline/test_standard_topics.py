@@ -21,16 +21,16 @@ from tests.fake_rosbridge import FakeRosbridge
 from tests.services.conftest import until
 from tests.services.pipeline.conftest import running
 from tests.services.pipeline.test_publisher import REASON, result
-from toolchain.deployment import Topics
+from toolchain.deployment import TopicsSection
 
 NAMES = ["/bm/counts", "/bm/decision", "/bm/posterior", "/bm/pose"]
-OFF = dict.fromkeys(Topics.model_fields, False)
+OFF = dict.fromkeys(TopicsSection.model_fields, False)
 
 
 @asynccontextmanager
 async def topics_of(deployment, fake, **on):
     if on:
-        deployment = deployment.model_copy(update={"topics": Topics(**on)})
+        deployment = deployment.model_copy(update={"topics": TopicsSection(**on)})
     topics = ResultTopics(Settings(uri=fake.uri), deployment)
     async with topics.opened():
         yield topics
@@ -63,7 +63,7 @@ async def test_every_topic_follows_the_result(boat):
         assert values(health["status"][2])["image"] == boat.boards[2].image_hash
 
 
-@pytest.mark.parametrize("on", [*Topics.model_fields])
+@pytest.mark.parametrize("on", [*TopicsSection.model_fields])
 async def test_each_is_switched_in_the_deployment(boat, on):
     async with FakeRosbridge() as fake:
         async with topics_of(boat, fake, **OFF | {on: True}) as topics:
