@@ -8,7 +8,7 @@ import argparse
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any, Final, cast
 
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from casestudies.sprinkler.model import model as sprinkler
 from machines.bm1 import BM1Machine, Start
-from machines.bm2 import BM2Machine, BM2Start, start_state, unpack
+from machines.bm2 import BM2Machine, unpack
 from machines.bm2_chains import Chains
 from machines.bm2_fast import FastBM2
 from machines.fast import FastBM1
 from machines.parameters import BM1Parameters, Sequencer
-from scripts.benches.networks import factors_of, machine_of
-from scripts.benches.samplers import CHAINS, THRML_LOCK, Factor, Known, pyagrum_gibbs, thrml_gibbs
+from scripts.benches.networks import factors_of, machine_of, start_of
+from scripts.benches.samplers import CHAINS, THRML_LOCK, Factor, Known, Sampled, pyagrum_gibbs, thrml_gibbs
 from scripts.running.flags import ScriptParser
 from scripts.running.script import print_table
 from scripts.verifications.installation import use_packages
@@ -44,17 +44,7 @@ TURNS: Final = 3
 BURN_IN: Final = 100
 
 
-@dataclass(frozen=True, slots=True)
-class Speed:
-    """A measured run; cycles and sweeps are those of all chains."""
-
-    cycles: int
-    sweeps: int
-    seconds: float
-    """Time of the processor."""
-
-
-def bm1(cycles: int) -> Speed:
+def bm1(cycles: int) -> Sampled:
     """Run a BM1 of 1024 lines and 7 columns, from another bank each time, for some cycles."""
     random = np.random.default_rng(1)
     codes = [random.integers(0, 255, (4, 1024), dtype=np.uint16) for _ in range(6)]
@@ -66,7 +56,7 @@ def bm1(cycles: int) -> Speed:
     )
     began = time.process_time()
     kernel.start(Start(addresses=(0,) * 6, target_count=2**32 - 1, max_cycles=cycles))
-    return Speed(kernel.cycles, 0, time.process_time() - began)
+    return Sampled({}, 0, time.process_time() - began, cycles=kernel.cycles)
 
 
 def _sweep(
@@ -106,7 +96,7 @@ def _sweep(
 _compiled_sweep = cast("Callable[..., None]", njit(_sweep))
 
 
-def numba_gibbs(factors: Sequence[Factor], start: Sequence[int], known: Known, sweeps: int) -> Speed:
+def numba_gibbs(factors: Sequence[Factor], start: Sequence[int], known: Known, sweeps: int) -> Sampled:
     """Run a plain Gibbs sampler over the variables' values, as one would write it in numba."""
     sizes = {each: size for scope, table in factors for each, size in zip(scope, table.shape, strict=True)}
     bases = np.cumsum([0, *(table.size for _, table in factors)])
@@ -132,7 +122,7 @@ def numba_gibbs(factors: Sequence[Factor], start: Sequence[int], known: Known, s
     _compiled_sweep(*arguments, 1)
     began = time.process_time()
     _compiled_sweep(*arguments, sweeps)
-    return Speed(0, sweeps, time.process_time() - began)
+    return Sampled({}, sweeps, time.process_time() - began)
 
 
 def in_pyagrum(pyagrum: Any, joint: JointDistribution) -> Any:
@@ -151,21 +141,12 @@ def in_pyagrum(pyagrum: Any, joint: JointDistribution) -> Any:
 
 def alternatives(
     pyagrum: Any, joint: JointDistribution, known: Known, arguments: argparse.Namespace
-) -> dict[str, Callable[[], Speed]]:
-    """Return functions that run each alternative once."""
+) -> dict[str, Callable[[], Sampled]]:
+    """Return functions that run each alternative once, and measure the time of the processor."""
     model = joint.ask(joint.symbols).network()
     machine = machine_of(model, Sequencer.LINEAR)
     parameters = machine.parameters
-    state = start_state(machine, known)
-    assert state is not None  # the evidence is possible
-    start = BM2Start(
-        state=state,
-        known=sum(parameters.masks[variable] for variable in known),
-        samples=arguments.sweeps,
-        burn_in=BURN_IN,
-        ops_timeout=parameters.ops_timeout,
-        max_cycles=2**40,
-    )
+    start = replace(start_of(machine, known, arguments.sweeps), burn_in=BURN_IN, max_cycles=2**40)
     kernel = FastBM2(machine)
     many = MANY[model.name]
     chains = Chains(
@@ -178,28 +159,29 @@ def alternatives(
     moves = many * len(parameters.moves(start.known, start.sequencer))
     short = replace(start, samples=1 + 2 * arguments.chain_sweeps // moves)
 
-    def single() -> Speed:
+    def single() -> Sampled:
         began = time.process_time()
         kernel.start(start)
-        return Speed(kernel.cycles, kernel.samples, time.process_time() - began)
+        return Sampled({}, kernel.samples, time.process_time() - began, cycles=kernel.cycles)
 
-    def together() -> Speed:
+    def together() -> Sampled:
         began = time.process_time()
         results = chains.run([short] * many)
         seconds = time.process_time() - began
-        return Speed(sum(each.cycles for each in results), sum(each.samples for each in results), seconds)
+        cycles, samples = (sum(getattr(each, name) for each in results) for name in ("cycles", "samples"))
+        return Sampled({}, samples, seconds, cycles=cycles)
 
-    def others(run: Callable[..., Any], *given: Any, **options: Any) -> Callable[[], Speed]:
+    def others(run: Callable[..., Sampled], *given: Any, **options: Any) -> Callable[[], Sampled]:
         @cache  # once is enough to tell, and THRML compiles in each run
-        def once() -> Speed:
+        def once() -> Sampled:
             began = time.process_time()
             sampled = run(*given, burn_in=BURN_IN, **options)
             # their seconds exclude compilation, and those of the processor what other processes took
-            return Speed(0, sampled.sweeps, min(sampled.seconds, time.process_time() - began))
+            return replace(sampled, seconds=min(sampled.seconds, time.process_time() - began))
 
         return once
 
-    sweeps, factors, values = arguments.sweeps, factors_of(model), unpack(parameters, state)
+    sweeps, factors, values = arguments.sweeps, factors_of(model), unpack(parameters, start.state)
     theirs = (pyagrum, in_pyagrum(pyagrum, joint), model.names, known)
     runs = {
         "BM2, one chain": single,
@@ -213,9 +195,9 @@ def alternatives(
     return runs
 
 
-def measure(runs: dict[str, Callable[[], Speed]]) -> dict[str, Speed]:
+def measure(runs: dict[str, Callable[[], Sampled]]) -> dict[str, Sampled]:
     """Run all in turns, and return the fastest run of each; the first turn, which compiles, does not count."""
-    best: dict[str, Speed] = {}
+    best: dict[str, Sampled] = {}
     for turn in range(1 + TURNS):
         for name, run in runs.items():
             speed = run()
@@ -224,7 +206,7 @@ def measure(runs: dict[str, Callable[[], Speed]]) -> dict[str, Speed]:
     return best
 
 
-def show(title: str, speeds: dict[str, Speed]) -> None:
+def show(title: str, speeds: dict[str, Sampled]) -> None:
     """Print a table; the ratios are those of sweeps a second to one chain."""
     rows = []
     single = next(iter(speeds.values()))

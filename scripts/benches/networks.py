@@ -133,21 +133,26 @@ def machine_of(model: NetworkModel, sequencer: Sequencer) -> BM2Machine:
     return BM2Machine.from_factors(parameters, [table for _, table in factors])
 
 
-def run(kernel: BM2Kernel, known: Known, sweeps: int, bank: int) -> Sampled:
-    """Run one chain in batches."""
-    parameters = kernel.machine.parameters
-    state = start_state(kernel.machine, known)
+def start_of(machine: BM2Machine, known: Known, samples: int, bank: int = 0) -> BM2Start:
+    """Return the start of a run from a possible state."""
+    parameters, state = machine.parameters, start_state(machine, known)
     assert state is not None  # the evidence is possible
-    start = BM2Start(
+    return BM2Start(
         state=state,
         known=sum(parameters.masks[variable] for variable in known),
-        samples=sweeps // BATCHES,
+        samples=samples,
         burn_in=parameters.burn_in,
         ops_timeout=parameters.ops_timeout,
         max_cycles=MAX_CYCLES,
         bank=bank,
         sequencer=parameters.sequencer,
     )
+
+
+def run(kernel: BM2Kernel, known: Known, sweeps: int, bank: int) -> Sampled:
+    """Run one chain in batches."""
+    parameters = kernel.machine.parameters
+    start = start_of(kernel.machine, known, sweeps // BATCHES, bank)
     began = time.perf_counter()
     kernel.start(start)
     batches = [kernel.results]

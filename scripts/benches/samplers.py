@@ -22,7 +22,10 @@ Known: TypeAlias = Mapping[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """Marginals of the unknown variables, by number, and what they took; the last three only of a machine."""
+    """Marginals of the unknown variables, by number (none if only the speed counts), and what they took.
+
+    Sweeps and cycles are those of all chains; only a machine has the last three.
+    """
 
     marginals: dict[int, NDArray[np.float64]]
     sweeps: int
