@@ -12,13 +12,12 @@ import asyncio
 import itertools
 import math
 import os
-import tempfile
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import ExitStack, asynccontextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -35,9 +34,9 @@ from pcie_shim.programming_file import Image, Partition
 from pcie_shim.wires import WIRES, LinkRate
 from scripts.running.flags import ScriptParser
 from scripts.running.script import print_table
+from scripts.running.stand import temporary_stand
 from terminal.output import write_json
 from terminal.pictures import new_figure, save_figure
-from terminal.processes import Process
 
 BOARDS = (1, 2, 4)
 WORDS = (1, 16, 256, 1024, 4096, 8192)
@@ -215,46 +214,32 @@ def fits(transfers: Sequence[Transfer]) -> list[Fitted]:
     return found
 
 
-@asynccontextmanager
-async def served(folder: Path, flags: Sequence[str]) -> AsyncIterator[None]:
-    """Run boards of every kind."""
-    processes = [Process(f"boards ({link})", folder / f"{link}.log") for link in LinkRate]
-    try:
-        for link, process in zip(LinkRate, processes, strict=True):
-            own = ("--boards", str(max(BOARDS)), "--directory", str(folder / link), "--link-rate", link)
-            await process.start("board", *own, *flags)
-        for process in processes:
-            await process.line("boards listen")
-        yield
-    finally:
-        await asyncio.gather(*(process.end() for process in processes))
-
-
 async def bench(arguments: argparse.Namespace) -> int:
     """Start boards of every kind, measure them, and print the tables."""
     transfers: list[Transfer] = []
     frames: list[FrameTime] = []
-    with tempfile.TemporaryDirectory(prefix="bench-rosbayes-") as name:
-        for way, flags in WAYS.items():
-            folder = Path(name) / way
-            folder.mkdir()
-            async with served(folder, flags):
-                for boards in BOARDS:
-                    for words in WORDS if way == "sent" else ():
-                        await asyncio.sleep(0)  # for Ctrl-C
-                        transfers += measure_transfers(folder, boards, words, arguments.repeats)
-                    frames += measure_frames(folder, way, boards, arguments.repeats)
+    for way, flags in WAYS.items():
+        async with temporary_stand() as stand:
+            for link in LinkRate:
+                own = (
+                    "--boards",
+                    str(max(BOARDS)),
+                    "--directory",
+                    str(stand.folder / link),
+                    "--link-rate",
+                    link,
+                )
+                await stand.start(f"boards-{link}", "boards listen", "board", *own, *flags)
+            for boards in BOARDS:
+                for words in WORDS if way == "sent" else ():
+                    await asyncio.sleep(0)  # for Ctrl-C
+                    transfers += measure_transfers(stand.folder, boards, words, arguments.repeats)
+                frames += measure_frames(stand.folder, way, boards, arguments.repeats)
     fitted = fits(transfers)
     show(transfers, frames, fitted)
     if arguments.json:
-        parts: dict[str, Sequence[Transfer | FrameTime | Fitted]] = {
-            "transfers": transfers,
-            "frames": frames,
-            "fitted": fitted,
-        }
-        write_json(
-            arguments.json, {name: [each._asdict() for each in those] for name, those in parts.items()}
-        )
+        parts: dict[str, Any] = {"transfers": transfers, "frames": frames, "fitted": fitted}
+        write_json(arguments.json, {name: [each._asdict() for each in parts[name]] for name in parts})
     if arguments.picture:
         draw(arguments.picture, transfers, frames)
     return int(arguments.check and not all(each.is_right for each in fitted))
