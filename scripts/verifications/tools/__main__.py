@@ -183,15 +183,9 @@ def draw(last: dict[str, Any]) -> None:
 async def foxglove(scene: Scene) -> None:
     """Check that Foxglove's readers decode each topic, as its application would."""
     modules, decoded = install_node_packages("foxglove", HERE), scene.stand.folder / "decoded.json"
-    command = (
-        shutil.which("node") or "node",
-        str(HERE / "foxglove.mjs"),
-        str(modules),
-        scene.stand.uri,
-        scene.ros_version,
-        str(decoded),
-    )
-    await scene.stand.start("foxglove", "messages of each", *command)
+    command = (shutil.which("node") or "node", str(HERE / "foxglove.mjs"), str(modules))
+    outcome = (scene.stand.uri, scene.ros_version, str(decoded))
+    await scene.stand.start("foxglove", "messages of each", *command, *outcome)
     if scene.pictures and scene.ros_version == "1":
         draw(json.loads(decoded.read_text()))
 
