@@ -57,14 +57,14 @@ class Stand:
         """Return the log of a process."""
         return self.folder / f"{name}.log"
 
-    async def start(self, name: str, ready: str, *command: str) -> str:
+    async def start(self, name: str, ready: str, *command: str, limit: float = 2 * PATIENCE) -> str:
         """Start a process, or start it again without a command, and return the text that shows its readiness."""
         self._commands[name] = command or self._commands[name]
         self._processes[name] = process = Process(name, self.log(name))
         if name not in self.shown:
             self.shown.append(name)
         await process.start(*self._commands[name])
-        async with asyncio.timeout(2 * PATIENCE):
+        async with asyncio.timeout(limit):
             return (await process.line(ready))[0]
 
     async def kill(self, name: str) -> None:

@@ -7,17 +7,12 @@ VHDL            --> Verilog (GHDL) --> yosys           --> properties for every 
 """
 
 import argparse
-import contextlib
+import asyncio
 import os
-import select
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from pathlib import Path
 from typing import Final
 
 from hdl.test.mutants import MUTANTS, Mutant, caught_by
@@ -29,8 +24,10 @@ from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, read_image
 from scripts.running.flags import ScriptParser
 from scripts.running.script import ROOT
+from scripts.running.stand import temporary_stand
 from scripts.verifications.checks import Tally
 from scripts.verifications.installation import install_programs
+from terminal.errors import ProcessError
 from toolchain.hardware import Simulator
 
 SESSIONS: Final = 60
@@ -38,35 +35,33 @@ SESSIONS: Final = 60
 BOARD: Final = 1
 """The board of the boat that is simulated: 256 lines in the middle of the map."""
 _COMPILING_S: Final = 1200.0
-_ENDING_S: Final = 30.0
 _ANSWER_S: Final = 120.0
-_BIN: Final = Path(sys.executable).parent
 
 
 # The boat on simulated hardware, whose counts must be those of emulated boards
 
 
-def boat_failure(engine: str, count: int) -> str | None:
+async def boat_failure(engine: str, count: int) -> str | None:
     """Run frames on emulated boards, and again with one of them simulated; return why the results differ, or None."""
     source = ("--uri", "ws://localhost:9090", "--topic", "/boat", "--type", "boat_msgs/Sensors")
     boat = ROOT / "casestudies" / "boat"
-    with tempfile.TemporaryDirectory(prefix="hdl-boat-") as where:
-        folder, deployment = Path(where), Path(where) / "boat"
+    async with temporary_stand() as stand:
+        folder, deployment = stand.folder, stand.folder / "boat"
         build = ("build", str(boat), "-o", str(deployment), "--partitions", "4", *source)
-        command = [str(_BIN / "toolchain"), *build]
-        subprocess.run(command, check=True, capture_output=True, timeout=_COMPILING_S)
+        await stand.start("toolchain", "", "toolchain", *build)
+        if await stand.wait("toolchain"):
+            return f"the boat is not built:\n{stand.tails()}"
         images = [read_image(deployment / "boards" / f"board{at}.bm") for at in range(4)]
         frames = _frames(images[BOARD], count)
         endpoints = [f"unix:{folder}/boards/board{at}.sock" for at in range(4)]
         simulated = f"unix:{folder}/simulated.sock"
         hardware = ("--engine", engine, "--hardware", str(ROOT / "build" / "hardware"))
-        with (
-            _board("--boards", "4", "--directory", str(folder / "boards")),
-            _board(*hardware, "-d", str(deployment), "--index", str(BOARD), "--listen", simulated),
-        ):
-            emulated = _outcomes(endpoints, images, frames)
-            endpoints[BOARD] = simulated
-            found = _outcomes(endpoints, images, frames)
+        await stand.start("boards", "listen", "board", "--boards", "4", "--directory", str(folder / "boards"))
+        board = ("board", *hardware, "-d", str(deployment), "--index", str(BOARD), "--listen", simulated)
+        await stand.start("simulated-board", "listen", *board, limit=_COMPILING_S)
+        emulated = _outcomes(endpoints, images, frames)
+        endpoints[BOARD] = simulated
+        found = _outcomes(endpoints, images, frames)
     wrong = [at for at, (one, other) in enumerate(zip(found, emulated, strict=True)) if one != other]
     return f"frames {wrong} differ" if wrong else None
 
@@ -83,26 +78,6 @@ def _frames(image: Image, count: int) -> list[FrameInput]:
         bank = at % machine.parameters.rng_banks
         frames.append(FrameInput(addresses=tuple(readings), target_count=255, max_cycles=1 << 17, bank=bank))
     return frames
-
-
-@contextlib.contextmanager
-def _board(*flags: str) -> Iterator[None]:
-    """Run the command `board` during the block, which begins when the board listens."""
-    process = subprocess.Popen([str(_BIN / "board"), *flags], stderr=subprocess.PIPE, text=True)
-    try:
-        assert process.stderr is not None
-        deadline = time.monotonic() + _COMPILING_S
-        said = ""
-        while "listen" not in said:
-            if not select.select([process.stderr], [], [], max(0.0, deadline - time.monotonic()))[0]:
-                raise HardwareToolError(f"board {' '.join(flags)} does not listen")
-            said = process.stderr.readline()
-            if not said or "error" in said:
-                raise HardwareToolError(f"board {' '.join(flags)} ended: {said.strip()}")
-        yield
-    finally:
-        process.terminate()
-        process.communicate(timeout=_ENDING_S)
 
 
 def _outcomes(
@@ -135,8 +110,10 @@ def verify(arguments: argparse.Namespace) -> int:
         checks = {each.name: partial(mutant_failure, each) for each in MUTANTS}
     else:
         checks = {
-            "boat: 10 frames with one of four boards in verilator": partial(boat_failure, "verilator", 10),
-            "boat: a frame with one of four boards in ghdl": partial(boat_failure, "ghdl", 1),
+            "boat: 10 frames with one of four boards in verilator": lambda: asyncio.run(
+                boat_failure("verilator", 10)
+            ),
+            "boat: a frame with one of four boards in ghdl": lambda: asyncio.run(boat_failure("ghdl", 1)),
             **{each.name: each.failure for each in (*units(), *formal(), *sessions(arguments.sessions))},
         }
     tally = Tally()
@@ -145,7 +122,9 @@ def verify(arguments: argparse.Namespace) -> int:
         began = time.monotonic()
         try:
             why = checks[name]()
-        except (HardwareToolError, PcieShimError, OSError, subprocess.SubprocessError, ValueError) as error:
+        except TimeoutError:
+            why = "a process was not ready in time"
+        except (HardwareToolError, PcieShimError, ProcessError, OSError, ValueError) as error:
             why = str(error)
         tally.report(name, began, why)
 
