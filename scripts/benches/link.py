@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,31 +49,14 @@ TOLERANCE = 0.15
 """Deviation of a fitted rate from the stated one that the bench accepts."""
 LIMIT_S = 30.0
 
+SIZES = tuple(4 * words for words in WORDS)
+"""Bytes of a block."""
+
 Move = Callable[[Sequence[SocketLink], int], None]
-
-
-class Transfer(NamedTuple):
-    """Blocks of `size` bytes to or from each of the boards: the time until all have moved."""
-
-    link: LinkRate
-    direction: str
-    boards: int
-    size: int
-    us: float
-
-    @property
-    def mbps(self) -> float:
-        """10^6 bits of payload per second, over all boards."""
-        return 8 * self.size * self.boards / self.us
-
-
-class FrameTime(NamedTuple):
-    """A frame of RESULTS results on so many boards: its time besides computing."""
-
-    link: LinkRate
-    way: str
-    boards: int
-    us: float
+Transfers = dict[tuple[LinkRate, str, int, int], float]
+"""The time (us) until a block has moved to or from each board, by link, direction, boards and size."""
+Frames = dict[tuple[LinkRate, str, int], float]
+"""The time (us) of a frame of RESULTS results besides computing, by link, way and boards."""
 
 
 class Fitted(NamedTuple):
@@ -155,9 +138,9 @@ def endpoints(folder: Path, link: LinkRate, boards: int) -> list[str]:
     return [f"unix:{folder / link}/board{at}.sock" for at in range(boards)]
 
 
-def measure_transfers(folder: Path, boards: int, words: int, repeats: int) -> list[Transfer]:
+def measure_transfers(folder: Path, boards: int, words: int, repeats: int) -> Transfers:
     """Measure blocks of one size, in both directions, over every kind of link."""
-    found = []
+    found = {}
     with ExitStack() as stack:
         links: dict[LinkRate, list[SocketLink]] = {link: [] for link in LinkRate}
         for link in LinkRate:
@@ -167,11 +150,11 @@ def measure_transfers(folder: Path, boards: int, words: int, repeats: int) -> li
         for direction, move in MOVES.items():
             works = {link: partial(timed, move, those, words) for link, those in links.items()}
             for link, us in times(works, repeats).items():
-                found.append(Transfer(link, direction, boards, 4 * words, us))
+                found[link, direction, boards, 4 * words] = us
     return found
 
 
-def measure_frames(folder: Path, way: str, boards: int, repeats: int) -> list[FrameTime]:
+def measure_frames(folder: Path, way: str, boards: int, repeats: int) -> Frames:
     """Measure frames on so many boards."""
     parts = [image(RESULTS // boards, index, boards) for index in range(boards)]
     frame = FrameInput(addresses=(0,), target_count=1, max_cycles=1 << 12, bank=0, stop="own")
@@ -189,35 +172,29 @@ def measure_frames(folder: Path, way: str, boards: int, repeats: int) -> list[Fr
             return (time.perf_counter_ns() - began - output.boards_compute_ns) / 1e3
 
         found = times({link: partial(besides, link) for link in LinkRate}, repeats)
-    return [FrameTime(link, way, boards, us) for link, us in found.items()]
+    return {(link, way, boards): us for link, us in found.items()}
 
 
-def fits(transfers: Sequence[Transfer]) -> list[Fitted]:
+def fits(transfers: Transfers) -> list[Fitted]:
     """Fit a rate and the latency of one transfer to the times of one board, less those of the socket alone."""
-    alone = {
-        (each.direction, each.size): each.us
-        for each in transfers
-        if each.boards == 1 and each.link is LinkRate.NONE
-    }
     found = []
-    for link in (LinkRate.PCIE_GEN2, LinkRate.JTAG):
-        for direction in ("write", "read"):
-            those = [
-                each for each in transfers if (each.link, each.direction, each.boards) == (link, direction, 1)
-            ]
-            more = [each.us - alone[direction, each.size] for each in those]
-            us_a_byte, _ = np.polyfit([each.size for each in those], more, 1)
-            # those of a word are two transfers, of 44 bytes with their headers
-            # on a busy computer, the larger blocks may have been the faster ones
-            rate = 8 / us_a_byte if us_a_byte > 0 else math.nan
-            found.append(Fitted(link, direction, rate, (more[0] - 44 * us_a_byte) / 2))
+    for link, direction in itertools.product((LinkRate.PCIE_GEN2, LinkRate.JTAG), ("write", "read")):
+        those, alone = (
+            [transfers[each, direction, 1, size] for size in SIZES] for each in (link, LinkRate.NONE)
+        )
+        more = np.subtract(those, alone)
+        us_a_byte, _ = np.polyfit(SIZES, more, 1)
+        # those of a word are two transfers, of 44 bytes with their headers
+        # on a busy computer, the larger blocks may have been the faster ones
+        rate = 8 / us_a_byte if us_a_byte > 0 else math.nan
+        found.append(Fitted(link, direction, rate, (more[0] - 44 * us_a_byte) / 2))
     return found
 
 
 async def bench(arguments: argparse.Namespace) -> int:
     """Start boards of every kind, measure them, and print the tables."""
-    transfers: list[Transfer] = []
-    frames: list[FrameTime] = []
+    transfers: Transfers = {}
+    frames: Frames = {}
     for way, flags in WAYS.items():
         async with temporary_stand() as stand:
             for link in LinkRate:
@@ -233,27 +210,33 @@ async def bench(arguments: argparse.Namespace) -> int:
             for boards in BOARDS:
                 for words in WORDS if way == "sent" else ():
                     await asyncio.sleep(0)  # for Ctrl-C
-                    transfers += measure_transfers(stand.folder, boards, words, arguments.repeats)
-                frames += measure_frames(stand.folder, way, boards, arguments.repeats)
+                    transfers |= measure_transfers(stand.folder, boards, words, arguments.repeats)
+                frames |= measure_frames(stand.folder, way, boards, arguments.repeats)
     fitted = fits(transfers)
     show(transfers, frames, fitted)
     if arguments.json:
-        parts: dict[str, Any] = {"transfers": transfers, "frames": frames, "fitted": fitted}
-        write_json(arguments.json, {name: [each._asdict() for each in parts[name]] for name in parts})
+        of_transfer, of_frame = ("link", "direction", "boards", "size", "us"), ("link", "way", "boards", "us")
+        parts = {
+            "transfers": [dict(zip(of_transfer, (*of, us), strict=True)) for of, us in transfers.items()],
+            "frames": [dict(zip(of_frame, (*of, us), strict=True)) for of, us in frames.items()],
+            "fitted": [each._asdict() for each in fitted],
+        }
+        write_json(arguments.json, parts)
     if arguments.picture:
         draw(arguments.picture, transfers, frames)
     return int(arguments.check and not all(each.is_right for each in fitted))
 
 
-def show(transfers: Sequence[Transfer], frames: Sequence[FrameTime], fitted: Sequence[Fitted]) -> None:
+def show(transfers: Transfers, frames: Frames, fitted: Sequence[Fitted]) -> None:
     """Print the tables on standard output."""
     rows: list[list[str] | None] = []
     for boards in BOARDS:
-        for direction, words in itertools.product(MOVES, WORDS):
-            row = [str(boards), direction, f"{4 * words:,}"]
+        for direction, size in itertools.product(MOVES, SIZES):
+            row = [str(boards), direction, f"{size:,}"]
             for link in LinkRate:
-                found = next(each for each in transfers if each[:4] == (link, direction, boards, 4 * words))
-                row += [f"{found.us:,.0f}", f"{found.mbps:,.{int(found.mbps < 100)}f}"]
+                us = transfers[link, direction, boards, size]
+                mbps = 8 * size * boards / us
+                row += [f"{us:,.0f}", f"{mbps:,.{int(mbps < 100)}f}"]
             rows.append(row)
         rows.append(None)
     units = (f"{link}\n{unit}" for link in LinkRate for unit in ("us", "Mbps"))
@@ -261,8 +244,7 @@ def show(transfers: Sequence[Transfer], frames: Sequence[FrameTime], fitted: Seq
     print_table(title, ("boards", "", "bytes", *units), rows, left=0)
     rows = []
     for way, boards in itertools.product(WAYS, BOARDS):
-        those = [next(each for each in frames if each[:3] == (link, way, boards)) for link in LinkRate]
-        rows.append([way, str(boards), *(f"{each.us:,.0f}" for each in those)])
+        rows.append([way, str(boards), *(f"{frames[link, way, boards]:,.0f}" for link in LinkRate)])
     title = f"a frame of {RESULTS} results: microseconds besides computing"
     print_table(title, ("results", "partitions", *LinkRate), rows, left=0)
     for each in fitted:
@@ -273,30 +255,26 @@ def show(transfers: Sequence[Transfer], frames: Sequence[FrameTime], fitted: Seq
             f"socket alone; the model has {wire.mbps:,g} Mbps and {wire.latency_us:g} us; {verdict} {TOLERANCE:.0%}"
         )
     by_link = {each.link: each.mbps for each in fitted if each.direction == "read"}
-    slow, fast = (
-        next(each.us for each in transfers if each[:4] == (link, "read", 1, 4 * WORDS[-1]))
-        for link in (LinkRate.JTAG, LinkRate.PCIE_GEN2)
-    )
+    slow, fast = (transfers[link, "read", 1, SIZES[-1]] for link in (LinkRate.JTAG, LinkRate.PCIE_GEN2))
     print(
         f"PCIe has {by_link[LinkRate.PCIE_GEN2] / by_link[LinkRate.JTAG]:.0f} times the rate of USB/JTAG (thesis 2.3: "
-        f"around 800); with the emulation's socket before it, {4 * WORDS[-1]:,} bytes are read {slow / fast:.0f} times as "
+        f"around 800); with the emulation's socket before it, {SIZES[-1]:,} bytes are read {slow / fast:.0f} times as "
         f"fast; {len(os.sched_getaffinity(0))} cores"
     )
 
 
-def draw(path: Path, transfers: Sequence[Transfer], frames: Sequence[FrameTime]) -> None:
+def draw(path: Path, transfers: Transfers, frames: Frames) -> None:
     """Draw the time of a read by its size, with the model's own time dotted, and that of a frame by partitions."""
     figure = new_figure(9.6, 4.2)
     by_size, by_boards = figure.subplots(1, 2)
     for link, colour in zip(LinkRate, ("#bbbbbb", "#4477aa", "#ee6677"), strict=True):
-        those = [each for each in transfers if (each.link, each.direction, each.boards) == (link, "read", 1)]
-        sizes = [each.size for each in those]
-        by_size.loglog(sizes, [each.us for each in those], marker="o", color=colour, label=link)
+        those = [transfers[link, "read", 1, size] for size in SIZES]
+        by_size.loglog(SIZES, those, marker="o", color=colour, label=link)
         if link in WIRES:
-            model = [1e6 * WIRES[link].seconds(size, 2) for size in sizes]
-            by_size.loglog(sizes, model, linestyle=":", color=colour, label=f"{link}, without the socket")
-        own = [each for each in frames if (each.link, each.way) == (link, "read")]
-        by_boards.semilogy([each.boards for each in own], [each.us for each in own], marker="o", color=colour)
+            model = [1e6 * WIRES[link].seconds(size, 2) for size in SIZES]
+            by_size.loglog(SIZES, model, linestyle=":", color=colour, label=f"{link}, without the socket")
+        own = [frames[link, "read", boards] for boards in BOARDS]
+        by_boards.semilogy(BOARDS, own, marker="o", color=colour)
     by_size.set_xlabel("bytes read from one board")
     by_size.set_ylabel("us")
     by_size.legend(frameon=False)
