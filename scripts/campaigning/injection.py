@@ -7,6 +7,7 @@ import resource
 import struct
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 from scripts.campaigning.accounts import FAILED
 from scripts.campaigning.connections import Weather
@@ -97,30 +98,22 @@ class Injector:
 
     async def _change_weather(self, fault: Fault) -> None:
         link = self._stack.links[fault.target]
-        weather = link.weather
-        if fault.what == "cut":
-            link.cut()
+        if fault.what in {"cut", "finish"}:
+            (link.cut if fault.what == "cut" else link.finish)()
             return
-        if fault.what == "finish":
-            link.finish()
-            return
-        match fault.what:
-            case "gone":
-                link.vanish()
-            case "hold":
-                weather.open.clear()
-            case "slow":
-                weather.rate = 20_000.0
-            case "delay":
-                weather.delay = 0.05
-            case "nonsense":
-                weather.insert = NONSENSE[fault.number]
-            case "cut-inside":
-                weather.cut_inside = True
-            case "corrupt":
-                weather.spoil = True
-            case "repeat":
-                weather.repeat = True
+        changes: dict[str, dict[str, Any]] = {
+            "slow": {"rate": 20_000.0},
+            "delay": {"delay": 0.05},
+            "nonsense": {"insert": NONSENSE[fault.number]},
+            "cut-inside": {"cut_inside": True},
+            "corrupt": {"spoil": True},
+            "repeat": {"repeat": True},
+        }
+        link.weather = weather = Weather(**changes.get(fault.what, {}))
+        if fault.what == "hold":
+            weather.open.clear()
+        elif fault.what == "gone":
+            link.vanish()
         try:
             await asyncio.sleep(fault.seconds)
         finally:
