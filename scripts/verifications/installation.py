@@ -19,14 +19,13 @@ ROSLIBPY: Final = HERE / "conformance" / "roslibpy.lock"
 OLDEST_NODE: Final = 20
 LIMIT: Final = 600.0
 """Time limit of one installer, in seconds."""
+PIP: Final = ("-m", "pip", "-q", "--disable-pip-version-check")
+PINNED: Final = ("--no-deps", "--require-hashes", "--only-binary", ":all:")
+"""Flags for wheels of a lock file."""
 
 
 def run(*command: str | Path, cwd: Path | None = None) -> None:
-    """Run an installer.
-
-    Raises:
-        SettingsError: It fails or does not end in time.
-    """
+    """Run an installer; raise a SettingsError if it fails or does not end in time."""
     shown = " ".join(Path(word).name for word in command[:4])
     try:
         subprocess.run(command, cwd=cwd, check=True, capture_output=True, text=True, timeout=LIMIT)
@@ -60,11 +59,6 @@ def cached(name: str, locks: tuple[Path, ...], make: Callable[[Path], None]) -> 
     return folder
 
 
-def pip(folder: Path) -> tuple[str | Path, ...]:
-    """Return the command line of the pip in `folder`/venv, without its arguments."""
-    return folder / "venv" / "bin" / "python", "-m", "pip", "-q", "--disable-pip-version-check"
-
-
 def use_packages(name: str, lock: Path) -> Path:
     """Make the packages of a lock file importable, from a folder of their own, which is returned.
 
@@ -72,9 +66,7 @@ def use_packages(name: str, lock: Path) -> Path:
     """
 
     def make(folder: Path) -> None:
-        options = ("--no-deps", "--require-hashes", "--only-binary", ":all:", "-r", lock)
-        command = (sys.executable, "-m", "pip", "-q", "--disable-pip-version-check", "install")
-        run(*command, *options, "--target", folder / "packages")
+        run(sys.executable, *PIP, "install", *PINNED, "-r", lock, "--target", folder / "packages")
 
     packages = cached(name, (lock,), make) / "packages"
     sys.path.append(str(packages))  # last, so that all other packages come from this environment
@@ -86,15 +78,14 @@ def install_roslibpy() -> Path:
 
     def make(folder: Path) -> None:
         run(sys.executable, "-m", "venv", folder / "venv")
-        run(
-            *pip(folder), "install", "--no-deps", "--only-binary", ":all:", "--require-hashes", "-r", ROSLIBPY
-        )
+        python = folder / "venv" / "bin" / "python"
+        run(python, *PIP, "install", *PINNED, "-r", ROSLIBPY)
         # only the block of roslibpy, whose hashes are those of the wheel and of the source package
         block = re.search(r"^roslibpy==(?:.*\\\n)+.*\n", ROSLIBPY.read_text(), re.MULTILINE)
         assert block is not None
         (folder / "source.lock").write_text(block[0])
         source = ("--require-hashes", "--no-deps", "--no-binary", ":all:", "--no-build-isolation")
-        run(*pip(folder), "download", *source, "-r", folder / "source.lock", "-d", folder)
+        run(python, *PIP, "download", *source, "-r", folder / "source.lock", "-d", folder)
         (archive,) = folder.glob("roslibpy-*.tar.gz")
         with tarfile.open(archive) as tar:
             tar.extractall(folder, filter="data")
@@ -104,11 +95,7 @@ def install_roslibpy() -> Path:
 
 
 def install_node_packages(name: str, folder: Path) -> Path:
-    """Return the `node_modules` of a folder's package-lock.json, after installing them once.
-
-    Raises:
-        SettingsError: Node is missing or too old.
-    """
+    """Return the `node_modules` of a folder's package-lock.json, after installing them once; needs a recent Node."""
     node, npm = shutil.which("node"), shutil.which("npm")
     version = subprocess.run([node, "-v"], capture_output=True, text=True, check=True).stdout if node else ""
     if npm is None or int(re.sub(r"\D*(\d*).*\n?", r"\1", version) or 0) < OLDEST_NODE:
@@ -127,14 +114,7 @@ def install_node_packages(name: str, folder: Path) -> Path:
 
 
 def install_programs(packages: Mapping[str, str]) -> None:
-    """Install the Debian packages of missing programs.
-
-    Args:
-        packages: The package of each program, or of each path.
-
-    Raises:
-        SettingsError: This is not Debian, the user may not install packages, or apt-get failed.
-    """
+    """Install the Debian packages, given for each program or path, of missing ones; a SettingsError if that fails."""
 
     def absent_ones() -> list[str]:
         return [each for each in packages if shutil.which(each) is None and not Path("/", each).exists()]

@@ -18,7 +18,7 @@ import zipfile
 from pathlib import Path
 
 from scripts.running.script import reporting_errors
-from scripts.verifications.installation import cached, run
+from scripts.verifications.installation import PINNED, cached, run
 from services.errors import SettingsError
 
 LOCK = Path(__file__).with_name("real-rosbridge.lock")
@@ -32,7 +32,7 @@ _LIBRARY = re.compile(r"[^/]+\.data/data/lib/([^/]+\.so[.0-9]*)|[^/]+\.libs/([^/
 _SERVER = "rosbridge_server_rs/rosbridge_server_rs_jazzy"
 _CONVERTERS = "__rosidl_generator_py.so"
 _TAGS = (
-    *("--only-binary", ":all:", "--python-version", "3.11", "--implementation", "cp", "--abi", "cp311"),
+    *("--python-version", "3.11", "--implementation", "cp", "--abi", "cp311"),
     *("--platform", "manylinux_2_35_x86_64", "--platform", "manylinux_2_28_x86_64"),
 )
 _ROS_VARIABLES = ("AMENT_", "CYCLONEDDS_", "FASTDDS_", "FASTRTPS_", "RCUTILS_", "RMW_", "ROS_")
@@ -40,11 +40,7 @@ _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 0x1
 
 
 def install() -> Path:
-    """Return the server's folder (bin, lib), after installing it if it is missing.
-
-    Raises:
-        SettingsError: The machine is not supported, the download fails, or a folder cannot be written.
-    """
+    """Return the server's folder (bin, lib), after installing it if it is missing; a SettingsError if that fails."""
     kind, version = platform.libc_ver()
     here = (sys.platform, platform.machine(), kind)
     if here != ("linux", "x86_64", "glibc") or tuple(map(int, version.split(".")[:2])) < GLIBC:
@@ -55,8 +51,8 @@ def install() -> Path:
 
     def make(folder: Path) -> None:
         wheels = folder / "wheels"
-        download = ("-m", "pip", "download", "-q", "--disable-pip-version-check", "--no-deps", *_TAGS)
-        run(sys.executable, *download, "--require-hashes", "-r", LOCK, "-d", wheels)
+        download = ("-m", "pip", "download", "-q", "--disable-pip-version-check", *PINNED, *_TAGS)
+        run(sys.executable, *download, "-r", LOCK, "-d", wheels)
         _unpack(sorted(wheels.glob("*.whl")), folder)
         shutil.rmtree(wheels)
 
@@ -102,11 +98,7 @@ def network_is_alone() -> bool:
 
 
 def become_alone(command: list[str]) -> None:
-    """Replace this process by a command in a new network with only loopback.
-
-    Raises:
-        SettingsError: This user or container may not create one.
-    """
+    """Replace this process by a command in a new network with only loopback, or raise a SettingsError."""
     # a user namespace lets users other than root create a network, if the system allows it
     as_user = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
     unshare = ["unshare", *as_user, "--net", "--"]
@@ -122,11 +114,7 @@ def become_alone(command: list[str]) -> None:
 
 
 def become(command: list[str], environment: dict[str, str] | None = None) -> None:
-    """Replace this process by a command.
-
-    Raises:
-        SettingsError: The command does not exist.
-    """
+    """Replace this process by a command, or raise a SettingsError if it does not exist."""
     try:
         os.execvpe(command[0], command, environment or dict(os.environ))  # noqa: S606 - the command needs no shell
     except OSError as error:
@@ -142,13 +130,9 @@ def inside(command: list[str]) -> None:
 
 
 def serve(port: int) -> None:
-    """Replace this process by the server, on 127.0.0.1.
-
-    Raises:
-        SettingsError: This network has other interfaces, on whose addresses ROS's transport would listen.
-    """
+    """Replace this process by the server, on 127.0.0.1."""
     prefix = install()
-    if not network_is_alone():
+    if not network_is_alone():  # on the addresses of other interfaces, ROS's transport would listen
         raise SettingsError(
             "the real server runs only in a network with nothing but loopback; start it with `scripts/real-rosbridge alone ...`"
         )

@@ -15,7 +15,7 @@ from scripts.running.flags import ScriptParser
 from scripts.running.patience import FACTOR, PRODUCT_LIMITS
 from scripts.running.script import ROOT
 from scripts.verifications.checks import Tally, expect
-from scripts.verifications.installation import pip, run
+from scripts.verifications.installation import PIP, run
 
 LIMIT: Final = 300.0 * FACTOR
 """Time limit of a command, in seconds."""
@@ -29,7 +29,7 @@ class Installed:
         run(ROOT / "scripts" / "wheel", folder)
         run(sys.executable, "-m", "venv", folder / "venv")
         (wheel,) = folder.glob("rosbayes-*.whl")
-        run(*pip(folder), "install", wheel)
+        run(folder / "venv" / "bin" / "python", *PIP, "install", wheel)
         self.commands = folder / "venv" / "bin"
         self.out = folder / "empty"
         (folder / "run").mkdir(mode=0o700)
@@ -38,11 +38,7 @@ class Installed:
         self._environment = {"HOME": str(folder), "BM_RUN_DIRECTORY": str(folder / "run"), **limits}
 
     def run(self, *command: str, code: int = 0) -> str:
-        """Run a command of the environment, without PATH, and return what it prints.
-
-        Raises:
-            CheckError: It ends with another exit code, or not in time.
-        """
+        """Run a command of the environment, without PATH, and return what it prints, or raise a CheckError."""
         done = subprocess.run(
             [self.commands / command[0], *command[1:]],
             cwd=self.out,
