@@ -11,6 +11,7 @@ from collections import defaultdict
 
 from bridge.client import Publication, Ros, Subscription, connect
 from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
+from posteriors.frame_report import read_frame_report
 from scripts.benches.cycle import ALL_READINGS, Times, add_seed, message, quantile, readings, until_read
 from scripts.running.flags import ScriptParser
 from scripts.running.script import print_table
@@ -44,14 +45,10 @@ class Run:
         frame = await self._frames.next(timeout=60)
         await self._results.next(timeout=60)
         whole = (time.perf_counter_ns() - started) / 1e3
-        values = {
-            pair["key"]: float(pair["value"])
-            for pair in frame.msg["status"][0]["values"]
-            if pair["key"].endswith("_us")
-        }
+        stages = read_frame_report(frame.msg, frame.received_ns).stages
         shares = dict.fromkeys(THESIS, 0.0)
         for stage, part in STAGES.items():
-            shares[part] += values[f"{stage}_us"]
+            shares[part] += getattr(stages, stage)
         shares["rosbridge"] = whole - sum(shares.values())
         for part, spent in (shares | {"cycle": whole}).items():
             self.times[part].append(spent)
