@@ -7,7 +7,6 @@ floor      client --reading--> hub --> echo ------------------------------------
 
 import argparse
 import asyncio
-import math
 import os
 import random
 import statistics
@@ -20,9 +19,10 @@ from pathlib import Path
 from bridge.client import Publication, Ros, Subscription, connect
 from bridge.stamps import header, header_stamp_ns
 from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
+from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
 from scripts.running.flags import ScriptParser
 from scripts.running.script import print_table
-from scripts.running.stand import Stand, temporary_stand
+from scripts.running.stand import Stand, readings_at, temporary_stand
 from services.errors import SettingsError
 
 STAGES = (
@@ -46,15 +46,7 @@ Times = defaultdict[str, list[float]]
 def readings(seed: int, count: int) -> list[dict[str, int]]:
     """Return readings of boats at random positions, without noise, rounded as by the normaliser."""
     chance = random.Random(seed)
-    made = []
-    for _ in range(count):
-        x, y = chance.uniform(-48, 48), chance.uniform(-48, 48)
-        reading = {}
-        for beacon, (bx, by) in enumerate(((-50, -50), (-50, 0), (0, -50)), 1):
-            reading[f"D{beacon}"] = min(100, round(math.hypot(x - bx, y - by)))
-            reading[f"B{beacon}"] = round(math.degrees(math.atan2(y - by, x - bx))) % 360
-        made.append(reading)
-    return made
+    return [readings_at(chance.uniform(-48, 48), chance.uniform(-48, 48)) for _ in range(count)]
 
 
 def add_seed(parser: ScriptParser) -> None:
@@ -111,6 +103,14 @@ class Measured:
         self.lost = 0
         """Frames without a posterior, of those whose stages were measured."""
         self._pids = processes_of(master) if master else {}
+
+    @classmethod
+    async def of_stack(cls, ros: Ros, topic: str = SENSORS_TOPIC, type_: str = SENSORS_TYPE) -> "Measured":
+        """Return the stack that reads a topic, as soon as it does."""
+        results = ros.subscribe(RESULTS_TOPIC, RESULTS_TYPE)
+        publication = await ros.advertise(topic, type_)
+        await until_read(ros, topic)
+        return cls(publication, results, 0)
 
     async def one_by_one(self, some: list[dict[str, int]], hz: float = 0.0) -> None:
         """Publish readings, each after the answer to the previous one, and at most so many a second, if given."""
@@ -186,9 +186,8 @@ async def in_turns(
 
 async def measure(ros: Ros, stand: Stand, some: list[dict[str, int]]) -> dict[str, Measured]:
     """Measure the echo and the stacks in turns, so that noise affects all alike."""
-    kind = "std_msgs/Float64MultiArray"
-    results = ros.subscribe("/BMresults", kind)
-    echoes = ros.subscribe("/bench/echo", kind)
+    results = ros.subscribe(RESULTS_TOPIC, RESULTS_TYPE)
+    echoes = ros.subscribe("/bench/echo", RESULTS_TYPE)
     all_ = {FLOOR: Measured(await ros.advertise("/bench/reading", SENSORS_TYPE), echoes, 0)}
     for name, topic in STACKS.items():
         all_[name] = Measured(await ros.advertise(topic, SENSORS_TYPE), results, stand.pid(name))

@@ -22,11 +22,10 @@ import numpy as np
 from websockets.sync.client import connect as connect_plainly
 
 from bridge.client import Ros, connect
-from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
 from posteriors import BoardReport, FrameReport, StageTimes
 from posteriors.frame_report import FRAME_TOPIC, FRAME_TYPE, VariableReading, write_frame_report
 from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
-from scripts.benches.cycle import Measured, add_seed, cpu_us, in_turns, quantile, readings, until_read
+from scripts.benches.cycle import Measured, add_seed, cpu_us, in_turns, quantile, readings
 from scripts.running.browser import Browser, Visit, browser
 from scripts.running.flags import ScriptParser
 from scripts.running.script import print_table
@@ -173,11 +172,7 @@ async def cycles(plain: Stand, beside: Stand, frames: int, seed: int) -> Rows:
         # a process of its own, as a browser is
         reader = multiprocessing.get_context("spawn").Process(target=read, args=(beside.url,), daemon=True)
         reader.start()
-        sides = []
-        for ros in (other, one):
-            results = ros.subscribe(RESULTS_TOPIC, RESULTS_TYPE)
-            sides.append(Measured(await ros.advertise(SENSORS_TOPIC, SENSORS_TYPE), results, 0))
-            await until_read(ros, SENSORS_TOPIC)
+        sides = [await Measured.of_stack(ros) for ros in (other, one)]
         with_it, without, ratio = await in_turns(sides, readings(seed, frames), TURN, HZ)
         reader.kill()
     figures = f"{with_it:,.0f} / {without:,.0f}, {ratio:.3f}"

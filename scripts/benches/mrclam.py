@@ -91,11 +91,7 @@ def exact_distance(
 
 
 async def fit(arguments: argparse.Namespace) -> Model:
-    """Return the model with the learnt tables in a file; if it does not exist, learn them from robot 3 first.
-
-    Raises:
-        ProcessError: The toolchain failed.
-    """
+    """Return the model with the learnt tables in a file; if it does not exist, learn them from robot 3 first."""
     landmarks = arguments.data / "landmarks.csv"
     if not arguments.fit.exists():
         print(f"learning {arguments.fit} from {RECORDINGS[0]} ...", file=sys.stderr)

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bridge.client import Ros, connect
-from scripts.benches.cycle import ALL_READINGS, Measured, message, quantile, until_read
+from bridge.client import connect
+from scripts.benches.cycle import ALL_READINGS, Measured, message, quantile
 from scripts.running.script import print_table
 from scripts.running.stand import Stand, temporary_stand
 from terminal.output import write_json
@@ -98,7 +98,13 @@ async def measure(stand: Stand, problem: tuple[int, int, int], arguments: argpar
     flags = (*ALL_READINGS, "--topic-bytes", str(2 * max(PADDING)))
     await stand.start_master(stand.folder / name, *flags, name=f"master-{name}", boards=1)
     async with connect(stand.uri) as ros:
-        measured = await _measured(ros, topic, some)
+        measured = await Measured.of_stack(ros, topic, TYPE)
+        # a lost frame has no result to wait for: their number is known before results are awaited alone
+        await measured.stages(ros, some[:10])
+        measured.times.clear()  # that was the warm-up
+        await measured.stages(ros, some)
+        if not measured.lost:
+            await measured.one_by_one(some)
     await stand.end(f"master-{name}")
     times = measured.times
     parts = {
@@ -117,20 +123,6 @@ async def measure(stand: Stand, problem: tuple[int, int, int], arguments: argpar
         parts_us={part: quantile(values, 0.1) for part, values in parts.items()},
         lost=measured.lost,
     )
-
-
-async def _measured(ros: Ros, topic: str, some: list[dict[str, Any]]) -> Measured:
-    measured = Measured(
-        await ros.advertise(topic, TYPE), ros.subscribe("/BMresults", "std_msgs/Float64MultiArray"), 0
-    )
-    await until_read(ros, topic)
-    # a lost frame has no result to wait for: their number is known before results are awaited alone
-    await measured.stages(ros, some[:10])
-    measured.times.clear()  # that was the warm-up
-    await measured.stages(ros, some)
-    if not measured.lost:
-        await measured.one_by_one(some)
-    return measured
 
 
 async def bench_sizes(arguments: argparse.Namespace) -> int:

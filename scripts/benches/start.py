@@ -48,11 +48,7 @@ DEMO = {"deployment written": "deployment/deployment.toml"}
 
 
 async def steps(folder: Path, files: Mapping[str, str], *command: str, **variables: str) -> dict[str, float]:
-    """Run a command, and return the time of each step, in seconds.
-
-    Raises:
-        ProcessError: It failed.
-    """
+    """Run a command, and return the time of each step, in seconds; raise a ProcessError if it fails."""
     run = folder / "run"
     run.mkdir(parents=True, mode=0o700)
     began, times = time.monotonic(), {}

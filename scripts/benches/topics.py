@@ -7,9 +7,7 @@ import statistics
 from typing import Final
 
 from bridge.client import connect
-from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
-from posteriors.posterior import RESULTS_TOPIC, RESULTS_TYPE
-from scripts.benches.cycle import Measured, in_turns, readings, until_read
+from scripts.benches.cycle import Measured, in_turns, readings
 from scripts.running.flags import ScriptParser
 from scripts.running.stand import temporary_stand
 from toolchain.deployment import TopicsSection
@@ -29,9 +27,7 @@ async def measure(some: list[dict[str, int]]) -> float:
             await stand.start_hub()
             await stand.start_boat_master(extra=extra)
             tool, robot = [await stack.enter_async_context(connect(stand.uri)) for _ in range(2)]
-            results = robot.subscribe(RESULTS_TOPIC, RESULTS_TYPE)
-            sides.append(Measured(await robot.advertise(SENSORS_TOPIC, SENSORS_TYPE), results, 0))
-            await until_read(robot, SENSORS_TOPIC)
+            sides.append(await Measured.of_stack(robot))
             if not extra:
                 heard = [tool.subscribe(topic) for topic in TOPICS]
             await tool.call("/rosapi/get_time")  # so that the hub knows the subscriptions

@@ -179,11 +179,7 @@ class Browser:
 
 @contextlib.asynccontextmanager
 async def browser() -> AsyncIterator[Browser]:
-    """Start Chromium, after installing what is missing.
-
-    Raises:
-        SettingsError: Chromium or Playwright is absent and cannot be installed.
-    """
+    """Start Chromium, after installing what is missing; raise a SettingsError if that cannot be installed."""
     install_programs({"chromium": "chromium"})
     use_packages("playwright", LOCK)
     from playwright.async_api import async_playwright

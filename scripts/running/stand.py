@@ -8,6 +8,7 @@ boat-simulator --> boat-normaliser --> hub <--> masters with 4 boards each
 
 import asyncio
 import contextlib
+import math
 import os
 import signal
 import socket
@@ -17,7 +18,8 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-from casestudies.boat.sensors import SENSORS_TOPIC, SENSORS_TYPE
+from casestudies.boat.normaliser import normalise
+from casestudies.boat.sensors import BEACONS, SENSOR_NAMES, SENSORS_TOPIC, SENSORS_TYPE, bearing, distance
 from casestudies.demo import build
 from scripts.running.patience import FACTOR
 from terminal.processes import Process
@@ -33,6 +35,13 @@ def free_port() -> int:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return int(free.getsockname()[1])
+
+
+def readings_at(x: float, y: float) -> dict[str, int]:
+    """Return the normaliser's readings of a boat at (x, y), without noise."""
+    bearings = (math.radians(bearing(x, y, beacon)) for beacon in BEACONS)
+    values = normalise((*(distance(x, y, beacon) for beacon in BEACONS), *bearings))
+    return {name: value for name, value in zip(SENSOR_NAMES, values, strict=True) if value is not None}
 
 
 class Stand:
