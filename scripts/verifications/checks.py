@@ -17,11 +17,7 @@ class DownloadError(Exception):
 
 
 def expect(condition: bool, otherwise: str) -> None:
-    """Raise an error unless a condition holds.
-
-    Raises:
-        CheckError: The condition does not hold.
-    """
+    """Raise a CheckError unless a condition holds."""
     if not condition:
         raise CheckError(otherwise)
 

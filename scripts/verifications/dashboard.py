@@ -109,11 +109,7 @@ class Scene:
         await self.until(lambda: math.dist(self.boat, (x, y)) < 1, f"the boat is not at {x:g}, {y:g}")
 
     async def dragged(self, visit: Visit, to: Place) -> None:
-        """Drag the boat, and wait until the page and the stack have its posterior there.
-
-        Raises:
-            CheckError: The boat did not move, or the posterior did not follow.
-        """
+        """Drag the boat, and wait until the page and the stack have its posterior there, or raise a CheckError."""
         await self.put(*START)
         await visit.frame_above(self.newest)  # the page, too, shows the boat there
         await visit.drag(to)

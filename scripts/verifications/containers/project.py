@@ -67,11 +67,7 @@ def copy_project(folder: Path) -> None:
 
 
 def fetch_wheels() -> None:
-    """Download the wheels of the lock file, with hashes checked, for the image's Python.
-
-    Raises:
-        DownloadError: pip cannot download them.
-    """
+    """Download the wheels of the lock file for the image's Python, or raise a DownloadError; pip checks the hashes."""
     folder, lock = home() / "wheels", ROOT / "requirements-image.lock"
     made = folder / ".made"
     stamp = hashlib.sha256(lock.read_bytes()).hexdigest()

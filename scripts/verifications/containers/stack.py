@@ -31,11 +31,7 @@ CHECK: Final = "check"
 
 
 def until(condition: Callable[[], object], otherwise: Callable[[], str], limit: float = FLOW_LIMIT) -> None:
-    """Poll until a condition holds.
-
-    Raises:
-        CheckError: It does not hold in time.
-    """
+    """Poll until a condition holds; raise a CheckError if it does not in time."""
     deadline = time.monotonic() + limit
     while not condition():
         if time.monotonic() > deadline:
@@ -71,11 +67,7 @@ class Stack:
         codes: Collection[int] = (0,),
         streams: str = "output",
     ) -> str:
-        """Run docker and return its output.
-
-        Raises:
-            CheckError: It ends with another exit code than these, if they are checked, or not in time.
-        """
+        """Run docker and return its output; raise a CheckError if it ends with none of the codes or not in time."""
         what = f"docker {' '.join(arguments[:3])}"
         with (OUT / "docker.log").open("a") as log:
             log.write(f"--- {datetime.now(UTC):%H:%M:%S} docker {' '.join(arguments)}\n")
@@ -106,11 +98,7 @@ class Stack:
         return self.docker("compose", *arguments, limit=limit)
 
     def bits(self, count: int, uri: str = "ws://hub:9090", network: str = "rosbayes_ros") -> None:
-        """Let a client container recompute results that arrive from now on.
-
-        Raises:
-            CheckError: One is wrong, or they do not arrive.
-        """
+        """Let a client container recompute results that arrive from now on; none may be wrong or absent."""
         client = self.project / CLIENT.relative_to(ROOT)
         confined = ("--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL", "--init")  # noqa: S108 - the container's
         self.docker(
@@ -130,11 +118,7 @@ class Stack:
         return {each["name"]: each for each in self.status().get("processes", [])}
 
     def up(self, services: tuple[str, ...] = SERVICES) -> None:
-        """Start the project, and wait until all services are healthy.
-
-        Raises:
-            CheckError: A service does not become healthy, or the services are not the expected ones.
-        """
+        """Start the project, and wait until the expected services, and no others, are healthy."""
         wait = ("--wait", "--wait-timeout", str(int(UP_LIMIT)))
         try:
             self.compose("up", "--detach", *wait, limit=UP_LIMIT + COMMAND_LIMIT)
@@ -149,11 +133,7 @@ class Stack:
         expect(running == set(services), f"it runs {sorted(running)} instead of {sorted(services)}")
 
     def refused(self, *arguments: str) -> str:
-        """Return the log of `docker compose up` of a stack that cannot start, with the engine's own error.
-
-        Raises:
-            CheckError: It starts, or a service runs or restarts afterwards.
-        """
+        """Return the log of `docker compose up` of a stack, with the engine's own error; no service may run."""
         try:
             self.compose("up", "--detach", *arguments)
         except CheckError as error:
