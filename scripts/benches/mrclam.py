@@ -61,17 +61,12 @@ def unquantised_posterior(
     for landmark, (range_m, bearing_rad) in zip(landmarks, readings, strict=True):
         if range_m is not None:
             away = range_m - np.hypot(landmark.x - x, landmark.y - y)
-            factors.append(_likelihood(away / RANGE_SIGMA, floor))
+            factors.append(np.exp(-0.5 * (away / RANGE_SIGMA) ** 2) + floor)
         if bearing_rad is not None:
             away = bearing_rad - np.arctan2(landmark.y - y, landmark.x - x)
             away = (away + np.pi) % (2 * np.pi) - np.pi
-            factors.append(_likelihood(away / BEARING_SIGMA, floor))
+            factors.append(np.exp(-0.5 * (away / BEARING_SIGMA) ** 2) + floor)
     return fuse(np.ones(width * height), factors)
-
-
-def _likelihood(z: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
-    likelihood: NDArray[np.float64] = np.exp(-0.5 * z**2) + floor
-    return likelihood
 
 
 def exact_distance(
@@ -149,6 +144,8 @@ async def run_stack(
 
 async def bench(arguments: argparse.Namespace) -> int:
     """Play recordings through stacks; return 1 if a robot exceeds the bound or a fit is not better."""
+    arguments.data = arguments.data.resolve()  # for the processes of the run
+    arguments.fit = arguments.fit and arguments.fit.resolve()
     for name in RECORDINGS:
         read_recording(arguments.data / name)  # refuse an invalid recording before anything starts
     fitted = None if arguments.fit is None else await fit(arguments)
@@ -184,25 +181,19 @@ def cells(text: str) -> int:
     return int(text)
 
 
-def resolved(text: str) -> Path:
-    """Return an absolute path, which the processes of the run need."""
-    return Path(text).resolve()
-
-
 if __name__ == "__main__":
     parser = ScriptParser(
         "scripts/bench mrclam",
         "Replay the data of recorded robots through the whole stack, and compare with float64.",
     )
     parser.add_argument(
-        "data", type=resolved, help="folder with landmarks.csv and ds1_robot3.csv, ds1_robot5.csv"
+        "data", type=Path, help="folder with landmarks.csv and ds1_robot3.csv, ds1_robot5.csv"
     )
     parser.flag(
         "--fit",
         "on robot 5, compare tables set by hand with tables learnt on robot 3; if FILE does not exist, they are "
         "learnt now and written to it",
-        type=resolved,
-        metavar="FILE",
+        type=Path,
     )
     parser.flag("--cells", "number of cells along x, and along y", 32, type=cells, metavar="NUMBER")
     parser.run(bench, 600)

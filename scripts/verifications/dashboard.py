@@ -27,6 +27,7 @@ from casestudies.boat.sensors import (
     TRUE_POSE_TOPIC,
     TRUE_POSE_TYPE,
     map_grid,
+    read_set_pose,
     true_pose,
 )
 from posteriors import BoardReport, FrameReport, Posterior, StageTimes, posteriors
@@ -85,8 +86,7 @@ class Scene:
     async def follow_boat(self) -> None:
         """Receive positions until cancelled."""
         async for message in self.ros.subscribe(TRUE_POSE_TOPIC, TRUE_POSE_TYPE):
-            position = message.msg["pose"]["position"]
-            self.boat = position["x"], position["y"]
+            self.boat = read_set_pose(message.msg)
             async with self.news:
                 self.news.notify_all()
 

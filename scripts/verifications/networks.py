@@ -126,8 +126,8 @@ def infer(pyagrum: Any, network: Any, asked: Asked) -> NDArray[np.float64]:
     inference = pyagrum.LazyPropagation(network)
     # Only the part that the targets need is triangulated, because some networks are too large as a whole.
     inference.eraseAllTargets()
-    searched = list(asked.searched)
-    if len(searched) > 1:
+    searched, joint = list(asked.searched), len(asked.searched) > 1
+    if joint:
         inference.addJointTarget(set(searched))
     else:
         inference.addTarget(searched[0])
@@ -135,7 +135,6 @@ def infer(pyagrum: Any, network: Any, asked: Asked) -> NDArray[np.float64]:
     for row in asked.rows:
         inference.setEvidence(dict(zip(asked.known, row, strict=True)))
         inference.makeInference()
-        joint = len(searched) > 1
         table = inference.jointPosterior(set(searched)) if joint else inference.posterior(searched[0])
         found.append(array_of(table, searched).ravel())
     return np.array(found)
@@ -232,7 +231,6 @@ def check(tally: Tally, pyagrum: Any, path: Path) -> None:
     network.saveBIFXML(str(path.with_suffix(".bifxml")))
     network.saveNET(str(path.with_suffix(".net")))
     path.with_suffix(".uai").write_text(uai(tables))
-    worst = {}
     try:
         joints = {suffix: read_network(path.with_suffix(suffix)) for suffix in FORMATS}
     except ModelError as error:
