@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any, Final, cast
+from typing import Any, Final, TypeAlias, cast
 
 import numpy as np
 from numba import njit
@@ -42,6 +42,8 @@ MANY: Final = {"sprinkler": 512, "alarm": 32}
 TURNS: Final = 3
 """Times that each alternative is measured; the fastest counts, because other processes only slow it down."""
 BURN_IN: Final = 100
+Ints: TypeAlias = NDArray[np.int64]
+Floats: TypeAlias = NDArray[np.float64]
 
 
 def bm1(cycles: int) -> Sampled:
@@ -60,13 +62,13 @@ def bm1(cycles: int) -> Sampled:
 
 
 def _sweep(
-    values: NDArray[np.int64],
-    unknown: NDArray[np.int64],
-    sizes: NDArray[np.int64],
-    first: NDArray[np.int64],
-    held: NDArray[np.int64],
-    tables: NDArray[np.float64],
-    counts: NDArray[np.int64],
+    values: Ints,
+    unknown: Ints,
+    sizes: Ints,
+    first: Ints,
+    held: Ints,
+    tables: Floats,
+    counts: Ints,
     sweeps: int,
 ) -> None:
     """Draw each unknown variable in turn, from the product of its factors."""
@@ -149,12 +151,8 @@ def alternatives(
     start = replace(start_of(machine, known, arguments.sweeps), burn_in=BURN_IN, max_cycles=2**40)
     kernel = FastBM2(machine)
     many = MANY[model.name]
-    chains = Chains(
-        [
-            BM2Machine(replace(parameters, chain=at, chains=many), machine.tables, machine.supports)
-            for at in range(many)
-        ]
-    )
+    each_chain = (replace(parameters, chain=at, chains=many) for at in range(many))
+    chains = Chains([BM2Machine(each, machine.tables, machine.supports) for each in each_chain])
     # as many moves in all for both networks
     moves = many * len(parameters.moves(start.known, start.sequencer))
     short = replace(start, samples=1 + 2 * arguments.chain_sweeps // moves)

@@ -64,15 +64,8 @@ class Point(NamedTuple):
 def problems() -> list[tuple[int, int, int]]:
     """Return lines, sensors and padding of every problem; the base is among them once."""
     lines, sensors, padding = BASE
-    return list(
-        dict.fromkeys(
-            [
-                *((each, sensors, padding) for each in LINES),
-                *((lines, each, padding) for each in SENSORS),
-                *((lines, sensors, each) for each in PADDING),
-            ]
-        )
-    )
+    first = [(each, sensors, padding) for each in LINES] + [(lines, each, padding) for each in SENSORS]
+    return list(dict.fromkeys(first + [(lines, sensors, each) for each in PADDING]))
 
 
 def model(lines: int, sensors: int) -> Model:

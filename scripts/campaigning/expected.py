@@ -1,7 +1,7 @@
 """Correct results of the campaign's readings, from the reference kernel and the deployment's images."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -75,18 +75,13 @@ class Expected:
 
     def _outcome(self, addresses: Addresses, bank: int) -> Outcome:
         boards = [ReferenceBM1(machine) for machine in self._machines]
+        start = Start(
+            addresses=(), target_count=TARGET, max_cycles=MAX_CYCLES, bank=bank, run_until=FIRST_SLICE
+        )
         for machine, board in zip(self._machines, boards, strict=True):
             tops = [(1 << bits) - 1 for bits in machine.parameters.sensor_bits]
             inputs = tuple(top if own is None else own for own, top in zip(addresses, tops, strict=True))
-            board.start(
-                Start(
-                    addresses=inputs,
-                    target_count=TARGET,
-                    max_cycles=MAX_CYCLES,
-                    bank=bank,
-                    run_until=FIRST_SLICE,
-                )
-            )
+            board.start(replace(start, addresses=inputs))
         end = FIRST_SLICE
         while not any(board.reason is StopReason.OVERFLOW for board in boards):
             running = [board for board in boards if board.reason is StopReason.SLICE]

@@ -40,13 +40,8 @@ def home() -> Path:
 def copy_project(folder: Path) -> None:
     """Copy the image's sources: the files known to git, and the wheels, because builds here have no network."""
     shutil.rmtree(folder, ignore_errors=True)
-    listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        check=True,
-        timeout=60 * FACTOR,
-    ).stdout.decode()
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    listed = subprocess.check_output(command, cwd=ROOT, timeout=60 * FACTOR).decode()
     for name in filter(None, listed.split("\0")):
         if (ROOT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -76,13 +71,8 @@ def fetch_wheels() -> None:
     shutil.rmtree(folder, ignore_errors=True)
     pip = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check"]
     what = ["--require-hashes", "--no-deps", "--only-binary", ":all:", "--python-version", "3.11"]
-    done = subprocess.run(
-        [*pip, *what, "--dest", str(folder), "--requirement", str(lock)],
-        stderr=subprocess.PIPE,
-        text=True,
-        timeout=FETCH_LIMIT,
-        check=False,
-    )
+    command = [*pip, *what, "--dest", str(folder), "--requirement", str(lock)]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=FETCH_LIMIT, check=False)
     if done.returncode:
         raise DownloadError(f"pip could not get the wheels of {lock.name}: {done.stderr.strip()[-500:]}")
     made.write_text(stamp)
