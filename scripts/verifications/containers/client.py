@@ -7,6 +7,7 @@ import asyncio
 import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,18 +44,13 @@ def differences(instance: Instance, addresses: tuple[int, ...]) -> str:
     assert report is not None
     assert report.number is not None
     assert posterior is not None
+    bank = report.number % machine.rng_banks
+    start = Start(addresses=addresses, target_count=machine.target_count, max_cycles=MOST_CYCLES, bank=bank)
     counts, cycles = [], []
     for at, outcome in enumerate(report.boards):
         kernel = ReferenceBM1(read_image(deployment.image_path(at)).machine)
         if outcome.cycles:  # it stopped there, by itself or because another board overflowed
-            kernel.start(
-                Start(
-                    addresses=addresses,
-                    target_count=machine.target_count,
-                    max_cycles=outcome.cycles,
-                    bank=report.number % machine.rng_banks,
-                )
-            )
+            kernel.start(replace(start, max_cycles=outcome.cycles))
         ours = kernel.cycles, int(kernel.counts.sum())
         if ours != (outcome.cycles, outcome.counts_total):
             return f"board {at} reports {outcome.cycles} cycles and counts of {outcome.counts_total}, expected {ours}"
