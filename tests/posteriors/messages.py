@@ -1,6 +1,9 @@
-"""Messages of a stack that are made by hand, and arbitrary JSON values for hostile ones."""
+"""Messages and posteriors of a stack that are made by hand, and arbitrary JSON values for hostile ones."""
 
+import numpy as np
 from hypothesis import strategies as st
+
+from posteriors.posterior import Posterior
 
 JSON = st.recursive(
     st.none()
@@ -31,3 +34,12 @@ def posterior_message(data, *sizes, offset=0):
     """Return a `/BMresults` over y and x."""
     dims = [{"label": label, "size": size, "stride": 1} for label, size in zip("yx", sizes, strict=False)]
     return {"layout": {"dim": dims, "data_offset": offset}, "data": data}
+
+
+def posterior_of(values, *labels, heard_ns=0, **fields):
+    """Return a posterior of these probabilities, with an axis for each label."""
+    values = np.asarray(values, float)
+    probabilities = tuple(values.ravel().tolist())
+    return Posterior(
+        probabilities=probabilities, labels=labels, sizes=values.shape, heard_ns=heard_ns, **fields
+    )

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays
 
 from posteriors import BadResultError, FrameReport, LabelError, Posterior, StageTimes
 from posteriors.posterior import read_posterior, read_samples
-from tests.posteriors.messages import JSON, posterior_message
+from tests.posteriors.messages import JSON, posterior_message, posterior_of
 
 
 class TestReading:
@@ -48,18 +48,11 @@ class TestReading:
 
 
 def made(values, labels):
-    values = np.asarray(values, float)
-    return Posterior(
-        probabilities=tuple((values / values.sum()).ravel().tolist()),
-        labels=labels,
-        sizes=values.shape,
-        heard_ns=0,
-    )
+    return posterior_of(np.asarray(values) / np.sum(values), *labels)
 
 
 def received(heard_ns, **report):
-    report = FrameReport(stamp_ns=5, outcome="", **report)
-    return Posterior(probabilities=(1.0,), labels=("x",), sizes=(1,), heard_ns=heard_ns, report=report)
+    return posterior_of([1], "x", heard_ns=heard_ns, report=FrameReport(stamp_ns=5, outcome="", **report))
 
 
 class TestPosterior:

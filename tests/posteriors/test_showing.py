@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from matplotlib.image import imread
 
 from posteriors import LabelError, Posterior
+from tests.posteriors.messages import posterior_of
 from toolchain.deployment import Dimension
 
 mpl.use("Agg")
@@ -26,22 +27,8 @@ PURPLE, YELLOW = (68, 1, 84), (253, 231, 36)
 
 
 def made(values, *dimensions, **details):
-    values = np.asarray(values, float)
-    return Posterior(
-        probabilities=tuple((values / values.sum()).ravel().tolist()),
-        labels=tuple(each.label for each in dimensions),
-        sizes=values.shape,
-        heard_ns=0,
-        dimensions=dimensions,
-        details=details,
-    )
-
-
-def bare(values, *labels):
-    values = np.asarray(values, float)
-    return Posterior(
-        probabilities=tuple(values.ravel().tolist()), labels=labels, sizes=values.shape, heard_ns=0
-    )
+    labels = (each.label for each in dimensions)
+    return posterior_of(np.asarray(values) / np.sum(values), *labels, dimensions=dimensions, details=details)
 
 
 class _Reader(HTMLParser):
@@ -118,13 +105,13 @@ def test_a_long_dimension_is_a_curve_and_a_third_one_is_summed_out():
     assert (np.diff(filled) >= 0).all()
     values = np.zeros((2, 4, 3))
     values[1, 0, 2] = 1
-    html = as_html(bare(values, "floor", "y", "x"))
+    html = as_html(posterior_of(values, "floor", "y", "x"))
     assert "summed over floor" in html
     assert tuple(pixels_of(html)[-1, -1]) == YELLOW
 
 
 def test_replicas_are_shown_and_drawn_one_by_one():
-    several = bare([[0, 0, 1], [0, 0, 0], [0.25, 0.5, 0.25]], "replica", "x")
+    several = posterior_of([[0, 0, 1], [0, 0, 0], [0.25, 0.5, 0.25]], "replica", "x")
     assert "3 replicas" in as_html(several)
     assert cells_of(as_html(several.replica(2)))[0][1][-1] == "1"
     with pytest.raises(LabelError, match="replica"):

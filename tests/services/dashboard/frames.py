@@ -3,7 +3,7 @@
 import numpy as np
 
 from posteriors.frame_report import FrameReport, StageTimes
-from posteriors.posterior import Posterior
+from tests.posteriors.messages import posterior_of
 
 
 def report(number, **more):
@@ -13,16 +13,9 @@ def report(number, **more):
 
 
 def posterior(number, values=None, labels=("y", "x"), **more):
-    values = np.full((3, 4), 1 / 12) if values is None else np.asarray(values, float)
     found = report(number, **more)
-    return Posterior(
-        probabilities=tuple(values.ravel().tolist()),
-        labels=labels,
-        sizes=values.shape,
-        heard_ns=number,
-        report=found,
-        details=found.details,
-    )
+    values = np.full((3, 4), 1 / 12) if values is None else values
+    return posterior_of(values, *labels, heard_ns=number, report=found, details=found.details)
 
 
 def stages(**times):

@@ -23,6 +23,7 @@ from services.output.master_output import print_json, sentence
 from services.output.posterior_file import open_result_file, record
 from services.output.posterior_output import ROWS, drawing, line, picture
 from services.sockets.records import Outcome, Published
+from tests.posteriors.messages import posterior_of
 from toolchain.deployment import BM1Section, BoardSection, Deployment, Dimension, Source
 
 HASH = "0" * 64
@@ -58,13 +59,7 @@ def made(values, *labels, number=7):
         received_ns=1_000_000,
         readings={"D1": VariableReading(7.5, 7, 0.2)},
     )
-    return Posterior(
-        probabilities=tuple((values / values.sum()).ravel().tolist()),
-        labels=labels,
-        sizes=values.shape,
-        heard_ns=4_210_000,
-        report=report or None,
-    )
+    return posterior_of(values / values.sum(), *labels, heard_ns=4_210_000, report=report or None)
 
 
 def axes_of(posterior, deployment):

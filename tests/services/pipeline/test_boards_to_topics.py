@@ -25,9 +25,7 @@ from services.settings import Settings
 from services.sockets.records import FrameRequest, Outcome, Publish
 from tests.fake_rosbridge import FakeRosbridge
 from tests.pcie_shim.boards import ServedBoard, expected_of_replicas
-from toolchain.building.build import build_deployment
-from toolchain.building.machine import plan_machine
-from toolchain.building.options import BuildOptions
+from tests.toolchain.running import build_model
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address_array import to_addresses
 from toolchain.models.model import Known, Model, PriorSelect, dimension
@@ -47,8 +45,7 @@ def built(folder, **options):
         ),
         prior_select=PriorSelect(name="light", table=random.dirichlet(np.ones(LINES), 2)),
     )
-    target = {"uri": "ws://r:9090", "topic": "/t", "type": "a/B"}
-    build_deployment(plan_machine(model, BuildOptions(**target, **options)), folder / "built")
+    build_model(model, folder / "built", **options)
     return load_deployment(folder / "built")
 
 

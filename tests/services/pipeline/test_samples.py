@@ -32,9 +32,9 @@ from services.settings import Settings
 from services.sockets.records import FrameRequest, Outcome, Publish
 from tests.fake_rosbridge import FakeRosbridge
 from tests.services.pipeline.test_boards_to_topics import opened
+from tests.toolchain.running import OPTIONS
 from toolchain.building.bm2_machine import plan_bm2
 from toolchain.building.build import build_deployment
-from toolchain.building.options import BuildOptions
 from toolchain.deployment import load_deployment
 from toolchain.models import JointDistribution, LabelType, Symbol, table
 
@@ -56,9 +56,8 @@ def built(folder, **options):
         ),
     )
     network = joint.ask([rain], [grass]).network()
-    target = {"uri": "ws://r:9090", "topic": "/t", "type": "a/B"}
-    options = target | {"target_count": SAMPLES, "burn_in": 20, "partitions": 2} | options
-    build_deployment(plan_bm2(network, BuildOptions(**options)), folder / "built")
+    options = {"target_count": SAMPLES, "burn_in": 20, "partitions": 2} | options
+    build_deployment(plan_bm2(network, replace(OPTIONS, **options)), folder / "built")
     return load_deployment(folder / "built")
 
 
