@@ -8,6 +8,7 @@ Every published posterior is that of kernels in the test, whose predictions are 
 
 import itertools
 import json
+import shlex
 
 import numpy as np
 import pytest
@@ -65,16 +66,7 @@ async def test_the_stack_filters_as_a_reference_does(stage, tmp_path, options):
         n=CELLS, names=names, start=start, moves=rows(MOVES), doors=rows(DOORS.T), lights=rows(LIGHTS.T)
     )
     (tmp_path / "ring.bif").write_text(text)
-    question = (
-        "--searched",
-        "place",
-        "--previous",
-        "before",
-        "--known",
-        "door,light",
-        "--on-missing",
-        "missing",
-    )
+    question = shlex.split("--searched place --previous before --known door,light --on-missing missing")
     folder = build(tmp_path / "ring.bif", tmp_path / "ring", *question, "--partitions", "2", "--queue", "all")
     readings = walk(40)
     _, uri = await stage.hub()

@@ -9,7 +9,10 @@ from itertools import product
 
 from machines.bm2 import BM2StopReason
 
-EXPONENTS = {"lfsr16": (16, 15, 13, 4), "lfsr24": (24, 23, 22, 17), "lfsr32": (32, 22, 2, 1)}
+EXPONENTS = {
+    "lfsr8": (8, 6, 5, 4), "lfsr16": (16, 15, 13, 4), "lfsr24": (24, 23, 22, 17), "lfsr32": (32, 22, 2, 1),
+}  # fmt: skip
+"""Exponents of the polynomials; the first is the width."""
 WORD = 2**64 - 1
 
 

@@ -8,21 +8,10 @@ import pytest
 from machines.bm1 import BM1Machine
 from machines.parameters import BM1Parameters, RngKind
 from machines.rng import LFSR, apply_map, jump_tables, random_numbers
+from tests.machines.bm2_of_the_page import lfsr_step
 from tests.machines.random_machines import LFSRS
 
-EXPONENTS = {
-    RngKind.LFSR8: (8, 6, 5, 4),
-    RngKind.LFSR16: (16, 15, 13, 4),
-    RngKind.LFSR24: (24, 23, 22, 17),
-    RngKind.LFSR32: (32, 22, 2, 1),
-}
 PRIMES = {8: (3, 5, 17), 16: (3, 5, 17, 257), 24: (3, 5, 7, 13, 17, 241), 32: (3, 5, 17, 257, 65537)}
-
-
-def step(kind, state):
-    width = max(EXPONENTS[kind])
-    parity = sum(state >> (exponent - 1) for exponent in EXPONENTS[kind]) & 1
-    return ((state << 1) | parity) & ((1 << width) - 1)
 
 
 def words(*numbers):
@@ -41,7 +30,7 @@ def numbers(kind, **parameters):
 @pytest.mark.parametrize("kind", LFSRS)
 def test_a_step_is_the_definitions(kind):
     states = [random.Random(3).randrange(1, 1 << kind.lfsr_bits) for _ in range(200)]
-    assert LFSR(kind).step(words(*states)).tolist() == [step(kind, state) for state in states]
+    assert LFSR(kind).step(words(*states)).tolist() == [lfsr_step(kind, state) for state in states]
 
 
 @pytest.mark.parametrize("kind", LFSRS)
@@ -69,7 +58,7 @@ def test_a_jump_is_its_steps(kind):
     first = 0b1011
     states = [first]
     for _ in range(1000):
-        states.append(step(kind, states[-1]))
+        states.append(lfsr_step(kind, states[-1]))
     steps = np.arange(1001, dtype=np.uint64)
     assert lfsr.jump(np.full(1001, first, dtype=np.uint64), steps).tolist() == states
     around = steps + np.uint64(lfsr.period)
@@ -84,7 +73,7 @@ def test_seeds_are_reached_from_the_base_state(kind, bank, first):
     for number in range(first, first + 3):
         state = 0x2545F4914F6CDD1D & period
         for _ in range(((((number + 1) * 0x9E3779B97F4A7C15) >> 32) & 0xFFFFFFFF) % period):
-            state = step(kind, state)
+            state = lfsr_step(kind, state)
         expected.append(state)
     assert numbers(kind).restart(bank).tolist() == expected
 
@@ -113,7 +102,7 @@ def test_a_clock_is_its_steps_and_shows_the_low_bits(steps_per_clock):
         assert generators.show(states).tolist() == [state & 127 for state in expected]
         states = generators.clock(states)
         for _ in range(steps_per_clock):
-            expected = [step(RngKind.LFSR16, state) for state in expected]
+            expected = [lfsr_step(RngKind.LFSR16, state) for state in expected]
     assert states.tolist() == expected
 
 

@@ -25,26 +25,15 @@ from pcie_shim.host.mini_cluster import MiniCluster
 from pcie_shim.programming_file import Image, Partition, image_bytes, image_from_bytes
 from pcie_shim.register_map import ErrorCode
 from services.boards.hardware import Engine, SimulatedHardware
+from tests.machines.test_bm2 import EXACT
+from tests.machines.test_bm2 import sprinkler as machine_of_the_thesis
 from tests.pcie_shim.boards import board_fails, opened, words
 from tests.pcie_shim.boards import image as bm1_image
 from tests.pcie_shim.boards import machine as bm1_machine
 
-FACTORS = (
-    np.array([0.8, 0.2]),
-    np.array([[0.6, 0.4], [0.99, 0.01]]),
-    np.array([[[1.0, 0.0], [0.1, 0.9]], [[0.2, 0.8], [0.01, 0.99]]]),
-)
-"""The sprinkler: rain, sprinkler given rain, wet grass given both."""
-RAIN_GIVEN_WET = 0.16038 / 0.44838
-
 
 def sprinkler(chain=0, chains=1, **parameters):
-    built = BM2Parameters(
-        cardinalities=(2, 2, 2),
-        factors=((0,), (0, 1), (0, 1, 2)),
-        **({"searched": (0,), "known": (2,), "burn_in": 50, "chain": chain, "chains": chains} | parameters),
-    )
-    return BM2Machine.from_factors(built, FACTORS)
+    return machine_of_the_thesis(**{"burn_in": 50, "chain": chain, "chains": chains} | parameters)
 
 
 def weather(**parameters):
@@ -140,7 +129,7 @@ def test_two_boards_are_chains_equal_to_kernels(sequencer):
             assert output.slices == BATCHES
     inference = BM2.infer(output.boards, ("rain", "sprinkler", "grass"))
     assert (inference.outcome, inference.details["samples"]) == ("posterior", "600")
-    assert inference.posterior[1] == pytest.approx(RAIN_GIVEN_WET, abs=0.3)
+    assert inference.posterior[1] == pytest.approx(EXACT, abs=0.3)
     assert float(inference.details["r_hat"]) > 0.9
     # a chain that always saw the same rain may be stuck
     moved = all(board.counts[:2].all() for board in output.boards)

@@ -5,17 +5,17 @@ network, flags ──▶ plan_bm2 ──▶ BM2Plan ──▶ one image per chai
 """
 
 import contextlib
-import itertools
-import math
+import shlex
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from machines.bm2 import unpack
+from machines.bm2 import BM2Parameters, unpack
 from machines.parameters import RngKind, Sequencer
 from machines.rng import LFSR, random_numbers
 from posteriors import posterior
+from tests.machines.bm2_of_the_page import PageBM2
 from tests.toolchain.running import OPTIONS, TARGET, TINY, assert_refused, contents, done, toolchain
 from toolchain.building.bm2_machine import BM2Plan, chain_machines, plan_bm2
 from toolchain.building.build import assemble, check_agreement, read_images
@@ -64,49 +64,22 @@ def build(path, *arguments, name="out"):
 
 
 def codes_of_the_page(term, sizes, prob_bits):
-    """Compute a CDE's table from the words of its description, code by code."""
-    widths = [math.ceil(math.log2(sizes[name])) for name in term.scope]
-    n = sum(widths)
-    table = np.zeros(n * 2**n // 2, dtype=np.uint16)
-
-    def values(code):
-        found = []
-        for width in widths:
-            found.append(code % 2**width)
-            code //= 2**width
-        return found
-
-    for j, others in itertools.product(range(n), range(2**n // 2)):
-        low, high = others % 2**j, others // 2**j
-        zero, one = (low + bit * 2**j + high * 2 ** (j + 1) for bit in (0, 1))
-        moved = next(at for at in range(len(widths)) if sum(widths[: at + 1]) > j)
-        legal = [
-            [value < sizes[name] for value, name in zip(values(x), term.scope, strict=True)]
-            for x in (zero, one)
-        ]
-        if not all(legal[0][at] for at in range(len(widths)) if at != moved) or not legal[0][moved]:
-            odds = 0.5
-        elif not legal[1][moved]:
-            odds = 0.0
-        else:
-            f0, f1 = term.table[tuple(values(zero))], term.table[tuple(values(one))]
-            odds = 0.5 if f1 + f0 == 0 else f1 / (f1 + f0)
-        table[j * 2**n // 2 + others] = min(max(math.floor(2**prob_bits * odds + 0.5), 1), 2**prob_bits - 1)
-    return table
+    """Compute a CDE's table, code by code, with the machine that is written from its description."""
+    cardinalities = tuple(sizes[name] for name in term.scope)
+    parameters = BM2Parameters(
+        cardinalities=cardinalities, factors=(tuple(range(len(cardinalities))),), prob_bits=prob_bits
+    )
+    page, codes = PageBM2(parameters, [term.table], None), []
+    for pointed in page.names:
+        others = [name for name in page.names if name != pointed]
+        for state in range(2 ** len(others)):
+            page.bits = {pointed: 0} | {name: state >> at & 1 for at, name in enumerate(others)}
+            codes.append(page.code(0, pointed))
+    return codes
 
 
 def test_a_network_becomes_chains_with_the_tables_of_its_factors(network):
-    arguments = (
-        *GRASS,
-        "--partitions",
-        "3",
-        "--prob-bits",
-        "12",
-        "--samples",
-        "70",
-        "--sequencer",
-        "coloured",
-    )
+    arguments = (*GRASS, *shlex.split("--partitions 3 --prob-bits 12 --samples 70 --sequencer coloured"))
     result = done(build(network, *arguments, "--burn-in", "5", "--stream", "9", "--on-missing", "missing"))
     out = network.parent / "out"
     assert "Building a BM2, since sprinkler and grass are not independent given rain" in result.stderr
@@ -128,9 +101,9 @@ def test_a_network_becomes_chains_with_the_tables_of_its_factors(network):
     sizes = dict(zip(question.names, question.cardinalities, strict=True))
     for at, term in enumerate(question.factors):
         expected = codes_of_the_page(term, sizes, 12)
-        assert images[2].machine.tables[at].tolist() == expected.tolist()
+        assert images[2].machine.tables[at].tolist() == expected
         mif = read_mif(out / f"bm_arch/Memory_MIFs/cde{at}.mif")
-        assert (mif.width, list(mif.words)) == (12, expected.tolist())
+        assert (mif.width, list(mif.words)) == (12, expected)
         assert f"  {question.titles[at]} " in result.stdout
 
 
@@ -154,7 +127,7 @@ def test_codes_of_values_that_are_no_power_of_two():
     (machine,) = chain_machines(plan_bm2(model, OPTIONS))
     sizes = {"A": 3, "B": 5}
     for term, codes in zip(model.factors, machine.tables, strict=True):
-        assert codes.tolist() == codes_of_the_page(term, sizes, 16).tolist()
+        assert codes.tolist() == codes_of_the_page(term, sizes, 16)
 
 
 def test_the_hash_of_a_model_covers_what_is_possible():

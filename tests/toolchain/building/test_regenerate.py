@@ -1,5 +1,7 @@
 """Regenerating one part of a deployment: it changes, the other bytes stay, and every file is reported."""
 
+import shlex
+
 import pytest
 
 from tests.toolchain.running import TARGET, assert_refused, contents, done, toolchain
@@ -150,16 +152,7 @@ def test_how_the_model_was_read_is_not_asked_again(case, network):
     told = load_deployment(out).model
     assert (told.settings, told.bits) == (("sigma=2.0", "cells=6"), ("D1=6",))
     assert load_deployment(out).machine.lines == 6
-    asked = (
-        "--searched",
-        "rain",
-        "--known",
-        "grass,shoes",
-        "--given",
-        "sprinkler=on",
-        "--on-missing",
-        "missing",
-    )
+    asked = shlex.split("--searched rain --known grass,shoes --given sprinkler=on --on-missing missing")
     out = build(network, "garden", *asked)
     before = contents(out)
     regenerate("memories", out, "--model", network)

@@ -1,9 +1,10 @@
 """The preset `--thesis`: its options, what check and report say about it, and the cycles of its boat.
 
-The cycles come from a model of the machine in this file alone: five frames on four
+The cycles come from a model of the machine apart from the product: five frames on four
 boards, whose generators go on from frame to frame.
 """
 
+import shlex
 from functools import partial
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 from machines import make_kernel
 from machines.bm1 import Start, StopReason
 from pcie_shim.programming_file import read_image
+from tests.machines.bm2_of_the_page import lfsr_seed
 from tests.toolchain.running import TARGET, assert_refused, done, toolchain
 from toolchain.analysis import Sweep
 from toolchain.deployment import load_deployment
@@ -40,18 +42,7 @@ def test_it_is_a_set_of_options_that_check_does_not_mention(boat, tmp_path):
         assert done(toolchain("check", *checked)).stdout == ""
     assert "steps_per_clock = 1" in done(toolchain("check", "boat", "--steps-per-clock", "1")).stdout
     # the same options without the preset are the same deployment
-    flags = [
-        "--stop",
-        "own",
-        "--rng-reset",
-        "free",
-        "--steps-per-clock",
-        "1",
-        "--interface",
-        "20x1200",
-        "--partitions",
-        "4",
-    ]
+    flags = shlex.split("--stop own --rng-reset free --steps-per-clock 1 --interface 20x1200 --partitions 4")
     done(build("boat", "-o", tmp_path / "flags", *TARGET, *flags))
     assert (tmp_path / "flags/deployment.toml").read_bytes() == (folder / "deployment.toml").read_bytes()
 
@@ -86,20 +77,9 @@ def test_a_bm2(tmp_path):
 
 
 def test_a_sweep_starts_from_it(case, tmp_path):
-    lists = [
-        "--prob-bits",
-        "8",
-        "--targets",
-        "255",
-        "--rngs",
-        "lfsr32",
-        "--scales",
-        "address",
-        "--frames",
-        "1",
-        "--partitions",
-        "2",
-    ]
+    lists = shlex.split(
+        "--prob-bits 8 --targets 255 --rngs lfsr32 --scales address --frames 1 --partitions 2"
+    )
     found = done(toolchain("explore", case, "--thesis", *lists, "-o", tmp_path / "points.jsonl"))
     row = found.stdout.splitlines()[1].split()
     assert row[1:4] == ["address", "lfsr32", "1"]
@@ -109,41 +89,14 @@ def test_a_sweep_starts_from_it(case, tmp_path):
 
 # --- the cycles ----------------------------------------------------------------------------------------------
 
-BITS, MOST_CYCLES, TARGET_COUNT = 32, 2**17, 255
-FEEDBACK = (32, 22, 2, 1)
-"""Exponents of the polynomial of lfsr32."""
-
-
-def stepped(state):
-    """The state of an LFSR after a step: a shift to the left, and the parity of the tapped bits below."""
-    parity = sum(state >> exponent - 1 for exponent in FEEDBACK) & 1
-    return (state << 1 | parity) & 2**BITS - 1
-
-
-def times(matrix, state):
-    """The product of a matrix over two elements, its columns as numbers, and a state."""
-    product = 0
-    for bit, column in enumerate(matrix):
-        product ^= column * (state >> bit & 1)
-    return product
-
-
-def seed(column):
-    """The first state of a column of bank 0."""
-    state, steps = 0x4F6CDD1D, ((column + 1) * 0x9E3779B97F4A7C15 >> 32 & 2**32 - 1) % (2**BITS - 1)
-    matrix = [stepped(1 << bit) for bit in range(BITS)]
-    while steps:
-        state = times(matrix, state) if steps & 1 else state
-        matrix = [times(matrix, column) for column in matrix]
-        steps >>= 1
-    return state
+MOST_CYCLES, TARGET_COUNT = 2**17, 255
 
 
 def numbers(columns, count):
-    """The low 8 bits of the states of some columns: uint8[columns, count]."""
+    """The low 8 bits of the states of some columns of bank 0: uint8[columns, count]."""
     found = np.zeros((columns, count), np.uint8)
     for column in range(columns):
-        state, row = seed(column), bytearray(count)
+        state, row = lfsr_seed("lfsr32", column), bytearray(count)
         for cycle in range(count):
             row[cycle] = state & 0xFF
             state = (state << 1 | (state >> 31 ^ state >> 21 ^ state >> 1 ^ state) & 1) & 0xFFFFFFFF
