@@ -8,23 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from casestudies.boat import sensors
 from casestudies.boat.model import model
 from casestudies.boat.normaliser import app, normalise, normalise_bearing, normalise_distance
-from casestudies.boat.sensors import (
-    BEACONS,
-    BEARING_SIGMA,
-    LONGEST_DISTANCE,
-    SENSOR_NAMES,
-    BadNumberError,
-    bearing,
-    distance,
-    distance_sigma,
-    map_grid,
-    read_drive,
-    read_raw,
-    read_set_pose,
-    readings_message,
-)
 from casestudies.boat.simulator import Boat
 from tests.casestudies.cells import centre, line_at
 from tests.casestudies.figures import coverage, distances, means
@@ -35,24 +21,24 @@ from toolchain.models.model import exact_posterior
 on_map = st.floats(-50, 50)
 
 
-@given(on_map, on_map, st.sampled_from(BEACONS))
+@given(on_map, on_map, st.sampled_from(sensors.BEACONS))
 def test_distance_and_bearing_lead_back_to_the_boat(x, y, beacon):
-    length, angle = distance(x, y, beacon), math.radians(bearing(x, y, beacon))
+    length, angle = sensors.distance(x, y, beacon), math.radians(sensors.bearing(x, y, beacon))
     assert beacon[0] + length * math.cos(angle) == pytest.approx(x, abs=1e-9)
     assert beacon[1] + length * math.sin(angle) == pytest.approx(y, abs=1e-9)
 
 
 def test_just_below_the_axis_is_not_a_full_turn():
-    assert bearing(0.0, -1e-300, BEACONS[1]) == 0.0
+    assert sensors.bearing(0.0, -1e-300, sensors.BEACONS[1]) == 0.0
 
 
 BOAT = model().model()
-GRID = map_grid()
+GRID = sensors.map_grid()
 LINES = st.integers(0, GRID.width * GRID.height - 1)
 
 
 def test_shape_order_and_widths():
-    assert tuple(known.name for known in BOAT.known) == SENSOR_NAMES
+    assert tuple(known.name for known in BOAT.known) == sensors.SENSOR_NAMES
     assert [known.table.shape for known in BOAT.known] == [(101, 1024)] * 3 + [(360, 1024)] * 3
     assert [known.bits for known in BOAT.known] == [7] * 3 + [9] * 3
     assert [known.on_missing for known in BOAT.known] == ["missing"] * 6
@@ -71,11 +57,11 @@ def test_lines_are_the_grids_cells(line):
 
 def test_tables_are_normals_around_distance_and_bearing():
     centres = [centre(GRID, line) for line in range(GRID.width * GRID.height)]
-    for away, around, beacon in zip(BOAT.known[:3], BOAT.known[3:], BEACONS, strict=True):
-        means = np.array([distance(x, y, beacon) for x, y in centres])
+    for away, around, beacon in zip(BOAT.known[:3], BOAT.known[3:], sensors.BEACONS, strict=True):
+        means = np.array([sensors.distance(x, y, beacon) for x, y in centres])
         assert away.normal.mean == pytest.approx(means)
         assert away.normal.sigma == pytest.approx(means / 10 + 5)
-        turned = np.array([bearing(x, y, beacon) for x, y in centres])
+        turned = np.array([sensors.bearing(x, y, beacon) for x, y in centres])
         assert around.normal.mean % 360 == pytest.approx(turned)
         assert np.all(around.normal.sigma == 10)
         assert (away.offset, away.step, around.offset, around.step) == (0, 1, 0, 1)
@@ -142,14 +128,14 @@ def test_a_seed_is_a_journey():
 def test_the_noise_is_the_models():
     boat = Boat(11, 0)
     measured = [boat.measure() for _ in range(4000)]
-    for column, beacon in enumerate(BEACONS):
+    for column, beacon in enumerate(sensors.BEACONS):
         distances = [values[column] for values in measured]
-        sigma = distance_sigma(distance(0, 0, beacon))
-        assert statistics.fmean(distances) == pytest.approx(distance(0, 0, beacon), abs=0.08 * sigma)
+        sigma = sensors.distance_sigma(sensors.distance(0, 0, beacon))
+        assert statistics.fmean(distances) == pytest.approx(sensors.distance(0, 0, beacon), abs=0.08 * sigma)
         assert statistics.stdev(distances) == pytest.approx(sigma, rel=0.06)
         bearings = [math.degrees(values[3 + column]) for values in measured]
-        assert statistics.fmean(bearings) == pytest.approx(bearing(0, 0, beacon), abs=0.8)
-        assert statistics.stdev(bearings) == pytest.approx(BEARING_SIGMA, rel=0.06)
+        assert statistics.fmean(bearings) == pytest.approx(sensors.bearing(0, 0, beacon), abs=0.8)
+        assert statistics.stdev(bearings) == pytest.approx(sensors.BEARING_SIGMA, rel=0.06)
 
 
 def pose(x, y):
@@ -158,7 +144,7 @@ def pose(x, y):
 
 def test_a_boat_that_is_put_somewhere_lies_still_until_it_sails_on():
     boat = Boat(5, 60)
-    boat.put(*read_set_pose(pose(-20, 30.5)))
+    boat.put(*sensors.read_set_pose(pose(-20, 30.5)))
     boat.sail(1.0)
     assert (boat.x, boat.y) == (-20, 30.5)
     boat.put(1e300, -51)
@@ -183,8 +169,8 @@ def test_a_boat_that_is_put_somewhere_lies_still_until_it_sails_on():
     ],
 )
 def test_a_place_that_is_no_place_is_refused(message, field):
-    with pytest.raises(BadNumberError, match=field):
-        read_set_pose(message)
+    with pytest.raises(sensors.BadNumberError, match=field):
+        sensors.read_set_pose(message)
 
 
 def twist(forward, turn):
@@ -195,13 +181,13 @@ def twist(forward, turn):
     ("message", "field"), [({}, "linear.x"), (twist(math.nan, 0), "linear.x"), (twist(1, None), "angular.z")]
 )
 def test_a_velocity_that_is_none_is_refused(message, field):
-    with pytest.raises(BadNumberError, match=field):
-        read_drive(message)
+    with pytest.raises(sensors.BadNumberError, match=field):
+        sensors.read_drive(message)
 
 
 def test_a_boat_that_is_driven_follows_the_velocity_for_a_second_and_stays_on_the_map():
     boat = Boat(5, 60)
-    boat.drive(*read_drive(twist(10.0, 0.0)))
+    boat.drive(*sensors.read_drive(twist(10.0, 0.0)))
     for _ in range(20):  # two seconds: the velocity is too old in the second one
         boat.sail(0.1)
     assert (boat.x, boat.y, boat.heading) == (pytest.approx(10), 0, 0)
@@ -234,7 +220,7 @@ def test_a_turn_while_driving_is_an_arc_to_the_left():
 
 def test_switches_of_the_boat():
     boat = Boat(5, 0)
-    boat.put(*BEACONS[1])
+    boat.put(*sensors.BEACONS[1])
     boat.switch("noise", on=False)
     exact = (50, 0, math.hypot(50, 50), math.pi / 2, 0, math.radians(135))
     assert boat.measure() == pytest.approx(exact)
@@ -244,7 +230,7 @@ def test_switches_of_the_boat():
     assert boat.switch("D1/plugged", on=True) != boat.switch("D1/plugged", on=False)
     boat.switch("beacon2/works", on=False)
     measured = [boat.measure() for _ in range(2000)]
-    for column, turn in ((1, LONGEST_DISTANCE), (4, 2 * math.pi)):
+    for column, turn in ((1, sensors.LONGEST_DISTANCE), (4, 2 * math.pi)):
         values = [each[column] for each in measured]
         assert 0 <= min(values) < 0.01 * turn
         assert 0.99 * turn < max(values) <= turn
@@ -254,7 +240,7 @@ def test_switches_of_the_boat():
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_float64_fusion_covers_the_truth(seed):
-    grid, boat = map_grid(), Boat(seed, 60)
+    grid, boat = sensors.map_grid(), Boat(seed, 60)
     lines, posteriors = [], []
     for _ in range(500):
         boat.sail(0.5)
@@ -294,40 +280,47 @@ def test_all_that_leaves_is_in_range(raw):
 
 
 def test_header_and_names_are_kept():
-    values, head = read_raw({"header": HEAD, **RAW}, array=False)
+    values, head = sensors.read_raw({"header": HEAD, **RAW}, array=False)
     whole = {"D1": 2, "D2": 0, "D3": 100, "B1": 0, "B2": 180, "B3": 270}
-    assert readings_message(normalise(values), head, array=False) == {"header": HEAD, **whole}
+    assert sensors.readings_message(normalise(values), head, array=False) == {"header": HEAD, **whole}
 
 
 def test_arrays_hold_the_numbers_in_the_columns_order():
-    values, head = read_raw({"layout": {}, "data": list(RAW.values())}, array=True)
+    values, head = sensors.read_raw({"layout": {}, "data": list(RAW.values())}, array=True)
     assert head is None
-    message = readings_message(normalise(values), head, array=True)
+    message = sensors.readings_message(normalise(values), head, array=True)
     assert message["data"] == [2.0, 0.0, 100.0, 0.0, 180.0, 270.0]
     assert message["layout"]["dim"] == [{"label": "sensor", "size": 6, "stride": 6}]
 
 
 @pytest.mark.parametrize("bad", ["12", math.inf, True, [1.0]])
 def test_a_reading_that_is_not_a_number_is_refused_by_name(bad):
-    with pytest.raises(BadNumberError, match="B2"):
-        read_raw(RAW | {"B2": bad}, array=False)
+    with pytest.raises(sensors.BadNumberError, match="B2"):
+        sensors.read_raw(RAW | {"B2": bad}, array=False)
 
 
 @pytest.mark.parametrize("missing", [{}, {"B2": None}, {"B2": math.nan}])
 def test_a_missing_reading_stays_missing(missing):
     rest = {name: value for name, value in RAW.items() if name != "B2"}
-    whole = normalise(read_raw({"header": HEAD, **rest, **missing}, array=False)[0])
+    whole = normalise(sensors.read_raw({"header": HEAD, **rest, **missing}, array=False)[0])
     assert whole == (2, 0, 100, 0, None, 270)
-    assert list(readings_message(whole, HEAD, array=False)) == ["header", "D1", "D2", "D3", "B1", "B3"]
+    assert list(sensors.readings_message(whole, HEAD, array=False)) == [
+        "header",
+        "D1",
+        "D2",
+        "D3",
+        "B1",
+        "B3",
+    ]
     data = [missing.get(name, RAW[name]) if name != "B2" else missing.get("B2") for name in RAW]
-    again = normalise(read_raw({"data": data}, array=True)[0])
-    assert readings_message(again, None, array=True)["data"] == [2.0, 0.0, 100.0, 0.0, None, 270.0]
+    again = normalise(sensors.read_raw({"data": data}, array=True)[0])
+    assert sensors.readings_message(again, None, array=True)["data"] == [2.0, 0.0, 100.0, 0.0, None, 270.0]
 
 
 @pytest.mark.parametrize("data", [None, [], [1.0] * 5, "AAAA"])
 def test_an_array_needs_six_numbers(data):
-    with pytest.raises(BadNumberError):
-        read_raw({"data": data}, array=True)
+    with pytest.raises(sensors.BadNumberError):
+        sensors.read_raw({"data": data}, array=True)
 
 
 def test_the_message_types_can_be_printed():

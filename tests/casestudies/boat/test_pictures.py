@@ -4,16 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from casestudies.boat.pictures import (
-    StageKind,
-    draw_positions,
-    draw_shares,
-    far_apart,
-    mean_link_us,
-    posterior_grid,
-    projected_shares,
-    stage_shares,
-)
+from casestudies.boat import pictures
 from casestudies.topics import Instance, Truth
 from posteriors.frame_report import FrameReport, StageTimes
 from posteriors.posterior import Posterior
@@ -55,7 +46,7 @@ def pixels_of(path, colour):
 def test_the_probable_cell_and_the_true_position_are_in_one_place(tmp_path):
     """A certain posterior in the cell of the truth: in panel b both marks are at the same pixels."""
     path = tmp_path / "new" / "figure-4.4.png"
-    draw_positions(path, [instance(1, 25, 25, cell=24 * 32 + 24)])
+    pictures.draw_positions(path, [instance(1, 25, 25, cell=24 * 32 + 24)])
     assert imread(path).shape[:2] > (300, 500)
     low, high = pixels_of(path, VIRIDIS_LOW), pixels_of(path, VIRIDIS_HIGH)
     columns = np.flatnonzero(np.bincount(low[:, 1]) > 150)  # the panel's, but not the colour bar's
@@ -76,22 +67,22 @@ def test_the_probable_cell_and_the_true_position_are_in_one_place(tmp_path):
 
 def test_any_number_and_any_grid_with_and_without_a_truth(tmp_path):
     instances = [instance(n, n, n, cell=0, width=8, height=6) for n in range(5)]
-    draw_positions(tmp_path / "x.png", instances, route=[i.truth for i in instances])
+    pictures.draw_positions(tmp_path / "x.png", instances, route=[i.truth for i in instances])
     assert len(pixels_of(tmp_path / "x.png", VIRIDIS_LOW)) > 5000
-    draw_positions(tmp_path / "x.png", [instance(1, truth=False)])
+    pictures.draw_positions(tmp_path / "x.png", [instance(1, truth=False)])
     assert not len(pixels_of(tmp_path / "x.png", TRUTH_COLOUR))
 
 
 def test_pictures_that_cannot_be_drawn(tmp_path):
     with pytest.raises(OutputError):
-        posterior_grid(Posterior(probabilities=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0))
+        pictures.posterior_grid(Posterior(probabilities=(0.5, 0.5), labels=("x",), sizes=(2,), heard_ns=0))
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError):
-        draw_positions(tmp_path / "file" / "x.png", [instance(1)])
+        pictures.draw_positions(tmp_path / "file" / "x.png", [instance(1)])
 
 
 def chosen(instances):
-    return [each.report.number for each in far_apart(instances)]
+    return [each.report.number for each in pictures.far_apart(instances)]
 
 
 def test_the_corners_are_chosen_in_the_order_of_time():
@@ -105,7 +96,7 @@ def test_frames_without_a_truth_are_spread_over_time_and_those_without_a_posteri
     blind = [instance(n, truth=False) for n in range(10)]
     assert chosen([*blind, instance(10)]) == [10]
     assert chosen(blind)[::3] == [0, 9]
-    assert far_apart([Instance(heard=FrameReport(stamp_ns=1, heard_ns=1, outcome=""))]) == ()
+    assert pictures.far_apart([Instance(heard=FrameReport(stamp_ns=1, heard_ns=1, outcome=""))]) == ()
 
 
 STAGES = {"rosbridge_in": 100, "local_hops": 200, "register_writes": 50, "reads": 50}
@@ -114,37 +105,37 @@ STAGES |= {"compute": 700, "boards_compute": 600}
 
 def test_means_and_shares():
     double = {name: 2 * time for name, time in STAGES.items()}
-    shares = stage_shares([instance(1, **STAGES), instance(2, **double)])
+    shares = pictures.stage_shares([instance(1, **STAGES), instance(2, **double)])
     assert [stage.name for stage in shares] == [
         *("rosbridge in", "local hops", "register writes", "computing", "start and answer"),
         *("register reads", "rosbridge out"),
     ]
     assert [stage.mean_us for stage in shares] == [150, 300, 75, 900, 150, 75, 500]
     assert sum(stage.share for stage in shares) == pytest.approx(1)
-    assert shares[3].part is StageKind.COMPUTING
+    assert shares[3].part is pictures.StageKind.COMPUTING
     assert shares[3].share == pytest.approx(900 / 2150)
-    some = stage_shares([instance(1, compute=500), instance(2)])  # the others were not told
+    some = pictures.stage_shares([instance(1, compute=500), instance(2)])  # the others were not told
     assert [stage.mean_us for stage in some] == [500, 0, 500]
-    assert stage_shares([]) == ()
+    assert pictures.stage_shares([]) == ()
 
 
 def test_the_projected_boards_compute_at_their_clock_and_move_what_has_moved():
     instances = [instance(1, moved=(2000, 5200, 8), **STAGES), instance(2, moved=(4000, 5200, 8), **STAGES)]
-    shares = projected_shares(instances, 50e6)
+    shares = pictures.projected_shares(instances, 50e6)
     assert [(stage.part, stage.mean_us) for stage in shares] == [
-        (StageKind.ROSBRIDGE, 100),
-        (StageKind.HOST, 200),
-        (StageKind.REGISTERS, pytest.approx(2 + 8 * 0.5)),
-        (StageKind.COMPUTING, pytest.approx(60)),
-        (StageKind.ROSBRIDGE, 500),
+        (pictures.StageKind.ROSBRIDGE, 100),
+        (pictures.StageKind.HOST, 200),
+        (pictures.StageKind.REGISTERS, pytest.approx(2 + 8 * 0.5)),
+        (pictures.StageKind.COMPUTING, pytest.approx(60)),
+        (pictures.StageKind.ROSBRIDGE, 500),
     ]
-    assert mean_link_us(instances, "jtag") == pytest.approx(5200 * 8 / 24 + 8 * 125)
-    assert projected_shares([instance(1, **STAGES)], 50e6) == ()
+    assert pictures.mean_link_us(instances, "jtag") == pytest.approx(5200 * 8 / 24 + 8 * 125)
+    assert pictures.projected_shares([instance(1, **STAGES)], 50e6) == ()
 
 
 def test_the_bars_are_as_long_as_the_times(tmp_path):
     path = tmp_path / "figure-4.5.png"
-    draw_shares(path, stage_shares([instance(1, **STAGES)]), frames=1)
+    pictures.draw_shares(path, pictures.stage_shares([instance(1, **STAGES)]), frames=1)
     height = imread(path).shape[0]
 
     def bar(colour):

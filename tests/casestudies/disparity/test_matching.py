@@ -6,18 +6,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from casestudies.disparity import matching
 from casestudies.disparity.matcher import tiles_of
-from casestudies.disparity.matching import (
-    FILTERS,
-    OUTLIER,
-    SCALES,
-    WINDOW,
-    as_bytes,
-    filtered,
-    fused,
-    likelihoods,
-    matching_costs,
-)
 from casestudies.disparity.scene import Scene
 from machines import make_kernel
 from machines.bm1 import Start
@@ -40,8 +30,8 @@ def mean_around(values, y, x, reach):
 
 def test_filters_are_those_of_loops():
     picture = image(1)
-    outputs = filtered(picture)
-    assert outputs.shape == (len(FILTERS), *picture.shape)
+    outputs = matching.filtered(picture)
+    assert outputs.shape == (len(matching.FILTERS), *picture.shape)
     height, width = picture.shape
     grey = picture.astype(float)
 
@@ -58,28 +48,30 @@ def test_filters_are_those_of_loops():
 
 def test_costs_are_those_of_a_loop_and_none_beyond_the_border():
     left, right = image(2), image(3)
-    costs = matching_costs(left, right, 14)  # more disparities than the 11 columns
-    ours, theirs = filtered(left), filtered(right)
+    costs = matching.matching_costs(left, right, 14)  # more disparities than the 11 columns
+    ours, theirs = matching.filtered(left), matching.filtered(right)
     for d in range(14):
         assert np.isnan(costs[:, d, :, :d]).all()
-        for number in range(len(FILTERS)):
+        for number in range(len(matching.FILTERS)):
             # the columns for which there is a match
             difference = np.abs(ours[number][:, d:] - theirs[number][:, : max(11 - d, 0)])
             for y, x in np.ndindex(difference.shape):
                 assert costs[number, d, y, d + x] == pytest.approx(
-                    mean_around(difference, y, x, WINDOW), abs=1e-3
+                    mean_around(difference, y, x, matching.WINDOW), abs=1e-3
                 )
 
 
 def test_likelihoods_fall_with_the_cost_to_that_of_an_outlier():
     costs = np.array([0, 2, 1e6], np.float32).reshape(1, 3, 1, 1).repeat(3, axis=0)
-    likely = likelihoods(costs)[..., 0, 0]
-    for row, scale in zip(likely, SCALES, strict=True):
-        assert row == pytest.approx([1, (1 - OUTLIER) * np.exp(-2 / scale) + OUTLIER, OUTLIER])
+    likely = matching.likelihoods(costs)[..., 0, 0]
+    for row, scale in zip(likely, matching.SCALES, strict=True):
+        assert row == pytest.approx(
+            [1, (1 - matching.OUTLIER) * np.exp(-2 / scale) + matching.OUTLIER, matching.OUTLIER]
+        )
 
 
 def test_a_disparity_beyond_the_border_is_neither_preferred_nor_excluded():
-    likely = likelihoods(matching_costs(image(4), image(5), 8))
+    likely = matching.likelihoods(matching.matching_costs(image(4), image(5), 8))
     assert np.isfinite(likely).all()
     for x in range(8):
         assert likely[:, x + 1 :, :, x] == pytest.approx(
@@ -88,16 +80,16 @@ def test_a_disparity_beyond_the_border_is_neither_preferred_nor_excluded():
             )
         )
     # nothing is known but the prior
-    assert fused(likely)[:, :, 0] == pytest.approx(1 / 8)
+    assert matching.fused(likely)[:, :, 0] == pytest.approx(1 / 8)
 
 
 def test_a_shift_is_found_and_bytes_hardly_change_it():
     right = Scene(5).pair(0, 64, 32).left
     left = np.roll(right, 3, axis=1)
-    likely = likelihoods(matching_costs(left, right, 8))
-    codes = as_bytes(likely)
+    likely = matching.likelihoods(matching.matching_costs(left, right, 8))
+    codes = matching.as_bytes(likely)
     assert (codes.max(axis=1) == 255).all()
-    exact, rounded = fused(likely), fused(codes)
+    exact, rounded = matching.fused(likely), matching.fused(codes)
     assert exact.sum(axis=0) == pytest.approx(1)
     assert np.abs(exact - rounded).sum(axis=0).max() / 2 < 0.01
     assert (exact.argmax(axis=0)[:, 12:] == 3).all()
@@ -115,13 +107,13 @@ def test_a_tile_on_the_machine_counts_as_the_reference_does(tmp_path):
     deployment = load_deployment(tmp_path)
     machine = read_image(tmp_path / "boards" / "board0.bm").machine
     pair = Scene(3).pair(0, 30, 10)
-    codes = as_bytes(likelihoods(matching_costs(pair.left, pair.right, 16)))
+    codes = matching.as_bytes(matching.likelihoods(matching.matching_costs(pair.left, pair.right, 16)))
     tiles = tiles_of(codes, 40)
     assert tiles.shape == (8, 3, 40, 16)  # 300 pixels
     assert (tiles[2, :, 5] == codes[:, :, 2, 25]).all()
     assert (tiles[7, :, 20:] == 255).all()
     variables = [each for each in deployment.variables if each.kind == "sensor"]
-    assert [each.name for each in variables] == list(FILTERS)
+    assert [each.name for each in variables] == list(matching.FILTERS)
     columns = [
         to_addresses(deployment, variable, base64.b64encode(each.tobytes()).decode())
         for variable, each in zip(variables, tiles[7], strict=True)

@@ -14,21 +14,12 @@ import pytest
 
 from machines import make_kernel
 from machines.bm1 import Start, StopReason
-from pcie_shim import framing
+from pcie_shim import errors, framing
 from pcie_shim import register_map as rm
 from pcie_shim.board import connection as connection_module
 from pcie_shim.board import server as board_module
 from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.endpoint import connect, listen, parse_endpoint
-from pcie_shim.errors import (
-    AccessError,
-    DamagedImageError,
-    EndpointError,
-    HeldError,
-    ImageError,
-    ImageMismatchError,
-    LinkClosedError,
-)
 from pcie_shim.host import socket_link
 from pcie_shim.host.loader import program
 from pcie_shim.host.socket_link import SocketLink
@@ -52,7 +43,7 @@ def programmed(start_board, of):
 
 
 def refused(code):
-    return pytest.raises(AccessError, check=lambda error: error.code == code)
+    return pytest.raises(errors.AccessError, check=lambda error: error.code == code)
 
 
 def run_for_minutes(link):
@@ -156,10 +147,10 @@ def test_a_second_host_is_refused_and_the_first_goes_on(start_board):
         # the first connection made no request, and so does not hold the board
         assert link.read32(rm.ID) == rm.ID_VALUE
         for attempt in (open_link, lambda _: silent.read32(rm.ID)):
-            with pytest.raises(HeldError):
+            with pytest.raises(errors.HeldError):
                 attempt(board)
         run_for_minutes(link)
-        with pytest.raises(HeldError):
+        with pytest.raises(errors.HeldError):
             open_link(board)
         assert link.read32(rm.STATUS) & 15 == BoardState.RUNNING
     with open_link(board) as link:
@@ -171,7 +162,7 @@ def test_silent_connections_are_bounded_and_keep_nobody_out(start_board, program
     board = start_board()
     opens = open_programming if programming else open_link
     silent = [opens(board) for _ in range(board_module.MAX_SILENT + 1)]
-    with pytest.raises(LinkClosedError):
+    with pytest.raises(errors.LinkClosedError):
         silent[0].read32(rm.ID)
     if programming:
         program(board.endpoint, image(MACHINE))
@@ -194,7 +185,7 @@ def test_a_host_that_vanishes_leaves_the_board_well(start_board):
         assert link.read32(rm.STATUS) == BoardState.IDLE
         assert link.read32(rm.CONTROL) == 0
         assert link.read32(rm.DONE) == 0
-    with pytest.raises(LinkClosedError):
+    with pytest.raises(errors.LinkClosedError):
         link.read32(rm.ID)
 
 
@@ -257,7 +248,7 @@ def test_a_host_that_breaks_the_protocol_loses_its_link(start_board, nonsense):
 def test_the_host_hears_why_its_link_was_closed(start_board):
     with open_link(start_board()) as link:
         link._sequence += 1
-        with pytest.raises(AccessError):
+        with pytest.raises(errors.AccessError):
             link.read32(rm.ID)
         assert link.fileno() == -1
 
@@ -272,14 +263,14 @@ def test_sockets_are_private_and_go_away_though_the_machine_runs(start_board, fo
     with open_link(board) as link:
         run_for_minutes(link)
         board.stop()
-        with pytest.raises(LinkClosedError):
+        with pytest.raises(errors.LinkClosedError):
             link.read32(rm.ID)
     assert list(folder.iterdir()) == []
 
 
 def test_a_taken_programming_port_leaves_no_socket_behind(start_board, folder):
     start_board(f"unix:{folder}/a.program.sock")
-    with pytest.raises(EndpointError):
+    with pytest.raises(errors.EndpointError):
         board_module.serve_board(f"unix:{folder}/a.sock", index=1, stop=board_module.StopSignal(), pin=False)
     assert not (folder / "a.sock").exists()
 
@@ -329,7 +320,7 @@ def test_the_loader_is_refused_while_a_host_holds_the_board(start_board):
     board = programmed(start_board, MACHINE)
     with open_link(board) as link:
         assert link.read32(rm.PROGRAMMED) == 1
-        with pytest.raises(HeldError):
+        with pytest.raises(errors.HeldError):
             program(board.endpoint, image(machine(2)))
         assert link.read32(rm.PROGRAMMED) == 1
     assert program(board.endpoint, image(machine(2))) == image(machine(2)).image_hash
@@ -339,7 +330,7 @@ def test_one_loader_at_a_time(start_board):
     board = start_board()
     first = open_programming(board)
     first.read32(rm.ID)
-    with pytest.raises(HeldError):
+    with pytest.raises(errors.HeldError):
         program(board.endpoint, image(MACHINE))
     first.close()
     program(board.endpoint, image(MACHINE))
@@ -353,11 +344,11 @@ def test_a_loader_that_says_nothing_loses_its_turn(start_board, monkeypatch):
     for _ in range(2):
         silent.read32(rm.ID)
         now[0] += board_module.PROGRAMMING_SILENCE_S
-        with pytest.raises(HeldError):
+        with pytest.raises(errors.HeldError):
             program(board.endpoint, image(MACHINE))
     now[0] += 1
     open_link(board).close()  # the board looks at its clock when something happens
-    with pytest.raises(LinkClosedError):
+    with pytest.raises(errors.LinkClosedError):
         wait_done(silent, 1)
     program(board.endpoint, image(MACHINE))
 
@@ -403,14 +394,14 @@ def test_a_file_that_no_loader_has_checked_is_checked_by_the_board(start_board, 
         begin(link, len(announced_content), hashlib.sha256(announced_content).digest())
         padded = sent_content + bytes(-len(sent_content) % 4)
         link.request(framing.PROGRAM, 0, 0, len(padded) // 4, padded)
-        with pytest.raises(AccessError):
+        with pytest.raises(errors.AccessError):
             link.request(framing.PROGRAM, framing.END, len(sent_content), 0)
         assert link.read_block(rm.IMAGE_HASH, 8) == bytes(32)
 
 
 def test_the_loader_refuses_a_file_for_another_map(start_board, folder):
     (folder / "other.bm").write_bytes(foreign(b""))
-    with pytest.raises(ImageMismatchError):
+    with pytest.raises(errors.ImageMismatchError):
         program(start_board().endpoint, folder / "other.bm")
 
 
@@ -420,7 +411,7 @@ def test_the_programming_port_takes_no_registers_writes_no_part_out_of_turn_and_
         link.write32(rm.CONTROL, 1)
     with open_programming(board) as link, refused(ErrorCode.BAD_FRAME):
         link.request(framing.PROGRAM, 0, 0, 1, words(1))
-    with open_programming(board) as link, pytest.raises(AccessError):
+    with open_programming(board) as link, pytest.raises(errors.AccessError):
         begin(link, 2**40, hashlib.sha256().digest())
     for second in (0, 8):  # repeated, and lost
         with open_programming(board) as link:
@@ -437,7 +428,7 @@ def test_a_host_that_opens_the_board_during_a_transfer_keeps_it(start_board):
         begin(loader, len(content), hashlib.sha256(content).digest())
         loader.post_part(0, content + bytes(-len(content) % 4))
         assert host.read32(rm.PROGRAMMED) == 0
-        with pytest.raises(HeldError):
+        with pytest.raises(errors.HeldError):
             loader.request(framing.PROGRAM, framing.END, len(content), 0)
         assert host.read_block(rm.IMAGE_HASH, 8) == bytes(32)
 
@@ -448,10 +439,10 @@ def test_a_host_that_opens_the_board_during_a_transfer_keeps_it(start_board):
 def test_a_damaged_or_missing_file_is_refused_before_the_board_is_touched(folder):
     nowhere = f"unix:{folder}/nobody.sock"
     path = folder / "board0.bm"
-    with pytest.raises(ImageError):
+    with pytest.raises(errors.ImageError):
         program(nowhere, path)
     path.write_bytes(image_bytes(image(machine(1)))[:-2] + b"xx")
-    with pytest.raises(DamagedImageError):
+    with pytest.raises(errors.DamagedImageError):
         program(nowhere, path)
 
 
@@ -463,5 +454,5 @@ def test_a_board_that_does_not_become_what_was_loaded_is_an_error(start_board, m
         return bytes(4 * count) if address == rm.IMAGE_HASH else good(link, address, count)
 
     monkeypatch.setattr(SocketLink, "read_block", other)
-    with pytest.raises(ImageMismatchError):
+    with pytest.raises(errors.ImageMismatchError):
         program(board.endpoint, image(machine(1)))

@@ -23,24 +23,10 @@ from hypothesis import strategies as st
 from machines.bm1 import StopReason
 from machines.kind import FrameInput, FrameSettings
 from machines.parameters import PriorMode
+from pcie_shim import errors
 from pcie_shim import register_map as rm
 from pcie_shim.board.emulated_board import EmulatedBoard
 from pcie_shim.endpoint import Endpoint, parse_endpoint
-from pcie_shim.errors import (
-    AccessError,
-    DeviceGoneError,
-    FrameInputError,
-    FramingError,
-    GreetingMismatchError,
-    HeldError,
-    ImageMismatchError,
-    LinkClosedError,
-    LinkTimeoutError,
-    LinkUnreachableError,
-    SequenceError,
-    ShortReadError,
-    StaleHandleError,
-)
 from pcie_shim.host import mini_cluster
 from pcie_shim.host.driven_board import DrivenBoard
 from pcie_shim.host.loader import program
@@ -66,9 +52,9 @@ PARTS = images(10, LINES, zeros=0.3)
 
 def test_a_board_that_is_not_open_has_no_link_and_no_result():
     board = DrivenBoard(0, Endpoint(path="/nowhere"), PARTS[0])
-    with pytest.raises(LinkClosedError):
+    with pytest.raises(errors.LinkClosedError):
         board.receive()
-    with pytest.raises(SequenceError):
+    with pytest.raises(errors.SequenceError):
         board.result()
 
 
@@ -116,10 +102,10 @@ def test_frames_are_the_kernels_to_the_bit(cluster, given_frames):
 def test_a_frame_in_pieces_is_the_same_frame(cluster):
     whole = frame(5, 8, target_count=255, max_cycles=2**17)
     assert cluster.awaited is None
-    with pytest.raises(FrameInputError):
+    with pytest.raises(errors.FrameInputError):
         cluster.collect(0)
     cluster.post(whole)
-    with pytest.raises(FrameInputError):
+    with pytest.raises(errors.FrameInputError):
         cluster.post(whole)
     output = None
     while output is None:
@@ -192,7 +178,7 @@ def test_the_computing_times_of_the_slices_are_added(start_board, monkeypatch):
 )  # fmt: skip
 def test_a_frame_that_does_not_fit_is_refused(cluster, bad):
     given_frame = {"addresses": (1, 1), "target_count": 5, "max_cycles": 10} | bad
-    with pytest.raises(FrameInputError) as caught:
+    with pytest.raises(errors.FrameInputError) as caught:
         cluster.run(FrameInput(**given_frame))
     assert caught.value.exit_code == 2
     assert outcome(cluster.run(frame())) == expected(PARTS, frame())
@@ -235,7 +221,7 @@ def test_written_priors_are_split_over_the_boards(boards, monkeypatch):
         first[:] = second  # changed in place, after it was written
         assert outcome(cluster.run(given_frame)) == expected(parts, given_frame)
         for codes in (first[:4], np.full(5, 256, np.uint16)):
-            with pytest.raises(FrameInputError):
+            with pytest.raises(errors.FrameInputError):
                 cluster.run(frame(prior_codes=codes))
 
 
@@ -286,7 +272,7 @@ def test_boards_are_programmed_once_and_found_again(boards):
 def test_another_image_is_refused_with_both_hashes(boards):
     parts, others = images(60, (3, 2)), images(61, (3, 2))
     program(boards[1].endpoint, others[1])
-    with board_fails(ImageMismatchError) as caught:
+    with board_fails(errors.ImageMismatchError) as caught:
         MiniCluster.open(endpoints_of(boards), parts)
     assert re.search(
         rf"Board 1: .*holds image {others[1].image_hash}, the deployment's is {parts[1].image_hash}: program it",
@@ -299,7 +285,7 @@ def test_another_image_is_refused_with_both_hashes(boards):
         assert outcome(cluster.run(frame())) == expected(parts, frame())
         assert [board.link.read32(rm.PROGRAMMED) for board in cluster._boards] == [1, 2]
         program(boards[1].endpoint, others[1], token=cluster._boards[1].link.token)
-        with board_fails(StaleHandleError):
+        with board_fails(errors.StaleHandleError):
             cluster.run(frame())
         cluster.reopen(1)
         assert outcome(cluster.run(frame())) == expected(parts, frame())
@@ -308,7 +294,7 @@ def test_another_image_is_refused_with_both_hashes(boards):
 def test_a_held_board_is_refused(boards):
     parts = images(60, (3, 2))
     with MiniCluster.open(endpoints_of(boards), parts) as cluster:
-        with board_fails(HeldError) as caught:
+        with board_fails(errors.HeldError) as caught:
             MiniCluster.open(endpoints_of(boards), parts)
         assert caught.value.exit_code == 5
         assert outcome(cluster.run(frame())) == expected(parts, frame())
@@ -330,7 +316,7 @@ ONE, TWO = images(1, (3, 2))
     ],
 )
 def test_images_that_are_not_the_parts_of_one_model_are_refused(parts, endpoints):
-    with pytest.raises(ImageMismatchError):
+    with pytest.raises(errors.ImageMismatchError):
         MiniCluster.open([f"unix:/tmp/{name}.sock" for name in endpoints], parts)
 
 
@@ -367,13 +353,13 @@ OWN = {"stop": "own"}
 @pytest.mark.parametrize(
     ("kind", "error", "on_opening"),
     [
-        ("drop", LinkTimeoutError, True), ("stall", LinkTimeoutError, True),
-        ("never-done", LinkTimeoutError, False), ("endless", LinkTimeoutError, True),
-        ("short-read", FramingError, True), ("wrong-sequence", FramingError, True),
-        ("wrong-crc", FramingError, True), ("done-twice", FramingError, False),
-        ("done-early", FramingError, False), ("stale-result", FramingError, False),
-        ("all-ones", DeviceGoneError, True), ("no-results", ShortReadError, False),
-        ("more-results", ShortReadError, False), ("reset-after-done", SequenceError, False),
+        ("drop", errors.LinkTimeoutError, True), ("stall", errors.LinkTimeoutError, True),
+        ("never-done", errors.LinkTimeoutError, False), ("endless", errors.LinkTimeoutError, True),
+        ("short-read", errors.FramingError, True), ("wrong-sequence", errors.FramingError, True),
+        ("wrong-crc", errors.FramingError, True), ("done-twice", errors.FramingError, False),
+        ("done-early", errors.FramingError, False), ("stale-result", errors.FramingError, False),
+        ("all-ones", errors.DeviceGoneError, True), ("no-results", errors.ShortReadError, False),
+        ("more-results", errors.ShortReadError, False), ("reset-after-done", errors.SequenceError, False),
     ],
 )  # fmt: skip
 def test_a_misbehaving_board_fails_the_frame_and_comes_back(start_board, clock, kind, error, on_opening):
@@ -384,14 +370,14 @@ def test_a_misbehaving_board_fails_the_frame_and_comes_back(start_board, clock, 
     with MiniCluster.open(endpoints_of(boards), parts, timeout=PATIENCE) as cluster:
         assert outcome(cluster.run(frame(**OWN))) == expected(parts, frame(**OWN))
         link = cluster._boards[0].link
-        silent = error is LinkTimeoutError
+        silent = error is errors.LinkTimeoutError
         with board_fails(error) as caught:
             run_past_the_deadline(cluster, frame(**OWN), clock) if silent else cluster.run(frame(**OWN))
         assert (caught.value.board, caught.value.exit_code) == (1, 5)
         assert [cluster.is_open(at) for at in (0, 1)] == [True, False]
         if silent:  # meanwhile the others have finished, so their links stay
             assert cluster._boards[0].link is link
-        with board_fails(LinkClosedError):
+        with board_fails(errors.LinkClosedError):
             cluster.run(frame(**OWN))
         cluster.reopen(1, timeout=PATIENCE)
         for given_frame in (frame(bank=3, **OWN), frame(bank=3)):
@@ -401,13 +387,13 @@ def test_a_misbehaving_board_fails_the_frame_and_comes_back(start_board, clock, 
 
 
 def refuse_on_opening(board, error):
-    limit = 0.2 if error is LinkTimeoutError else PATIENCE
+    limit = 0.2 if error is errors.LinkTimeoutError else PATIENCE
     with board_fails(error):
         MiniCluster.open([board.endpoint], images(1, (3,)), timeout=limit)
 
 
 def test_a_board_of_another_register_map_is_refused(start_board):
-    refuse_on_opening(start_board(misbehave="wrong-map"), GreetingMismatchError)
+    refuse_on_opening(start_board(misbehave="wrong-map"), errors.GreetingMismatchError)
 
 
 @pytest.mark.parametrize("words", [-1, 0, 1])
@@ -417,7 +403,7 @@ def test_an_interrupt_has_exactly_the_results_of_its_board(words):
     status = in_field(rm.STATUS_STATE_MASK, BoardState.DONE)
     status |= in_field(rm.STATUS_STOP_REASON_MASK, StopReason.OVERFLOW)
     done = Done(board.number, status, 9, 100, memoryview(bytes(4 * (3 + words))))
-    with pytest.raises(ShortReadError) if words else contextlib.nullcontext():
+    with pytest.raises(errors.ShortReadError) if words else contextlib.nullcontext():
         board._take(done)
     assert board.waiting is bool(words)
 
@@ -450,7 +436,7 @@ def test_a_failure_in_a_later_slice(start_board, clock):
     parts = images(70, (3, 2), zeros=0.0, counter_bits=16)
     slow = frame(5, 8, target_count=500, max_cycles=100000)
     with MiniCluster.open(endpoints_of(boards), parts, timeout=PATIENCE) as cluster:
-        with board_fails(LinkTimeoutError):
+        with board_fails(errors.LinkTimeoutError):
             run_past_the_deadline(cluster, slow, clock, slices=1)
         cluster.reopen(1)
         assert outcome(cluster.run(slow)) == expected(parts, slow)
@@ -461,11 +447,11 @@ def test_a_board_that_ends_is_gone_and_its_successor_is_programmed(boards, start
     with MiniCluster.open(endpoints_of(boards), parts, timeout=PATIENCE) as cluster:
         cluster.run(frame())
         boards[0].stop()
-        with board_fails(LinkClosedError):
+        with board_fails(errors.LinkClosedError):
             cluster.run(frame())
-        with board_fails(LinkUnreachableError):
+        with board_fails(errors.LinkUnreachableError):
             cluster.reopen(0, timeout=0.05)
-        with board_fails(LinkClosedError):
+        with board_fails(errors.LinkClosedError):
             cluster.run(frame())
         start_board(boards[0].endpoint)
         cluster.reopen(0)
@@ -484,12 +470,12 @@ def test_a_board_that_is_killed_while_it_computes(folder):
         cluster.post(endless)
         assert cluster._boards[1].open_link.read32(rm.STATUS) & 15 == rm.BoardState.RUNNING
         boards[1].kill()
-        with board_fails(LinkClosedError):
+        with board_fails(errors.LinkClosedError):
             run_until_it_fails(cluster)
         # the other board was computing: it was stopped, and is ready
         assert cluster.is_open(0)
         program(endpoints[0], part, timeout=PATIENCE)
-        with board_fails(LinkClosedError):
+        with board_fails(errors.LinkClosedError):
             cluster.run(FrameInput(addresses=(1,), target_count=1, max_cycles=5))
     for board in boards:
         board.terminate()
@@ -534,9 +520,9 @@ def program_behind_the_hosts_back(_, cluster):
     ("breaks", "error", "stays_open"),
     [
         (interrupt, KeyboardInterrupt, None),
-        (expect_another_number, FramingError, False),
-        (write_what_is_refused, AccessError, True),
-        (program_behind_the_hosts_back, StaleHandleError, False),
+        (expect_another_number, errors.FramingError, False),
+        (write_what_is_refused, errors.AccessError, True),
+        (program_behind_the_hosts_back, errors.StaleHandleError, False),
     ],
 )
 def test_a_frame_that_fails_leaves_boards_that_can_be_used_again(boards, breaks, error, stays_open):
@@ -589,5 +575,5 @@ def test_a_closed_cluster_runs_nothing(boards):
     cluster = MiniCluster.open(endpoints_of(boards), images(1, (3, 2)))
     cluster.close()
     cluster.close()
-    with board_fails(LinkClosedError):
+    with board_fails(errors.LinkClosedError):
         cluster.run(frame())

@@ -10,17 +10,9 @@ import threading
 
 import pytest
 
-from pcie_shim import framing
+from pcie_shim import errors, framing
 from pcie_shim import register_map as rm
 from pcie_shim.endpoint import parse_endpoint
-from pcie_shim.errors import (
-    AccessError,
-    DeviceGoneError,
-    LinkClosedError,
-    LinkTimeoutError,
-    SequenceError,
-    ShortReadError,
-)
 from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK
 from pcie_shim.register_map import ErrorCode
@@ -78,13 +70,13 @@ def refusal(code):
 
 def test_a_board_may_take_longer_to_greet_than_to_answer(folder):
     with linked(folder, greets_after=0.2, timeout=0.05, connect_timeout=PATIENCE) as (link, _):
-        with pytest.raises(LinkTimeoutError, match=r"within 0\.05 s"):
+        with pytest.raises(errors.LinkTimeoutError, match=r"within 0\.05 s"):
             link.read32(rm.ID)
         assert link.fileno() == -1
 
 
 def test_a_board_that_does_not_greet_is_not_waited_for_as_for_an_answer(folder):
-    with pytest.raises(LinkTimeoutError), linked(folder, greets_after=PATIENCE, connect_timeout=0.1):
+    with pytest.raises(errors.LinkTimeoutError), linked(folder, greets_after=PATIENCE, connect_timeout=0.1):
         pass
 
 
@@ -92,9 +84,9 @@ def test_a_board_that_does_not_greet_is_not_waited_for_as_for_an_answer(folder):
 def test_an_interrupt_without_all_its_registers_closes_the_link(folder, words):
     with linked(folder) as (link, board):
         board.sendall(interrupt(1, bytes(4 * words)))
-        with pytest.raises(ShortReadError):
+        with pytest.raises(errors.ShortReadError):
             link.receive_done()
-        with pytest.raises(LinkClosedError):
+        with pytest.raises(errors.LinkClosedError):
             link.take_done()
 
 
@@ -112,7 +104,7 @@ def test_an_interrupt_without_results_is_taken(folder):
 def test_only_an_interrupt_of_all_ones_is_from_no_device(folder, number, status, gone):
     with linked(folder) as (link, board):
         board.sendall(interrupt(1, DONE_BLOCK.pack(number, status, 0, 0)))
-        with pytest.raises(DeviceGoneError) if gone else contextlib.nullcontext():
+        with pytest.raises(errors.DeviceGoneError) if gone else contextlib.nullcontext():
             assert link.receive_done() is not None
         assert (link.fileno() == -1) is gone
 
@@ -120,7 +112,7 @@ def test_only_an_interrupt_of_all_ones_is_from_no_device(folder, number, status,
 def test_an_answer_without_a_request_closes_the_link(folder):
     with linked(folder) as (link, board):
         board.sendall(framing.encode(framing.WRITE, framing.REPLY, 1, rm.START, 0))
-        with pytest.raises(SequenceError):
+        with pytest.raises(errors.SequenceError):
             link.receive_done()
         assert link.fileno() == -1
 
@@ -130,7 +122,7 @@ def test_the_reason_that_a_board_sent_before_it_closed_is_reported(folder, code)
     with linked(folder) as (link, board):
         board.sendall(interrupt(1, DONE_BLOCK.pack(1, 5, 0, 0)) + refusal(code))
         board.close()
-        with pytest.raises(AccessError) as caught:
+        with pytest.raises(errors.AccessError) as caught:
             link.write32(rm.START, 1)
         assert caught.value.code == code
         assert link.fileno() == -1
@@ -140,7 +132,7 @@ def test_a_board_that_closes_without_a_reason_is_gone(folder):
     with linked(folder) as (link, board):
         board.sendall(interrupt(1, DONE_BLOCK.pack(1, 5, 0, 0)))
         board.close()
-        with pytest.raises(LinkClosedError) as caught:
+        with pytest.raises(errors.LinkClosedError) as caught:
             link.write32(rm.START, 1)
         assert str(link.endpoint) in str(caught.value)
         assert link.fileno() == -1
@@ -151,7 +143,7 @@ def test_an_id_of_all_ones_is_no_device(folder, address, gone):
     with linked(folder) as (link, board):
         answer = framing.encode(framing.READ, framing.REPLY, 1, address, 1, b"\xff" * 4)
         board.sendall(answer)
-        with pytest.raises(DeviceGoneError) if gone else contextlib.nullcontext():
+        with pytest.raises(errors.DeviceGoneError) if gone else contextlib.nullcontext():
             assert link.read32(address) == ALL_ONES
         assert (link.fileno() == -1) is gone
 
@@ -175,6 +167,6 @@ def test_a_board_that_reads_late_gets_everything(folder, blocking):
 def test_a_board_that_never_reads_is_given_up(folder, blocking):
     with linked(folder, timeout=0.05, connect_timeout=PATIENCE) as (link, _):
         os.set_blocking(link.fileno(), blocking)
-        with pytest.raises(LinkTimeoutError, match=r"did not accept the data within 0\.05 s"):
+        with pytest.raises(errors.LinkTimeoutError, match=r"did not accept the data within 0\.05 s"):
             link.post([(rm.INPUTS, bytes(4 * rm.INPUTS.words))] * 1000)
         assert link.fileno() == -1

@@ -8,15 +8,9 @@ import numpy as np
 import pytest
 
 from machines.kind import BoardResult
+from services import errors
 from services.boards.frames import encode_boards
 from services.child import RESTARTS
-from services.errors import (
-    BoardFailedError,
-    OverflowedQueueError,
-    ReportedError,
-    RosbridgeLostError,
-    VariableError,
-)
 from services.master.flow import MOST_AT_PUBLISHER, QUEUE_ALL_DEPTH, REMEMBERED, Latencies
 from services.pipeline.inference import infer, report_of
 from services.sockets.records import (
@@ -175,7 +169,7 @@ async def test_too_many_readings_end_the_run(run):
         computed(run)
     assert [each.addresses for each in run.app.records] == [[0], [1], [2], [3]]
     run.read(4)
-    assert isinstance(run.error, OverflowedQueueError)
+    assert isinstance(run.error, errors.OverflowedQueueError)
     assert run.error.exit_code == 6
     assert run.lost == {}
 
@@ -216,7 +210,7 @@ async def test_only_a_board_that_fails_again_and_again_ends_the_run(run, reason)
     assert run.lost == {LossReason.FAILED: RESTARTS}
     assert run.error is None
     failed(run, reason)
-    assert isinstance(run.error, BoardFailedError) is (reason is FailureReason.FAILED)
+    assert isinstance(run.error, errors.BoardFailedError) is (reason is FailureReason.FAILED)
     assert len(run.app.frames) == RESTARTS + (2 if run.error is None else 1)
 
 
@@ -230,7 +224,7 @@ async def test_boards_that_fail_seldom_do_not_end_the_run(boat, monkeypatch):
             assert run.error is None
             failed(run, FailureReason.FAILED)
         now[0] += 5.1 if count == RESTARTS and now[0] < 105 else 0.0
-    assert isinstance(run.error, BoardFailedError)
+    assert isinstance(run.error, errors.BoardFailedError)
     assert str(run.error).endswith(f"; {RESTARTS + 1} frames failed on boards within 5 s")
 
 
@@ -272,10 +266,10 @@ async def test_one_cause_of_a_biased_posterior_and_of_none_has_two_warnings(run)
 @pytest.mark.parametrize(
     ("end", "error", "code"),
     [
-        (lambda run: run.take(run.subscriber, Unusable("a", "D1 is missing")), VariableError, 4),
-        (failed, ReportedError, 5),
-        (lambda run: published(run, 1, Outcome.NO_POSTERIOR), VariableError, 4),
-        (lambda run: published(run, 1, Outcome.ROSBRIDGE_AWAY), RosbridgeLostError, 3),
+        (lambda run: run.take(run.subscriber, Unusable("a", "D1 is missing")), errors.VariableError, 4),
+        (failed, errors.ReportedError, 5),
+        (lambda run: published(run, 1, Outcome.NO_POSTERIOR), errors.VariableError, 4),
+        (lambda run: published(run, 1, Outcome.ROSBRIDGE_AWAY), errors.RosbridgeLostError, 3),
     ],
     ids=["unusable", "failed", "no posterior", "rosbridge away"],
 )

@@ -14,15 +14,7 @@ from services.boards.frames import BoardAwayError
 from services.pipeline import pcie_app
 from services.pipeline.pcie_app import PcieApp
 from services.settings import Settings
-from services.sockets.records import (
-    FailureReason,
-    FrameFailed,
-    FrameRequest,
-    FrameResult,
-    Notice,
-    Ready,
-    Trouble,
-)
+from services.sockets import records
 from tests.patience import PATIENCE
 
 OUTPUT = SimpleNamespace(boards=[], compute_ns=2)
@@ -96,18 +88,20 @@ class Stage:
 @pytest.fixture
 async def stage(link, monkeypatch):
     monkeypatch.setattr(pcie_app, "TICK", 0.005)
-    monkeypatch.setattr(pcie_app, "result_record", lambda number, _: FrameResult(number, None, 1, 2, 3, 4))
+    monkeypatch.setattr(
+        pcie_app, "result_record", lambda number, _: records.FrameResult(number, None, 1, 2, 3, 4)
+    )
     link.masters = 1
     stage = Stage(link)
     assert not stage.app.status().ready
-    await stage.sent(Ready)
+    await stage.sent(records.Ready)
     yield stage
     stage.task.cancel()
     await asyncio.wait([stage.task])
 
 
 def frame(number):
-    return FrameRequest(number, [1], 0)
+    return records.FrameRequest(number, [1], 0)
 
 
 async def test_a_frame_is_computed(stage):
@@ -115,7 +109,7 @@ async def test_a_frame_is_computed(stage):
         stage.link.take(frame(number))
         stage.boards.finish(None)  # one board of several
         stage.boards.finish()
-        assert (await stage.sent(FrameResult, number))[-1].number == number
+        assert (await stage.sent(records.FrameResult, number))[-1].number == number
     status = stage.app.status()
     assert (status.ready, status.frames.received, status.frames.completed) == (True, 2, 2)
     assert (status.frames.last_number, status.frames.lost) == (2, {})
@@ -129,25 +123,25 @@ async def test_a_master_gets_no_result_of_a_former_one(stage):
     assert stage.boards.frames == [1]  # the boards are busy
     stage.boards.finish()
     await stage.link.until(lambda: stage.boards.frames == [1, 1])
-    assert not stage.link.of(FrameResult)
+    assert not stage.link.of(records.FrameResult)
     stage.boards.finish()
-    await stage.sent(FrameResult)
+    await stage.sent(records.FrameResult)
 
 
 async def test_a_board_that_fails_is_recovered(stage):
     stage.link.take(frame(1))
     stage.boards.finish(BoardError("board 2 died", board=2))
-    (failed,) = await stage.sent(FrameFailed)
-    assert (failed.number, failed.board, failed.reason) == (1, 2, FailureReason.FAILED)
+    (failed,) = await stage.sent(records.FrameFailed)
+    assert (failed.number, failed.board, failed.reason) == (1, 2, records.FailureReason.FAILED)
     assert stage.app.status().why == "board 2 died"
     stage.link.take(frame(2))
-    assert (await stage.sent(FrameFailed, 2))[1].reason is FailureReason.AWAY
+    assert (await stage.sent(records.FrameFailed, 2))[1].reason is records.FailureReason.AWAY
     assert stage.app.status().frames.lost == {"failed on a board": 2}
     stage.boards.recovers = [[2]]
-    await stage.sent(Notice)
+    await stage.sent(records.Notice)
     stage.link.take(frame(3))
     stage.boards.finish()
-    assert (await stage.sent(FrameResult))[0].number == 3
+    assert (await stage.sent(records.FrameResult))[0].number == 3
 
 
 async def test_a_board_that_is_late_fails_its_frame(stage):
@@ -156,7 +150,7 @@ async def test_a_board_that_is_late_fails_its_frame(stage):
     os.write(stage.boards._write, b"xx")
     stage.app._unwatch()  # nothing arrives from the board
     stage.boards.is_late = True
-    await stage.sent(FrameFailed)
+    await stage.sent(records.FrameFailed)
 
 
 @pytest.mark.parametrize(
@@ -171,4 +165,4 @@ async def test_an_error_that_no_wait_can_mend_ends_the_service(stage, error):
         stage.boards.recovers = [error]
     with pytest.raises(type(error)):
         await asyncio.wait_for(stage.task, PATIENCE)
-    assert (await stage.sent(Trouble))[0].exit_code == error.exit_code
+    assert (await stage.sent(records.Trouble))[0].exit_code == error.exit_code

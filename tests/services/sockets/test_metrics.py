@@ -10,27 +10,17 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from services.errors import SettingsError
 from services.settings import load_settings
+from services.sockets import status
 from services.sockets.reporting import check_metrics, serve_status, serve_status_in_thread, shifted
-from services.sockets.status import (
-    BUCKETS_S,
-    BoardStatus,
-    ConnectionStatus,
-    FrameCounts,
-    HubStatus,
-    PeerStatus,
-    ProcessStatus,
-    StageLatency,
-    read_process_status,
-)
 from terminal.health import status_socket
 from tests.patience import PATIENCE
 
-STATUS = ProcessStatus(
+STATUS = status.ProcessStatus(
     ready=True,
     why="results flow",
     deployment="ab" * 32,
-    connections=[ConnectionStatus('ws://robot"\n:9090', "connected", 2)],
-    frames=FrameCounts(
+    connections=[status.ConnectionStatus('ws://robot"\n:9090', "connected", 2)],
+    frames=status.FrameCounts(
         received=120,
         completed=100,
         lost={"passed over": 19},
@@ -38,12 +28,17 @@ STATUS = ProcessStatus(
         last_age_s=0.2,
         without={"/t": 1},
     ),
-    boards=[BoardStatus(index=1, endpoint="unix:/b", state="gone", restarts=3)],
-    peers=[PeerStatus(name="pcie-app", endpoint="unix:/p", pid=1, restarts=4, ready=True)],
-    hub=HubStatus(3, 5, 7),
+    boards=[status.BoardStatus(index=1, endpoint="unix:/b", state="gone", restarts=3)],
+    peers=[status.PeerStatus(name="pcie-app", endpoint="unix:/p", pid=1, restarts=4, ready=True)],
+    hub=status.HubStatus(3, 5, 7),
 )
-STAGE = StageLatency(
-    stage="frame", p50_ms=1.5, p99_ms=9, frames=3, sum_s=0.5, buckets=[1, *[0] * (len(BUCKETS_S) - 1), 2]
+STAGE = status.StageLatency(
+    stage="frame",
+    p50_ms=1.5,
+    p99_ms=9,
+    frames=3,
+    sum_s=0.5,
+    buckets=[1, *[0] * (len(status.BUCKETS_S) - 1), 2],
 )
 
 
@@ -108,7 +103,7 @@ async def test_a_running_loop_is_scraped_and_a_client_that_resets_prints_nothing
 async def test_an_occupied_port_does_not_end_the_run(tmp_path, port, capsys):
     with socket.create_server(("127.0.0.1", port)):
         async with serve_status(tmp_path, "hub", lambda: STATUS, metrics=str(port)):
-            assert (await read_process_status(status_socket(tmp_path, "hub"), PATIENCE)).ready
+            assert (await status.read_process_status(status_socket(tmp_path, "hub"), PATIENCE)).ready
     assert capsys.readouterr().err.count("warning") == 1
 
 

@@ -15,19 +15,8 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from bridge import stamps
+from bridge import errors, stamps
 from bridge.client import Message, State, connect
-from bridge.errors import (
-    ConcurrentReadError,
-    DecodeError,
-    DisconnectedError,
-    EncodeError,
-    NoMessageError,
-    OptionError,
-    ServiceError,
-    SlowPeerError,
-    WrongThreadError,
-)
 from bridge.qos import Qos
 from tests.bridge.client.stand_ins import give_up
 from tests.bridge.hub.sockets import until
@@ -52,7 +41,7 @@ async def test_a_message_goes_round(fake, ros):
     await fake.wait_for_op("unsubscribe", topic="/a")
     await fake.wait_for_op("unadvertise", topic="/a")
     assert len(fake.ops("unsubscribe")) == 1
-    with pytest.raises(DisconnectedError):
+    with pytest.raises(errors.DisconnectedError):
         await publication.publish({})
 
 
@@ -84,7 +73,7 @@ async def test_messages_of_one_moment_leave_in_one_piece(fake, ros):
     with ros.together():
         await one.publish({"n": 4})
         await ros.close()
-    with ros.together(), pytest.raises(DisconnectedError):
+    with ros.together(), pytest.raises(errors.DisconnectedError):
         await one.publish({"n": 5})
 
 
@@ -92,7 +81,7 @@ async def test_a_connection_that_is_about_to_end_takes_no_message(fake, ros):
     publication = await ros.advertise("/a", "p/T")
     ros._session._websocket.abort()  # what the watchdog does; the end is reported in a later turn of the loop
     assert publication.must_wait
-    with pytest.raises(DisconnectedError):
+    with pytest.raises(errors.DisconnectedError):
         publication.publish_nowait({"n": 1})
     ros.subscribe("/b", "p/T")
 
@@ -103,20 +92,20 @@ async def test_a_message_that_need_not_wait_does_not(fake, ros):
     assert not publication.must_wait
     publication.publish_nowait({"n": 1})
     assert (await fake.wait_for_op("publish", topic="/a"))["msg"] == {"n": 1}
-    with pytest.raises(EncodeError, match="a message of /a cannot be published: n is NaN"):
+    with pytest.raises(errors.EncodeError, match="a message of /a cannot be published: n is NaN"):
         publication.publish_nowait({"n": math.nan})
     await closed.close()
-    with pytest.raises(DisconnectedError, match="^/a "):
+    with pytest.raises(errors.DisconnectedError, match="^/a "):
         closed.publish_nowait({})
     await ros.close()
     assert publication.must_wait
-    with pytest.raises(DisconnectedError):
+    with pytest.raises(errors.DisconnectedError):
         publication.publish_nowait({})
-    with pytest.raises(DisconnectedError):
+    with pytest.raises(errors.DisconnectedError):
         await publication.publish({})
-    with pytest.raises(DisconnectedError):
+    with pytest.raises(errors.DisconnectedError):
         ros.subscribe("/a")
-    with pytest.raises(DisconnectedError):
+    with pytest.raises(errors.DisconnectedError):
         await ros.advertise("/b", "p/T")
 
 
@@ -131,12 +120,12 @@ async def test_iteration_ends_with_the_subscription_or_the_client():
             await fake.wait_for_op("subscribe")
             await fake.publish("/a", {"n": 1})
             await fake.publish("/a", {"n": 2})
-            with pytest.raises(ServiceError):
+            with pytest.raises(errors.ServiceError):
                 await ros.call("/answers/after/the/messages")
             await one.close()
             assert await asyncio.wait_for(readers[0], PATIENCE) == [1, 2]
         assert await asyncio.wait_for(readers[1], PATIENCE) == [1, 2]
-        with pytest.raises(DisconnectedError, match="/a is closed"):
+        with pytest.raises(errors.DisconnectedError, match="/a is closed"):
             await two.next(1)
 
 
@@ -152,7 +141,7 @@ async def test_what_was_published_before_the_end_still_goes_out():
 
 async def test_an_empty_queue_is_refused(fake, ros):
     for want in (ros.subscribe, ros.advertise):
-        with pytest.raises(OptionError):
+        with pytest.raises(errors.OptionError):
             await want("/a", "p/T", queue_size=0)
     ros.subscribe("/a", "p/T", queue_size=1)
     await fake.wait_for_op("subscribe")
@@ -182,9 +171,9 @@ async def test_a_second_reader_of_a_subscription_gets_an_error(fake, ros):
         await given_up
     first = asyncio.create_task(subscription.next(0.3))
     await asyncio.sleep(0)
-    with pytest.raises(ConcurrentReadError, match="/a"):
+    with pytest.raises(errors.ConcurrentReadError, match="/a"):
         await subscription.next(3600)
-    with pytest.raises(NoMessageError):  # at its own time, not at the other's
+    with pytest.raises(errors.NoMessageError):  # at its own time, not at the other's
         await asyncio.wait_for(first, PATIENCE)
     await fake.wait_for_op("subscribe")
     await fake.publish("/a", {"n": 1})
@@ -214,12 +203,12 @@ async def test_each_wait_ends_at_its_own_time(fake, ros, monkeypatch):
     assert not waiting.done()
     now[0] += 300
     subscription._ring()
-    with pytest.raises(NoMessageError, match="within 1000 s"):
+    with pytest.raises(errors.NoMessageError, match="within 1000 s"):
         await waiting
     await hear(await begin(subscription.next(600)))  # its alarm is far away
     waiting = await begin(subscription.next(0.01))
     now[0] += 0.01
-    with pytest.raises(NoMessageError, match="within 0.01 s"):
+    with pytest.raises(errors.NoMessageError, match="within 0.01 s"):
         await waiting
     await hear(await begin(subscription.next(700)))  # its alarm rings while nobody has a limit
     waiting = await begin(anext(subscription))
@@ -249,7 +238,7 @@ async def test_only_a_reader_of_prompt_answers_busy_waits_and_not_for_long(fake,
         nonlocal now
         waiting = asyncio.create_task(subscription.next(1000))
         await asyncio.sleep(0)
-        with pytest.raises(ConcurrentReadError):
+        with pytest.raises(errors.ConcurrentReadError):
             await subscription.next(1000)
         busy = await is_busy()
         now += delay
@@ -284,7 +273,7 @@ async def test_only_a_reader_of_prompt_answers_busy_waits_and_not_for_long(fake,
 async def test_a_topic_that_nobody_publishes_is_named(fake, ros, prepare, said):
     if prepare:
         fake.know("/quiet", prepare)
-    with pytest.raises(NoMessageError) as caught:
+    with pytest.raises(errors.NoMessageError) as caught:
         await asyncio.wait_for(ros.subscribe("/quiet", "p/T").next(0.1), PATIENCE)
     what, _, why = str(caught.value).partition("; ")
     assert all(part in what for part in ("/quiet", fake.uri, "0.1 s"))
@@ -298,11 +287,11 @@ async def test_what_the_server_says_about_it_is_passed_on(ros):
     waiting = asyncio.create_task(subscription.next(3600))
     await until(lambda: ros.statuses)
     give_up(subscription)
-    with pytest.raises(NoMessageError, match="type is required: /a is not known$"):
+    with pytest.raises(errors.NoMessageError, match="type is required: /a is not known$"):
         await waiting
     assert {status.level for status in ros.statuses} == {"error"}  # it may have been asked again
     # A status message before a wait does not concern that wait.
-    with pytest.raises(NoMessageError, match=r"within 0\.1 s$"):
+    with pytest.raises(errors.NoMessageError, match=r"within 0\.1 s$"):
         await ros.subscribe("/b", "p/T").next(0.1)
 
 
@@ -435,20 +424,20 @@ async def test_a_server_that_takes_nothing_more(fake, ros):
             await publication.publish(big, timeout=0.2)
             sent += 1
 
-    with pytest.raises(SlowPeerError, match="/a") as caught:
+    with pytest.raises(errors.SlowPeerError, match="/a") as caught:
         await flood()
     assert caught.value.exit_code == 3
     assert 0 < sent < 100, "what waits here is bounded"
     waiting = [asyncio.create_task(publication.publish({"n": n}, timeout=PATIENCE)) for n in range(4)]
     await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
-    with pytest.raises(SlowPeerError, match="3 messages of /a "):
+    with pytest.raises(errors.SlowPeerError, match="3 messages of /a "):
         await waiting[3]
-    with pytest.raises(SlowPeerError, match="a call of /s"):
+    with pytest.raises(errors.SlowPeerError, match="a call of /s"):
         await ros.call("/s", timeout=0.1)
     assert publication.must_wait
-    with pytest.raises(SlowPeerError, match="a message of /a "):
+    with pytest.raises(errors.SlowPeerError, match="a message of /a "):
         publication.publish_nowait({"n": 9})
-    with pytest.raises(SlowPeerError, match="/a"):
+    with pytest.raises(errors.SlowPeerError, match="/a"):
         await publication.ready(timeout=0.1)
     fake.thaw()
     await asyncio.wait_for(asyncio.gather(*waiting[:3]), PATIENCE)
@@ -521,7 +510,7 @@ async def test_calls_from_another_thread_are_refused_and_change_nothing(fake, ro
         ros.together,
     )
     for call in calls:
-        with pytest.raises(WrongThreadError):
+        with pytest.raises(errors.WrongThreadError):
             await asyncio.to_thread(call)
     await publication.publish({"n": 1})
     await fake.wait_for_op("publish", topic="/a")
@@ -557,7 +546,7 @@ async def test_a_scan_arrives_in_every_form(hub, compression, fragment_size, arr
     else:
         msg = received.msg
         assert isinstance(msg["ranges"], np.ndarray if arrays == "numpy" else list)
-        with pytest.raises(DecodeError, match="/scan has no serialised bytes"):
+        with pytest.raises(errors.DecodeError, match="/scan has no serialised bytes"):
             _ = received.raw
     assert (msg["header"]["frame_id"], list(msg["ranges"])) == ("laser", [0.5, 1.5, 2.5])
     if compression == "cbor":
