@@ -197,16 +197,8 @@ def test_every_error_and_operation_of_a_board_is_described():
 
 
 COMMANDS = (
-    "master",
-    "subscriber",
-    "publisher",
-    "pcie_app",
-    "board",
-    "loader",
-    "hub",
-    "listen",
-    "dashboard",
-    "status",
+    *("master", "subscriber", "publisher", "pcie_app", "board", "loader", "hub", "listen"),
+    *("dashboard", "status"),
 )
 OTHERS = {"hub": {"ros_version", "message_bytes"}, "board": {"boards"}}
 """Flags of a command that are not settings, but have the name of one."""

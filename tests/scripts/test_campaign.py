@@ -7,6 +7,7 @@ import pytest
 from scripts.campaigning.accounts import FAILED, PASSED_OVER, Counters, Excuses, judge
 from scripts.campaigning.expected import BANKS, LINES, BoardOutcome, Outcome
 from scripts.campaigning.observer import DEPLOYMENT, Flaw, Observer
+from tests.posteriors.messages import status
 
 HALF = LINES // 2
 
@@ -25,27 +26,16 @@ def stamp(index):
     return 1_700_000_000 * 10**9 + index
 
 
-def status(name, message, **values):
-    pairs = [{"key": key, "value": str(value)} for key, value in values.items()]
-    return {"hardware_id": name, "level": 0, "message": message, "values": pairs}
-
-
 def report(index, number, tables=0):
     boards = outcome((index, index), number % BANKS, tables).boards
     sums = {"cycles": max(each.cycles for each in boards), "counts_total": sum(each.total for each in boards)}
     secs, nsecs = divmod(stamp(index), 10**9)
-    return {
-        "header": {"stamp": {"secs": secs, "nsecs": nsecs}},
-        "status": [
-            status(DEPLOYMENT, "posterior", number=number, published="true", **sums),
-            *(
-                status(
-                    f"board{at}", each.reason, cycles=each.cycles, counts_total=each.total, reason=each.reason
-                )
-                for at, each in enumerate(boards)
-            ),
-        ],
-    }
+    boards = [
+        status("", each.reason, f"board{at}", cycles=each.cycles, counts_total=each.total, reason=each.reason)
+        for at, each in enumerate(boards)
+    ]
+    frame = status("", "posterior", DEPLOYMENT, number=number, published="true", **sums)
+    return {"header": {"stamp": {"secs": secs, "nsecs": nsecs}}, "status": [frame, *boards]}
 
 
 def result(index, number, tables=0):

@@ -22,7 +22,7 @@ from posteriors.posterior import Posterior
 from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
-from tests.posteriors.messages import status
+from tests.posteriors.messages import posterior_message, report_message
 
 DRY, WET = 0, 1
 
@@ -142,28 +142,13 @@ class FakeStack:
         values = {"number": self.number, "published": "true", "effective_samples": "50.0", "sent_ns": 1}
         dims = [{"label": "sample", "size": len(samples), "stride": samples.size}]
         dims.append({"label": "byte", "size": samples.shape[1], "stride": samples.shape[1]})
+        data = base64.b64encode(samples.tobytes()).decode()
+        result = posterior_message([1 - rain, rain], 2)
+        result["layout"]["dim"][0]["label"] = "R"
         messages = {
-            "frame": (
-                "/bm/frame",
-                {
-                    "header": {"stamp": stamp, "frame_id": "bm"},
-                    "status": [status("frame", "samples", **values)],
-                },
-            ),
-            "samples": (
-                "/bm/samples",
-                {
-                    "layout": {"dim": dims, "data_offset": 0},
-                    "data": base64.b64encode(samples.tobytes()).decode(),
-                },
-            ),
-            "result": (
-                "/BMresults",
-                {
-                    "layout": {"dim": [{"label": "R", "size": 2, "stride": 2}], "data_offset": 0},
-                    "data": [1 - rain, rain],
-                },
-            ),
+            "frame": ("/bm/frame", report_message(stamp, "samples", **values)),
+            "samples": ("/bm/samples", {"layout": {"dim": dims, "data_offset": 0}, "data": data}),
+            "result": ("/BMresults", result),
         }
         for each in sent:
             await self.fake.publish(*messages[each])

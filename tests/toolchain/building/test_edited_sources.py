@@ -16,27 +16,14 @@ from pcie_shim.programming_file import image_bytes, read_image
 from pcie_shim.register_layout import next_doorbell
 from pcie_shim.register_map import ErrorCode
 from services.boards.hardware import Engine, SimulatedHardware
+from tests.toolchain.building import test_regenerate
 from tests.toolchain.running import TARGET, assert_refused, contents, done, toolchain
 from toolchain.building.edited_sources import regenerate_images
 from toolchain.checks.check import check_deployment
 from toolchain.deployment import load_deployment
 from toolchain.outputs import output_files
 
-MODEL = """
-import numpy as np
-from toolchain.models import *
-
-def model(sigma: float = 1.0):
-    place = Symbol("x", IntervalType(0, 10, 8))
-    one = Symbol("D1", IntegerType(0, 11), path="data[0]", on_range="clamp")
-    two = Symbol("D2", IntegerType(0, 11), path="data[1]", on_range="clamp")
-    joint = JointDistribution("small", (
-        uniform(place),
-        conditional_normal(one, [place], mean=lambda x: x, sigma=sigma, floor=0.05),
-        conditional_normal(two, [place], mean=lambda x: 10 - x, sigma=2.0, floor=0.05),
-    ))
-    return joint.ask(searched=[place], known=[one, two])
-"""
+MODEL = test_regenerate.MODEL
 COLUMN = "bm_arch/Memory_MIFs/board1_column2.mif"
 PARAMETERS = "bm_arch/bm1_parameters.vhd"
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from machines.bm2 import BM2Machine, BM2Parameters, pack, unpack
 from machines.rng import LFSR
 from tests.toolchain.chains import network, sprinkler
+from tests.toolchain.checks.test_check import found, only
 from tests.toolchain.running import OPTIONS
 from toolchain.building.bm2_machine import clipped, plan_bm2
 from toolchain.building.build import assemble
@@ -27,15 +28,6 @@ def checked(model, *, samples=10_000, known_model=True, **options):
     built = assemble(plan_bm2(model, replace(OPTIONS, target_count=samples, **options)))
     chain = CheckedChain(built.deployment, built.images[0].machine, model if known_model else None)
     return list(chain_findings(chain))
-
-
-def found(findings, check):
-    return [finding for finding in findings if finding.check == check]
-
-
-def only(findings, check):
-    (finding,) = found(findings, check)
-    return finding
 
 
 def gate(**options):
