@@ -160,13 +160,8 @@ def decided(values, *dimensions, why="", replicas=1):
     row = None if values is None else np.array(values, float)
     statuses = decision_statuses(row, deployment, why=why, number=7, age_ms=2.34)
     return [
-        (
-            each["name"],
-            each["level"],
-            each["message"],
-            {pair["key"]: pair["value"] for pair in each["values"]},
-        )
-        for each in statuses
+        (one["name"], one["level"], one["message"], {pair["key"]: pair["value"] for pair in one["values"]})
+        for one in statuses
     ]
 
 

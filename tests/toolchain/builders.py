@@ -35,22 +35,14 @@ def corridor(cells=12, *, sigma=1.0, select=False, missing=False):
     place = interval("x", 0.0, 10.0, cells=cells)
     (x,) = cell_centres(place)
     loud = 0.05 + 0.9 * np.exp(-x / 3)
+    on_missing = "missing" if missing else "error"
     rows = np.stack([np.exp(-x / 4), np.exp(x / 4), np.ones(cells)])
     return Model(
         name="corridor",
         searched=(place,),
         known=(
-            normal(
-                "range",
-                mean=x,
-                sigma=sigma,
-                values=21,
-                step=0.5,
-                on_missing="missing" if missing else "error",
-            ),
-            Known(
-                name="loud", table=np.array([1 - loud, loud]), on_missing="missing" if missing else "error"
-            ),
+            normal("range", mean=x, sigma=sigma, values=21, step=0.5, on_missing=on_missing),
+            Known(name="loud", table=np.array([1 - loud, loud]), on_missing=on_missing),
         ),
         prior_select=PriorSelect(name="door", table=rows / rows.sum(axis=1, keepdims=True))
         if select

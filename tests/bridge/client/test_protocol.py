@@ -250,12 +250,7 @@ def test_calls_are_bounded_and_they_and_requests_end_with_the_connection():
 @pytest.mark.parametrize(
     ("operation", "level", "text", "of"),
     [
-        (
-            {"level": "error", "msg": "bad type", "id": "advertise:/a:1"},
-            "error",
-            "bad type",
-            "advertise:/a:1",
-        ),
+        ({"level": "error", "msg": "bad type", "id": "publish:/a:1"}, "error", "bad type", "publish:/a:1"),
         ({"level": "info", "msg": {"a": 1}}, "info", '{"a":1}', ""),
         ({}, "error", "", ""),
     ],

@@ -20,6 +20,7 @@ def peer(hub):
 
 _NOTHING = {"publishing": [], "subscribing": [], "services": []}
 _SECONDS, _NANOSECONDS = divmod(WALL_CLOCK, 10**9)
+_TIME = dict.fromkeys(("secs", "sec"), _SECONDS) | dict.fromkeys(("nsecs", "nanosec"), _NANOSECONDS)
 
 
 @pytest.mark.parametrize(
@@ -54,14 +55,7 @@ _SECONDS, _NANOSECONDS = divmod(WALL_CLOCK, 10**9)
         ("get_param", {"name": "/p"}, {"value": "null"}),
         ("get_param", {"name": "/p", "default": "[1]"}, {"value": "[1]"}),
         ("get_ros_version", {}, {"version": 1, "distro": "hub"}),
-        (
-            "get_time",
-            {},
-            {
-                "time": dict.fromkeys(("secs", "sec"), _SECONDS)
-                | dict.fromkeys(("nsecs", "nanosec"), _NANOSECONDS)
-            },
-        ),
+        ("get_time", {}, {"time": _TIME}),
         (
             "topics",
             {},

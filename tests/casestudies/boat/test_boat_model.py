@@ -195,11 +195,7 @@ def test_a_boat_that_is_driven_follows_the_velocity_for_a_second_and_stays_on_th
     boat.sail(1.0)
     boat.drive(-5.0, 0.0)
     boat.sail(1.0)
-    assert (boat.x, boat.y, boat.heading) == (
-        pytest.approx(10),
-        pytest.approx(-5),
-        pytest.approx(math.pi / 2),
-    )
+    assert (boat.x, boat.y, boat.heading) == pytest.approx((10, -5, math.pi / 2))
     boat.drive(1e300, 0.0)  # no faster than its speed
     boat.sail(0.5)
     assert boat.y == pytest.approx(25)
@@ -304,14 +300,8 @@ def test_a_missing_reading_stays_missing(missing):
     rest = {name: value for name, value in RAW.items() if name != "B2"}
     whole = normalise(sensors.read_raw({"header": HEAD, **rest, **missing}, array=False)[0])
     assert whole == (2, 0, 100, 0, None, 270)
-    assert list(sensors.readings_message(whole, HEAD, array=False)) == [
-        "header",
-        "D1",
-        "D2",
-        "D3",
-        "B1",
-        "B3",
-    ]
+    named = sensors.readings_message(whole, HEAD, array=False)
+    assert list(named) == ["header", "D1", "D2", "D3", "B1", "B3"]
     data = [missing.get(name, RAW[name]) if name != "B2" else missing.get("B2") for name in RAW]
     again = normalise(sensors.read_raw({"data": data}, array=True)[0])
     assert sensors.readings_message(again, None, array=True)["data"] == [2.0, 0.0, 100.0, 0.0, None, 270.0]

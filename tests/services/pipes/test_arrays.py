@@ -46,12 +46,9 @@ def test_the_numbers_of_a_line(line, element, numbers):
 @pytest.mark.parametrize(
     ("line", "element"),
     [
-        *((line, "float64") for line in (b"nan", b"[NaN]", b"1e999", b"[1e999]", b"-inf", b"9" * 5000)),
-        *(
-            (line, "float64")
-            for line in (b"one two", b"1,,2", b"0,5 0,5", b"1_0", b"[]", b"[true]", b"[[1]]")
-        ),
-        *((line, "float64") for line in (b'["1"]', b"[1", b"\xff\xb2", b"[" * 10**5, b'{"data": [1]}')),
+        *((row, "float64") for row in (b"nan", b"[NaN]", b"1e999", b"[1e999]", b"-inf", b"9" * 5000)),
+        *((row, "float64") for row in (b"one two", b"1,,2", b"0,5 0,5", b"1_0", b"[]", b"[true]", b"[[1]]")),
+        *((row, "float64") for row in (b'["1"]', b"[1", b"\xff\xb2", b"[" * 10**5, b'{"data": [1]}')),
         *((b"300", "uint8"), (b"-1", "uint8"), (b"1.5", "int16"), (b"18446744073709551616", "uint64")),
         *((b"1e39", "float32"), (b"-1e39", "float"), (b"9007199254740993.0", "int64")),
     ],

@@ -259,14 +259,8 @@ BM2_FLAGS = (
 
 def test_flags_of_the_other_machine_are_refused(network):
     for flag in BM1_FLAGS:
-        assert_refused(
-            build(network, *GRASS, *flag),
-            flag[0],
-            "BM1",
-            "this is a BM2, since",
-            "grass",
-            "joins them; leave it out",
-        )
+        refused = build(network, *GRASS, *flag)
+        assert_refused(refused, flag[0], "BM1", "this is a BM2, since", "grass", "joins them; leave it out")
     for flag in BM2_FLAGS:
         fusion = build(network, "--searched", "rain", "--known", "grass", *flag)
         assert_refused(fusion, flag[0], "BM2", "this is a BM1, since", "--machine bm2")

@@ -166,19 +166,9 @@ def test_a_bm2_has_a_section_of_its_own(tmp_path):
     ("old", "new", "line", "words"),
     [
         ('sequencer = "linear"', 'sequencer = "liner"', 56, "did you mean 'linear'?"),
-        (
-            "burn_in = 1000",
-            "burn_out = 1000",
-            59,
-            "unknown key 'burn_out' in [machine]; did you mean 'burn_in'?",
-        ),
+        ("burn_in", "burn_out", 59, "unknown key 'burn_out' in [machine]; did you mean 'burn_in'?"),
         ("burn_in = 1000", "counter_bits = 8", 59, "unknown key 'counter_bits' in [machine]"),
-        (
-            'type = "BM2"',
-            'type = "BM3"',
-            52,
-            "type = 'BM3' in [machine] is not a valid value; did you mean 'BM2'?",
-        ),
+        ('"BM2"', '"BM3"', 52, "type = 'BM3' in [machine] is not a valid value; did you mean 'BM2'?"),
         (
             "line_offset = 1\nlines = 1",
             "line_offset = 1\nlines = 2",

@@ -9,7 +9,7 @@ from tests.toolchain.builders import interval, normal, wrapped_normal
 from tests.toolchain.running import OPTIONS, refused_within
 from toolchain.building.machine import partition_lines, plan_machine
 from toolchain.errors import BuildError, ModelError
-from toolchain.models.distribution import (
+from toolchain.models import (
     IntegerType,
     IntervalType,
     LabelType,

@@ -19,7 +19,7 @@ def symbols(*sizes):
     return [Symbol(name, LabelType(*"klmnopqrs"[:size])) for name, size in zip("ABCDEF", sizes, strict=False)]
 
 
-def random_table(symbol, *given):
+def some_table(symbol, *given):
     weights = RNG.random((symbol.size, *(each.size for each in given))) + 0.05
     return table(symbol, weights / weights.sum(axis=0), given=given)
 
@@ -47,14 +47,8 @@ def posterior_of(joint, searched, evidence):
 
 def test_the_posterior_of_a_network_is_that_of_the_whole_joint_distribution():
     a, b, c, d, e, f = symbols(2, 3, 4, 2, 3, 2)
-    factors = (
-        random_table(a),
-        random_table(b, a),
-        random_table(d, c, b),
-        random_table(c, a),
-        random_table(e, d),
-    )
-    joint = JointDistribution("six", (*factors, random_table(f, e, c), potential([b, e], RNG.random((3, 3)))))
+    factors = (some_table(a), some_table(b, a), some_table(d, c, b), some_table(c, a), some_table(e, d))
+    joint = JointDistribution("six", (*factors, some_table(f, e, c), potential([b, e], RNG.random((3, 3)))))
     network = joint.ask(["E", "B"], ["C", "F"], given={"D": "l"}).network()
     assert network.names == ("A", "B", "C", "E", "F")
     for scope in (term.scope for term in network.factors):
@@ -73,14 +67,7 @@ def test_only_what_matters_to_the_question_is_sampled():
         Symbol("G", LabelType("k", "l")),
     ]
     idle = table(b, [[0.3, 0.3], [0.7, 0.7]], given=[a])  # B does not depend on A
-    factors = (
-        random_table(a),
-        idle,
-        random_table(c, b, one),
-        uniform(one),
-        random_table(d, a),
-        random_table(g, b),
-    )
+    factors = (some_table(a), idle, some_table(c, b, one), uniform(one), some_table(d, a), some_table(g, b))
     network = JointDistribution("n", factors).ask(["B"], ["C"]).network()
     assert (network.names, network.cardinalities) == (("B", "C"), (2, 2))
     assert network.titles == ("P(B)", "P(C | B)")
@@ -90,7 +77,7 @@ def test_only_what_matters_to_the_question_is_sampled():
 
 def test_a_searched_variable_of_constant_factors_is_uniform():
     a, b, one = [*symbols(2, 3), Symbol("one", LabelType("x"))]
-    joint = JointDistribution("n", (uniform(one), random_table(a), potential([a, b], np.ones((2, 3)))))
+    joint = JointDistribution("n", (uniform(one), some_table(a), potential([a, b], np.ones((2, 3)))))
     network = joint.ask(["B", "one"], ["A"]).network()
     assert network.names == ("one", "A", "B")
     assert network.exact([1]) == pytest.approx([1 / 3] * 3)
