@@ -438,6 +438,14 @@ async def stage(tmp_path_factory):
     await made.end_all()
 
 
+@pytest.fixture
+async def robot(stage):
+    """A robot at a hub, which publishes whatever it is told to."""
+    _, uri = await stage.hub()
+    async with Robot(uri) as robot:
+        yield robot
+
+
 def toolchain(*arguments):
     ended = invoke(main.app, arguments)
     assert ended.exit_code == 0, ended.output

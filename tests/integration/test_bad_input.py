@@ -7,7 +7,7 @@ import pytest
 from machines import warm_up
 from services.commands import master
 from tests.command_runner import invoke
-from tests.integration.conftest import READING, Robot, build_boat, only_error
+from tests.integration.conftest import READING, build_boat, only_error
 from tests.pcie_shim.boards import ServedBoard
 
 
@@ -17,14 +17,6 @@ async def once(stage, deployment, uri, *options):
     sentence = only_error(running)
     await stage.nothing_left("hub", "board")
     return code, sentence
-
-
-@pytest.fixture
-async def server(stage):
-    """A hub, and a robot that publishes whatever it is told to."""
-    _, uri = await stage.hub()
-    async with Robot(uri) as robot:
-        yield uri, robot
 
 
 @pytest.mark.process
@@ -56,10 +48,9 @@ INCOMPLETE = {name: value for name, value in READING.items() if name not in {"D2
         ),
     ],
 )
-async def test_a_reading_without_a_result(stage, boat, server, reading, frames):
-    uri, robot = server
+async def test_a_reading_without_a_result(stage, boat, robot, reading, frames):
     await robot.keep_publishing(**reading)
-    code, sentence = await once(stage, boat, uri)
+    code, sentence = await once(stage, boat, robot.uri)
     assert code == 4, sentence
     assert frames or ["'D2'" in sentence, "'B1'" in sentence] == [True, True]
     assert robot.results == []
@@ -79,15 +70,14 @@ async def test_an_image_of_a_deployment_that_is_damaged(stage, boat, tmp_path):
 
 
 @pytest.mark.process
-async def test_a_board_that_never_says_done(stage, server, tmp_path):
+async def test_a_board_that_never_says_done(stage, robot, tmp_path):
     """One board, because no other one could be late on a slow machine."""
-    uri, robot = server
     folder = build_boat(tmp_path / "one", partitions=1)
     endpoint = f"unix:{stage.where}/b.sock"
     warm_up()
     board = ServedBoard(endpoint, misbehave="never-done")
     await robot.keep_publishing()
-    code, sentence = await once(stage, folder, uri, "--boards", endpoint, "--board-timeout", "0.3")
+    code, sentence = await once(stage, folder, robot.uri, "--boards", endpoint, "--board-timeout", "0.3")
     board.stop()
     assert (code, "board 0" in sentence.lower()) == (5, True)
 

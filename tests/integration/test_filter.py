@@ -17,7 +17,7 @@ from machines.encode import encode_probability
 from machines.kind import FrameInput
 from machines.posterior import joint_posterior
 from pcie_shim.programming_file import read_image
-from tests.integration.conftest import LOOP, Robot, build, inferred, until_subscribed
+from tests.integration.conftest import LOOP, build, inferred, until_subscribed
 from tests.pcie_shim.boards import expected
 from toolchain.deployment import load_deployment
 
@@ -59,7 +59,7 @@ def walk(frames):
 
 @pytest.mark.process
 @pytest.mark.parametrize("options", [(), ("--fused",)])
-async def test_the_stack_filters_as_a_reference_does(stage, tmp_path, options):
+async def test_the_stack_filters_as_a_reference_does(stage, robot, tmp_path, options):
     names = ", ".join(f"s{at}" for at in range(CELLS))
     start = ", ".join(map(str, START))
     text = NETWORK.format(
@@ -69,15 +69,13 @@ async def test_the_stack_filters_as_a_reference_does(stage, tmp_path, options):
     question = shlex.split("--searched place --previous before --known door,light --on-missing missing")
     folder = build(tmp_path / "ring.bif", tmp_path / "ring", *question, "--partitions", "2", "--queue", "all")
     readings = walk(40)
-    _, uri = await stage.hub()
-    async with Robot(uri) as robot:
-        master = stage.start(*LOOP, "-d", folder, "--uri", uri, "--count", str(len(readings)), *options)
-        await until_subscribed(uri, "/boat/sensors")
-        for reading in readings:
-            names = (None if at is None else states[at] for states, at in zip(STATES, reading, strict=True))
-            await robot.publish(**dict(zip(("door", "light"), names, strict=True)))
-        await robot.have(len(readings))
-        assert await master.end() == 0, master.err
+    master = stage.start(*LOOP, "-d", folder, "--uri", robot.uri, "--count", str(len(readings)), *options)
+    await until_subscribed(robot.uri, "/boat/sensors")
+    for reading in readings:
+        names = (None if at is None else states[at] for states, at in zip(STATES, reading, strict=True))
+        await robot.publish(**dict(zip(("door", "light"), names, strict=True)))
+    await robot.have(len(readings))
+    assert await master.end() == 0, master.err
     assert master.err.count("the filter begins with its start distribution") == 1
     deployment = load_deployment(folder)
     parts = [read_image(deployment.image_path(board)) for board in range(2)]

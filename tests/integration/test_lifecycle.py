@@ -17,7 +17,6 @@ from tests.integration.conftest import (
     LOOP,
     PROGRAMMED,
     READING,
-    Robot,
     endpoints_in,
     only_error,
     right_posteriors,
@@ -30,52 +29,44 @@ from tests.patience import PROCESS_PATIENCE
 
 @pytest.mark.process
 @pytest.mark.parametrize("how", ["--read-results", "--fused"])
-async def test_once_publishes_one_result_sees_it_and_ends(stage, boat, how):
+async def test_once_publishes_one_result_sees_it_and_ends(stage, robot, boat, how):
     """The result is to the bit what the machines count, so with these it is the same."""
-    _, uri = await stage.hub()
-    async with Robot(uri) as robot:
-        await robot.keep_publishing()
-        master = stage.start("master", "--once", how, "-d", str(boat), "--uri", uri, "--json")
-        assert await master.end() == 0, master.err
-        assert json.loads(master.out)["seen"] is True
-        await robot.have(1)
-        await stage.nothing_left("hub")
-        assert robot.order == ["/bm/frame", "/BMresults"]
-        assert abs(sum(robot.results[0]["data"]) - 1) < 1e-9
-        (number,) = (
-            pair["value"] for pair in robot.frames[0]["status"][0]["values"] if pair["key"] == "number"
-        )
-        right = right_posteriors(boat)
-        assert robot.results[0]["data"] == right[int(number) % len(right)].tolist()
+    await robot.keep_publishing()
+    master = stage.start("master", "--once", how, "-d", str(boat), "--uri", robot.uri, "--json")
+    assert await master.end() == 0, master.err
+    assert json.loads(master.out)["seen"] is True
+    await robot.have(1)
+    await stage.nothing_left("hub")
+    assert robot.order == ["/bm/frame", "/BMresults"]
+    assert abs(sum(robot.results[0]["data"]) - 1) < 1e-9
+    (number,) = (pair["value"] for pair in robot.frames[0]["status"][0]["values"] if pair["key"] == "number")
+    right = right_posteriors(boat)
+    assert robot.results[0]["data"] == right[int(number) % len(right)].tolist()
 
 
 @pytest.mark.process
-async def test_loop_ends_by_itself_after_count(stage, boat):
-    _, uri = await stage.hub()
-    async with Robot(uri) as robot:
-        master = stage.start(*LOOP, "--count", "5", "-d", str(boat), "--uri", uri)
-        await until_subscribed(uri, "/boat/sensors")  # the boards are ready, and nothing is published yet
-        services = ("hub", "master", "subscriber", "publisher", "pcie-app")
-        processes = dict.fromkeys(services, 1) | {"board": 5}
-        assert {name: len(found) for name, found in stage.processes().items()} == processes
-        await robot.keep_publishing()
-        assert await master.end() == 0, master.err
-        await robot.have(5)
-        await stage.nothing_left("hub")
-        assert robot.order == ["/bm/frame", "/BMresults"] * 5
+async def test_loop_ends_by_itself_after_count(stage, robot, boat):
+    master = stage.start(*LOOP, "--count", "5", "-d", str(boat), "--uri", robot.uri)
+    await until_subscribed(robot.uri, "/boat/sensors")  # the boards are ready, and nothing is published yet
+    services = ("hub", "master", "subscriber", "publisher", "pcie-app")
+    processes = dict.fromkeys(services, 1) | {"board": 5}
+    assert {name: len(found) for name, found in stage.processes().items()} == processes
+    await robot.keep_publishing()
+    assert await master.end() == 0, master.err
+    await robot.have(5)
+    await stage.nothing_left("hub")
+    assert robot.order == ["/bm/frame", "/BMresults"] * 5
 
 
 @pytest.mark.process
-async def test_with_queue_all_every_reading_has_a_result(stage, boat):
-    _, uri = await stage.hub()
-    async with Robot(uri) as robot:
-        command = (*LOOP, "--fused", "--queue", "all", "--count", "12", "-d", str(boat), "--uri", uri)
-        master = stage.start(*command)
-        await master.says(PROGRAMMED)
-        await until_subscribed(uri, "/boat/sensors")
-        stamps = [await robot.publish(**READING) for _ in range(12)]
-        assert await master.end() == 0, master.err
-        await robot.have(12)
+async def test_with_queue_all_every_reading_has_a_result(stage, robot, boat):
+    command = (*LOOP, "--fused", "--queue", "all", "--count", "12", "-d", str(boat), "--uri", robot.uri)
+    master = stage.start(*command)
+    await master.says(PROGRAMMED)
+    await until_subscribed(robot.uri, "/boat/sensors")
+    stamps = [await robot.publish(**READING) for _ in range(12)]
+    assert await master.end() == 0, master.err
+    await robot.have(12)
     assert [stamp_of(frame) for frame in robot.frames] == stamps
     assert "not published" not in master.err
 
@@ -118,18 +109,16 @@ async def test_a_signal_while_the_boards_start_is_not_waited_out(stage, boat):
 
 
 @pytest.mark.thorough
-async def test_a_closed_terminal_leaves_nothing(stage, boat):
-    _, uri = await stage.hub()
-    async with Robot(uri) as robot:
-        await robot.keep_publishing()
-        pid, terminal = pty.fork()
-        if pid == 0:
-            os.execve(BIN / "master", [*LOOP, "-d", str(boat), "--uri", uri], stage.environment)
-        await robot.have(2)
-        os.close(terminal)
-        ended = await until(lambda: (ended := os.waitpid(pid, os.WNOHANG))[0] and ended)
-        assert os.waitstatus_to_exitcode(ended[1]) == 129
-        await stage.nothing_left("hub")
+async def test_a_closed_terminal_leaves_nothing(stage, robot, boat):
+    await robot.keep_publishing()
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execve(BIN / "master", [*LOOP, "-d", str(boat), "--uri", robot.uri], stage.environment)
+    await robot.have(2)
+    os.close(terminal)
+    ended = await until(lambda: (ended := os.waitpid(pid, os.WNOHANG))[0] and ended)
+    assert os.waitstatus_to_exitcode(ended[1]) == 129
+    await stage.nothing_left("hub")
 
 
 @pytest.mark.thorough
@@ -212,35 +201,31 @@ async def test_loop_gives_up_on_the_fourth_death_of_a_board(stage, boat):
 
 
 @pytest.mark.process
-async def test_the_parts_alone_make_a_pipeline(stage, boat):
-    _, uri = await stage.hub()
+async def test_the_parts_alone_make_a_pipeline(stage, robot, boat):
     _, boards = stage.start_boards()
-    async with Robot(uri) as robot:
-        await robot.keep_publishing()
-        code, err = await shell(
-            stage,
-            f"subscriber -d {boat} --uri {uri} --count 3 | pcie-app -d {boat} --boards {boards}"
-            f" | publisher -d {boat} --uri {uri}",
-        )
-        assert code == 0, err
-        await robot.have(3)
+    await robot.keep_publishing()
+    code, err = await shell(
+        stage,
+        f"subscriber -d {boat} --uri {robot.uri} --count 3 | pcie-app -d {boat} --boards {boards}"
+        f" | publisher -d {boat} --uri {robot.uri}",
+    )
+    assert code == 0, err
+    await robot.have(3)
 
 
 @pytest.mark.thorough
-async def test_the_first_and_the_last_part_alone(stage, boat):
-    _, uri = await stage.hub()
-    async with Robot(uri) as robot:
-        await robot.keep_publishing()
-        (stage.where / "results").write_text(json.dumps([1 / 64] * 64) + "\n")
-        code, err = await shell(stage, f"publisher -d {boat} --uri {uri} < results")
-        assert code == 0, err
-        await robot.have(1)
-        alone = stage.start(
-            *("subscriber", "--uri", uri, "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors"),
-            *("--variables", "D1,header.frame_id", "--count", "2"),
-        )
-        assert await alone.end() == 0, alone.err
-        assert alone.out == f'{{"D1":{READING["D1"]},"header.frame_id":"map"}}\n' * 2
+async def test_the_first_and_the_last_part_alone(stage, robot, boat):
+    await robot.keep_publishing()
+    (stage.where / "results").write_text(json.dumps([1 / 64] * 64) + "\n")
+    code, err = await shell(stage, f"publisher -d {boat} --uri {robot.uri} < results")
+    assert code == 0, err
+    await robot.have(1)
+    alone = stage.start(
+        *("subscriber", "--uri", robot.uri, "--topic", "/boat/sensors", "--type", "boat_msgs/Sensors"),
+        *("--variables", "D1,header.frame_id", "--count", "2"),
+    )
+    assert await alone.end() == 0, alone.err
+    assert alone.out == f'{{"D1":{READING["D1"]},"header.frame_id":"map"}}\n' * 2
 
 
 async def shell(stage, command):
@@ -261,21 +246,19 @@ async def shell(stage, command):
     ("redirection", "code"),
     [("--fused --json | head -1", 0), (">&- 2>&-", 143), ("--fused --json >/dev/full", 2)],
 )
-async def test_closed_and_full_streams_leave_no_run_behind(stage, boat, redirection, code):
-    _, uri = await stage.hub()
-    async with Robot(uri) as robot:
-        await robot.keep_publishing()
-        command = f"master --loop -d {boat} --uri {uri} {redirection}"
-        running = asyncio.create_task(shell(stage, f"{command}; exit $?"))
-        if code == 143:
-            await robot.have(1)
-            for master in stage.processes()["master"]:
-                master.terminate()
-        ended, err = await running
-        assert ended == code, err
-        assert "Traceback" not in err
+async def test_closed_and_full_streams_leave_no_run_behind(stage, robot, boat, redirection, code):
+    await robot.keep_publishing()
+    command = f"master --loop -d {boat} --uri {robot.uri} {redirection}"
+    running = asyncio.create_task(shell(stage, f"{command}; exit $?"))
+    if code == 143:
         await robot.have(1)
-        await stage.nothing_left("hub")
+        for master in stage.processes()["master"]:
+            master.terminate()
+    ended, err = await running
+    assert ended == code, err
+    assert "Traceback" not in err
+    await robot.have(1)
+    await stage.nothing_left("hub")
 
 
 @pytest.mark.thorough
