@@ -8,18 +8,19 @@ and its most probable line is wrong.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Final, Self, TypeAlias
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from machines.bm1 import BM1Machine, Start, addressed_codes
+from machines.bm1 import BM1Machine, Start, StopReason, addressed_codes
 from machines.encode import decode_code
 from machines.parameters import RngReset
-from toolchain.analysis.emulation import EmulatedBoards, Inputs, inputs_of_boards, priors_of_boards
+from toolchain.analysis.emulation import EmulatedBoards, Inputs, WrittenPrior
 from toolchain.analysis.readings import Readings
-from toolchain.cluster import Run, Work, in_this_process
+from toolchain.cluster import Job, Run, Work, in_this_process
 from toolchain.deployment.filter import Filter
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.model import Model, exact_posterior, fuse
@@ -46,15 +47,6 @@ def bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.f
     drawn = np.asarray(values)[chosen].reshape(RESAMPLES, -1)
     low, high = np.quantile(statistic(drawn, axis=1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2]).tolist()
     return Interval(float(statistic(values.reshape(-1), axis=0)), low, high)
-
-
-def bootstrap_rows(rows: NDArray[np.float64], statistic: Callable[[NDArray[np.float64]], float]) -> Interval:
-    """Return a statistic of a table's rows with its percentile bootstrap interval; whole rows are drawn."""
-    chosen = np.random.default_rng(0).integers(0, len(rows), (RESAMPLES, len(rows)))
-    low, high = np.quantile(
-        [statistic(rows[each]) for each in chosen], [(1 - LEVEL) / 2, (1 + LEVEL) / 2]
-    ).tolist()
-    return Interval(statistic(rows), low, high)
 
 
 def share_of_frames(share: float, frames: int) -> Interval:
@@ -158,52 +150,6 @@ class Accuracy:
     cycles: Cycles
 
 
-_Posterior: TypeAlias = NDArray[np.float64] | None
-
-
-class _Differences:
-    """Differences of many frames, total variation, KL and agreement; runs and replicas of a frame are averaged."""
-
-    def __init__(self) -> None:
-        self.every: dict[int, list[NDArray[np.float64]]] = {}
-        self.alone: dict[int, list[NDArray[np.float64]]] = {}
-
-    def add(self, frame: int, ours: Sequence[_Posterior], theirs: _Posterior) -> None:
-        runs = [_difference(each, theirs) for each in ours if each is not None and theirs is not None]
-        lost = [_LOST] * (len(ours) - len(runs))
-        self.every.setdefault(frame, []).append(np.mean([*runs, *lost], axis=0))
-        if runs:
-            self.alone.setdefault(frame, []).append(np.mean(runs, axis=0))
-
-    def take(self, other: "_Differences") -> None:
-        """Add the differences of other frames."""
-        self.every |= other.every
-        self.alone |= other.alone
-
-    def summary(self) -> Difference | None:
-        if not self.every:
-            return None
-        alone = None
-        if self.alone:
-            variation, divergence, same = _columns(self.alone)
-            alone = Difference(
-                total_variation=bootstrap(variation, np.mean),
-                map_agreement=share_of_frames(float(same.mean()), len(same)),
-                kl_bits=bootstrap(divergence, np.mean),
-            )
-        variation, _, same = _columns(self.every)
-        return Difference(
-            total_variation=bootstrap(variation, np.mean),
-            map_agreement=share_of_frames(float(same.mean()), len(same)),
-            alone=alone,
-        )
-
-
-def _columns(frames: dict[int, list[NDArray[np.float64]]]) -> NDArray[np.float64]:
-    """Return total variation, KL and agreement of each frame, averaged over its replicas: float64[3, frames]."""
-    return np.array([np.mean(frames[frame], axis=0) for frame in sorted(frames)]).T
-
-
 def measure(
     boards: EmulatedBoards,
     readings: Readings,
@@ -236,23 +182,76 @@ def measure(
     banks = max(1, min(banks, parameters.rng_banks if parameters.rng_reset is RngReset.BANK else banks))
     if own is not None or parameters.rng_reset is RngReset.FREE:
         run = in_this_process  # a frame depends on those before
-    frames = _Frames(boards, readings, model, banks, replicas, own)
-    found = _Results(banks)
-
-    def keep(_: int, result: _Results) -> None:
-        found.take(result)
-        for _ in range(replicas):
-            advance()
-
-    run(frames, range(len(readings) // replicas), keep)
-    if found.unlikely == found.posteriors:
+    frames = len(readings) // replicas
+    job = _Frames(boards, readings, model, banks, replicas, own)
+    found: list[_Reading] = in_order(run, job, range(frames * replicas), advance)
+    if not any(each.is_likely for each in found):
         raise ModelError(f"none of the readings ({readings.source}) is possible in the model")
-    return found.summary(boards, readings, run)
+    lengths, z = np.array([each.lengths for each in found]), None
+    if (lengths > 0).any():
+        # the z-score of a count uses the cycles of single replicas
+        usual = int(np.median(lengths[lengths > 0]))
+        priors = {place: each.prior for place, each in enumerate(found) if each.is_possible}
+        z = _z_scores(_Counts(boards, readings, priors, usual), run)
+    differences = np.reshape([each.differences for each in found], (frames, replicas, -1, 2, 3))
+    sampling, *others = map(_summary, np.moveaxis(differences, 2, 0))
+    quantising, machine = others or (None, None)
+    return Accuracy(
+        frames=frames,
+        posteriors=len(found),
+        banks=banks,
+        impossible=sum(not each.is_possible for each in found) / len(found),
+        without=sum(each.without for each in found) / lengths.size,
+        overflow=sum(each.overflow for each in found) / lengths.size,
+        machine=machine,
+        quantising=quantising,
+        sampling=sampling,
+        z=z,
+        cycles=Cycles.of(lengths.reshape(frames, replicas, banks).max(axis=1)),
+    )
+
+
+def in_order(run: Run, job: Job, numbers: Sequence[int], advance: Callable[[], None]) -> list[Any]:
+    """Do the pieces of a job, and call `advance` after each.
+
+    Results are in the order of the numbers, whatever that of the work, because sums of floats depend on their order.
+    """
+    found: dict[int, Any] = {}
+
+    def keep(number: int, result: object) -> None:
+        found[number] = result
+        advance()
+
+    run(job, numbers, keep)
+    return [found[number] for number in numbers]
+
+
+class _Reading(NamedTuple):
+    """Results of a reading, which was run with every bank.
+
+    Attributes:
+        is_likely: Whether it is possible in the model; true without one.
+        is_possible: Whether it is possible in the codes.
+        lengths: Cycles with each bank.
+        without: Number of runs without a posterior.
+        overflow: Number of runs that ended with an overflow.
+        prior: uint16[lines], its written prior, if any.
+        differences: Pairs as of `_differences`: of machine and codes, and with a model of codes and model, and of
+            machine and model.
+    """
+
+    is_likely: bool
+    is_possible: bool
+    lengths: list[int]
+    without: int
+    overflow: int
+    prior: WrittenPrior
+    differences: list[NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True)
 class _Frames:
-    """The job of running the readings: piece n is frame n, whose result is that of this frame alone."""
+    """The job of running the readings: piece n is the reading at index n, of a frame of `replicas` of them."""
 
     boards: EmulatedBoards
     readings: Readings
@@ -262,125 +261,73 @@ class _Frames:
     own: Filter | None
 
     def prepare(self) -> Work:
-        """Return the function that runs the readings of a frame."""
-        belief = None if self.own is None else self.own.transition.start
+        """Return the function that runs a reading with every bank, and compares it with exact inference."""
+        boards, model, own = self.boards, self.model, self.own
+        belief = None if own is None else own.transition.start
 
-        def measured(frame: int) -> _Results:
+        def measured(place: int) -> _Reading:
             nonlocal belief
-            found = _Results(self.banks)
-            for place in range(frame * self.replicas, (frame + 1) * self.replicas):
-                exact = codes = None
-                if self.own is not None and belief is not None:
-                    belief, codes = self.own.transition.after(belief), self.own.predict()
-                if self.model is not None:
-                    addresses, row = self.readings.of_model(place)
-                    try:
-                        exact = exact_posterior(self.model, addresses, prior_address=row, prior=belief)
-                    except ModelError:
-                        found.unlikely += 1
-                last = found.add(
-                    self.boards, self.readings, place, frame, exact, codes, compare=self.model is not None
-                )
-                if self.own is not None:
-                    self.own.update(last)
-                    belief = belief if exact is None else exact
-            return found
+            exact = prior = None
+            if own is not None and belief is not None:
+                belief, prior = own.transition.after(belief), own.predict()
+            if model is not None:
+                addresses, row = self.readings.of_model(place)
+                with suppress(ModelError):
+                    exact = exact_posterior(model, addresses, prior_address=row, prior=belief)
+            inputs, prior_row = self.readings.of_machine(place, boards.machines[0])
+            likelihood = _line_probabilities(boards, inputs, prior_row, prior)
+            codes = fuse(likelihood, ()) if likelihood.any() else None
+            first = place // self.replicas * self.banks
+            numbers = [(first + each) % boards.parameters.rng_banks for each in range(self.banks)]
+            ran = [boards.run(inputs, prior_row, bank, prior) for bank in numbers]
+            posteriors = [each.posterior for each in ran]
+            if own is not None:
+                own.update(posteriors[-1])
+                belief = belief if exact is None else exact
+            differences = [_differences(posteriors, codes)]
+            if model is not None:
+                differences += [_differences([codes], exact), _differences(posteriors, exact)]
+            return _Reading(
+                is_likely=model is None or exact is not None,
+                is_possible=codes is not None,
+                lengths=[each.length for each in ran],
+                without=sum(each is None for each in posteriors),
+                overflow=sum(StopReason.OVERFLOW in each.reasons for each in ran),
+                prior=prior,
+                differences=differences,
+            )
 
         return measured
 
 
-@dataclass(slots=True)
-class _Results:
-    """Results of some readings; `lengths` are cycles with each bank, by frame and replica.
+def _differences(
+    ours: Sequence[NDArray[np.float64] | None], theirs: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """Return the means over all runs, and over those with a posterior alone: float64[2, 3], NaN if there are none."""
+    runs = [_difference(each, theirs) for each in ours if each is not None and theirs is not None]
+    every = [*runs, *[_LOST] * (len(ours) - len(runs))]
+    return np.array([np.mean(every, axis=0), np.mean(runs or [(math.nan,) * 3], axis=0)])
 
-    `places` are those of the readings that are possible in the codes, with their written prior.
-    """
 
-    banks: int
-    of_machine: _Differences = field(default_factory=_Differences)
-    of_codes: _Differences = field(default_factory=_Differences)
-    of_sampling: _Differences = field(default_factory=_Differences)
-    lengths: dict[int, list[list[int]]] = field(default_factory=dict)
-    places: dict[int, NDArray[np.uint16] | None] = field(default_factory=dict)
-    unlikely: int = 0
-    """Readings that are impossible in the model."""
-    posteriors: int = 0
-    impossible: int = 0
-    without: int = 0
-    overflow: int = 0
-
-    def take(self, other: "_Results") -> None:
-        """Add the results of other frames."""
-        for name in ("of_machine", "of_codes", "of_sampling"):
-            getattr(self, name).take(getattr(other, name))
-        self.lengths |= other.lengths
-        self.places |= other.places
-        for name in ("unlikely", "posteriors", "impossible", "without", "overflow"):
-            setattr(self, name, getattr(self, name) + getattr(other, name))
-
-    def add(
-        self,
-        boards: EmulatedBoards,
-        readings: Readings,
-        place: int,
-        frame: int,
-        exact: _Posterior,
-        prior: NDArray[np.uint16] | None,
-        *,
-        compare: bool,
-    ) -> _Posterior:
-        """Run the reading at an index with every bank, and compare it with `exact`, the posterior of the model, if any.
-
-        `prior` is a written one. Return the posterior of the last bank.
-        """
-        inputs, prior_row = readings.of_machine(place, boards.machines[0])
-        likelihood = _line_probabilities(boards, inputs, prior_row, prior)
-        numbers = [(frame * self.banks + run) % boards.parameters.rng_banks for run in range(self.banks)]
-        ran = [boards.run(inputs, prior_row, bank, prior) for bank in numbers]
-        posteriors = [each.posterior for each in ran]
-        self.posteriors += 1
-        self.without += sum(each is None for each in posteriors)
-        self.overflow += sum(any(reason.name == "OVERFLOW" for reason in each.reasons) for each in ran)
-        self.lengths.setdefault(frame, []).append([each.length for each in ran])
-        of_codes = fuse(likelihood, ()) if likelihood.any() else None
-        if of_codes is None:
-            self.impossible += 1
-        else:
-            self.places[place] = prior
-        self.of_sampling.add(frame, posteriors, of_codes)
-        if compare:
-            self.of_codes.add(frame, [of_codes], exact)
-            self.of_machine.add(frame, posteriors, exact)
-        return posteriors[-1]
-
-    def summary(self, boards: EmulatedBoards, readings: Readings, run: Run) -> Accuracy:
-        """Return the statistics over all frames."""
-        frames = sorted(self.lengths)
-        lengths = np.array([np.max(self.lengths[frame], axis=0) for frame in frames])
-        # the z-score of a count uses the cycles of single replicas
-        by_themselves = np.array([length for frame in frames for length in self.lengths[frame]])
-        runs = self.posteriors * self.banks
-        z = None
-        if (by_themselves > 0).any():
-            usual = int(np.median(by_themselves[by_themselves > 0]))
-            z = _z_scores(_Counts(boards, readings, self.places, usual), run)
-        return Accuracy(
-            frames=len(self.lengths),
-            posteriors=self.posteriors,
-            banks=self.banks,
-            impossible=self.impossible / self.posteriors,
-            without=self.without / runs,
-            overflow=self.overflow / runs,
-            machine=self.of_machine.summary(),
-            quantising=self.of_codes.summary(),
-            sampling=self.of_sampling.summary(),
-            z=z,
-            cycles=Cycles.of(lengths),
+def _summary(pairs: NDArray[np.float64]) -> Difference:
+    """Average pairs of `_differences`, float64[frames, replicas, 2, 3], over the replicas, and then over frames."""
+    every, alone, of_alone = pairs[:, :, 0].mean(axis=1), pairs[:, :, 1], None
+    alone = np.nanmean(alone[~np.isnan(alone).all(axis=(1, 2))], axis=1)
+    if len(alone):
+        of_alone = Difference(
+            total_variation=bootstrap(alone[:, 0], np.mean),
+            map_agreement=share_of_frames(float(alone[:, 2].mean()), len(alone)),
+            kl_bits=bootstrap(alone[:, 1], np.mean),
         )
+    return Difference(
+        total_variation=bootstrap(every[:, 0], np.mean),
+        map_agreement=share_of_frames(float(every[:, 2].mean()), len(every)),
+        alone=of_alone,
+    )
 
 
 def addressed_chances(
-    machine: BM1Machine, addresses: Inputs, prior_address: int, prior: NDArray[np.uint16] | None = None
+    machine: BM1Machine, addresses: Inputs, prior_address: int, prior: WrittenPrior = None
 ) -> NDArray[np.float64]:
     """Return the probability that each cell gives a 1 in a cycle: float64[columns, lines], the prior first."""
     frame = Start(
@@ -390,12 +337,11 @@ def addressed_chances(
 
 
 def _line_probabilities(
-    boards: EmulatedBoards, inputs: Inputs, prior_address: int, prior: NDArray[np.uint16] | None
+    boards: EmulatedBoards, inputs: Inputs, prior_address: int, prior: WrittenPrior
 ) -> NDArray[np.float64]:
     """Return the probability that each line of all boards counts in a cycle: float64[lines]."""
-    machines = boards.machines
-    parts = zip(machines, inputs_of_boards(inputs, machines), priors_of_boards(prior, machines), strict=True)
-    chances = [addressed_chances(machine, own, prior_address, codes) for machine, own, codes in parts]
+    parts = zip(boards.machines, boards.parts(inputs, prior), strict=True)
+    chances = [addressed_chances(machine, own, prior_address, codes) for machine, (own, codes) in parts]
     return np.concatenate([np.prod(each, axis=0) for each in chances])
 
 
@@ -415,49 +361,44 @@ class _Counts:
 
     boards: EmulatedBoards
     readings: Readings
-    places: dict[int, NDArray[np.uint16] | None]
+    priors: dict[int, WrittenPrior]
     cycles: int
 
     def prepare(self) -> Work:
-        """Return the function for a reading: sums of z^2, of z and of 1, and the number beyond 3; None without counts."""
+        """Return the function for a reading: sums over its counts of z^2, z, 1, and |z| > 3, float64[4]."""
 
-        def compared(place: int) -> tuple[NDArray[np.float64], int] | None:
-            boards, prior, cycles = self.boards, self.places[place], self.cycles
+        def compared(place: int) -> NDArray[np.float64]:
+            boards, prior, cycles = self.boards, self.priors[place], self.cycles
             addresses, row = self.readings.of_machine(place, boards.machines[0])
             chance = _line_probabilities(boards, addresses, row, prior)
             ran = boards.run_for(addresses, row, place % boards.parameters.rng_banks, cycles, prior)
             looked_at = (chance * cycles >= EXPECTED_COUNT) & (chance < 1)
-            if not looked_at.any():
-                return None
             p = chance[looked_at]
             z = (np.concatenate(ran.counts)[looked_at] - cycles * p) / np.sqrt(cycles * p * (1 - p))
-            return np.array([(z**2).sum(), z.sum(), len(z)]), int((np.abs(z) > 3).sum())
+            return np.array([(z**2).sum(), z.sum(), len(z), (np.abs(z) > 3).sum()])
 
         return compared
 
 
 def _z_scores(job: _Counts, run: Run) -> ZScores | None:
-    found: dict[int, tuple[NDArray[np.float64], int] | None] = {}
-    run(job, sorted(job.places), found.__setitem__)
     # Frames with the same bank share all random numbers, so a bank is one draw for all of them.
-    free = job.boards.parameters.rng_reset is RngReset.FREE
+    p = job.boards.parameters
+    draws = len(job.readings) if p.rng_reset is RngReset.FREE else p.rng_banks
     drawn: dict[int, NDArray[np.float64]] = {}
-    beyond = 0
-    for place in sorted(found):  # the sum of floats depends on their order
-        if (each := found[place]) is not None:
-            key = place if free else place % job.boards.parameters.rng_banks
-            drawn[key] = drawn[key] + each[0] if key in drawn else each[0]
-            beyond += each[1]
+    found = in_order(run, job, list(job.priors), lambda: None)
+    for place, sums in zip(job.priors, found, strict=True):
+        if sums[2]:
+            drawn[place % draws] = drawn.get(place % draws, 0) + sums
     if not drawn:
         return None
     table = np.array(list(drawn.values()))
     counts = int(table[:, 2].sum())
-
     return ZScores(
         cycles=job.cycles,
         counts=counts,
         draws=len(table),
-        rms=bootstrap_rows(table, lambda rows: math.sqrt(rows[:, 0].sum() / rows[:, 2].sum())),
-        mean=bootstrap_rows(table, lambda rows: float(rows[:, 1].sum() / rows[:, 2].sum())),
-        beyond_three=beyond / counts,
+        # whole rows of the table are drawn, and stand one after the other
+        rms=bootstrap(table, lambda a, axis: np.sqrt(a[..., ::4].sum(axis) / a[..., 2::4].sum(axis))),
+        mean=bootstrap(table, lambda a, axis: a[..., 1::4].sum(axis) / a[..., 2::4].sum(axis)),
+        beyond_three=int(table[:, 3].sum()) / counts,
     )

@@ -1,6 +1,6 @@
 """Emulation of a deployment's boards in this process, with the host's stop rule."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeAlias
@@ -17,6 +17,8 @@ from toolchain.errors import BuildError
 
 Inputs: TypeAlias = "tuple[int, ...] | NDArray[np.int64]"
 """Inputs of a frame: an address per column, or int64[sensors, all lines] if lines have their own readings."""
+WrittenPrior: TypeAlias = "NDArray[np.uint16] | None"
+"""Codes of the prior of a frame, uint16[all lines]; None if the machines have it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +58,7 @@ class EmulatedBoards:
         self.target_count = target_count
         self.max_cycles = max_cycles
         self.stop = stop
+        self._ends = np.cumsum([machine.parameters.lines for machine in machines])[:-1]
         # Counters that never stop a run of a given length. Frames are stopped by the target, so their results
         # do not change.
         self._kernels = [
@@ -78,14 +81,13 @@ class EmulatedBoards:
         """Parameters of the first board; on the others only the number of lines differs."""
         return self.machines[0].parameters
 
-    @property
-    def lines(self) -> int:
-        """Lines of all boards."""
-        return sum(machine.parameters.lines for machine in self.machines)
+    def parts(self, inputs: Inputs, prior: WrittenPrior) -> Iterator[tuple[Inputs, WrittenPrior]]:
+        """Return each board's inputs of a frame, all or those of its lines, and its part of a written prior, if any."""
+        count, ends = len(self.machines), self._ends
+        of_boards = [inputs] * count if isinstance(inputs, tuple) else np.split(inputs, ends, axis=1)
+        return zip(of_boards, [None] * count if prior is None else np.split(prior, ends), strict=True)
 
-    def run(
-        self, addresses: Inputs, prior_address: int, bank: int, prior: NDArray[np.uint16] | None = None
-    ) -> FrameRun:
+    def run(self, addresses: Inputs, prior_address: int, bank: int, prior: WrittenPrior = None) -> FrameRun:
         """Run a frame like the host: in slices of 256 * 2^k cycles until a board overflows, or each board alone.
 
         `prior` is a written prior, uint16[all lines].
@@ -111,12 +113,7 @@ class EmulatedBoards:
         return self._shown()
 
     def run_for(
-        self,
-        addresses: Inputs,
-        prior_address: int,
-        bank: int,
-        cycles: int,
-        prior: NDArray[np.uint16] | None = None,
+        self, addresses: Inputs, prior_address: int, bank: int, cycles: int, prior: WrittenPrior = None
     ) -> FrameRun:
         """Run every board that can count for this many cycles, regardless of its counts."""
         start = Start(
@@ -129,11 +126,10 @@ class EmulatedBoards:
         self._start(start, addresses, prior)
         return self._shown()
 
-    def _start(self, start: Start, addresses: Inputs, prior: NDArray[np.uint16] | None) -> list[StopReason]:
-        inputs, priors = inputs_of_boards(addresses, self.machines), priors_of_boards(prior, self.machines)
+    def _start(self, start: Start, addresses: Inputs, prior: WrittenPrior) -> list[StopReason]:
+        parts = zip(self._kernels, self.parts(addresses, prior), strict=True)
         return [
-            kernel.start(replace(start, addresses=own, prior_codes=codes))
-            for kernel, own, codes in zip(self._kernels, inputs, priors, strict=True)
+            kernel.start(replace(start, addresses=own, prior_codes=codes)) for kernel, (own, codes) in parts
         ]
 
     def _shown(self) -> FrameRun:
@@ -142,24 +138,6 @@ class EmulatedBoards:
             tuple(kernel.cycles for kernel in self._kernels),
             tuple(kernel.reason for kernel in self._kernels),
         )
-
-
-def inputs_of_boards(inputs: Inputs, machines: Sequence[BM1Machine]) -> list[Inputs]:
-    """Return each board's inputs of a frame: all inputs, or those of its lines."""
-    if isinstance(inputs, tuple):
-        return [inputs] * len(machines)
-    return [*np.split(inputs, _first_lines(machines), axis=1)]
-
-
-def priors_of_boards(
-    prior: NDArray[np.uint16] | None, machines: Sequence[BM1Machine]
-) -> Sequence[NDArray[np.uint16] | None]:
-    """Return each board's part of a written prior, if there is one."""
-    return [None] * len(machines) if prior is None else np.split(prior, _first_lines(machines))
-
-
-def _first_lines(machines: Sequence[BM1Machine]) -> NDArray[np.int64]:
-    return np.cumsum([machine.parameters.lines for machine in machines])[:-1]
 
 
 def one_replica(machine: BM1Machine) -> BM1Machine:

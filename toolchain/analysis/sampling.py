@@ -4,7 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from machines.bm2 import BM2Machine
 from machines.bm2_kind import BM2, kernels_of, run_batches
 from machines.kind import FrameInput
 from machines.parameters import RngReset, SampleEvery
-from toolchain.analysis.accuracy import Cycles, Interval, bootstrap
+from toolchain.analysis.accuracy import Cycles, Interval, bootstrap, in_order
 from toolchain.analysis.chain import distance
 from toolchain.analysis.logic import (
     MLAB_ALMS,
@@ -88,12 +88,8 @@ class Sampled:
     reasons: Mapping[str, int]
 
 
-@dataclass(frozen=True, slots=True)
-class _Frame:
-    """A frame: why each board stopped, and distance, effective samples, R-hat and cycles; None without a posterior."""
-
-    reasons: tuple[str, ...]
-    row: tuple[float, ...] | None
+_Frame: TypeAlias = tuple[list[str], tuple[float, ...] | None]
+"""Why each board stopped, and distance, effective samples, R-hat and cycles; None without a posterior."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +99,8 @@ class _Frames:
     machines: Sequence[BM2Machine]
     readings: Sequence[Addresses]
     model: NetworkModel | None
-    samples: int
-    max_cycles: int
+    settings: FrameInput
+    """Samples and limit of every frame."""
 
     def prepare(self) -> Work:
         """Return the function that runs a reading on all boards."""
@@ -112,19 +108,14 @@ class _Frames:
 
         def measured(number: int) -> _Frame:
             addresses, row = self.readings[number], None
-            frame = FrameInput(
-                addresses=addresses,
-                target_count=self.samples,
-                max_cycles=self.max_cycles,
-                bank=number % banks,
-            )
+            frame = replace(self.settings, addresses=addresses, bank=number % banks)
             found = BM2.infer(run_batches(kernels, frame))
             if found.posterior is not None:
                 exact = found.posterior if self.model is None else self.model.exact(addresses)
                 details = (float(found.details.get(key, 0)) for key in ("effective_samples", "r_hat"))
                 cycles = max(kernel.cycles for kernel in kernels)
                 row = (distance(found.posterior, exact), *details, cycles)
-            return _Frame(tuple(kernel.reason.name.lower() for kernel in kernels), row)
+            return [kernel.reason.name.lower() for kernel in kernels], row
 
         return measured
 
@@ -140,18 +131,14 @@ def run_chains(
     run: Run = in_this_process,
 ) -> Sampled:
     """Run every reading on boards with these machines; a BuildError if none of them gives a posterior."""
-    p, found = machines[0].parameters, dict[int, _Frame]()
-
-    def keep(number: int, frame: _Frame) -> None:
-        found[number] = frame
-        advance()
-
+    p = machines[0].parameters
     if p.rng_reset is RngReset.FREE:
         run = in_this_process  # the generators run on from frame to frame
-    run(_Frames(machines, readings, model, samples, max_cycles), range(len(readings)), keep)
-    frames = [found[number] for number in sorted(found)]
-    reasons = Counter(reason for frame in frames for reason in frame.reasons)
-    rows = [frame.row for frame in frames if frame.row is not None]
+    settings = FrameInput(addresses=(), target_count=samples, max_cycles=max_cycles)
+    job = _Frames(machines, readings, model, settings)
+    frames: list[_Frame] = in_order(run, job, range(len(readings)), advance)
+    reasons = Counter(reason for stopped, _ in frames for reason in stopped)
+    rows = [row for _, row in frames if row is not None]
     if not rows:
         ends = ", ".join(f"{name} {count}" for name, count in sorted(reasons.items()))
         raise BuildError(f"none of the readings gives a posterior; boards stopped by: {ends}")
