@@ -48,17 +48,11 @@ class Readings:
     def __len__(self) -> int:
         return len(self.addresses)
 
-    def only(self, kept: NDArray[np.bool_]) -> "Readings":
-        """Return the recorded frames of which this is true."""
-        return replace(self, addresses=self.addresses[kept], prior_addresses=self.prior_addresses[kept])
-
     def of_model(self, frame: int) -> tuple[tuple[int | NDArray[np.int64] | None, ...], int | None]:
         """Return a frame in the form for `toolchain.models.model.exact_posterior`."""
-        row = int(self.prior_addresses[frame])
-        addresses: tuple[int | NDArray[np.int64] | None, ...]
-        if self.addresses.ndim > 2:
-            return tuple(self.addresses[frame]), None if row == MISSING else row
-        addresses = tuple(None if at == MISSING else at for at in self.addresses[frame].tolist())
+        row, addresses = int(self.prior_addresses[frame]), tuple(self.addresses[frame])
+        if self.addresses.ndim == 2:
+            addresses = tuple(None if at == MISSING else int(at) for at in addresses)
         return addresses, None if row == MISSING else row
 
     def of_machine(self, frame: int, machine: BM1Machine) -> tuple[Inputs, int]:
@@ -98,17 +92,17 @@ def sample_readings(
     random = np.random.default_rng(seed)
     rows = np.full(frames, MISSING, dtype=np.int64)
     if in_sequence and model.transition is not None:
-        line, drawn_lines = random.choice(model.lines, p=_normalised(model.transition.start)), []
+        line, drawn_lines = random.choice(model.lines, p=_distribution(model.transition.start)), []
         for _ in range(frames):
-            line = random.choice(model.lines, p=_normalised(model.transition.table[line]))
+            line = random.choice(model.lines, p=_distribution(model.transition.table[line]))
             drawn_lines.append(line)
         lines = np.array(drawn_lines)
     elif model.prior_select is None:
-        lines = random.choice(model.lines, size=frames, p=_normalised(model.prior_distribution))
+        lines = random.choice(model.lines, size=frames, p=_distribution(model.prior_distribution))
     else:
         rows = random.integers(0, model.prior_select.values, frames)
         lines = np.array(
-            [random.choice(model.lines, p=_normalised(model.prior_select.table[row])) for row in rows]
+            [random.choice(model.lines, p=_distribution(model.prior_select.table[row])) for row in rows]
         )
     addresses = np.empty((frames, len(model.known)), dtype=np.int64)
     for column, known in enumerate(model.known):
@@ -138,7 +132,7 @@ def readings_of_lines(
     random = np.random.default_rng((seed, 1))
     addresses = np.empty(shape, dtype=np.int64)
     for column, known in enumerate(model.known):
-        mean = np.cumsum(known.table @ _normalised(model.prior_distribution))
+        mean = np.cumsum(known.table @ _distribution(model.prior_distribution))
         others = np.searchsorted(mean, random.random((frames, model.lines)) * mean[-1], side="right")
         addresses[:, column] = np.minimum(others, known.values - 1)
     addresses[np.arange(frames), :, drawn.lines] = drawn.addresses
@@ -166,17 +160,12 @@ def model_of_codes(
         codes = decode_code(table[: variable.values], width)
         known.append(Known(name=variable.name, table=_conditional(codes), bits=variable.bits))
     prior = decode_code(machine.prior, width)
+    model = Model(name=name, searched=tuple(searched), known=tuple(known), prior=_distribution(prior[-1]))
     select = next((variable for variable in variables if variable.kind == "prior_select"), None)
     if select is None:
-        return Model(name=name, searched=tuple(searched), known=tuple(known), prior=_distribution(prior[0]))
+        return model
     rows = np.stack([_distribution(row) for row in prior[: select.values]])
-    return Model(
-        name=name,
-        searched=tuple(searched),
-        known=tuple(known),
-        prior=_distribution(prior[-1]),
-        prior_select=PriorSelect(name=select.name, table=rows, bits=select.bits),
-    )
+    return replace(model, prior_select=PriorSelect(name=select.name, table=rows, bits=select.bits))
 
 
 def _conditional(codes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -193,14 +182,9 @@ def _conditional(codes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _distribution(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Normalise ratios, also those of a distribution of a model, which sums to 1 only within 1e-6."""
     total = ratios.sum()
     return ratios / total if total > 0 else np.full(ratios.shape, 1 / ratios.size)
-
-
-def _normalised(distribution: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Normalise a distribution of a model, which sums to 1 only within 1e-6."""
-    exact: NDArray[np.float64] = distribution / distribution.sum()
-    return exact
 
 
 def recorded_readings(
@@ -225,14 +209,15 @@ def recorded_readings(
     """
     check_frames(frames)
     columns = reading_columns([variable.name for variable in variables], given)
-    recording = read_recording(path, list(dict.fromkeys(columns.values())), tolerance_s=tolerance_s)
+    recording = read_recording(path, columns.values(), tolerance_s=tolerance_s)
     count = min(frames, recording.rows)
     spread = np.unique(np.linspace(0, recording.rows - 1, count).astype(int)).tolist()
     found = _rows_of(recording, variables, columns, range(count) if in_sequence else spread)
     refused = int((~found.fits).sum())
     left_out = f", without {refused} that do not fit ({found.why})" if refused else ""
-    kept = found.readings if in_sequence else found.readings.only(found.fits)
-    return replace(kept, source=f"{len(kept)} of {recording.rows} rows of {path.name}{left_out}")
+    kept, all_rows = found.fits | in_sequence, found.readings
+    source = f"{kept.sum()} of {recording.rows} rows of {path.name}{left_out}"
+    return Readings(source, all_rows.addresses[kept], all_rows.prior_addresses[kept])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -269,9 +254,7 @@ def recorded_frames(
     unnamed = [each.name for each in variables if each.name not in columns and each.on_missing == "error"]
     if unnamed:
         raise BuildError(f"{', '.join(unnamed)}: no column; add --reading {unnamed[0]}=COLUMN")
-    recording = read_recording(
-        path, list(dict.fromkeys(columns.values())), tolerance_s=tolerance_s, stamped=True
-    )
+    recording = read_recording(path, columns.values(), tolerance_s=tolerance_s, stamped=True)
     return _rows_of(recording, variables, columns, range(recording.rows))
 
 

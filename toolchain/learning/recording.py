@@ -9,7 +9,7 @@ import csv
 import math
 import re
 from bisect import bisect_left
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
@@ -44,7 +44,7 @@ class Recording:
 
 
 def read_recording(
-    path: Path, columns: Sequence[str], *, tolerance_s: float = 0.1, stamped: bool = False
+    path: Path, columns: Iterable[str], *, tolerance_s: float = 0.1, stamped: bool = False
 ) -> Recording:
     """Return the named columns of a recording: a CSV file (`.csv`), an MCAP file, a ROS 1 bag or a ROS 2 bag's folder.
 
@@ -57,9 +57,10 @@ def read_recording(
     """
     if not path.exists():
         raise ModelError(f"the recording {path} does not exist")
+    once = list(dict.fromkeys(columns))
     if path.suffix.lower() == ".csv":
-        return _read_csv(path, columns, stamped=stamped)
-    return _read_bag(path, columns, round(tolerance_s * 1e9))
+        return _read_csv(path, once, stamped=stamped)
+    return _read_bag(path, once, round(tolerance_s * 1e9))
 
 
 def reading_columns(names: Sequence[str], given: Sequence[str], flag: str = "--reading") -> dict[str, str]:
@@ -127,12 +128,10 @@ def _read_csv(path: Path, columns: Sequence[str], *, stamped: bool) -> Recording
 
 def _stamp(text: str, column: str, where: str) -> int:
     """Return a stamp in nanoseconds, exactly, which a float would not be."""
-    try:
+    with suppress(ArithmeticError):  # not a number, or NaN
         stamp = Decimal(text.strip()) * _STAMP_UNITS[column]
         if 0 <= stamp < 1 << 63:
             return round(stamp)
-    except ArithmeticError:  # not a number, or NaN
-        pass
     raise ModelError(
         f"{where}: {column} is {text[:80]!r}, expected a time that is not negative; correct it, or rename the column"
     )
