@@ -66,12 +66,9 @@ def seed_set(parameters: RngParameters, bank: int) -> int:
 
 def generator_numbers(parameters: RngParameters, bank: int) -> Words:
     """Return the numbers of a bank's generators, in the parameters' `generator_shape`."""
-    return _numbers_of_set(parameters.generator_shape, seed_set(parameters, bank))
-
-
-def _numbers_of_set(shape: tuple[int, ...], own: int) -> Words:
-    count = math.prod(shape)
-    return np.arange(own * count, (own + 1) * count, dtype=np.uint64).reshape(shape)
+    count = math.prod(parameters.generator_shape)
+    first = seed_set(parameters, bank) * count
+    return np.arange(first, first + count, dtype=np.uint64).reshape(parameters.generator_shape)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,8 +127,8 @@ def sequencer_seed(parameters: BM2Parameters, bank: int) -> int:
 
 
 @lru_cache(1 << 12)  # 2 ms each, and the same for all boards of a deployment and most machines of a sweep
-def _seeds(kind: RngKind, shape: tuple[int, ...], own: int) -> Words:
-    return LFSR(kind).seeds(_numbers_of_set(shape, own))
+def _seeds(kind: RngKind, first: int, count: int) -> Words:
+    return LFSR(kind).seeds(np.arange(first, first + count, dtype=np.uint64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +139,8 @@ class LFSRNumbers:
 
     def restart(self, bank: int) -> Words:
         """Return the seeds of the bank's generators."""
-        own = seed_set(self.parameters, bank)
-        return _seeds(self.parameters.rng, self.parameters.generator_shape, own).copy()
+        numbers = generator_numbers(self.parameters, bank)
+        return _seeds(self.parameters.rng, int(numbers.flat[0]), numbers.size).reshape(numbers.shape).copy()
 
     def show(self, states: Words) -> Words:
         """Return the low `prob_bits` bits of the states."""

@@ -14,7 +14,7 @@ from toolchain.analysis.resources import Estimate
 from toolchain.analysis.sampling import Sampled, chain_resources, drawn_readings, run_chains
 from toolchain.building.build import read_images
 from toolchain.building.report import edited_sentence
-from toolchain.cluster import Run, in_this_process
+from toolchain.cluster import Run
 from toolchain.deployment import Deployment
 from toolchain.errors import BuildError, counted
 from toolchain.models.network import NetworkModel
@@ -111,11 +111,7 @@ class ChainInspection:
 
 
 def inspect_chain(
-    deployment: Deployment,
-    model: NetworkModel | None,
-    options: InspectOptions,
-    progress: Progress,
-    run: Run = in_this_process,
+    deployment: Deployment, model: NetworkModel | None, options: InspectOptions, progress: Progress, run: Run
 ) -> ChainInspection:
     """Run a deployment's chains on readings, and estimate their costs, or raise a ToolchainError."""
     machines = [image.machine for image in read_images(deployment)]

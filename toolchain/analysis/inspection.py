@@ -24,7 +24,7 @@ from toolchain.analysis.resources import ASSUMPTIONS, Energy, Estimate, energy, 
 from toolchain.building.build import read_images
 from toolchain.building.quantise import ColumnLoss, quantise
 from toolchain.building.report import edited_sentence, loss_heading, many_sentence
-from toolchain.cluster import Run, in_this_process
+from toolchain.cluster import Run
 from toolchain.deployment import Deployment, Scale, Stop
 from toolchain.errors import BuildError, counted
 from toolchain.models.model import Model
@@ -55,11 +55,7 @@ class Inspection:
 
 
 def inspect_deployment(
-    deployment: Deployment,
-    model: Model | None,
-    options: InspectOptions,
-    progress: Progress,
-    run: Run = in_this_process,
+    deployment: Deployment, model: Model | None, options: InspectOptions, progress: Progress, run: Run
 ) -> Inspection:
     """Run the machine of a deployment on readings, and estimate its costs, or raise a ToolchainError."""
     device = device_named(options.device)
@@ -250,7 +246,8 @@ def _loss_part(found: Inspection) -> str:
 
 
 def _time_part(found: Inspection) -> str:
-    cycles = found.accuracy.cycles
+    accuracy, machine = found.accuracy, found.deployment.machine
+    cycles = accuracy.cycles
     rows = [
         f"Cycles of a frame, and time at {with_unit(found.clock_hz, 'Hz')} (the boards' computing alone: no link, no ROS):",
         "            cycles        time   95 % interval, cycles",
@@ -262,8 +259,7 @@ def _time_part(found: Inspection) -> str:
     ):
         row = f"  {name:6}  {count:10,.0f}  {with_unit(count / found.clock_hz, 's'):>10}"
         rows.append(row + (f"   {interval.low:,.0f}..{interval.high:,.0f}" if interval else ""))
-    kept = "posteriors" if found.deployment.machine.replicas > 1 else "frames"
-    machine = found.deployment.machine
+    kept = "posteriors" if machine.replicas > 1 else "frames"
     if machine.stop is Stop.OWN and len(found.deployment.boards) > 1:
         rule = (
             f"stops that board alone (stop = own); boards without one end after {machine.max_cycles} cycles"
@@ -271,34 +267,28 @@ def _time_part(found: Inspection) -> str:
     else:
         rule = f"is the stop rule; the other runs end after {machine.max_cycles} cycles"
     rows += [
-        f"  In {found.accuracy.overflow:.0%} of runs a count reaches {machine.target_count}: this overflow {rule}.",
-        (
-            f"  Without a posterior: {found.accuracy.without:.1%} of runs (in {found.accuracy.impossible:.1%} of {kept} no line "
-            "can count)."
-        ),
+        f"  In {accuracy.overflow:.0%} of runs a count reaches {machine.target_count}: this overflow {rule}.",
+        f"  Without a posterior: {accuracy.without:.1%} of runs (in {accuracy.impossible:.1%} of {kept} no line can count).",
     ]
-    if found.deployment.machine.replicas > 1:
-        replicas = found.deployment.machine.replicas
+    if machine.replicas > 1:
         rows.append(
-            f"  A frame has {replicas} posteriors and ends with the last of them: {cycles.median.value / replicas:,.1f} cycles per posterior "
-            "in the median."
+            f"  A frame has {machine.replicas} posteriors and ends with the last of them: {cycles.median.value / machine.replicas:,.1f} "
+            "cycles per posterior in the median."
         )
     return "\n".join(rows)
 
 
 def _accuracy_part(found: Inspection) -> str:
     accuracy = found.accuracy
-    is_filter = found.deployment.filter is not None
-    every = {
-        "machine against the exact filter"
-        if is_filter
-        else "the machine against the model": accuracy.machine,
-        "  of that, codes, earlier frames"
-        if is_filter
-        else "  of that, by quantising alone": accuracy.quantising,
-        "the machine against its codes": accuracy.sampling,
-    }
-    alone = {name: each and each.alone for name, each in every.items()}
+    names = [
+        "the machine against the model",
+        "  of that, by quantising alone",
+        "the machine against its codes",
+    ]
+    if found.deployment.filter is not None:
+        names[:2] = ["machine against the exact filter", "  of that, codes, earlier frames"]
+    every = (accuracy.machine, accuracy.quantising, accuracy.sampling)
+    alone = tuple(each and each.alone for each in every)
     rows = []
     title = (
         f"Accuracy over all {accuracy.frames} frames (means with 95 % intervals; frames are resampled, banks within them are "
@@ -309,7 +299,7 @@ def _accuracy_part(found: Inspection) -> str:
         (f"Over the {1 - accuracy.without:.1%} of runs with a posterior alone:", alone),
     ):
         rows += [heading, f"{'total variation':>57}{'same MAP':>21}"]
-        for name, each in differences.items():
+        for name, each in zip(names, differences, strict=True):
             if each is not None:
                 row = f"  {name:34}{_shown_interval(each.total_variation, '.4f'):>21}"
                 row += f"{_shown_interval(each.map_agreement, '.0%'):>21}"

@@ -97,9 +97,7 @@ class Results:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.points: dict[str, Point] = {}
-        content = b""
-        if path.exists():
-            content = read_bounded(path, MAX_FILE_BYTES, BuildError)
+        content = read_bounded(path, MAX_FILE_BYTES, BuildError) if path.exists() else b""
         lines = content.split(b"\n")
         # A power failure may leave an incomplete last line: that point is measured again.
         torn = lines.pop()
@@ -315,15 +313,10 @@ class Task:
 
 def _fingerprint(model: Model, readings: Readings) -> str:
     """Return a hash of the model and of the readings."""
-    digest = hashlib.sha256()
-    for known in model.known:
-        digest.update(known.table.tobytes())
-    digest.update(model.prior_distribution.tobytes())
-    if model.prior_select is not None:
-        digest.update(model.prior_select.table.tobytes())
-    digest.update(readings.addresses.tobytes())
-    digest.update(readings.prior_addresses.tobytes())
-    return digest.hexdigest()
+    select = [] if model.prior_select is None else [model.prior_select.table]
+    tables = [*(known.table for known in model.known), model.prior_distribution, *select]
+    arrays = (*tables, readings.addresses, readings.prior_addresses)
+    return hashlib.sha256(b"".join(each.tobytes() for each in arrays)).hexdigest()
 
 
 def tasks(model: Model, sweep: Sweep, readings: Readings, device: Device) -> list[Task]:
@@ -402,8 +395,7 @@ def with_resources(task: Task, point: Point, device: Device) -> Point:
     parameters, options = task.plan.parameters, task.plan.options
     if options.rng is RngKind.IDEAL:
         return point
-    lines = partition_lines(parameters.lines, options.partitions)[0].lines
-    largest = replace(parameters, lines=lines)
+    largest = replace(parameters, lines=partition_lines(parameters.lines, options.partitions)[0].lines)
     took = estimate(largest, device, inputs=(options.interface or (0, 0))[0])
     update = {"alms": took.alms, "blocks": took.memories.blocks, "fits": took.fits}
     return point.model_copy(update=update)
@@ -428,12 +420,9 @@ def run_sweep(job: SweepJob, run: Run, results: Results, advance: Callable[[Poin
 
     At the end, the points of the sweep stand in the file in its order, whoever has measured them.
     """
-    left = []
-    for number, task in enumerate(job.tasks):
-        if task.key in results.points:
-            advance(results.points[task.key])
-        else:
-            left.append(number)
+    left = [number for number, task in enumerate(job.tasks) if task.key not in results.points]
+    for key in (task.key for task in job.tasks if task.key in results.points):
+        advance(results.points[key])
 
     def keep(_: int, point: Point) -> None:
         results.append(point)
