@@ -11,6 +11,7 @@ from toolchain.analysis.accuracy import _difference, _line_probabilities, bootst
 from toolchain.analysis.emulation import EmulatedBoards, joined
 from toolchain.analysis.readings import MISSING, Readings, model_of_codes, recorded_readings, sample_readings
 from toolchain.building.machine import split
+from toolchain.cluster import in_this_process
 from toolchain.deployment import Stop
 from toolchain.errors import BuildError, ModelError
 from toolchain.learning.recording import reading_columns
@@ -258,6 +259,23 @@ def test_readings_that_the_model_finds_impossible():
     with pytest.raises(ModelError, match="by hand"):
         measure(boards_of(machine_of(model)), readings, model)
     assert exact_posterior(model, [0]) == pytest.approx([0.5, 0.5])
+
+
+@pytest.mark.parametrize("replicas", [1, 3])
+def test_the_order_of_the_work_changes_nothing(replicas):
+    model = corridor(20, sigma=1.5)
+    boards, readings = (
+        boards_of(machine_of(model, prob_bits=5), target=20),
+        sample_readings(model, 30, seed=1),
+    )
+
+    def backwards(job, numbers, keep):
+        in_this_process(job, numbers[::-1], keep)
+
+    forwards, other = (
+        measure(boards, readings, model, replicas=replicas, run=run) for run in (in_this_process, backwards)
+    )
+    assert other == forwards
 
 
 def test_intervals():
