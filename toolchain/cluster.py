@@ -318,8 +318,7 @@ def _do(address: str, client: Any, pickled: bytes, left: dict[int, None], keep: 
                     size, most_s = min(BATCH_S / piece_s, max(_SMALLEST_S / piece_s, size)), BATCH_S
                 numbers = [waiting.popleft() for _ in range(max(1, min(round(size), len(waiting))))]
                 with _noticing_loss():
-                    batch = client.submit(do_batch, table, numbers, most_s, software(), pure=False)
-                    batches[batch] = numbers
+                    batches[client.submit(do_batch, table, numbers, most_s, software(), pure=False)] = numbers
             with _noticing_loss():
                 try:
                     done = wait(list(batches), timeout=_POLL_S, return_when="FIRST_COMPLETED").done

@@ -103,7 +103,7 @@ class Results:
         torn = lines.pop()
         if torn and not torn.startswith(_BEGIN[: len(torn)]):
             lines.append(torn)
-        self._torn_at = len(content) - len(torn) if torn else None
+        self._torn_at, self._torn = len(content) - len(torn), torn
         for number, line in enumerate(lines, start=1):
             try:
                 point = Point.model_validate_json(line)
@@ -122,9 +122,10 @@ class Results:
         """Append a point with one write, and wait until it is on the disk."""
         line = point.model_dump_json().encode() + b"\n"
         with file_errors(self.path, "written", BuildError), self._locked() as file:
-            if self._torn_at is not None:
-                os.truncate(self.path, self._torn_at)
-                self._torn_at = None
+            file.seek(self._torn_at)
+            if self._torn and file.read() == self._torn:  # otherwise, another sweep has cut it
+                file.truncate(self._torn_at)
+            self._torn = b""
             written = file.write(line)
             os.fsync(file.fileno())
         if written != len(line):
@@ -135,7 +136,7 @@ class Results:
     def _locked(self) -> Iterator[BinaryIO]:
         """Open the file to append, alone among the sweeps that write it."""
         while True:
-            with self.path.open("ab", buffering=0) as file:
+            with self.path.open("a+b", buffering=0) as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
                 if os.fstat(file.fileno()).st_nlink:  # otherwise, another sweep has sorted it
                     yield file

@@ -142,10 +142,11 @@ def test_a_torn_last_line_is_measured_again_and_another_file_is_left_alone(tmp_p
     Results(path).append(point(1))
     with path.open("a") as file:
         file.write('{"key":"00')
-    results = Results(path)
+    results, other = Results(path), Results(path)  # of two sweeps at the same time
     assert list(results.points) == [point(1).key]
     results.append(point(2))
-    assert list(Results(path).points) == [point(1).key, point(2).key]
+    other.append(point(3))
+    assert list(Results(path).points) == [point(1).key, point(2).key, point(3).key]
     for notes in ("my notes\n", "my notes"):
         path.write_text(notes)
         with pytest.raises(BuildError) as caught:
