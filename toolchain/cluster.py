@@ -161,7 +161,7 @@ def runner(options: SchedulerOptions) -> Iterator[Run]:
             except (OSError, RuntimeError) as reason:
                 raise ClusterError(f"--scheduler local cannot start its workers: {reason}") from None
             with local:
-                yield partial(_run_on, address, lambda: Client(local))
+                yield partial(_on_scheduler, address, lambda: Client(local))
         return
     security = Security()
     if address.startswith("tls:"):
@@ -177,7 +177,7 @@ def runner(options: SchedulerOptions) -> Iterator[Run]:
         asyncio.run(asyncio.wait_for(_greet(address, security.get_connection_args("client")), _CONNECT_S))
         return Client(address, security=security, timeout=_CONNECT_S)
 
-    yield partial(_run_on, address, connect)
+    yield partial(_on_scheduler, address, connect)
 
 
 async def _greet(address: str, arguments: dict[str, Any]) -> None:
@@ -247,7 +247,9 @@ def _noticing_loss() -> Iterator[None]:
         raise _LostError from None
 
 
-def _run_on(address: str, connect: Callable[[], Any], job: Job, numbers: Sequence[int], keep: Keep) -> None:
+def _on_scheduler(
+    address: str, connect: Callable[[], Any], job: Job, numbers: Sequence[int], keep: Keep
+) -> None:
     """Do the pieces on the workers of a scheduler; what was not done when it disappeared is given to the next one.
 
     Raises:

@@ -139,7 +139,7 @@ class PartFile:
             BuildError: It cannot be written, or another run has it, or it is of other work.
         """
         heading, elsewhere = f"rosbayes infer {key}\n".encode(), "or name another file with -o"
-        with file_errors(path, "written", BuildError, f"; delete it, {elsewhere}"):
+        with file_errors(path, "written", BuildError):
             path.touch()
             with path.open("r+b", buffering=0) as file:
                 try:
@@ -153,13 +153,12 @@ class PartFile:
                     )
                 os.pwrite(file.fileno(), heading, 0)
                 os.posix_fallocate(file.fileno(), 0, len(heading) + frames * layout.itemsize)
-                records = np.memmap(
-                    path, layout, "r", len(heading), (frames,)
-                )  # of `file`, it would keep the lock
+                # not of `file`, because it would keep the lock
+                records = np.memmap(path, layout, "r", len(heading), (frames,))
                 whole = (crc32(each.tobytes()[_CRC_BYTES:]) == int(each["crc"]) for each in records)
                 there = bytearray(whole if found else frames)
                 yield cls(file.fileno(), len(heading), records, there)
-            path.unlink(missing_ok=True)
+                path.unlink(missing_ok=True)
 
     def add(self, row: int, record: bytes) -> None:
         """Write the record of a row."""

@@ -262,7 +262,7 @@ def test_a_part_file_of_other_work_is_refused(tmp_path, content):
 
 def test_a_pipe_is_no_part_file(tmp_path):
     os.mkfifo(tmp_path / "p.frames")
-    refused = pytest.raises(BuildError, match="cannot be written: Illegal seek; delete it")
+    refused = pytest.raises(BuildError, match="frames cannot be written: Illegal seek$")
     with refused, PartFile.opened(tmp_path / "p.frames", "key", LAYOUT, 4):
         pass
 
