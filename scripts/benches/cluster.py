@@ -24,11 +24,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from casestudies.boat.model import model as boat
 from scripts.running.flags import ScriptParser
+from scripts.running.script import print_table
 from terminal.ending import outcome
 from terminal.errors import ProcessError
 from toolchain.analysis import Sweep
@@ -249,7 +248,7 @@ def _sent(name: str) -> int:
     return sum(int((folder / f"{way}_bytes").read_text()) for way in ("rx", "tx"))
 
 
-def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> float:
+def measure(arguments: argparse.Namespace, folder: Path) -> float:
     """Measure everything, and return the lowest efficiency of two workers on this host."""
     kinds: dict[str, Callable[[Path], Designs | Recording]] = {
         f"{arguments.designs} designs": lambda own: Designs(own, arguments.designs, arguments.sweep_frames),
@@ -258,10 +257,9 @@ def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> fl
     load_kernels(arguments.designs)
     cores = sorted(os.sched_getaffinity(0))
     works = {name: kind(folder) for name, kind in kinds.items()}
-    table = Table(title="efficiency: seconds in one process / (cores x seconds)", title_justify="left")
-    columns = "work", "workers", "hosts", "alone", "at once", "seconds", "to one alone", "to all at once"
-    for name in (*columns, "bytes a batch"):
-        table.add_column(name, justify="right" if name != "work" else "left")
+    rows = list[list[str]]()
+    columns = ["work", "workers", "hosts", "alone", "at once", "seconds"]
+    columns += ["to one alone", "to all at once", "bytes a batch"]
     lowest, rate = 2.0, 0.0
     for workers, namespaces in ((2, False), (1, True), (2, True), (4, True)):
         used, hosts = min(workers, len(cores)), str(workers) if namespaces else "this one"
@@ -292,14 +290,14 @@ def measure(arguments: argparse.Namespace, folder: Path, console: Console) -> fl
                     lowest = lowest if namespaces else min(lowest, busy)
                     cells = [f"{each:.1f}" for each in seconds]
                     cells += [f"{serial:.0%}", f"{busy:.0%}", f"{sent / batches:,.0f}" if sent else "-"]
-                    table.add_row(name, str(workers), hosts, *cells)
+                    rows.append([name, str(workers), hosts, *cells])
         except ProcessError as reason:
             if not namespaces:
                 raise
-            console.print(f"no network namespaces here: {reason}")
+            print(f"no network namespaces here: {reason}")
             break
-    console.print(table)
-    console.print(f"The scheduler does {rate:,.0f} empty tasks/s.")
+    print_table("efficiency: seconds in one process / (cores x seconds)", columns, rows)
+    print(f"The scheduler does {rate:,.0f} empty tasks/s.")
     return lowest
 
 
@@ -336,7 +334,7 @@ def main() -> int:
     )
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="bench-cluster-") as name:
-        lowest = measure(arguments, Path(name), Console())
+        lowest = measure(arguments, Path(name))
     if arguments.check and lowest < AIM:
         raise BuildError(f"the efficiency is {lowest:.1%}, expected {AIM:.0%} or more")
     return 0
