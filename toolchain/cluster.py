@@ -71,6 +71,21 @@ def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:
             keep(number, work(number))
 
 
+def in_order(run: Run, job: Job, numbers: Sequence[int], advance: Callable[[], None]) -> list[Any]:
+    """Do the pieces of a job, and call `advance` after each.
+
+    Results are in the order of the numbers, whatever that of the work, because sums of floats depend on their order.
+    """
+    found: dict[int, Any] = {}
+
+    def keep(number: int, result: object) -> None:
+        found[number] = result
+        advance()
+
+    run(job, numbers, keep)
+    return [found[number] for number in numbers]
+
+
 class ClusterError(ToolchainError):
     """A scheduler that cannot be used, or workers that cannot do the work."""
 
@@ -186,10 +201,10 @@ async def _greet(address: str, arguments: dict[str, Any]) -> None:
 
     try:
         async with rpc(address, timeout=_CONNECT_S, connection_args=arguments) as there:
-            identity = await there.identity()
+            kind = (await there.identity())["type"]
     except Exception as reason:  # whatever dask makes of another protocol
         raise OSError(str(reason)) from None
-    if identity["type"] != "Scheduler":
+    if kind != "Scheduler":
         raise OSError("another part of dask")
 
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, Self
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from machines.encode import decode_code
 from machines.parameters import RngReset
 from toolchain.analysis.emulation import EmulatedBoards, Inputs, WrittenPrior
 from toolchain.analysis.readings import Readings
-from toolchain.cluster import Job, Run, Work, in_this_process
+from toolchain.cluster import Run, Work, in_order, in_this_process
 from toolchain.deployment.filter import Filter
 from toolchain.errors import BuildError, ModelError
 from toolchain.models.model import Model, exact_posterior, fuse
@@ -209,21 +209,6 @@ def measure(
         z=z,
         cycles=Cycles.of(lengths.reshape(frames, replicas, banks).max(axis=1)),
     )
-
-
-def in_order(run: Run, job: Job, numbers: Sequence[int], advance: Callable[[], None]) -> list[Any]:
-    """Do the pieces of a job, and call `advance` after each.
-
-    Results are in the order of the numbers, whatever that of the work, because sums of floats depend on their order.
-    """
-    found: dict[int, Any] = {}
-
-    def keep(number: int, result: object) -> None:
-        found[number] = result
-        advance()
-
-    run(job, numbers, keep)
-    return [found[number] for number in numbers]
 
 
 class _Reading(NamedTuple):

@@ -120,7 +120,7 @@ class PartFile:
     file: int
     """The descriptor of the file."""
     begin: int
-    """Where the first record begins."""
+    """Offset of the first record in bytes."""
     records: NDArray[np.void]
     """All of them as they are in the file, also those that `add` writes later."""
     there: bytearray

@@ -12,7 +12,7 @@ from machines.bm2 import BM2Machine
 from machines.bm2_kind import BM2, kernels_of, run_batches
 from machines.kind import FrameInput
 from machines.parameters import RngReset, SampleEvery
-from toolchain.analysis.accuracy import Cycles, Interval, bootstrap, in_order
+from toolchain.analysis.accuracy import Cycles, Interval, bootstrap
 from toolchain.analysis.chain import distance
 from toolchain.analysis.logic import (
     MLAB_ALMS,
@@ -28,7 +28,7 @@ from toolchain.analysis.logic import (
 )
 from toolchain.analysis.readings import check_frames
 from toolchain.analysis.resources import Estimate
-from toolchain.cluster import Run, Work, in_this_process
+from toolchain.cluster import Run, Work, in_order, in_this_process
 from toolchain.deployment import Dimension
 from toolchain.errors import BuildError
 from toolchain.models.network import NetworkModel

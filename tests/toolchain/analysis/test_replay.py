@@ -10,6 +10,7 @@ import pytest
 from tests.toolchain.builders import corridor
 from tests.toolchain.building.test_filter import ASKED, UMBRELLA
 from tests.toolchain.running import TARGET, assert_refused, build_model, done, toolchain
+from toolchain.analysis import replay as replays
 from toolchain.analysis.readings import recorded_frames
 from toolchain.analysis.replay import PartFile, record_layout, replay
 from toolchain.cluster import in_this_process
@@ -57,7 +58,7 @@ def recording(deployment, tmp_path):
     return path
 
 
-def test_an_interrupted_run_goes_on_to_the_same_bytes(deployment, recording, tmp_path):
+def test_an_interrupted_run_goes_on_to_the_same_bytes(deployment, recording, tmp_path, monkeypatch):
     frames = recorded_frames(recording, deployment.variables, ())
     whole, resumed = tmp_path / "whole.npz", tmp_path / "resumed.npz"
     assert replay(deployment, frames, whole, in_this_process)[0] == 12
@@ -78,7 +79,16 @@ def test_an_interrupted_run_goes_on_to_the_same_bytes(deployment, recording, tmp
         with pytest.raises(KeyboardInterrupt):
             replay(deployment, frames, resumed, stop_after_five)
     assert not resumed.exists()
+    ran, run_on = [], replays._run_on
+
+    def noting_rows(*given):
+        run = run_on(*given)
+        return lambda row, *rest: (ran.append(row), run(row, *rest))[1]
+
+    monkeypatch.setattr(replays, "_run_on", noting_rows)
     computed, without = replay(deployment, frames, resumed, backwards)
+    first = 0 if deployment.machine.rng_reset == "free" else 5
+    assert sorted(ran) == [row for row in range(first, 12) if frames.fits[row]]
     assert computed == (12 if deployment.machine.rng_reset == "free" else 7)
     assert resumed.read_bytes() == whole.read_bytes()
     assert not list(tmp_path.glob("*.frames"))
