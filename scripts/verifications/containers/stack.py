@@ -98,7 +98,7 @@ class Stack:
         return self.docker("compose", *arguments, limit=limit)
 
     def bits(self, count: int, uri: str = "ws://hub:9090", network: str = "rosbayes_ros") -> None:
-        """Let a client container recompute results that arrive from now on; none may be wrong or absent."""
+        """Let a client container recompute results from now on; raise a CheckError if one is wrong or none arrive."""
         client = self.project / CLIENT.relative_to(ROOT)
         confined = ("--read-only", "--tmpfs", "/tmp", "--cap-drop", "ALL", "--init")  # noqa: S108 - the container's
         self.docker(
@@ -118,7 +118,7 @@ class Stack:
         return {each["name"]: each for each in self.status().get("processes", [])}
 
     def up(self, services: tuple[str, ...] = SERVICES) -> None:
-        """Start the project, and wait until the expected services, and no others, are healthy."""
+        """Start the project; raise a CheckError unless the expected services, and no others, become healthy."""
         wait = ("--wait", "--wait-timeout", str(int(UP_LIMIT)))
         try:
             self.compose("up", "--detach", *wait, limit=UP_LIMIT + COMMAND_LIMIT)
@@ -133,7 +133,7 @@ class Stack:
         expect(running == set(services), f"it runs {sorted(running)} instead of {sorted(services)}")
 
     def refused(self, *arguments: str) -> str:
-        """Return the log of `docker compose up` of a stack, with the engine's own error; no service may run."""
+        """Return the log of `docker compose up` of a stack that cannot start; raise a CheckError if a service runs."""
         try:
             self.compose("up", "--detach", *arguments)
         except CheckError as error:
