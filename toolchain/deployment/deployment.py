@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 FORMAT: Final = 1
 FILE_NAME: Final = "deployment.toml"
+FORMER_KEYS: Final = frozenset({"integrity", "integrity_frames"})
+"""Keys of a check that was taken out; the format did not change, because they were not part of the hash."""
 MOST_TRANSITIONS: Final = 2**24
 """Maximum number of transitions of a filter, lines x lines (128 MiB as float64)."""
 REPLICA: Final = "replica"
@@ -266,6 +268,10 @@ def load_deployment(
         found = "has no key 'format'" if version is None else f"is of format {version!r}"
         raise DeploymentVersionError(
             f"{path} {found}, and this version reads format {FORMAT}: build it again with 'toolchain build'"
+        )
+    for key in FORMER_KEYS & toml.tables.keys():
+        raise toml.mistake(
+            (key,), f"'{key}' belonged to a check of the boards that is gone; delete this line"
         )
     file = toml.validated(DeploymentFile)
     computed = deployment_hash(file)

@@ -254,6 +254,12 @@ def test_another_format_is_reported_before_anything_else(folder, new):
     refused(folder, DeploymentVersionError)
 
 
+def test_a_key_of_a_check_that_was_taken_out_is_to_be_deleted(folder):
+    edit(folder, "\nname =", '\nintegrity = "off"\nname =')
+    assert "line 4: 'integrity' belonged" in refused(folder)
+    assert "delete this line" in refused(folder)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line", "place"),
     [
