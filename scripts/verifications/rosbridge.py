@@ -553,7 +553,7 @@ CHECKS: Final[dict[str, Check]] = {
     "client: JSON, lists and arrays, type names of either ROS": check_json,
     "client: CBOR, typed arrays of ten kinds, bytes": check_cbor,
     "client: cbor-raw, read by rosbags": check_raw,
-    "client: fragments, both ways": check_fragments,
+    "client: fragments from the server": check_fragments,
     "client: qualities of service": check_qos,
     "client: latch": check_latch,
     "client: throttle": check_throttle,
