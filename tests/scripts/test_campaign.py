@@ -1,14 +1,18 @@
 """The campaign: its observer finds planted bugs."""
 
 import copy
+import subprocess
+import sys
 
 import pytest
 
 from scripts.campaigning.accounts import FAILED, PASSED_OVER, Counters, Excuses, judge
 from scripts.campaigning.expected import BANKS, LINES, BoardOutcome, Outcome
 from scripts.campaigning.observer import DEPLOYMENT, Flaw, Observer
+from scripts.running.script import ROOT
 from tests.posteriors.messages import status
 
+CLOCK = ROOT / "scripts/campaigning/clock"
 HALF = LINES // 2
 
 
@@ -151,3 +155,29 @@ def test_a_fault_excuses_what_it_cuts_off_before_the_recovery(until, flaws):
     run.counters = Counters(7)
     run.excuses = Excuses(readings=True, results=True, until=until)
     assert run.play() == flaws
+
+
+WITHOUT_DESCRIPTORS = """
+import mmap, os, resource, struct, time
+shared = mmap.mmap(os.open(os.environ["CAMPAIGN_CLOCK"], os.O_RDWR), 0)
+_, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+resource.setrlimit(resource.RLIMIT_NOFILE, (0, most))
+for seconds in (0, 3600, -3600):
+    shared[:8] = struct.pack("<q", seconds)
+    before = time.clock_gettime_ns(time.CLOCK_REALTIME)
+    shifted = [time.time_ns(), round(time.time() * 1e9)]
+    after = time.clock_gettime_ns(time.CLOCK_REALTIME)
+    steps = [before - 1000 <= each - seconds * 10**9 <= after + 1000 for each in shifted]  # a float has 0.2 us
+    print(seconds, *steps)
+"""
+
+
+@pytest.mark.process
+def test_a_process_without_free_descriptors_sees_the_clocks_steps(tmp_path):
+    """A clock that opened its file at each call would end a master whose descriptors are used up."""
+    clock = tmp_path / "clock"
+    clock.write_bytes(bytes(8))
+    environment = {"PYTHONPATH": str(CLOCK), "CAMPAIGN_CLOCK": str(clock)}
+    command = [sys.executable, "-c", WITHOUT_DESCRIPTORS]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert run.stdout.split("\n") == ["0 True True", "3600 True True", "-3600 True True", ""], run.stderr

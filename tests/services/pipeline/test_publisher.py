@@ -2,7 +2,7 @@
 
 import asyncio
 from contextlib import asynccontextmanager
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from unittest.mock import Mock
 
 import msgspec
@@ -128,15 +128,15 @@ async def test_the_master_learns_that_no_server_is_there_and_that_one_is_back(bo
 
 
 @pytest.mark.parametrize(
-    ("refused", "outcome", "missed"), [("/a", Outcome.PUBLISHED, 1), ("/a /b", Outcome.REFUSED, 0)]
+    ("refused", "away", "outcome", "missed"),
+    [("/a", 0, Outcome.PUBLISHED, 1), ("/a", 2, Outcome.PUBLISHED, 2), ("/a /b /c", 1, Outcome.REFUSED, 0)],
 )
-async def test_a_result_counts_as_refused_if_every_topic_is(boat, link, refused, outcome, missed):
+async def test_a_result_counts_as_refused_if_every_topic_is(boat, link, refused, away, outcome, missed):
     publisher = Publisher(Settings(), boat, link.make)
     publisher._topics = FakeTopics()
-    publisher._topics.advertised = [Mock(), Mock()]
-    publisher._topics.advertised[0].name, publisher._topics.advertised[1].name = "/a", "/b"
+    publisher._topics.advertised = [SimpleNamespace(name=name) for name in ("/a", "/b", "/c")]
     publisher._refused = dict.fromkeys(refused.split(), "why")
-    publisher._report(Published(7, Outcome.PUBLISHED, None, 0, 1.0, 9, 9))
+    publisher._report(Published(7, Outcome.PUBLISHED, None, 0, 1.0, 9, 9, missed=away))
     (published,) = link.sent
     assert (published.outcome, published.missed) == (outcome, missed)
 
