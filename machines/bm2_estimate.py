@@ -58,7 +58,8 @@ class ChainEstimate:
 def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
     """Return the counts of the searched joint's values, row-major: integers[..., product of the cardinalities].
 
-    The results are integers[..., result_words]; the joint fits them, or one variable is searched.
+    The results are integers[..., result_words]. They must contain the joint, unless only one variable is searched:
+    then its histogram has the counts.
     """
     first = parameters.histogram_words
     if not parameters.joint_words:

@@ -16,7 +16,7 @@ from machines.rng import Words, random_numbers, sequencer_seed
 class BM2Kernel(ABC):
     """A running machine: one chain of samples (thesis 2.1.3).
 
-    All that it shows after a call is the same in every kernel, bit for bit.
+    After each call, every kernel has the same results and state, bit for bit.
     """
 
     def __init__(self, machine: BM2Machine) -> None:

@@ -121,7 +121,7 @@ def first_one(builder: Any, word: Any) -> Any:
 
 @in_llvm(VECTOR, VECTOR, VECTOR)
 def below(builder: Any, left: Any, right: Any) -> Any:
-    """Return all ones in each word of one vector that is less than that of another, else 0."""
+    """Compare word by word: all ones where the left one is less than the right one, else 0."""
     return builder.sext(builder.icmp_unsigned("<", left, right), _VECTOR)
 
 

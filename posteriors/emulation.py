@@ -25,7 +25,7 @@ class EmulatedPosterior(Posterior):
 
     deployment: Deployment = field(compare=False)
     machines: tuple[Any, ...] = field(compare=False)
-    """Those of its boards, which the folder may not have any more."""
+    """The machines of its boards, which are kept because the folder may have changed."""
     addresses: tuple[int | None, ...]
     """The reading of each variable of the deployment; None without one."""
 

@@ -274,10 +274,10 @@ class Process:
 
 
 class Screen:
-    """The lines of a script, and while there are none, the work that it waits for.
+    """The output of a script: its lines, and between them, the work that it is waiting for.
 
-    On a terminal, the work is one line with the time so far, which the next line replaces. Elsewhere it is a line
-    followed by dots.
+    On a terminal, this work is shown in a line with the time so far, which the next line replaces. Elsewhere it is a
+    line followed by dots.
     """
 
     def __init__(self) -> None:

@@ -56,7 +56,7 @@ class Job(Protocol):
     """Pieces of work with the same tables. A job is pickled, and so is every result."""
 
     def prepare(self) -> Work:
-        """Return the function that does the piece of a number."""
+        """Return a function that takes the number of a piece and does it."""
 
 
 Run: TypeAlias = Callable[[Job, Sequence[int], Keep], None]

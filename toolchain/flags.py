@@ -1,4 +1,4 @@
-"""Flags: made from dataclasses, so that each option is declared once; shared by commands; values of flags.
+"""Flags of the toolchain: groups made from dataclasses, single flags that commands share, and parsers of values.
 
 @dataclass                                               def explore(sweep: Sweep, model: ...)
 class Sweep:                                   ──▶           explore --steps LIST --banks N [MODEL]

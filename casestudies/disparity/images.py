@@ -83,8 +83,8 @@ def disparity_message(
 ) -> dict[str, Any]:
     """Return disparities in pixels, float64[height, width], as a stereo_msgs/DisparityImage.
 
-    Negative disparities are unknown, as for stereo_image_proc. Without a focal length it is the width of the image. The
-    baseline is `T` in ROS 1 and `t` in ROS 2.
+    Negative disparities are unknown, as for stereo_image_proc. Without a known focal length, the message
+    gives the width of the image for it. The baseline is `T` in ROS 1 and `t` in ROS 2.
     """
     height, width = disparity.shape
     window = {"x_offset": 0, "y_offset": 0, "height": height, "width": width, "do_rectify": False}

@@ -27,7 +27,7 @@ Clock: TypeAlias = Annotated[
 ]
 DeviceName: TypeAlias = Annotated[str, typer.Option(help="FPGA of the boards.", metavar="proce-v-d8")]
 Progress: TypeAlias = Callable[[int], AbstractContextManager[Callable[[str], None]]]
-"""A bar for a number of steps, whose function is called with a text after each."""
+"""Opens a progress bar for a number of steps; call what it yields after each step, with the text to show."""
 
 _Member = TypeVar("_Member", bound=StrEnum)
 _Numbers: TypeAlias = tuple[int, ...]

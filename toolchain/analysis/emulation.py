@@ -82,7 +82,10 @@ class EmulatedBoards:
         return self.machines[0].parameters
 
     def parts(self, inputs: Inputs, prior: WrittenPrior) -> Iterator[tuple[Inputs, WrittenPrior]]:
-        """Return each board's inputs of a frame, all or those of its lines, and its part of a written prior, if any."""
+        """Return for each board its inputs of a frame, and its part of a written prior; None without one.
+
+        Inputs of lines are split among the boards; addresses of columns go to all boards.
+        """
         count, ends = len(self.machines), self._ends
         of_boards = [inputs] * count if isinstance(inputs, tuple) else np.split(inputs, ends, axis=1)
         return zip(of_boards, [None] * count if prior is None else np.split(prior, ends), strict=True)

@@ -78,7 +78,7 @@ class Of(StrEnum):
     COUNTER_BIT = "counter bit"
     """bm1_counter and bm1_readout: increment, comparison with the target, and selection for the host; bm1_matrix."""
     STATE_BIT = "state bit"
-    """bm1_lfsr: shift of seeds, or the steps of a cycle."""
+    """bm1_lfsr: one bit of the state, which loads the seed or takes the steps of a cycle."""
     STEP = "step"
     """bm1_lfsr: the parity of the taps in one step."""
     PLACE_BIT = "place bit"

@@ -57,9 +57,8 @@ _SHOWN: Final = 3
 def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Change]]]:
     """Write the images again from the memories and parameters; return the edits, as sentences, and the files.
 
-    Edited sources are written in canonical form, and `deployment.toml` gets the hashes and parameters. If this is
-    interrupted, some images are new ones that `deployment.toml` does not name: the next call goes on with them, since it
-    needs only what sources and images of a build have in common.
+    Edited sources are written in canonical form, and `deployment.toml` gets the hashes and parameters. An interrupted
+    call may leave new images whose hashes are not in `deployment.toml` yet; the next call accepts them and finishes.
 
     Raises:
         BuildError: The sources contradict each other, or need another machine.

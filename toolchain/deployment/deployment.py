@@ -243,8 +243,8 @@ def load_deployment(
     """Read and check the deployment in a folder written by `toolchain build`.
 
     Without `images`, they are not read and compared with their hashes, and a process starts without NumPy. With
-    `edited`, a `deployment.toml` whose hash does not match its content is accepted. With `interrupted`, images and a
-    filter are accepted that it does not name, as they are written before it.
+    `edited`, a `deployment.toml` whose hash does not match its content is accepted. With `interrupted`,
+    images and a filter may differ from the hashes in `deployment.toml`, because they are written before it.
 
     Raises:
         DeploymentError: The deployment is absent, not TOML, or has a wrong key or value.

@@ -174,10 +174,10 @@ def _normals(
 def mixture(
     residuals: Sequence[NDArray[np.float64]], widths: Sequence[float], *, bias: bool, least_sigma: float
 ) -> tuple[float, float, list[float]]:
-    """Fit one normal and, for each variable, the share of uniform outliers: mean, standard deviation and shares.
+    """Fit one normal to all variables, and to each its share of outliers; return mean, standard deviation and shares.
 
-    `residuals` are readings minus expectations; outliers are uniform in the width of their variable. Without
-    `bias`, the mean is 0.
+    `residuals` are readings minus expectations. Outliers are uniform over the range of their variable, whose
+    width is in `widths`. Without `bias`, the mean is 0.
     """
     everything = np.concatenate(residuals)
     mean = float(np.median(everything)) if bias else 0.0

@@ -72,7 +72,7 @@ def printable(text: str) -> str:
 def read_mif(path: Path, due: tuple[int, int] | None = None) -> Mif:
     """Read the contents of a memory from any form of MIF; a MifError contains the line.
 
-    With `due`, the width and depth of the memory for which it is, another size is refused, and so is a missing address.
+    `due` is the expected width and depth: then a memory of another size, or with a missing address, is refused.
     """
     data = read_bounded(path, MOST_BYTES, MifError)
     return parse_mif(data.decode("latin-1"), str(path), due)
