@@ -38,6 +38,15 @@ def test_passed_over_readings_are_reported_once_and_counted_in_all(boat, link):
     assert (frames.completed, frames.lost) == (3, {LossReason.PASSED_OVER: 5})
 
 
+@pytest.mark.parametrize("queue", ["all", "latest"])
+def test_a_slow_master_gets_every_reading_if_all_are_kept(boat, link, queue):
+    subscriber = Subscriber(Settings(queue=queue), boat, link.make)
+    link.backlog = BUSY
+    subscriber._read(0, Message("/boat/sensors", dict(READING), 1, 2))
+    assert len(link.sent) == (1 if queue == "all" else 0)
+    assert subscriber.status().frames.lost == ({} if queue == "all" else {LossReason.PASSED_OVER: 1})
+
+
 def test_unpaired_messages_are_reported_once_and_a_wait_ends_by_itself(boat, link):
     """Every other variable has a topic of its own, which may be missing."""
     source = boat.sources[0]
