@@ -83,16 +83,19 @@ def test_a_set_waits_from_the_message_that_completed_its_needed_topics():
     assert synchroniser.take_set(8) is None
     assert synchroniser.deadline == 8 + TOLERANCE
     assert synchroniser.take_set(7 + TOLERANCE) is None
+    assert synchroniser.deadline == 8 + TOLERANCE  # looking again does not prolong it
     assert synchroniser.take_set(8 + TOLERANCE) == {0: "a", 1: "b"}
 
 
-def test_a_message_older_than_the_newest_of_a_set_makes_no_set_of_its_own():
+def test_a_set_without_needed_topics_ends_with_its_newest_message():
     synchroniser = Synchroniser([False] * 2, TOLERANCE)
     synchroniser.add(0, 0, 1, "a")
     synchroniser.add(1, 30 * MS, 2, "b")
     assert synchroniser.take_set(1 + TOLERANCE) == {0: "a", 1: "b"}
-    synchroniser.add(0, 20 * MS, 2 + TOLERANCE, "c")
+    synchroniser.add(0, 20 * MS, 2 + TOLERANCE, "older")
     assert (synchroniser.take_set(10 * TOLERANCE), synchroniser.unpaired) == (None, 1)
+    synchroniser.add(0, 40 * MS, 3 + TOLERANCE, "newer")
+    assert (synchroniser.take_set(10 * TOLERANCE), synchroniser.unpaired) == ({0: "newer"}, 1)
 
 
 @pytest.mark.parametrize("late", [300, 345], ids=["same stamp", "within half a period"])
