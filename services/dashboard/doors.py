@@ -8,21 +8,17 @@ A browser sends the token once, as `/?token=TOKEN`, and gets it back as a cookie
 import ipaddress
 import re
 import socket
-from collections.abc import Awaitable, Callable, MutableMapping
 from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
-from typing import Any, Final
-from urllib.parse import parse_qs
+from typing import Final
 
+from starlette.requests import HTTPConnection
+from starlette.responses import PlainTextResponse, RedirectResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocketClose
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
 from bridge.hub.access import AccessPolicy
-
-Scope = MutableMapping[str, Any]
-Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
-Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
-App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 COOKIE: Final = "rosbayes"
 _PORT: Final = re.compile(r":\d+$")
@@ -48,7 +44,7 @@ class Doors:
         loopback: Whether only this machine can reach the server.
     """
 
-    def __init__(self, app: App, policy: AccessPolicy, *, loopback: bool) -> None:
+    def __init__(self, app: ASGIApp, policy: AccessPolicy, *, loopback: bool) -> None:
         self._app = app
         self._policy = policy
         self._loopback = loopback
@@ -58,15 +54,17 @@ class Doors:
         if scope["type"] not in {"http", "websocket"}:  # start and end of the server
             await self._app(scope, receive, send)
             return
-        headers = Headers(
-            [(name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"]]
-        )
-        token = parse_qs(scope.get("query_string", b"").decode("latin-1")).get("token", [""])[0]
-        refused = self.refusal(headers, token)
+        request = HTTPConnection(scope)
+        token = next(filter(None, request.query_params.getlist("token")), "")
+        refused = self.refusal(Headers(request.headers.items()), token or request.cookies.get(COOKIE, ""))
         if refused is not None:
-            await _refuse(scope, send, refused)
+            await _refusal_of(scope, refused)(scope, receive, send)
         elif token and self._policy.tokens and scope["type"] == "http":
-            await self._give_cookie(scope, send, token)
+            # so that the token does not stay in the address bar
+            response = RedirectResponse("/", HTTPStatus.SEE_OTHER)
+            secure = scope.get("scheme") == "https"
+            response.set_cookie(COOKIE, token, httponly=True, samesite="strict", secure=secure)
+            await response(scope, receive, send)
         else:
             await self._app(scope, receive, _with_headers(send))
 
@@ -84,11 +82,10 @@ class Doors:
         if not origins and elsewhere and headers.get_all("Sec-Fetch-Dest") != ["document"]:
             return HTTPStatus.FORBIDDEN
         presented = Headers(headers)
-        found = token or _cookie(headers)
         # others are no tokens, and no headers
-        if found and found.isascii() and found.isprintable():
+        if token and token.isascii() and token.isprintable():
             presented.pop("Authorization", None)
-            presented["Authorization"] = f"Bearer {found}"
+            presented["Authorization"] = f"Bearer {token}"
         # the host was checked above, by stricter rules where others can reach the server
         return self._policy.refusal(Request("/", presented), loopback=False)
 
@@ -108,27 +105,9 @@ class Doors:
         # a zone, as in [::1%evil.example], may be any text
         return "%" not in name and (address.is_loopback or not self._loopback)
 
-    async def _give_cookie(self, scope: Scope, send: Send, token: str) -> None:
-        # so that the token does not stay in the address bar
-        secure = "; Secure" if scope.get("scheme") == "https" else ""
-        cookie = f"{COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict{secure}"
-        headers = [(b"location", b"/"), (b"set-cookie", cookie.encode()), (b"content-length", b"0")]
-        await send({"type": "http.response.start", "status": HTTPStatus.SEE_OTHER, "headers": headers})
-        await send({"type": "http.response.body", "body": b""})
-
-
-def _cookie(headers: Headers) -> str:
-    for line in headers.get_all("Cookie"):
-        try:
-            if (found := SimpleCookie(line).get(COOKIE)) is not None:
-                return found.value
-        except CookieError:
-            continue
-    return ""
-
 
 def _with_headers(send: Send) -> Send:
-    async def send_with_headers(event: MutableMapping[str, Any]) -> None:
+    async def send_with_headers(event: Message) -> None:
         if event["type"] == "http.response.start":
             event["headers"] = [*event.get("headers", ()), *_HEADERS]
         await send(event)
@@ -136,13 +115,10 @@ def _with_headers(send: Send) -> Send:
     return send_with_headers
 
 
-async def _refuse(scope: Scope, send: Send, status: HTTPStatus) -> None:
+def _refusal_of(scope: Scope, status: HTTPStatus) -> ASGIApp:
     if scope["type"] == "websocket":
-        await send({"type": "websocket.close", "code": 1008, "reason": ""})  # before it is accepted: 403
-        return
-    why = b"forbidden\n"
+        return WebSocketClose(1008)  # before it is accepted: 403
+    why = "forbidden\n"
     if status is HTTPStatus.UNAUTHORIZED:
-        why = b"this page needs a token: add ?token=TOKEN to its address\n"
-    headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"content-length", str(len(why)).encode())]
-    await send({"type": "http.response.start", "status": int(status), "headers": headers})
-    await send({"type": "http.response.body", "body": why})
+        why = "this page needs a token: add ?token=TOKEN to its address\n"
+    return PlainTextResponse(why, status)

@@ -6,7 +6,7 @@ import logging
 import os
 import socket
 from collections.abc import Iterator
-from typing import Final, cast
+from typing import Final
 
 # the framework would look for stored settings below the current folder; the page stores nothing
 os.environ.setdefault("NICEGUI_STORAGE_PATH", os.devnull)
@@ -14,7 +14,7 @@ os.environ.setdefault("NICEGUI_STORAGE_PATH", os.devnull)
 import uvicorn
 
 from bridge.hub.access import AccessPolicy
-from services.dashboard.doors import App, Doors
+from services.dashboard.doors import Doors
 from services.dashboard.feed import Feed
 from services.dashboard.page import Dashboard
 from services.dashboard.robot import WatchedRobot
@@ -50,10 +50,9 @@ class PageServer:
     ) -> None:
         self.ready = asyncio.Event()
         self._listener = listener
-        application = cast("App", Dashboard(feed, robot).application())
         tls = policy.tls
         config = uvicorn.Config(
-            Doors(application, policy, loopback=loopback),
+            Doors(Dashboard(feed, robot).application(), policy, loopback=loopback),
             log_config=None,
             log_level=logging.WARNING,
             access_log=False,
