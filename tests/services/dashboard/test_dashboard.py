@@ -16,6 +16,7 @@ import struct
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import AsyncMock
 
 import pytest
 import websockets
@@ -93,18 +94,20 @@ def test_landmarks_of_a_message_or_none():
     assert len(landmark[2]) == 100, "each page gets it twice a second"
 
 
+async def nothing(*_arguments):
+    pass
+
+
+def watched(feed=None, deployment=None):
+    """A robot that follows nothing but the plain topics."""
+    robot = WatchedRobot(
+        feed or Feed(), Settings(), deployment, uri="ws://robot:9090", topic="/BMresults", truth="/truth"
+    )
+    robot._ask_about_world = nothing
+    return robot
+
+
 STATE = 1 | 3 << 2 | 1 << 4 | 52 << 6 | 10 << 13
-
-
-class SamplesServer:
-    """A server on which only samples are published."""
-
-    def __init__(self, *messages):
-        self._messages = messages
-
-    async def subscribe(self, topic, _kind, **_flow):
-        for message in self._messages if topic == "/bm/samples" else ():
-            yield SimpleNamespace(msg=message)
 
 
 def samples_message(*states, words=1):
@@ -123,40 +126,41 @@ def chain():
     return builders.boat(machine=machine, boards=boards, hidden=hidden, variables=variables)
 
 
-async def samples_shown(monkeypatch, deployment, *messages, of="boat"):
+async def samples_shown(deployment, *messages, of="boat"):
+    async def subscribe(topic, _kind, **_flow):
+        for message in messages if topic == "/bm/samples" else ():
+            yield SimpleNamespace(msg=message)
+
     feed = Feed()
     feed.add(report(1, deployment=of), 0.0)
-    robot = WatchedRobot(
-        feed, Settings(), deployment, uri="ws://robot:9090", topic="/BMresults", truth="/truth"
-    )
-    for other in ("_follow_frames", "_ask_about_world"):
-        monkeypatch.setattr(robot, other, nothing)
-    await robot._follow(SamplesServer(*messages))
+    robot = watched(feed, deployment)
+    robot._follow_frames = nothing
+    await robot._follow(SimpleNamespace(subscribe=subscribe))
     return robot.samples
 
 
-async def test_sampled_states_are_shown_by_name(monkeypatch, chain):
+async def test_sampled_states_are_shown_by_name(chain):
     words = "S=yes  y=3  x=1  D1=52 m  B1=10"
     message = samples_message(*[0] * 10, STATE, STATE | 3)
-    shown = (await samples_shown(monkeypatch, chain, message)).split("\n")
+    shown = (await samples_shown(chain, message)).split("\n")
     assert (len(shown), shown[0]) == (8, "S=no  y=-3  x=0  D1=0 m  B1=0")
     assert shown[-2:] == [words, words.replace("S=yes", "S=code 3")]
 
 
-async def test_states_of_other_machines_are_hexadecimal_words(monkeypatch, chain, boat):
+async def test_states_of_other_machines_are_hexadecimal_words(chain, boat):
     message = samples_message(1 | 2 << 32, 3 | 0xABC << 32, words=2)
     for deployment in (None, boat, chain.replace(hidden=())):
-        shown = await samples_shown(monkeypatch, deployment, message)
+        shown = await samples_shown(deployment, message)
         assert shown == "00000002 00000001\n00000abc 00000003"
-    assert await samples_shown(monkeypatch, chain, samples_message(STATE), of="garden") == f"{STATE:08x}"
-    assert not await samples_shown(monkeypatch, chain, message, {"layout": 3, "data": 10**12})
-    long = await samples_shown(monkeypatch, None, samples_message(1, words=10_000))
+    assert await samples_shown(chain, samples_message(STATE), of="garden") == f"{STATE:08x}"
+    assert not await samples_shown(chain, message, {"layout": 3, "data": 10**12})
+    long = await samples_shown(None, samples_message(1, words=10_000))
     assert len(long) == 1000
 
 
 def test_units_are_those_of_the_deployment_of_a_frame(chain):
     feed = Feed()
-    robot = WatchedRobot(feed, Settings(), chain, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
+    robot = watched(feed, chain)
     assert robot.words_for(feed.add(report(1, deployment="boat"), 0.0)) == {"D1": ("m", ()), "B1": ("", ())}
     assert robot.words_for(feed.add(report(1, deployment="garden"), 0.0)) == {}
 
@@ -191,69 +195,48 @@ async def test_switches_that_do_not_answer_are_bounded_and_hold_up_nothing():
     assert b"not answered" in sent[0]
 
 
-async def nothing(*_arguments):
-    pass
-
-
-async def test_a_topic_with_too_large_messages_does_not_end_the_page(monkeypatch):
+async def test_a_topic_with_too_large_messages_does_not_end_the_page():
     asked = []
 
-    class Server:
-        async def subscribe(self, topic, _kind, **_flow):
-            asked.append(topic)
-            raise TopicLeftOutError(f"{topic} is left out")
-            yield
+    async def subscribe(topic, _kind, **_flow):
+        asked.append(topic)
+        raise TopicLeftOutError(f"{topic} is left out")
+        yield
 
-    robot = WatchedRobot(Feed(), Settings(), None, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
-    for other in ("_follow_frames", "_ask_about_world"):
-        monkeypatch.setattr(robot, other, nothing)
-    await robot._follow(Server())
+    robot = watched()
+    robot._follow_frames = nothing
+    await robot._follow(SimpleNamespace(subscribe=subscribe))
     assert set(asked) == {"/truth", "/boat/beacons", "/bm/samples"}
 
 
-async def test_each_reason_of_unreadable_messages_is_reported_once(monkeypatch, capsys):
-    errors = [BadResultError(f"it has {number % 30} values") for number in range(300)]
-
-    class Frames:
-        announced_only = lost = 0
-
-        async def next_frame(self, _timeout):
-            raise errors.pop() if errors else DisconnectedError("it is closed")
-
+async def fed(monkeypatch, outcomes, deployment=None):
+    """The feed after these frames and errors."""
+    next_frame = AsyncMock(side_effect=[*outcomes, DisconnectedError("it is closed")])
+    frames = SimpleNamespace(announced_only=0, lost=0, next_frame=next_frame)
     monkeypatch.setattr(
-        "services.dashboard.robot.posteriors", lambda *_, **__: contextlib.nullcontext(Frames())
+        "services.dashboard.robot.posteriors", lambda *_, **__: contextlib.nullcontext(frames)
     )
     feed = Feed()
-    robot = WatchedRobot(feed, Settings(), None, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
     with pytest.raises(DisconnectedError):
-        await robot._follow_frames(None)
+        await watched(feed, deployment)._follow_frames(None)
+    return feed
+
+
+async def test_each_reason_of_unreadable_messages_is_reported_once(monkeypatch, capsys):
+    errors = [BadResultError(f"it has {number // 2 % 30} values") for number in range(300)]
+    feed = await fed(monkeypatch, errors)
     said = capsys.readouterr().err.splitlines()
     assert (len(said), len(set(said))) == (20, 20)
     assert feed.lost == {"unreadable message": 300}
 
 
 async def test_frames_of_another_deployment_are_not_shown(monkeypatch, boat):
-    there = [
+    ours, *others = (
         posterior(1, deployment="boat"),
         posterior(2, deployment="garden"),
         report(3, deployment="garden"),
-    ]
-
-    class Frames:
-        announced_only = lost = 0
-
-        async def next_frame(self, _timeout):
-            if not there:
-                raise DisconnectedError("it is closed")
-            return there.pop()
-
-    monkeypatch.setattr(
-        "services.dashboard.robot.posteriors", lambda *_, **__: contextlib.nullcontext(Frames())
     )
-    feed = Feed()
-    robot = WatchedRobot(feed, Settings(), boat, uri="ws://robot:9090", topic="/BMresults", truth="/truth")
-    with pytest.raises(DisconnectedError):
-        await robot._follow_frames(None)
+    feed = await fed(monkeypatch, [*others, ours], boat)
     assert [each.report.number for each in feed.frames] == [1]
     assert feed.lost == {"of another deployment": 2}
 
@@ -312,7 +295,9 @@ class Browser:
         await self.say(json.dumps(wish))
 
 
-async def publish(ros, results, reports, numbers):
+async def publish(ros, numbers):
+    results = await ros.advertise("/BMresults", "std_msgs/Float64MultiArray")
+    reports = await ros.advertise("/bm/frame", "diagnostic_msgs/DiagnosticArray")
     stamp = {"secs": 5, "nsecs": 0}
     for number in numbers:
         await reports.publish(frame_message(stamp, number, published=True))
@@ -338,8 +323,6 @@ async def check_doors(port):
 
 async def use_the_robot(ros, browser, port):
     """Results, a pose, a switch and a file."""
-    results = await ros.advertise("/BMresults", "std_msgs/Float64MultiArray")
-    reports = await ros.advertise("/bm/frame", "diagnostic_msgs/DiagnosticArray")
     asked = []
 
     async def switched(request):
@@ -348,7 +331,7 @@ async def use_the_robot(ros, browser, port):
 
     poses = ros.subscribe("/boat/set_pose", "geometry_msgs/PoseStamped")
     await ros.advertise_service("/boat/noise", "std_srvs/SetBool", switched)
-    await publish(ros, results, reports, range(1, 4))
+    await publish(ros, range(1, 4))
     head = await browser.next("frame", lambda head: head["number"] == 3)
     assert head["plot"]["axes"][0]["label"] == "y"
     assert head["plot"]["mean"] == [1, 1]
@@ -393,9 +376,7 @@ async def test_a_page_from_the_first_result_to_the_last(stage):
         await stage.hub(int(uri.rpartition(":")[2]))
         await browser.next("stats", lambda head: head["connected"])
         async with connect(uri, check_types=False) as ros:
-            results = await ros.advertise("/BMresults", "std_msgs/Float64MultiArray")
-            reports = await ros.advertise("/bm/frame", "diagnostic_msgs/DiagnosticArray")
-            await publish(ros, results, reports, [9])
+            await publish(ros, [9])
             await browser.next("frame", lambda head: head["number"] == 9)
 
         # a page without a WebSocket waits for its next events
