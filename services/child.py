@@ -232,8 +232,7 @@ class Child:
 
     def _send(self, number: signal.Signals) -> None:
         if self._process is not None and self.is_running:
-            with contextlib.suppress(ProcessLookupError):
-                self._process.send_signal(number)
+            self._process.send_signal(number)
 
     def close(self) -> None:
         """Stop reading from an exited process."""

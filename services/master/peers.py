@@ -50,8 +50,7 @@ ANSWER_TIME = 60.0
 """Seconds by which a service may exceed its own timeouts before it counts as stuck."""
 
 COMPILING_TIME = 60.0
-"""Additional seconds for the run's own boards to listen, because without a cache they compile their kernels.
-"""
+"""Additional seconds for the run's own boards to listen, because without a cache they compile their kernels."""
 
 _CONNECT_EVERY = 0.01
 _WATCH_EVERY = 1.0

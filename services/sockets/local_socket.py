@@ -1,7 +1,7 @@
 """Local sockets between services: length-prefixed MessagePack records, and the handshake.
 
 A framed record is its length in four bytes (little-endian), followed by that many bytes of MessagePack. The core does
-not perform I/O; it has an asyncio wrapper and a blocking one.
+not perform I/O; `RecordProtocol` is its wrapper for asyncio.
 """
 
 from __future__ import annotations

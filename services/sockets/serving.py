@@ -1,10 +1,10 @@
 """The services of a run, and their side of a local socket, which serves one master at a time.
 
 master ──connects──▶ service   a second one is refused with `Trouble`
-◀───Hello────           role, version, deployment
-────Hello───▶           a difference is refused with `Trouble`
-◀─Notice, Ready         stored notices, and lasting states
-◀──records──▶
+       ◀───Hello────           role, version, deployment
+       ────Hello───▶           a difference is refused with `Trouble`
+       ◀─Notice, Ready         stored notices, and lasting states
+       ◀──records──▶
 """
 
 import asyncio

@@ -75,7 +75,7 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
             completed=completed,
             lost={str(reason): count for reason, count in lost.items() if count},
             last_number=number or None,
-            last_age_s=seconds_since(tick),
+            last_age_s=(time.monotonic_ns() - tick) / 1e9 if tick else None,
             without=dict(without or {}),
         )
 
@@ -177,11 +177,6 @@ class StackStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 # --- what processes say -----------------------------------------------------------------------------
-
-
-def seconds_since(tick: int) -> float | None:
-    """Return the age in seconds of a monotonic time in ns; None for 0, which means never."""
-    return (time.monotonic_ns() - tick) / 1e9 if tick else None
 
 
 def connections(rosbridges: Mapping[str, Ros]) -> list[ConnectionStatus]:

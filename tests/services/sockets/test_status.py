@@ -10,7 +10,7 @@ from services.errors import SettingsError
 from services.sockets import reporting
 from services.sockets.records import VERSION
 from services.sockets.reporting import Report, ServiceManager, serve_status, serve_status_in_thread
-from services.sockets.status import FrameCounts, ProcessStatus, read_process_status, seconds_since
+from services.sockets.status import FrameCounts, ProcessStatus, read_process_status
 from terminal.health import NoHealthError, in_thread, serve_health, status_socket
 from terminal.run_directory import remove_stale_sockets
 from tests.patience import PATIENCE
@@ -97,5 +97,5 @@ def test_a_rate_is_of_the_last_seconds(monkeypatch, completed, rate):
 
 
 def test_the_age_of_nothing_is_none():
-    assert seconds_since(0) is None
-    assert seconds_since(time.monotonic_ns() - 2_000_000_000) >= 2
+    assert FrameCounts.of(0, 0, {}, (0, 0)).last_age_s is None
+    assert FrameCounts.of(1, 1, {}, (1, time.monotonic_ns() - 2_000_000_000)).last_age_s >= 2
