@@ -322,6 +322,9 @@ def test_the_loader_is_refused_while_a_host_holds_the_board(start_board):
         assert link.read32(rm.PROGRAMMED) == 1
         with pytest.raises(errors.HeldError):
             program(board.endpoint, image(machine(2)))
+        # before the loader sends the file
+        with open_programming(board) as loader, pytest.raises(errors.HeldError):
+            begin(loader, 12, hashlib.sha256(words(1, 2, 3)).digest())
         assert link.read32(rm.PROGRAMMED) == 1
     assert program(board.endpoint, image(machine(2))) == image(machine(2)).image_hash
 
