@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from terminal.pictures import new_figure, save_figure
 
 THESIS_S: Final = 0.6
-"""Seconds that the matching costs of a pair took on the thesis's host (4.4); it gives no size of the images."""
+"""Seconds for the matching costs of a pair on the thesis's host (4.4); the thesis does not give the images' size."""
 UNKNOWN: Final = -1.0
 """Disparity of a pixel without a posterior."""
 _BAD: Final = 1.0

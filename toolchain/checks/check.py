@@ -173,7 +173,7 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
 
 
 def state_findings(variable: Variable) -> Iterator[Finding]:
-    """Find states that a reading could mean differently than it is taken, as a number or as a bool."""
+    """Find readings, numbers or bools, that select another state than their sender probably means."""
     states, shown = variable.states, ", ".join(variable.states[:_MOST_NAMES])
     for at, name in enumerate(states):
         number = variable.offset + at * variable.step

@@ -293,9 +293,10 @@ class Subscriptions:
     def receive_known(
         self, messages: Sequence[bytes], first: int, received_ns: int, monotonic_ns: int
     ) -> tuple[list[Message], tuple[int, ...]]:
-        """Return the messages with one known envelope, from index `first` to another, and their subscriptions.
+        """Decode the messages from index `first` on that have the known envelope; return them, and their subscriptions.
 
-        There are none if `ClientCore.receive` has to handle the first one.
+        It ends before the first message with another envelope; there are none if `ClientCore.receive` has to handle the
+        first one.
         """
         envelope, size, topic, subscribed = self._known
         depth = self._wire.max_depth - 1  # of a message inside its operation
