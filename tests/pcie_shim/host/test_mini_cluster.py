@@ -396,16 +396,31 @@ def test_a_board_of_another_register_map_is_refused(start_board):
     refuse_on_opening(start_board(misbehave="wrong-map"), errors.GreetingMismatchError)
 
 
-@pytest.mark.parametrize("words", [-1, 0, 1])
-def test_an_interrupt_has_exactly_the_results_of_its_board(words):
+def interrupted(state=BoardState.DONE, reason=StopReason.OVERFLOW, words=3):
+    """A board of three lines after an interrupt of this state, with these words of results."""
     board = DrivenBoard(0, parse_endpoint("unix:/nowhere"), images(1, (3,))[0])
     board.waiting = board.sends_results = True
-    status = in_field(rm.STATUS_STATE_MASK, BoardState.DONE)
-    status |= in_field(rm.STATUS_STOP_REASON_MASK, StopReason.OVERFLOW)
-    done = Done(board.number, status, 9, 100, memoryview(bytes(4 * (3 + words))))
-    with pytest.raises(errors.ShortReadError) if words else contextlib.nullcontext():
+    status = in_field(rm.STATUS_STATE_MASK, state) | in_field(rm.STATUS_STOP_REASON_MASK, reason)
+    return board, Done(board.number, status, 9, 100, memoryview(bytes(4 * words)))
+
+
+@pytest.mark.parametrize("words", [2, 3, 4])
+def test_an_interrupt_has_exactly_the_results_of_its_board(words):
+    board, done = interrupted(words=words)
+    with pytest.raises(errors.ShortReadError) if words != 3 else contextlib.nullcontext():
         board._take(done)
-    assert board.waiting is bool(words)
+    assert board.waiting is (words != 3)
+
+
+@pytest.mark.parametrize(
+    ("state", "reason"),
+    [(BoardState.RUNNING, StopReason.OVERFLOW), (BoardState.DONE, StopReason.NONE), (BoardState.DONE, 15)],
+)
+def test_an_interrupt_is_of_a_board_that_has_stopped_for_a_reason(state, reason):
+    board, done = interrupted(state, reason)
+    with pytest.raises(errors.FramingError):
+        board._take(done)
+    assert board.waiting
 
 
 def test_the_slowest_board_sets_the_deadline(boards, clock):
