@@ -6,9 +6,21 @@ import sys
 
 import pytest
 
-from scripts.campaigning.accounts import FAILED, PASSED_OVER, Counters, Excuses, judge
+from scripts.campaigning.accounts import (
+    FAILED,
+    PASSED_OVER,
+    ROSBRIDGE_AWAY,
+    UNUSABLE,
+    WITH_APP,
+    WITH_PUBLISHER,
+    Counters,
+    Excuses,
+    judge,
+)
 from scripts.campaigning.expected import BANKS, LINES, BoardOutcome, Outcome
+from scripts.campaigning.faults import Fault, Kind, excuses_of
 from scripts.campaigning.observer import DEPLOYMENT, Flaw, Observer
+from scripts.campaigning.stack import Topology
 from scripts.running.script import ROOT
 from tests.posteriors.messages import status
 
@@ -107,6 +119,11 @@ def reorder(run):
     run.replace(13, 13, *both(3, 6))
 
 
+def lose_under_another_reason(run):
+    run.end(7, {FAILED: 1})
+    run.excuses = Excuses(reasons=frozenset({WITH_APP}))
+
+
 def data(run):
     return run.message("result", 4)["data"]
 
@@ -128,6 +145,8 @@ BUGS = {
     "lost after counting": (Flaw.UNCOUNTED, lambda run: run.end(8)),
     "counted twice": (Flaw.MISCOUNTED, lambda run: setattr(run, "counters", Counters(8, {PASSED_OVER: 1}))),
     "lost without a fault": (Flaw.UNEXPLAINED, lambda run: run.end(7, {FAILED: 1})),
+    "lost under another reason than the fault's": (Flaw.UNEXPLAINED, lose_under_another_reason),
+    "unusable without an unusable variable": (Flaw.UNEXPLAINED, lambda run: run.end(7, {UNUSABLE: 1})),
     # the last reading is not followed by another one
     "passed over alone": (Flaw.UNEXPLAINED, lambda run: run.end(7, {PASSED_OVER: 1})),
     "not a number": (Flaw.MALFORMED, lambda run: data(run).__setitem__(3, float("nan"))),
@@ -155,6 +174,24 @@ def test_a_fault_excuses_what_it_cuts_off_before_the_recovery(until, flaws):
     run.counters = Counters(7)
     run.excuses = Excuses(readings=True, results=True, until=until)
     assert run.play() == flaws
+
+
+@pytest.mark.parametrize(
+    ("what", "target", "reasons"),
+    [
+        ("kill", "pcie-app", {WITH_APP}),
+        ("stop", "pcie-app", {FAILED}),
+        ("kill", "publisher", {WITH_PUBLISHER, ROSBRIDGE_AWAY}),
+        ("stop", "publisher", set()),
+        ("kill", "subscriber", set()),
+        ("cut", "board0", {FAILED}),
+        ("gone", "rosbridge", {ROSBRIDGE_AWAY}),
+        ("clock", "all", set()),
+    ],
+)
+def test_a_fault_explains_losses_of_its_own_reasons_only(what, target, reasons):
+    excuses = excuses_of((Fault(Kind.SIGNALS, what, target, 1.0),), Topology.OWN)
+    assert excuses.reasons == reasons
 
 
 WITHOUT_DESCRIPTORS = """
