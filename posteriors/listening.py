@@ -17,7 +17,7 @@ import asyncio
 import contextlib
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
-from typing import Any, Final, Protocol, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 from bridge.client import Message, Ros, State, Subscription, connect
 from bridge.client.protocol import Compression
@@ -39,13 +39,6 @@ _REPORT_TIMEOUT: Final = 1.0
 """Seconds that a posterior waits for its report."""
 
 Result = TypeVar("Result")
-
-
-class _RunInLoop(Protocol):
-    """Function that runs a coroutine on a loop in another thread."""
-
-    def __call__(self, work: Coroutine[Any, Any, Result]) -> Result:
-        """Return the coroutine's result."""
 
 
 class Posteriors:
@@ -307,7 +300,7 @@ def listen(
             run(ros.__aenter__())
             subscription = run(begin())
             while count is None or taken < count:
-                posterior = run(subscription.next(timeout if taken else first_timeout))
+                posterior: Posterior = run(subscription.next(timeout if taken else first_timeout))
                 taken += 1
                 if function(posterior) is False:
                     break
@@ -317,8 +310,8 @@ def listen(
 
 
 @contextlib.contextmanager
-def _loop_in_a_thread() -> Iterator[_RunInLoop]:
-    """Run an event loop in its own thread within the context."""
+def _loop_in_a_thread() -> Iterator[Callable[[Coroutine[Any, Any, Any]], Any]]:
+    """Run an event loop in its own thread within the context; yield a function that runs a coroutine there."""
     loops: list[asyncio.AbstractEventLoop] = []
 
     @contextlib.asynccontextmanager
@@ -326,7 +319,7 @@ def _loop_in_a_thread() -> Iterator[_RunInLoop]:
         loops.append(asyncio.get_running_loop())
         yield
 
-    def run(work: Coroutine[Any, Any, Result]) -> Result:
+    def run(work: Coroutine[Any, Any, Any]) -> Any:
         future = asyncio.run_coroutine_threadsafe(work, loops[0])
         try:
             return future.result()

@@ -21,8 +21,6 @@ OUTLIER: Final = 0.05
 WINDOW: Final = 2
 """Pixels on each side of a pixel over which a cost is averaged."""
 
-Volume = NDArray[np.float32]
-
 
 def box_sum(values: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
     """Return the sums over windows of 2 * reach + 1 in the last two dimensions, cut off at the borders."""
