@@ -96,15 +96,15 @@ def build_deployment(
         directory.mkdir(parents=True, exist_ok=True)
         # a process that reads the folder meanwhile finds no deployment, instead of parts of two
         (directory / FILE_NAME).unlink(missing_ok=True)
-    for part in (
+    write_files(
+        directory,
         image_files(built.deployment, built.images),
         filter_file(built.transition),
         memory_files(built.deployment, built.images),
         quartus_files(built.deployment, built.images),
         text_file(REPORT_NAME, built.report),
         text_file(FILE_NAME, deployment_text(built.deployment)),
-    ):
-        write_files(directory, part)
+    )
     return replace(built, deployment=built.deployment.replace(directory=directory))
 
 

@@ -184,5 +184,4 @@ def _sentence(path: Path, old: NDArray[Any], new: NDArray[Any], offset: int) -> 
         )
         shown.append(f"{where}: {old[address, line]:#x} -> {new[address, line]:#x}")
     more = f"; and {len(places) - _SHOWN} more" if len(places) > _SHOWN else ""
-    count = f"{len(places)} code{'s' if len(places) > 1 else ''}"
-    return f"{MEMORIES_FOLDER}/{path.name}: {count}: {'; '.join(shown)}{more}"
+    return f"{MEMORIES_FOLDER}/{path.name}: {counted(len(places), 'code')}: {'; '.join(shown)}{more}"

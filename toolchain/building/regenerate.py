@@ -103,16 +103,15 @@ def regenerate_memories(
         return _with_places(new, deployment, keeps_built=same_model)
 
     built = assemble(plan, place)
-    parts = [
+    return write_files(
+        directory,
         image_files(built.deployment, built.images),
         filter_file(built.transition),
         memory_files(built.deployment, built.images),
         text_file(REPORT_NAME, built.report),
-        text_file(
-            FILE_NAME, deployment_text(built.deployment)
-        ),  # last, so that a partially written folder has the old hashes
-    ]
-    return sorted(change for part in parts for change in write_files(directory, part))
+        # last, so that a partially written folder has the old hashes
+        text_file(FILE_NAME, deployment_text(built.deployment)),
+    )
 
 
 def regenerate_project(directory: Path) -> Changes:

@@ -177,13 +177,15 @@ def text_file(name: str, text: str) -> OutputFiles:
     return OutputFiles({name: [text.encode()]}, re.compile(re.escape(name)))
 
 
-def write_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
-    """Write the files of a part atomically; return every path, sorted, and its change."""
-    changes = {name: _write(directory / name, pieces) for name, pieces in files.contents.items()}
-    for name in _stale(directory, files):
-        with file_errors(directory / name, "written", BuildError):
-            (directory / name).unlink()
-        changes[name] = Change.REMOVED
+def write_files(directory: Path, *parts: OutputFiles) -> list[tuple[str, Change]]:
+    """Write the files of parts, one after the other, each atomically; return every path, sorted, and its change."""
+    changes: dict[str, Change] = {}
+    for part in parts:
+        changes |= {name: _write(directory / name, pieces) for name, pieces in part.contents.items()}
+        for name in _stale(directory, part):
+            with file_errors(directory / name, "written", BuildError):
+                (directory / name).unlink()
+            changes[name] = Change.REMOVED
     return sorted(changes.items())
 
 
