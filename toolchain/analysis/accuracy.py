@@ -15,10 +15,9 @@ from typing import Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from machines.bm1 import BM1Machine, Start, StopReason, addressed_codes
-from machines.encode import decode_code
+from machines.bm1 import StopReason
 from machines.parameters import RngReset
-from toolchain.analysis.emulation import EmulatedBoards, Inputs, WrittenPrior
+from toolchain.analysis.emulation import EmulatedBoards, Inputs, WrittenPrior, addressed_chances
 from toolchain.analysis.readings import Readings
 from toolchain.cluster import Run, Work, in_order, in_this_process
 from toolchain.deployment.filter import Filter
@@ -309,16 +308,6 @@ def _summary(pairs: NDArray[np.float64]) -> Difference:
         map_agreement=share_of_frames(float(every[:, 2].mean()), len(every)),
         alone=of_alone,
     )
-
-
-def addressed_chances(
-    machine: BM1Machine, addresses: Inputs, prior_address: int, prior: WrittenPrior = None
-) -> NDArray[np.float64]:
-    """Return the probability that each cell gives a 1 in a cycle: float64[columns, lines], the prior first."""
-    frame = Start(
-        addresses=addresses, prior_address=prior_address, prior_codes=prior, target_count=1, max_cycles=1
-    )
-    return decode_code(addressed_codes(machine, frame), machine.parameters.prob_bits)
 
 
 def _line_probabilities(

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machines import make_kernel
-from machines.bm1 import BM1Machine, Start, StopReason, first_slice
+from machines.bm1 import BM1Machine, Start, StopReason, addressed_codes, first_slice
+from machines.encode import decode_code
 from machines.parameters import COUNTER_BITS_MAX, CYCLES_MAX, BM1Parameters
 from machines.posterior import joint_posterior
 from toolchain.deployment import Stop
@@ -141,6 +142,16 @@ class EmulatedBoards:
             tuple(kernel.cycles for kernel in self._kernels),
             tuple(kernel.reason for kernel in self._kernels),
         )
+
+
+def addressed_chances(
+    machine: BM1Machine, addresses: Inputs, prior_address: int, prior: WrittenPrior = None
+) -> NDArray[np.float64]:
+    """Return the probability that each cell gives a 1 in a cycle: float64[columns, lines], the prior first."""
+    frame = Start(
+        addresses=addresses, prior_address=prior_address, prior_codes=prior, target_count=1, max_cycles=1
+    )
+    return decode_code(addressed_codes(machine, frame), machine.parameters.prob_bits)
 
 
 def one_replica(machine: BM1Machine) -> BM1Machine:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from machines.parameters import PROB_BITS_MAX, RngKind, SensorMode
-from toolchain.analysis.accuracy import addressed_chances
-from toolchain.analysis.emulation import one_replica
+from toolchain.analysis.emulation import addressed_chances, one_replica
 from toolchain.analysis.readings import Readings, readings_of_lines, sample_readings
 from toolchain.building.machine import MachinePlan, plan_machine, whole_machine
 from toolchain.building.options import BuildOptions

@@ -13,12 +13,11 @@ from typing import Final
 
 import numpy as np
 
-from machines.bm1 import BM1Machine, Start, addressed_codes
+from machines.bm1 import BM1Machine
 from machines.bm1_kind import BM1
-from machines.encode import decode_code
 from machines.parameters import REPLICAS_MAX, BM1Parameters
 from pcie_shim.register_layout import interface_room
-from toolchain.analysis.emulation import one_replica
+from toolchain.analysis.emulation import addressed_chances, one_replica
 from toolchain.analysis.logic import MLAB_ALMS, MLAB_SHARE, Device, Logic, Memories, logic_of, place_memories
 from toolchain.analysis.readings import Readings
 from toolchain.building.machine import partition_lines
@@ -225,13 +224,11 @@ def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
 
 def _stream_toggles(machine: BM1Machine, readings: Readings, lines: slice) -> float:
     """Toggles of cells, ANDs, counters and their comparators, averaged over frames."""
-    width = machine.parameters.prob_bits
     found = []
     for frame in range(min(len(readings), _FRAMES)):
         addresses, row = readings.of_machine(frame, machine)
         own = addresses if isinstance(addresses, tuple) else addresses[:, lines]
-        start = Start(addresses=own, prior_address=row, target_count=1, max_cycles=1)
-        chances = decode_code(addressed_codes(machine, start), width)
+        chances = addressed_chances(machine, own, row)
         line = np.prod(chances, axis=0)
         bits = float((2 * chances * (1 - chances)).sum())
         found.append(bits + float((2 * line * (1 - line)).sum()) + 3 * float(line.sum()))
