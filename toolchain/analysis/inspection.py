@@ -205,7 +205,7 @@ def _machine_part(found: Inspection) -> str:
     rows = [
         (
             f"Deployment {deployment.name} ({deployment.hash[:16]}): {machine.lines} lines ({grid}), {p.sensors} sensor "
-            f"columns and the prior, on {boards} board{'s' if boards > 1 else ''}{split}."
+            f"columns and the prior, on {counted(boards, 'board')}{split}."
         ),
         (
             f"Codes of {p.prob_bits} bits (scale = {machine.scale}), counters of {p.counter_bits} "

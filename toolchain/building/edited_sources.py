@@ -21,7 +21,7 @@ from toolchain.building.build import check_agreement, read_images
 from toolchain.building.machine import MACHINE_KEYS
 from toolchain.deployment import FILE_NAME, Deployment, deployment_text, load_deployment
 from toolchain.deployment.deployment import other_image, with_hash
-from toolchain.errors import BuildError
+from toolchain.errors import BuildError, counted
 from toolchain.outputs.memories import MEMORIES_FOLDER, Memory, memories, unpacked_codes
 from toolchain.outputs.mif import read_mif
 from toolchain.outputs.output_files import (
@@ -89,7 +89,7 @@ def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Chang
     parts = [image_files(changed, new), memory_files(changed, new), quartus_files(changed, new)]
     if changed != deployment:  # last, so that a partially written folder has the old hashes
         parts.append(text_file(FILE_NAME, deployment_text(changed)))
-    return edits, sorted(change for part in parts for change in write_files(directory, part))
+    return edits, write_files(directory, *parts)
 
 
 def _with_parameters(

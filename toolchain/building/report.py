@@ -12,6 +12,7 @@ from toolchain.building.bm2_machine import clipped
 from toolchain.building.machine import MachinePlan
 from toolchain.building.quantise import Quantised
 from toolchain.deployment import Deployment, MachineSection
+from toolchain.errors import counted
 from toolchain.models.model import Model
 from toolchain.models.network import NetworkModel
 
@@ -29,7 +30,7 @@ def build_report(model: Model, deployment: Deployment, quantised: Quantised, int
     names = ", ".join(
         each.name + (f" (table of {each.table_of})" if each.table_of else "") for each in deployment.sensors
     )
-    count = f"{len(model.known)} known variable{'s' if len(model.known) != 1 else ''}"
+    count = counted(len(model.known), "known variable")
     if names:
         names = f", in the order of the columns: {names}" if len(model.known) > 1 else f", {names}"
     sentence = (
@@ -106,7 +107,7 @@ def _report(
 
 
 def _generators(machine: MachineSection) -> str:
-    steps = f"{machine.steps_per_clock} step{'' if machine.steps_per_clock == 1 else 's'}"
+    steps = counted(machine.steps_per_clock, "step")
     text = (
         f"{machine.rng} with {machine.rng_banks} banks, rng_reset = {machine.rng_reset}, {steps} per clock."
     )

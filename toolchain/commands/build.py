@@ -17,7 +17,7 @@ from toolchain.commands.request import (
     model_file,
     read_source,
 )
-from toolchain.errors import BuildError, ToolchainError
+from toolchain.errors import BuildError, ToolchainError, counted
 from toolchain.networks import is_network
 
 if TYPE_CHECKING:
@@ -133,9 +133,7 @@ def check(
         typer.echo(json_text.dumps(asdict(finding)) if json else finding.sentence)
     counts = Counter(finding.severity for finding in findings)
     if not json:
-        summary = ", ".join(
-            f"{counts[severity]} {severity}{'' if counts[severity] == 1 else 's'}" for severity in Severity
-        )
+        summary = ", ".join(counted(counts[severity], severity) for severity in Severity)
         typer.echo(f"{checked}: {summary}", err=True)
     raise typer.Exit(ToolchainError.exit_code if counts[Severity.ERROR] else 0)
 

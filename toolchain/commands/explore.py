@@ -12,7 +12,7 @@ from toolchain.analysis import AdviceOptions, InspectOptions, ReadingOptions, Sw
 from toolchain.bounded_files import file_errors
 from toolchain.cluster import SchedulerOptions, runner
 from toolchain.commands.request import ModelFlags, ModelPath, read_model, read_source
-from toolchain.errors import BuildError, NotFusionError
+from toolchain.errors import BuildError, NotFusionError, counted
 from toolchain.flags import Bits
 
 RESULTS = Path("build/explore.jsonl")
@@ -145,7 +145,7 @@ def explore(
     kept.check_writable()
     there = sum(task.key in kept.points for task in found)
     typer.echo(
-        f"{len(found)} machine{'s' if len(found) != 1 else ''} of {read.name} over {drawn.source}"
+        f"{counted(len(found), 'machine')} of {read.name} over {drawn.source}"
         + (f"; {there} of them are in {results}" if there else ""),
         err=True,
     )

@@ -22,7 +22,7 @@ from toolchain.commands.infer import infer
 from toolchain.commands.query import query, show
 from toolchain.commands.request import ModelFlags, model_file, read_source
 from toolchain.deployment import FILE_NAME
-from toolchain.errors import BuildError
+from toolchain.errors import BuildError, counted
 from toolchain.flags import Settings, add_commands
 from toolchain.learning import FitOptions
 
@@ -155,8 +155,7 @@ def _print_changes(
                 if not line.startswith(("---", "+++", "@@")):
                     typer.echo(f"           {line}")
     if unchanged and not verbose:
-        files = "1 file" if len(unchanged) == 1 else f"{len(unchanged)} files"
-        typer.echo(f"unchanged  {files} (--verbose lists them)")
+        typer.echo(f"unchanged  {counted(len(unchanged), 'file')} (--verbose lists them)")
 
 
 def fit(
