@@ -142,8 +142,8 @@ _EDGE: Final = 0.2
 """Share of the map's width at each edge; within it, labels are not centred."""
 
 
-def far_apart(instances: Iterable[Instance], count: int = POSITIONS_SHOWN) -> tuple[Instance, ...]:
-    """Return results whose true positions are far from each other, in the order of time.
+def far_apart(instances: Iterable[Instance]) -> tuple[Instance, ...]:
+    """Return `POSITIONS_SHOWN` results whose true positions are far from each other, in the order of time.
 
     The first result is chosen, then repeatedly the one furthest from all those chosen. Results without a
     truth are used only if there are no others.
@@ -151,7 +151,7 @@ def far_apart(instances: Iterable[Instance], count: int = POSITIONS_SHOWN) -> tu
     results = [instance for instance in instances if instance.posterior is not None]
     candidates = [instance for instance in results if instance.truth is not None] or results
     kept: list[int] = []
-    while len(kept) < min(count, len(candidates)):
+    while len(kept) < min(POSITIONS_SHOWN, len(candidates)):
         free = [i for i in range(len(candidates)) if i not in kept]
         kept.append(max(free, key=lambda i: min((_apart(candidates, i, j) for j in kept), default=0.0)))
     return tuple(candidates[i] for i in sorted(kept))

@@ -4,6 +4,7 @@ import hashlib
 import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from statistics import fmean, median
@@ -48,28 +49,19 @@ def run_fit(
     truth_columns = _truth_columns(model, options.truth)
     columns_of_readings = reading_columns([known.name for known in model.known], options.readings or ())
     columns = list(dict.fromkeys([*columns_of_readings.values(), *truth_columns.values()]))
-    read = [read_recording(path, columns, tolerance_s=options.tolerance_s) for path in recordings]
-    truth = locate(model, _joined(read, truth_columns), sum(each.rows for each in read))
+    read = partial(read_recording, columns=columns, tolerance_s=options.tolerance_s)
+    learnt = [read(path) for path in recordings]
+    truth = locate(model, _joined(learnt, truth_columns), sum(each.rows for each in learnt))
     fit, supports = fit_model(
         model,
         truth,
-        _joined(read, columns_of_readings),
-        [FittedRecording(file=each.path.name, sha256=_sha256(each.path), rows=each.rows) for each in read],
+        _joined(learnt, columns_of_readings),
+        [FittedRecording(file=each.path.name, sha256=_sha256(each.path), rows=each.rows) for each in learnt],
         options,
     )
     write_fit(output, fit)
     fitted = apply_fit(model, fit)
-    compared = [
-        _comparison(
-            path,
-            model,
-            fitted,
-            read_recording(path, columns, tolerance_s=options.tolerance_s),
-            truth_columns,
-            columns_of_readings,
-        )
-        for path in checks
-    ]
+    compared = [_comparison(model, fitted, read(path), truth_columns, columns_of_readings) for path in checks]
     rows = len(truth.rows)
     visited = len(set(truth.lines.tolist()))
     parts = [
@@ -125,7 +117,6 @@ def _joined(recordings: Sequence[Recording], columns: Mapping[str, str]) -> dict
 
 
 def _comparison(
-    path: Path,
     model: Model,
     fitted: Model,
     recording: Recording,
@@ -136,8 +127,8 @@ def _comparison(
     truth = locate(model, _joined([recording], truth_columns), recording.rows)
     readings = _joined([recording], reading_columns)
     if not len(truth.rows):
-        raise ModelError(f"{path}: no row has a true value inside the searched dimensions")
-    rows = [f"{path.name}, {len(truth.rows)} rows that nothing was learnt from, exact inference:"]
+        raise ModelError(f"{recording.path}: no row has a true value inside the searched dimensions")
+    rows = [f"{recording.path.name}, {len(truth.rows)} rows that nothing was learnt from, exact inference:"]
     matrices: list[str] = []
     for name, each in (("by hand", model), ("fitted", fitted)):
         found = _posteriors(each, truth, readings)

@@ -63,12 +63,12 @@ def read_recording(
     return _read_bag(path, once, round(tolerance_s * 1e9))
 
 
-def reading_columns(names: Sequence[str], given: Sequence[str], flag: str = "--reading") -> dict[str, str]:
+def reading_columns(names: Sequence[str], given: Sequence[str]) -> dict[str, str]:
     """Return the column of each variable, by default its name; a BuildError for a pattern without a match."""
     if not given:
         return {name: name for name in names}
     columns: dict[str, str] = {}
-    for pattern, column in key_values(given, flag, "range=COLUMN").items():
+    for pattern, column in key_values(given, "--reading", "range=COLUMN").items():
         before, star, after = pattern.partition("*")
         fitting = [
             name
@@ -81,7 +81,7 @@ def reading_columns(names: Sequence[str], given: Sequence[str], flag: str = "--r
         ]
         if not fitting:
             raise BuildError(
-                f"{flag} {pattern}: not a known variable of the model; expected one of {', '.join(names[:20])}"
+                f"--reading {pattern}: not a known variable of the model; expected one of {', '.join(names[:20])}"
             )
         for name in fitting:
             same = name[len(before) : len(name) - len(after)] if star else ""
