@@ -28,7 +28,6 @@ _MAX_META_BYTES: Final = 4 << 20
 _HEADER: Final = "# Written by `toolchain fit`; read by toolchain.learning.fitted.with_fit. docs/how-to/models.md has the keys.\n"
 _META: Final = "fit.json"
 _PRIOR: Final = "prior.npy"
-_EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 _BAD: Final = (zipfile.BadZipFile, zlib.error, KeyError, ValueError, AttributeError, EOFError, RuntimeError)
 """Errors of NumPy, zipfile and pydantic for a damaged file."""
 
@@ -205,9 +204,9 @@ def read_fit(path: Path) -> Fit:
 
 
 def _write_tables(path: Path, content: dict[str, Any], fit: Fit) -> None:
-    """Write an NPZ file without the time of day, which np.savez would include."""
+    """Write an NPZ file without the time of day, which `writestr` would include."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        entry = zipfile.ZipInfo(_META, _EPOCH)
+        entry = zipfile.ZipInfo(_META)
         archive.writestr(entry, json.dumps(content, indent=1, sort_keys=True), zipfile.ZIP_DEFLATED)
         arrays = {
             f"table{number}.npy": fit.tables[variable["name"]]
@@ -216,9 +215,7 @@ def _write_tables(path: Path, content: dict[str, Any], fit: Fit) -> None:
         if fit.prior is not None:
             arrays[_PRIOR] = fit.prior[np.newaxis]
         for name, array in arrays.items():
-            entry = zipfile.ZipInfo(name, _EPOCH)
-            entry.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(entry, "w", force_zip64=True) as file:
+            with archive.open(name, "w", force_zip64=True) as file:
                 numbers = np.ascontiguousarray(array, dtype="<f8")
                 np.lib.format.write_array(file, numbers, version=(1, 0), allow_pickle=False)
 
