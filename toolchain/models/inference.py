@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 from itertools import combinations, pairwise
-from typing import Final, TypeAlias
+from typing import Final, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,11 @@ class Term:
 
     scope: tuple[str, ...]
     table: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, factor: Factor) -> Self:
+        """Return the term of a factor of a joint distribution."""
+        return cls(tuple(symbol.name for symbol in factor.scope), factor.table)
 
 
 def reduced(term: Term, values: Mapping[str, int]) -> Term:
@@ -199,10 +204,10 @@ class Links:
     Symbols in different components are independent given the removed ones (moral graph criterion).
     """
 
-    def __init__(self, terms: Sequence[Term], factors: Sequence[Factor], cut: set[str]) -> None:
+    def __init__(self, factors: Iterable[Factor], cut: set[str]) -> None:
         self._neighbours: dict[str, dict[str, Factor]] = {}
-        for term, factor in zip(terms, factors, strict=True):
-            inside = [name for name in term.scope if name not in cut]
+        for factor in factors:
+            inside = [symbol.name for symbol in factor.scope if symbol.name not in cut]
             for name in inside:
                 beside = self._neighbours.setdefault(name, {})
                 for other in inside:

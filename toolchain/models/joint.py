@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from operator import itemgetter
 from typing import Final, TypeAlias
@@ -76,6 +77,11 @@ class JointDistribution:
             cycle = " -> ".join(error.args[1])  # the first one is again at the end
             raise ModelError(f"{self.name}: {cycle} is a cycle; a joint distribution has none") from None
         object.__setattr__(self, "symbols", tuple(symbols.values()))
+
+    @cached_property
+    def active(self) -> tuple[Factor, ...]:
+        """The factors without symbols on which their values do not depend."""
+        return tuple(map(without_idle, self.factors))
 
     def symbol(self, name: Named) -> Symbol:
         """Return a symbol by its name, or raise a ModelError."""
@@ -183,8 +189,8 @@ class Question:
         )
         if (refusal := self.refusal()) is not None:
             raise refusal
-        factors, terms = self._factors([without_idle(factor) for factor in self.joint.factors], observed)
-        links = Links(terms, factors, {*searched, *self.given})
+        factors, links = self._linked(self.joint.active, observed)
+        terms = [reduced(Term.of(factor), self.given) for factor in factors]
         own: dict[str, list[Term]] = {symbol.name: [] for symbol in self.observed}
         common: list[Term] = []
         for component in links.components():
@@ -223,8 +229,7 @@ class Question:
         earlier = {symbol.name for symbol in self.previous}
         start: list[Term] = []
         moves: list[Term] = []
-        active = [without_idle(factor) for factor in self.joint.factors]
-        for factor in relevant(active, earlier | {symbol.name for symbol in self.searched}):
+        for factor in relevant(self.joint.active, earlier | {symbol.name for symbol in self.searched}):
             if not isinstance(factor, Distribution):
                 raise ModelError(f"{name}: a filter needs distributions, but {factor.title} is none")
             others = {symbol.name for symbol in factor.given} - earlier
@@ -233,7 +238,7 @@ class Question:
                     f"{name}: {factor.symbol.name}, which is previous, depends on {min(others)}, which is not"
                 )
             terms = start if factor.symbol.name in earlier else moves
-            terms.append(Term(tuple(symbol.name for symbol in factor.scope), factor.table))
+            terms.append(Term.of(factor))
         if not any(earlier.intersection(term.scope) for term in moves):
             names = [" and ".join(each.name for each in group) for group in zip(*pairs, strict=True)]
             raise ModelError(f"{name}: {names[0]} does not depend on {names[1]}, the previous {names[0]}")
@@ -247,7 +252,7 @@ class Question:
 
     def _check_known(self, earlier: set[str]) -> None:
         """Raise a ModelError if a known symbol is not independent of the previous ones given the searched ones."""
-        active = [without_idle(factor) for factor in self.joint.factors]
+        active = self.joint.active
         _, links = self._linked(active, [*(symbol.name for symbol in self.known), *earlier])
         for component in links.components():
             for symbol in self.known if component & earlier else ():
@@ -267,58 +272,48 @@ class Question:
             joint.name, joint.factors, joint.symbols, self.searched, self.observed, self.given
         )
 
-    def _factors(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], list[Term]]:
-        """Return the relevant factors for some observed symbols, and their terms at the given values."""
-        asked = {symbol.name for symbol in self.searched} | set(observed) | set(self.given)
-        factors = relevant(active, asked)
-        terms = [
-            reduced(Term(tuple(symbol.name for symbol in factor.scope), factor.table), self.given)
-            for factor in factors
-        ]
-        return factors, terms
-
     def refusal(self) -> NotFusionError | None:
         """Return why the question is not a naive fusion, or None if it is one."""
         observed = [symbol.name for symbol in self.observed]
-        active = [without_idle(factor) for factor in self.joint.factors]
-        _, links = self._linked(active, observed)
+        _, links = self._linked(self.joint.active, observed)
         if any(len(component.intersection(observed)) > 1 for component in links.components()):
-            return self._refusal(active)
+            return self._refusal()
         return None
 
     def dependent(self) -> list[tuple[str, str]]:
         """Return the pairs of known symbols that are not independent given the searched ones: no BM1 knows both."""
-        factors, pairs = self._pairs([without_idle(factor) for factor in self.joint.factors])
+        factors, pairs = self._pairs()
         return [
             (one, other) for _, one, other in pairs if self._linked(factors, [one, other])[1].path(one, other)
         ]
 
     def _linked(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], Links]:
         """Return the relevant factors for some observed symbols, and their links without the searched and given ones."""
-        factors, terms = self._factors(active, observed)
-        return factors, Links(terms, factors, {*(symbol.name for symbol in self.searched), *self.given})
+        cut = {*(symbol.name for symbol in self.searched), *self.given}
+        factors = relevant(active, cut | set(observed))
+        return factors, Links(factors, cut)
 
-    def _pairs(self, active: Sequence[Factor]) -> tuple[list[Factor], list[tuple[int, str, str]]]:
+    def _pairs(self) -> tuple[list[Factor], list[tuple[int, str, str]]]:
         """Return the factors of all observed symbols, and the pairs that these join, with the lengths of their paths.
 
         The factors of two symbols are among those of all, so no other pair is dependent, and the path of a pair is not
         shorter than that among all.
         """
         observed = [symbol.name for symbol in self.observed]
-        factors, links = self._linked(active, observed)
+        factors, links = self._linked(self.joint.active, observed)
         return factors, [
             (length, one, other)
             for at, one in enumerate(observed)
             for other, length in links.lengths(one, observed[at + 1 :]).items()
         ]
 
-    def _refusal(self, active: Sequence[Factor]) -> NotFusionError:
+    def _refusal(self) -> NotFusionError:
         """Return an error with two dependent observed symbols, the path between them, and advice.
 
         If the observed symbols are not all independent, two of them are dependent, regardless of the others (a property
         of d-separation).
         """
-        factors, pairs = self._pairs(active)
+        factors, pairs = self._pairs()
         path: list[str] = []
         drawn = ""
         for length, one, other in sorted(pairs, key=itemgetter(0)):  # because there may be thousands

@@ -101,7 +101,7 @@ def network_model(
     terms: list[Term] = []
     titles: list[str] = []
     for factor in relevant(map(without_idle, factors), asked | set(given)):
-        term = reduced(Term(tuple(each.name for each in factor.scope), factor.table), fixed)
+        term = reduced(Term.of(factor), fixed)
         if not term.table.any():
             which = [
                 f"{each.name} = {each.shown(fixed[each.name])}" for each in factor.scope if each.name in fixed

@@ -156,13 +156,13 @@ def test_refusals_draw_the_path(joint, searched, known, path):
 
 def test_a_refusal_looks_only_at_pairs_that_could_have_the_shortest_path(monkeypatch):
     looked_at = []
-    whole = Question._factors
+    whole = Question._linked
 
     def counted(self, active, observed):
         looked_at.append(tuple(observed))
         return whole(self, active, observed)
 
-    monkeypatch.setattr(Question, "_factors", counted)
+    monkeypatch.setattr(Question, "_linked", counted)
     with pytest.raises(ModelError, match="v50 and v51 are not independent"):
         long_chain(200).ask(["v0"], [f"v{number}" for number in (*range(10, 200, 4), 51)]).model()
     assert len(looked_at) < 5, looked_at
