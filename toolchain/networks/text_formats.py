@@ -19,7 +19,7 @@ _SHOWN: Final = 40
 class Scanner:
     """A forward scanner; its methods raise a NetworkFileError for an unexpected token."""
 
-    def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str = "") -> None:
+    def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str) -> None:
         """Scan the bytes of a file.
 
         Each of `signs` is a token, and ends a word. `comments` is a regular expression for comments; of /* ... */ only
@@ -33,8 +33,7 @@ class Scanner:
             raise NetworkFileError("not UTF-8 text", path=path, line=line) from None
         self._text = text
         self._start = self._end = 0
-        if comments:
-            self._text = self._without(re.compile(rf'"[^"\n]*"|{comments}'))
+        self._text = self._without(re.compile(rf'"[^"\n]*"|{comments}'))
         signs = re.escape(signs)
         self._signs = re.compile(f"[{signs}]")
         self._token = re.compile(rf'\s*(?:"([^"\n]*)"|([{signs}])|([^\s{signs}"]+)|(\Z)|(.))')

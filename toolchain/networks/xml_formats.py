@@ -61,9 +61,9 @@ class Element:
     children: list[Element] = field(default_factory=list)
     text: str = ""
 
-    def named(self, *names: str) -> list[Element]:
-        """Return the children with one of these names."""
-        return [child for child in self.children if child.name in names]
+    def named(self, name: str) -> list[Element]:
+        """Return the children with this name."""
+        return [child for child in self.children if child.name == name]
 
     def texts(self, name: str) -> list[str]:
         """Return the texts of the children with this name."""
