@@ -110,6 +110,17 @@ def test_a_player_looks_it_up_too(looked_up):
     assert looked_up == ["Adam"]
 
 
+@pytest.mark.parametrize(
+    ("command", "flag", "name"),
+    [(viewer, "--out", "pictures"), (viewer, "--json", "n.json"), (sprinkler_viewer, "--out", "pictures")],
+)
+def test_a_folder_that_cannot_be_written_is_reported_at_the_start(command, flag, name, tmp_path):
+    (tmp_path / "file").write_text("")
+    ended = invoke(command, ["--uri", "ws://127.0.0.1:1", flag, tmp_path / "file" / name])
+    assert ended.exit_code == 2  # an unreachable server is 3
+    assert ended.stderr.startswith(f"error: {tmp_path}/file")
+
+
 async def test_messages_that_are_too_large_are_dropped_with_one_warning(capsys):
     publication = AsyncMock(topic="/t")
     lossy = LossyPublication(publication)

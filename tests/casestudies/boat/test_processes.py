@@ -15,11 +15,9 @@ import sys
 import pytest
 from matplotlib.image import imread
 
-from casestudies.boat import viewer
 from casestudies.boat.sensors import map_grid
 from tests.casestudies.cells import line_at
 from tests.casestudies.pretend_stack import PretendStack, certain, frame_message
-from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PROCESS_PATIENCE
 from tests.posteriors.messages import posterior_message
@@ -159,14 +157,6 @@ async def test_ctrl_c_ends_an_endless_viewer_with_its_pictures(tmp_path):
     assert (code, err.splitlines()[-1]) == (130, "interrupted (Ctrl-C)")
     assert (tmp_path / "figure-4.4.png").exists()
     assert "2 results" in out
-
-
-@pytest.mark.parametrize(("flag", "name"), [("--out", "pictures"), ("--json", "numbers.json")])
-def test_a_folder_that_cannot_be_written_is_reported_at_the_start(flag, name, tmp_path):
-    (tmp_path / "file").write_text("")
-    ended = invoke(viewer.app, ["--uri", "ws://127.0.0.1:1", flag, tmp_path / "file" / name])
-    assert ended.exit_code == 2  # an unreachable server is 3
-    assert ended.stderr.startswith(f"error: {tmp_path}/file")
 
 
 @pytest.mark.thorough

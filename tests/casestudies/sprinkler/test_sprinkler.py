@@ -12,14 +12,12 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from casestudies.sprinkler import viewer as viewer_module
 from casestudies.sprinkler.garden import mornings, publish_mornings
 from casestudies.sprinkler.model import exact_rain, model
 from casestudies.sprinkler.viewer import FrameSummary, SamplesViewer, draw, frame_of, mean_and_error
 from posteriors.errors import NoResultError
 from posteriors.frame_report import FrameReport
 from posteriors.posterior import Posterior
-from tests.command_runner import invoke
 from tests.fake_rosbridge import FakeRosbridge
 from tests.patience import PATIENCE
 from tests.posteriors.messages import posterior_message, report_message
@@ -220,10 +218,3 @@ async def test_a_deployment_without_a_stream_is_told(watched):
     with pytest.raises(NoResultError) as told:
         await watched(1, lambda stack: stack.frame(states(0.36, WET, 10), sent=("frame", "result")), 0.1)
     assert "--stream" in str(told.value)
-
-
-def test_a_folder_that_cannot_be_written_is_reported_at_the_start(tmp_path):
-    (tmp_path / "file").write_text("")
-    ended = invoke(viewer_module.app, ["--uri", "ws://127.0.0.1:1", "--out", tmp_path / "file" / "pictures"])
-    assert ended.exit_code == 2  # an unreachable server is 3
-    assert ended.stderr.startswith(f"error: {tmp_path}/file")
