@@ -73,12 +73,12 @@ def text_of(value: Any) -> str:
     return "" if value is None else orjson.dumps(value).decode()
 
 
-def decode(data: bytes | str, *, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH) -> dict[str, Any]:
+def decode(data: bytes, *, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH) -> dict[str, Any]:
     """Read one message.
 
     Args:
-        data: A whole WebSocket message, as UTF-8 or decoded.
-        max_size: Maximum of bytes (of characters in a str).
+        data: A whole WebSocket message.
+        max_size: Maximum of bytes.
         max_depth: Maximum nesting of objects and arrays, including the outermost.
 
     Returns:
@@ -100,12 +100,10 @@ def decode(data: bytes | str, *, max_size: int = MAX_SIZE, max_depth: int = MAX_
     return message
 
 
-def is_deeper(data: bytes | str, limit: int) -> bool:
+def is_deeper(data: bytes, limit: int) -> bool:
     """Return whether valid JSON is nested deeper than `limit`, without visiting its values."""
     if len(data) <= 2 * limit:
         return False
-    if isinstance(data, str):
-        data = data.encode("utf-8", "surrogatepass")
     if len(data) < _SMALL * limit:
         # A level of an array takes two bytes, and one of an object five (`{"":}`), except the innermost one (`{}`).
         arrays = data.count(b"[")
@@ -141,10 +139,10 @@ def _has_more_brackets(data: bytes, limit: int) -> bool:
     return False
 
 
-def _decode_leniently(data: bytes | str, error: orjson.JSONDecodeError) -> Any:
+def _decode_leniently(data: bytes, error: orjson.JSONDecodeError) -> Any:
     """Read JSON with non-finite numbers, which become None; raise an error for everything else."""
     try:
-        text = data if isinstance(data, str) else data.decode()
+        text = data.decode()
         if "infinity when parsed" not in error.msg and "NaN" not in text and "Infinity" not in text:
             raise ValueError  # noqa: TRY301 - the same error as for the other cases
         message = json.loads(

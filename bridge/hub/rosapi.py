@@ -287,7 +287,7 @@ class Rosapi:
             parsed = orjson.loads(value)
         except orjson.JSONDecodeError:
             return self._outcome(f"the value of parameter {name} must be JSON text")
-        if is_deeper(value, self._limits.depth):
+        if is_deeper(value.encode(), self._limits.depth):
             return self._outcome(
                 f"the value of parameter {name} is nested deeper than {self._limits.depth} levels"
             )
