@@ -59,24 +59,15 @@ class _Set:
 class Reassembler:
     """Reassembly of the messages of one connection. The caller reads the clock."""
 
-    def __init__(
-        self, *, max_size: int = MAX_SIZE, max_sets: int = MAX_SETS, max_age: float = MAX_AGE
-    ) -> None:
+    def __init__(self, *, max_size: int = MAX_SIZE) -> None:
         """Start without fragments.
 
-        Args:
-            max_size: Maximum size of a complete message in bytes; all incomplete ones together may occupy
-                four times as many, including overhead.
-            max_sets: Maximum number of incomplete messages.
-            max_age: Seconds that a message waits for its next fragment.
+        `max_size` is the maximum size of a complete message in bytes; all incomplete ones together may occupy four
+        times as many, including overhead.
         """
-        self.given_up = 0
-        """Number of messages that were discarded before they were complete."""
         self.waiting_bytes = 0
         """Number of bytes that incomplete messages occupy."""
         self._max_size = max_size
-        self._max_sets = max_sets
-        self._max_age = max_age
         self._sets: dict[FragmentId, _Set] = {}  # in the order of their first fragments
 
     def __len__(self) -> int:
@@ -86,7 +77,7 @@ class Reassembler:
     @property
     def deadline(self) -> float:
         """Time at which `expire` is due; infinity for never."""
-        return min((begun.touched for begun in self._sets.values()), default=math.inf) + self._max_age
+        return min((begun.touched for begun in self._sets.values()), default=math.inf) + MAX_AGE
 
     def take(self, fragment: Mapping[str, Any], now: float) -> bytes | None:
         """Add one fragment; `now` is in seconds of any monotonic clock.
@@ -100,14 +91,14 @@ class Reassembler:
         self.expire(now)
         begun = self._sets.get(key)
         if begun is not None and (begun.total != total or begun.parts.get(number, data) != data):
-            self._give_up(key)  # the id was reused: the previous message will never be complete
+            self._forget(key)  # the id was reused: the previous message will never be complete
             begun = None
         if begun is None:
             if total == 1:
                 return self._checked(data)
             # The oldest is dropped, so that a restarted client is not locked out by messages that it never completed.
-            while len(self._sets) >= self._max_sets:
-                self._give_up(next(iter(self._sets)))
+            while len(self._sets) >= MAX_SETS:
+                self._forget(next(iter(self._sets)))
             begun = self._sets[key] = _Set(total, now)
         # A duplicate counts too: it shows that the sender has not given up.
         begun.touched = now
@@ -117,22 +108,22 @@ class Reassembler:
         begun.size += len(data)
         self.waiting_bytes += len(data) + OVERHEAD
         if begun.size > self._max_size:
-            self._give_up(key)
+            self._forget(key)
         self._checked(data, begun.size)
         if len(begun.parts) == total:
             return self._join(key, begun)
         # The message itself may be the oldest, if its fragments are so small that their overhead exceeds the bound.
         while self.waiting_bytes > 4 * (self._max_size + OVERHEAD):
             oldest = next(iter(self._sets))
-            self._give_up(oldest)
+            self._forget(oldest)
             if oldest == key:
                 raise DecodeError("a message arrived in too many small fragments")
         return None
 
     def expire(self, now: float) -> None:
         """Discard the messages that have waited too long for a fragment."""
-        for key in [key for key, begun in self._sets.items() if begun.touched + self._max_age <= now]:
-            self._give_up(key)
+        for key in [key for key, begun in self._sets.items() if begun.touched + MAX_AGE <= now]:
+            self._forget(key)
 
     def clear(self) -> None:
         """Drop everything, because the connection is lost."""
@@ -146,7 +137,6 @@ class Reassembler:
         try:
             return b"".join([begun.parts[number] for number in range(first, first + begun.total)])
         except KeyError:
-            self.given_up += 1
             raise DecodeError(
                 f"fragments arrived that are not numbered from 0 or 1 to {begun.total}"
             ) from None
@@ -158,10 +148,6 @@ class Reassembler:
 
     def _forget(self, key: FragmentId) -> None:
         self.waiting_bytes -= self._sets.pop(key).charged
-
-    def _give_up(self, key: FragmentId) -> None:
-        self._forget(key)
-        self.given_up += 1
 
 
 def split(message: bytes, fragment_size: int, fragment_id: FragmentId) -> Iterator[bytes]:
