@@ -16,7 +16,7 @@ import asyncio
 import ipaddress
 import re
 import socket
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Literal
@@ -42,6 +42,7 @@ _TIMEOUT: Final = 10.0
 """Seconds in which a robot must answer, unless the caller has another limit; that of `connect` is the same."""
 _TAKEN_TIME: Final = 3.0
 """Seconds to wait for an objection from another owner of a name."""
+_LOOPBACK: Final = ["127.0.0.1"]
 
 
 class DiscoveryError(BridgeError):
@@ -71,17 +72,16 @@ class Robot:
     token: bool = False
 
 
-async def discover(timeout: float = 2.0, *, interfaces: Sequence[str] | None = None) -> list[Robot]:
+async def discover(timeout: float = 2.0) -> list[Robot]:
     """Return the rosbridge servers that answer within `timeout` seconds, sorted by name.
 
-    It always waits for the whole time. `interfaces` are the addresses of this machine to query from; None for
-    all.
+    It always waits for the whole time.
 
     Raises:
         DiscoveryError: `zeroconf` is not installed, or there is no network.
     """
     from_name: dict[str, Robot] = {}
-    async with _zeroconf(interfaces) as zeroconf:
+    async with _zeroconf() as zeroconf:
         from zeroconf import ServiceStateChange
         from zeroconf.asyncio import AsyncServiceBrowser
 
@@ -115,8 +115,8 @@ async def discover(timeout: float = 2.0, *, interfaces: Sequence[str] | None = N
     return sorted(from_name.values(), key=lambda robot: robot.name)
 
 
-async def resolve(name: str, timeout: float = _TIMEOUT, *, interfaces: Sequence[str] | None = None) -> str:
-    """Return the URI of the rosbridge server of a robot; `interfaces` as for `discover`.
+async def resolve(name: str, timeout: float = _TIMEOUT) -> str:
+    """Return the URI of the rosbridge server of a robot.
 
     Raises:
         UnknownRobotError: No robot of that name answers in time.
@@ -124,7 +124,7 @@ async def resolve(name: str, timeout: float = _TIMEOUT, *, interfaces: Sequence[
     """
     # Asked for directly, which is faster than listing all robots.
     _check_name(name)
-    async with _zeroconf(interfaces) as zeroconf:
+    async with _zeroconf() as zeroconf:
         robot = await _ask(zeroconf, f"{name}.{SERVICE_TYPE}", timeout)
     if robot is None:
         raise UnknownRobotError(
@@ -153,24 +153,21 @@ async def announced(
     ros_version: Literal[1, 2] | None = None,
     tls: bool = False,
     token: bool = False,
-    interfaces: Sequence[str] | None = None,
 ) -> AsyncIterator[None]:
     """Announce a rosbridge server while the context is open.
 
     `host` is the address on which the server listens; `0.0.0.0` and `::` mean all addresses of this machine,
     and a loopback address is announced only to this machine. With `tls`, clients get the host name of this
-    machine, which must be in the certificate; `token` says whether they need one. Without `interfaces`, all
-    interfaces answer.
+    machine, which must be in the certificate; `token` says whether they need one.
 
     Raises:
         DiscoveryError: `zeroconf` is not installed, there is no network, or another server has the name.
     """
     _check_name(name)
+    addresses = _addresses(host)
     # A hub on loopback is not announced to a network that cannot reach it.
-    addresses = _addresses(host, interfaces)
-    if interfaces is None and all(ipaddress.ip_address(address).is_loopback for address in addresses):
-        interfaces = ("127.0.0.1",)  # other machines cannot reach it
-    async with _zeroconf(interfaces) as zeroconf:
+    is_local = all(ipaddress.ip_address(address).is_loopback for address in addresses)
+    async with _zeroconf(_LOOPBACK if is_local else None) as zeroconf:
         from zeroconf.asyncio import AsyncServiceInfo
 
         # zeroconf would rename this one silently, and clients would look for a name that nobody has.
@@ -212,10 +209,8 @@ def _check_name(name: str) -> None:
         )
 
 
-def _addresses(host: str, interfaces: Sequence[str] | None) -> list[str]:
+def _addresses(host: str) -> list[str]:
     """Return the addresses of a server that listens on `host`."""
-    if interfaces is not None:
-        return list(interfaces)
     try:
         address = ipaddress.ip_address("127.0.0.1" if host == "localhost" else host)
     except ValueError:
@@ -230,7 +225,8 @@ def _addresses(host: str, interfaces: Sequence[str] | None) -> list[str]:
 
 
 @asynccontextmanager
-async def _zeroconf(interfaces: Sequence[str] | None) -> AsyncIterator[AsyncZeroconf]:
+async def _zeroconf(interfaces: list[str] | None = None) -> AsyncIterator[AsyncZeroconf]:
+    """Open the network interfaces of this machine with these addresses, or all of them."""
     try:
         from zeroconf import Error, InterfaceChoice
         from zeroconf.asyncio import AsyncZeroconf
@@ -239,7 +235,7 @@ async def _zeroconf(interfaces: Sequence[str] | None) -> AsyncIterator[AsyncZero
             "finding robots by name needs the package zeroconf, which is not installed: pip install zeroconf"
         ) from None
     try:
-        zeroconf = AsyncZeroconf(interfaces=InterfaceChoice.All if interfaces is None else list(interfaces))
+        zeroconf = AsyncZeroconf(interfaces=interfaces or InterfaceChoice.All)
     except (OSError, Error) as error:
         raise DiscoveryError(
             f"robots cannot be found by name here, because there is no network for multicast DNS ({error})"

@@ -13,7 +13,19 @@ from bridge import discovery
 from bridge.discovery import DiscoveryError, Robot, UnknownRobotError, announced, discover, resolve
 from tests.patience import PATIENCE
 
-LOOPBACK = ("127.0.0.1",)
+LOOPBACK = ["127.0.0.1"]
+ZEROCONF = discovery._zeroconf
+
+
+@pytest.fixture(autouse=True)
+def loopback_only(monkeypatch):
+    """Ask on loopback only; what is announced there must not be announced elsewhere."""
+
+    def on_loopback(interfaces=LOOPBACK):
+        assert interfaces == LOOPBACK
+        return ZEROCONF(interfaces)
+
+    monkeypatch.setattr(discovery, "_zeroconf", on_loopback)
 
 
 def _name(what):
@@ -26,13 +38,13 @@ async def test_a_robot_that_is_announced_is_found_and_then_gone(monkeypatch):
     monkeypatch.setattr(discovery, "_TAKEN_TIME", 0.5)
     name = _name("Röbot")
     with pytest.raises(UnknownRobotError, match=name):
-        await resolve(name, 0.1, interfaces=LOOPBACK)
-    async with announced(name, "127.0.0.1", 9099, ros_version=2, token=True, interfaces=LOOPBACK):
-        assert await resolve(name, PATIENCE, interfaces=LOOPBACK) == "ws://127.0.0.1:9099"
+        await resolve(name, 0.1)
+    async with announced(name, "127.0.0.1", 9099, ros_version=2, token=True):
+        assert await resolve(name, PATIENCE) == "ws://127.0.0.1:9099"
         found = []
         async with asyncio.timeout(PATIENCE):
             while not found:
-                found = [robot for robot in await discover(1.5, interfaces=LOOPBACK) if robot.name == name]
+                found = [robot for robot in await discover(1.5) if robot.name == name]
         assert found == [Robot(name, "ws://127.0.0.1:9099", 2, token=True)]
 
 
@@ -41,19 +53,19 @@ async def test_a_name_that_is_taken_is_refused(monkeypatch):
     name = _name("Twin")
     async with AsyncExitStack() as stack:
         monkeypatch.setattr(discovery, "_TAKEN_TIME", 0.5)
-        await stack.enter_async_context(announced(name, "127.0.0.1", 9099, interfaces=LOOPBACK))
+        await stack.enter_async_context(announced(name, "127.0.0.1", 9099))
         monkeypatch.setattr(discovery, "_TAKEN_TIME", PATIENCE)
         with pytest.raises(DiscoveryError, match=f"called {name}") as caught:
-            await stack.enter_async_context(announced(name, "127.0.0.1", 9100, interfaces=LOOPBACK))
+            await stack.enter_async_context(announced(name, "127.0.0.1", 9100))
         assert caught.value.exit_code == 2
 
 
 @pytest.mark.parametrize("name", ["", "x" * 64, "ü" * 32, "a.b", "a\nb", "a\x1b[31mb"])
 async def test_what_cannot_be_a_name_is_refused(name):
     with pytest.raises(DiscoveryError, match="cannot be the name"):
-        await resolve(name, 0.1, interfaces=LOOPBACK)
+        await resolve(name, 0.1)
     with pytest.raises(DiscoveryError, match="cannot be the name"):
-        async with announced(name, "127.0.0.1", 9099, interfaces=LOOPBACK):
+        async with announced(name, "127.0.0.1", 9099):
             pass
 
 
@@ -77,7 +89,8 @@ async def test_without_zeroconf_one_sentence_says_so(monkeypatch):
 @pytest.mark.filterwarnings("ignore:.*socket.socket:pytest.PytestUnraisableExceptionWarning")
 async def test_without_a_network_one_sentence_says_so():
     with pytest.raises(DiscoveryError, match="no network"):
-        await discover(0.1, interfaces=("192.0.2.77",))
+        async with ZEROCONF(["192.0.2.77"]):
+            pass
 
 
 def _announced(**properties):
@@ -118,9 +131,8 @@ def test_what_the_network_says_is_checked(said, robot):
 
 
 def test_the_addresses_that_are_announced():
-    assert discovery._addresses("192.0.2.7", None) == ["192.0.2.7"]
-    assert discovery._addresses("localhost", None) == ["127.0.0.1"]
-    assert discovery._addresses("::", LOOPBACK) == ["127.0.0.1"]
-    every = discovery._addresses("::", None)
+    assert discovery._addresses("192.0.2.7") == ["192.0.2.7"]
+    assert discovery._addresses("localhost") == ["127.0.0.1"]
+    every = discovery._addresses("::")
     assert every
     assert every == ["127.0.0.1"] or "127.0.0.1" not in every
