@@ -113,7 +113,6 @@ class ServiceError(BridgeError):
     def __init__(self, reason: str, service: str = "") -> None:
         """Store the reason separately from the sentence, because the reason of a handler is sent unchanged."""
         self.reason = reason
-        self.service = service
         where = f"service {service} refused the call" if service else "the call was refused"
         super().__init__(f"{where}: {reason or 'it gave no reason'}")
 

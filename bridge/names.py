@@ -17,11 +17,11 @@ MAX_NAME = 255
 
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:(msg|srv|action)/)?([A-Za-z][A-Za-z0-9_]*)")
 _TOPIC = re.compile(r"[~/]?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
-_EDGE_NAME_SIZE = 1024
+_CACHED_TYPES = 1024
 
 
 # Cached, because the few types of a robot are compared often.
-@lru_cache(maxsize=_EDGE_NAME_SIZE)
+@lru_cache(maxsize=_CACHED_TYPES)
 def split_type(name: str) -> tuple[str, str, str]:
     """Return the package, kind (`msg`, `srv`, `action`, or empty in the ROS 1 form) and name of a type."""
     match = _TYPE.fullmatch(name) if len(name) <= MAX_NAME else None

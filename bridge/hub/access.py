@@ -9,7 +9,6 @@ import hmac
 import ipaddress
 import re
 import ssl
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from pathlib import Path
@@ -22,7 +21,7 @@ from websockets.typing import Origin, Subprotocol
 from bridge.hub.limits import HubError
 
 SUBPROTOCOL: Final = Subprotocol("rosbridge")
-"""The hub's subprotocol, for clients that request one."""
+"""The hub's subprotocol, for clients that request one; a client that requests only others disconnects."""
 _BEARER: Final = "bearer."
 # Tokens of characters that both a header and a subprotocol accept.
 _TOKEN: Final = re.compile(r"[A-Za-z0-9._~-]{16,1024}")
@@ -100,11 +99,6 @@ def _presented(request: Request) -> list[str]:
         names = (name.strip() for name in line.split(","))
         presented += [name.removeprefix(_BEARER) for name in names if name.startswith(_BEARER)]
     return presented
-
-
-def choose_subprotocol(offered: Sequence[Subprotocol]) -> Subprotocol | None:
-    """Return the hub's subprotocol if it is offered; otherwise None, and a client that offered others disconnects."""
-    return SUBPROTOCOL if SUBPROTOCOL in offered else None
 
 
 def read_tokens(path: Path) -> tuple[str, ...]:

@@ -62,7 +62,6 @@ class Broker:
         self.graph = Graph()
         self.definitions = MessageDefinitions(ros_version, wall_clock)
         self._wall_clock = wall_clock
-        self._ros_version: RosVersion = ros_version
         rosapi = Rosapi(self.graph, self.limits, self.definitions, wall_clock)
         self._dispatcher = Dispatcher(self.limits)
         self.take_ready = self._dispatcher.take_ready
@@ -134,7 +133,7 @@ class Broker:
         self._topics.leave(client)
         self._calls.leave(client)
         self._actions.leave(client)
-        self._dispatcher.forget(client)
+        self._dispatcher.throttled.discard(client)
         self._reassembling.discard(client)
 
     def receive(self, client: Client, data: bytes, now: float) -> None:
@@ -248,16 +247,17 @@ class Broker:
             self._logging_to_rosout = False
 
     def _log_message(self, sentence: str) -> dict[str, Any]:
-        time_ = stamp(self._wall_clock(), self._ros_version)
+        ros_version = self.definitions.ros_version
+        time_ = stamp(self._wall_clock(), ros_version)
         message = {
-            "level": _LOG_ERROR[self._ros_version],
+            "level": _LOG_ERROR[ros_version],
             "name": NODE,
             "msg": sentence,
             "file": "",
             "function": "",
             "line": 0,
         }
-        if self._ros_version == 2:
+        if ros_version == 2:
             return {"stamp": time_, **message}
         return {"header": {"seq": 0, "stamp": time_, "frame_id": ""}, **message, "topics": []}
 

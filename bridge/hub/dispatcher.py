@@ -24,8 +24,8 @@ class Dispatcher:
         self._limits = limits
         # The clients with output, each once (`Client.is_ready`), until the owner of the sockets takes them.
         self._ready: list[Client] = []
-        # The clients whose outboxes hold messages for their throttles.
         self.throttled: set[Client] = set()
+        """The clients whose outboxes hold messages for their throttles."""
         self.deadline = inf
         """Time at which the broker must be woken (monotonic seconds): for a throttle, a call or a fragment."""
         self.work = 0
@@ -70,9 +70,7 @@ class Dispatcher:
         client.outbox.offer(lane, payload, now)
         if lane.throttle:
             self.schedule_release(client)
-        if not client.is_ready:
-            client.is_ready = True
-            self._ready.append(client)
+        self.mark_ready(client)
 
     def schedule(self, deadline: float) -> None:
         """Have the broker woken at `deadline`, or earlier."""
@@ -107,10 +105,6 @@ class Dispatcher:
         except TypeError:  # an unpaired surrogate in an id or a name
             return
         self.offer(client, client.status_lane, payload, now)
-
-    def forget(self, client: Client) -> None:
-        """Forget a client that left."""
-        self.throttled.discard(client)
 
 
 def fragment_size_of(requested: float) -> int:

@@ -27,7 +27,7 @@ from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 from websockets.server import ServerProtocol
 
-from bridge.hub.access import AccessPolicy, choose_subprotocol, is_loopback
+from bridge.hub.access import SUBPROTOCOL, AccessPolicy, is_loopback
 from bridge.hub.broker import Broker
 from bridge.hub.graph import Client, Graph
 from bridge.hub.limits import HubError, HubLimits
@@ -147,7 +147,6 @@ class _Hub:
         self.loopback = loopback
         self.access = access
         self.broker = Broker(limits, ros_version=ros_version)
-        self._take_ready = self.broker.take_ready
         # All sockets, from `begin` to `forget`; `_nobody_left` is set when the last one is gone.
         self.connections: set[_Connection] = set()
         self._nobody_left = asyncio.Event()
@@ -236,7 +235,7 @@ class _Hub:
 
     def serve(self) -> None:
         """Write the clients' output, and schedule the broker's next deadline."""
-        for client in self._take_ready():
+        for client in self.broker.take_ready():
             connection = self._by_client.get(client)
             if connection is not None:
                 connection.flush()
@@ -294,7 +293,7 @@ class _Connection(WebSocketTransport):
         protocol = ServerProtocol(
             origins=hub.access.allowed_origins,
             max_size=hub.limits.message_bytes,
-            select_subprotocol=lambda _, offered: choose_subprotocol(offered),
+            select_subprotocol=lambda _, offered: SUBPROTOCOL if SUBPROTOCOL in offered else None,
         )
         super().__init__(protocol, max_size=hub.limits.message_bytes, write_limit=_WRITE_BUFFER)
         self._hub = hub
