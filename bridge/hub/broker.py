@@ -73,8 +73,8 @@ class Broker:
         )
         # Clients are numbered in the order of connection; a number is not used again.
         self._client_numbers = itertools.count(1)
-        # The clients with incomplete messages, and when the first of these expires, or earlier.
-        self._reassembling: set[Client] = set()
+        # The clients with incomplete messages, these, and when the first of them expires, or earlier.
+        self._reassembling: dict[Client, Reassembler] = {}
         self._fragment_deadline = inf
         # Time and id of the operation that is being performed, for a refusal anywhere below.
         self._now = 0.0
@@ -134,7 +134,7 @@ class Broker:
         self._calls.leave(client)
         self._actions.leave(client)
         self._dispatcher.throttled.discard(client)
-        self._reassembling.discard(client)
+        self._reassembling.pop(client, None)
 
     def receive(self, client: Client, data: bytes, now: float) -> None:
         """Perform the operation in a whole WebSocket message, text or binary, with any content."""
@@ -197,11 +197,12 @@ class Broker:
         throttle_deadline = self._dispatcher.release(now)
         self._calls.expire(now)
         if now >= self._fragment_deadline:
-            for client in list(self._reassembling):
-                if client.fragments is not None:
-                    client.fragments.expire(now)
-                self._note_fragments(client)
-            self._fragment_deadline = min(map(_fragment_deadline, self._reassembling), default=inf)
+            for client, fragments in list(self._reassembling.items()):
+                fragments.expire(now)
+                self._note_fragments(client, fragments)
+            self._fragment_deadline = min(
+                (each.deadline for each in self._reassembling.values()), default=inf
+            )
         self._dispatcher.deadline = min(throttle_deadline, self._calls.deadline, self._fragment_deadline)
 
     def _take_fragment(self, client: Client, operation: Operation, now: float) -> None:
@@ -210,18 +211,18 @@ class Broker:
         try:
             message = client.fragments.take(operation, now)
         finally:
-            self._note_fragments(client)
+            self._note_fragments(client, client.fragments)
         if message is not None:
             self._perform(client, message, now, is_whole=False)
 
-    def _note_fragments(self, client: Client) -> None:
+    def _note_fragments(self, client: Client, fragments: Reassembler) -> None:
         """Schedule the expiry of a client's incomplete messages."""
-        if client.fragments:
-            self._reassembling.add(client)
-            self._fragment_deadline = min(self._fragment_deadline, client.fragments.deadline)
+        if fragments:
+            self._reassembling[client] = fragments
+            self._fragment_deadline = min(self._fragment_deadline, fragments.deadline)
             self._dispatcher.schedule(self._fragment_deadline)
         else:
-            self._reassembling.discard(client)
+            self._reassembling.pop(client, None)
 
     def _set_level(self, client: Client, operation: Operation, _now: float) -> None:
         level = text(operation, "level")
@@ -260,7 +261,3 @@ class Broker:
         if ros_version == 2:
             return {"stamp": time_, **message}
         return {"header": {"seq": 0, "stamp": time_, "frame_id": ""}, **message, "topics": []}
-
-
-def _fragment_deadline(client: Client) -> float:
-    return client.fragments.deadline if client.fragments is not None else inf
