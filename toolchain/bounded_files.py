@@ -1,4 +1,4 @@
-"""Files of bounded size and depth: read with errors that name file and line, written as a whole."""
+"""Files of bounded size and depth: read with errors that name file and line, and replaced as a whole when written."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PIECE: Final = 1 << 18
 
 @contextmanager
 def file_errors(path: Path, done: str, error: type[ToolchainError], advice: str = "") -> Iterator[None]:
-    """Convert an OSError of the block: the file cannot be `read` or `written`, whichever is `done` to it."""
+    """Convert an OSError of the block to `error`: the file cannot be `done`, which is "read" or "written"."""
     try:
         yield
     except OSError as reason:
@@ -239,7 +239,7 @@ def _type_of(model: type[BaseModel]) -> str:
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models in an annotation: several if the `type` of a section decides."""
+    """Return the models in an annotation: several if the `type` of a section selects one."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for each in get_args(annotation) for model in _models_in(each)]
@@ -248,7 +248,7 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 def _followed(
     model: type[BaseModel], place: Sequence[str | int]
 ) -> tuple[list[str | int], list[type[BaseModel]]]:
-    """Follow a place through the fields of models; return it without the types of sections, and the last models."""
+    """Follow a place through the fields of models; return it without types of sections, and the models at its end."""
     followed: list[str | int] = []
     models = [model]
     for step in place:

@@ -2,11 +2,11 @@
 
     this process                          scheduler           workers
     job, once ────────────────────────────────┼─────────────▶ prepare(): tables and kernels, once for each
-    batches of numbers, half a second each ───┼─────────────▶ work(number) for each number
+    batches of numbers, 2 s at most each ─────┼─────────────▶ work(number) for each number
     keep(number, result) ◀────────────────────┴────────────── as batches are done, in any order
 
-A piece is a number, so that only the job has tables. Results depend on job and number alone, not on the place or the
-order. Whoever keeps results on disk can begin again with the numbers that are missing.
+A piece is only a number, so the tables are sent once, with the job. A result depends on job and number alone, not on
+where or in which order it is computed. A caller that keeps results on disk can resume with the missing numbers.
 """
 
 import asyncio
@@ -37,17 +37,17 @@ Work: TypeAlias = Callable[[int], Any]
 Keep: TypeAlias = Callable[[int, Any], None]
 
 BATCH_S: Final = 2.0
-"""Maximum number of seconds of work in a batch, so that dask's share of about 15 ms of CPU time for each is small."""
+"""Maximum seconds of work in a batch: long, because dask itself takes about 15 ms of CPU time for each batch."""
 _SMALLEST_S: Final = BATCH_S / 20
-"""The same at the end, so that the workers finish at about the same time, and until their speed is known."""
+"""Seconds of work in the first batches, until the speed is known, and in the last, so that workers finish together."""
 _AHEAD: Final = 3
-"""Batches on their way for each worker: one that is computed, one that waits there, and one at the scheduler."""
+"""Number of batches under way for each worker: one being computed, one that waits there, one at the scheduler."""
 _PATIENCE_S: Final = 60.0
 """Seconds in which a scheduler must come back, or get a worker again."""
 _CONNECT_S: Final = 10.0
 _POLL_S: Final = 1.0
 _LEAN: Final = {"distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "1s"}
-"""Settings of our own scheduler and workers: by dask's, each spends 3 to 5 % of a core on watching itself."""
+"""Settings of our own scheduler and workers; with dask's, each spends 3 to 5 % of a core on watching itself."""
 _ADDRESS: Final = re.compile(r"(tcp|tls)://(\[[\da-fA-F:.]+]|[^][:/]+):\d{1,5}")
 _LOOPBACK: Final = re.compile(r"127(\.\d+){3}|\[::1]|localhost")
 
@@ -60,7 +60,7 @@ class Job(Protocol):
 
 
 Run: TypeAlias = Callable[[Job, Sequence[int], Keep], None]
-"""A way to do the pieces of these numbers; it calls `keep` with each result as soon as it is there."""
+"""A function that does the pieces of a job with these numbers, and calls `keep` with each result at once."""
 
 
 def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:
@@ -74,7 +74,7 @@ def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:
 def in_order(run: Run, job: Job, numbers: Sequence[int], advance: Callable[[], None]) -> list[Any]:
     """Do the pieces of a job, and call `advance` after each.
 
-    Results are in the order of the numbers, whatever that of the work, because sums of floats depend on their order.
+    Results are returned in the order of the numbers, however they arrive, because sums of floats depend on the order.
     """
     found: dict[int, Any] = {}
 
@@ -146,7 +146,7 @@ def _check_certificates(files: dict[str, Path | None]) -> None:
 
 @contextmanager
 def runner(options: SchedulerOptions) -> Iterator[Run]:
-    """Yield the way to do work that the options ask for, or raise a ClusterError."""
+    """Yield the function that does the pieces where the options say, or raise a ClusterError."""
     address = options.scheduler
     if address is None:
         yield in_this_process
@@ -224,7 +224,7 @@ def software() -> str:
 
 @lru_cache(8)
 def _prepared(pickled: bytes, _thread: int) -> Work:
-    """Return the work of a job, which each thread of a worker prepares once: two cannot share a kernel."""
+    """Return the work of a job, which each thread of a worker prepares once, because threads cannot share a kernel."""
     job: Job = pickle.loads(pickled)  # noqa: S301 - dask runs whatever its client sends anyway
     return job.prepare()
 
@@ -232,7 +232,8 @@ def _prepared(pickled: bytes, _thread: int) -> Work:
 def do_batch(pickled: bytes, numbers: Sequence[int], most_s: float, theirs: str) -> tuple[bytes, float]:
     """Do pieces on a worker for `most_s` seconds, but at least one; return their results and the seconds.
 
-    The results are pickled and compressed: a posterior is mostly zeros, and would pass through the scheduler as it is.
+    The results are pickled and compressed, because a posterior is mostly zeros, and dask would not compress it on the
+    way through the scheduler. `theirs` is the client's `software()`.
 
     Raises:
         ClusterError: This worker has another version of our software than the client.
@@ -255,7 +256,7 @@ class _LostError(Exception):
 
 @contextmanager
 def _noticing_loss() -> Iterator[None]:
-    """Convert what dask's client raises when its connection is lost or being closed, and for results that are lost."""
+    """Convert what dask's client raises for a lost result, or a lost or closing connection, to a `_LostError`."""
     try:
         yield
     except (OSError, RuntimeError, ValueError, CancelledError):
@@ -265,13 +266,13 @@ def _noticing_loss() -> Iterator[None]:
 def _on_scheduler(
     address: str, connect: Callable[[], Any], job: Job, numbers: Sequence[int], keep: Keep
 ) -> None:
-    """Do the pieces on the workers of a scheduler; what was not done when it disappeared is given to the next one.
+    """Do the pieces on the workers of a scheduler; if it is lost, do the rest on the one that is started in its place.
 
     Raises:
         ClusterError: The workers cannot do them, or stay away for a minute.
     """
-    left = dict.fromkeys(numbers)  # in order; those without a result
-    until = 0.0  # until when (monotonic) the work may stand still since the scheduler was lost; not at first
+    left = dict.fromkeys(numbers)  # the numbers without a result, in order
+    until = 0.0  # monotonic time until which to wait after a loss; 0 before the first
     while left:
         before, client = len(left), _client(address, connect, until)
         try:
@@ -290,7 +291,7 @@ def _on_scheduler(
 
 
 def _client(address: str, connect: Callable[[], Any], until: float) -> Any:
-    """Return a client of a scheduler that has a worker; try until a monotonic time."""
+    """Return a client of a scheduler that has a worker; try again until `until`, a monotonic time."""
     while True:
         client = None
         try:
@@ -357,7 +358,7 @@ def _do(address: str, client: Any, pickled: bytes, left: dict[int, None], keep: 
 
 
 def _results(address: str, batch: Any) -> tuple[list[Any], float]:
-    """Return the results of a batch; a ToolchainError if it failed, a `_LostError` if it is gone."""
+    """Return the results of a batch; a ToolchainError if the batch failed, a `_LostError` if it is lost."""
     from distributed import KilledWorker
     from lz4.frame import decompress
 

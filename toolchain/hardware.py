@@ -183,7 +183,7 @@ class Simulator(StrEnum):
 
     @property
     def tools(self) -> tuple[str, ...]:
-        """The programs that it needs, which are also names of Debian's packages."""
+        """The programs that the simulator needs, which are also the names of their Debian packages."""
         return ("ghdl",) if self is Simulator.GHDL else ("ghdl", "verilator", "make", "g++")
 
 

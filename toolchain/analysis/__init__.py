@@ -27,7 +27,7 @@ Clock: TypeAlias = Annotated[
 ]
 DeviceName: TypeAlias = Annotated[str, typer.Option(help="FPGA of the boards.", metavar="proce-v-d8")]
 Progress: TypeAlias = Callable[[int], AbstractContextManager[Callable[[str], None]]]
-"""Opens a progress bar for a number of steps; call what it yields after each step, with the text to show."""
+"""Opens a progress bar for a number of steps, and yields a function to call after each step with the text to show."""
 
 _Member = TypeVar("_Member", bound=StrEnum)
 _Numbers: TypeAlias = tuple[int, ...]
@@ -75,7 +75,7 @@ class InspectOptions(ReadingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """The options of a sweep: all combinations of the comma-separated lists; the other options are the same for all machines."""
+    """The options of a sweep over all combinations of the comma-separated lists; other options are the same for all."""
 
     prob_bits: Annotated[str, typer.Option(help="Bits of a code, comma-separated.", metavar="LIST")] = (
         "4,6,8,10"
@@ -167,7 +167,7 @@ def _members(flag: str, text: str, kind: type[_Member]) -> tuple[_Member, ...]:
 
 
 def with_unit(value: float, unit: str) -> str:
-    """Return a value with an SI prefix so that 1 to 999 precede the point."""
+    """Return a value with its unit and the SI prefix that leaves 1 to 999 before the point."""
     if value <= 0:
         return f"0 {unit}"
     prefixes = ("p", "n", "u", "m", "", "k", "M", "G")

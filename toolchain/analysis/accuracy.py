@@ -1,9 +1,9 @@
-"""Accuracy of a machine's posteriors compared with exact inference, apart from the quantisation loss.
+"""Accuracy of a machine's posteriors compared with exact inference, with the quantisation loss apart.
 
 Each frame has three posteriors: of the model (float64), of the codes (float64), and of the machine (counts). The
-difference between codes and model is the quantisation loss, that between machine and codes the sampling loss. Means
+codes differ from the model by the quantisation loss, and the machine differs from the codes by the sampling loss. Means
 over frames have confidence intervals. A frame without a posterior is not left out of a mean: its total variation is 1,
-and its most probable line is wrong.
+and its most probable line counts as wrong.
 """
 
 import math
@@ -41,7 +41,7 @@ class Interval:
 
 
 def bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]]) -> Interval:
-    """Return a statistic over frames (the first axis) with its percentile bootstrap interval over whole frames."""
+    """Return a statistic over frames (the first axis) with a percentile bootstrap interval, which resamples frames."""
     chosen = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
     drawn = np.asarray(values)[chosen].reshape(RESAMPLES, -1)
     low, high = np.quantile(statistic(drawn, axis=1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2]).tolist()
@@ -57,7 +57,7 @@ def share_of_frames(share: float, frames: int) -> Interval:
 
 
 EXPECTED_COUNT: Final = 5.0
-"""Minimum expected count of a line to get a z-score, because lower counts are not approximately normal."""
+"""Minimum expected count of a line that gets a z-score, because lower counts are not approximately normal."""
 
 _TIE: Final = 1e-9
 _LOST: Final = (1.0, math.nan, 0.0)
@@ -70,10 +70,10 @@ class Difference:
 
     Attributes:
         total_variation: Half the sum of absolute differences, 0 to 1; 1 for a frame without a posterior.
-        map_agreement: Share of frames in which the most probable line is the same; it is not without a posterior.
-        kl_bits: KL(ours || theirs) in bits; None where frames without a posterior count. (KL(theirs || ours) is
-            infinite if a count is 0.)
-        alone: The same over the frames with a posterior alone; None if there are none.
+        map_agreement: Share of all frames in which both have a posterior, with the same most probable line.
+        kl_bits: KL(ours || theirs) in bits; None if the mean includes frames without a posterior. (KL(theirs || ours)
+            would be infinite if a count is 0.)
+        alone: The same distances over only the frames with a posterior; None if there are no such frames.
     """
 
     total_variation: Interval
@@ -88,10 +88,10 @@ class ZScores:
 
     Attributes:
         cycles: The length c.
-        draws: Number of independent draws of random numbers, the banks, for the intervals.
-        rms: Root mean square: 1 for independent bits, 1.6 if the variance is 2.6 times as large.
-        mean: 0 if the counts are unbiased.
-        beyond_three: Share beyond -3 or 3; 0.0027 for a normal distribution.
+        draws: Number of independent draws of random numbers for the intervals: banks, or readings with free generators.
+        rms: Root mean square of the z-scores: 1 for independent bits, 1.6 if the variance is 2.6 times as large.
+        mean: Their mean: 0 if the counts are unbiased.
+        beyond_three: Share of z-scores below -3 or above 3; 0.0027 for a normal distribution.
     """
 
     cycles: int
@@ -112,7 +112,7 @@ class Cycles:
 
     @classmethod
     def of(cls, lengths: NDArray[np.float64]) -> Self:
-        """Return the statistics of frames, [frames] or [frames, banks]."""
+        """Return the statistics of the cycles of frames, float64[frames] or [frames, banks]."""
         return cls(
             median=bootstrap(lengths, np.median),
             percentile_95=bootstrap(lengths, lambda a, **k: np.quantile(a, 0.95, **k)),
@@ -126,7 +126,7 @@ class Accuracy:
 
     Attributes:
         posteriors: Number of posteriors: one per frame, or one per replica of a frame.
-        banks: Number of seed sets with which each was run.
+        banks: Number of seed sets with which each reading was run.
         impossible: Share of posteriors for which no line can count.
         without: Share of runs without a posterior, including those whose counts remained 0.
         overflow: Share of runs that ended with an overflow.
@@ -163,10 +163,10 @@ def measure(
     """Run a machine on readings and compare its posteriors with exact inference.
 
     A replica has the same counts as a single machine with the same bank, so a single machine is run for all
-    replicas: successive readings, one per replica, form a frame, which ends when the last one ends. Without a
-    `model`, only the codes are known. Readings that are impossible in the model have no posterior. `advance` is
-    called after every reading. With the filter `own`, the readings are a sequence, in which every frame has one bank, and
-    the machine is compared with the exact filter.
+    replicas. As many successive readings as there are replicas form a frame, which is as long as the longest of these
+    runs. Without a `model`, the machine is compared only with its codes. Readings that are impossible in the model have
+    no posterior. `advance` is called after every reading. With the filter `own`, the readings are a sequence, each is
+    run with one bank, and the machine is compared with the exact filter.
 
     Raises:
         BuildError: Fewer readings than replicas.
@@ -214,14 +214,14 @@ class _Reading(NamedTuple):
     """Results of a reading, which was run with every bank.
 
     Attributes:
-        is_likely: Whether it is possible in the model; true without one.
+        is_likely: Whether it is possible in the model; true without a model.
         is_possible: Whether it is possible in the codes.
         lengths: Cycles with each bank.
         without: Number of runs without a posterior.
         overflow: Number of runs that ended with an overflow.
         prior: uint16[lines], its written prior, if any.
-        differences: Pairs as of `_differences`: of machine and codes, and with a model of codes and model, and of
-            machine and model.
+        differences: Results of `_differences` for the machine against its codes and, if there is a model, for the
+            codes against the model and the machine against the model.
     """
 
     is_likely: bool
@@ -235,7 +235,7 @@ class _Reading(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Frames:
-    """The job of running the readings: piece n is the reading at index n, of a frame of `replicas` of them."""
+    """The job of running the readings: piece n is the reading at index n; `replicas` readings are a frame."""
 
     boards: EmulatedBoards
     readings: Readings
@@ -287,14 +287,14 @@ class _Frames:
 def _differences(
     ours: Sequence[NDArray[np.float64] | None], theirs: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """Return the means over all runs, and over those with a posterior alone: float64[2, 3], NaN if there are none."""
+    """Return mean differences over all runs, and over those with a posterior (NaN if none has one): float64[2, 3]."""
     runs = [_difference(each, theirs) for each in ours if each is not None and theirs is not None]
     every = [*runs, *[_LOST] * (len(ours) - len(runs))]
     return np.array([np.mean(every, axis=0), np.mean(runs or [(math.nan,) * 3], axis=0)])
 
 
 def _summary(pairs: NDArray[np.float64]) -> Difference:
-    """Average pairs of `_differences`, float64[frames, replicas, 2, 3], over the replicas, and then over frames."""
+    """Average results of `_differences`, float64[frames, replicas, 2, 3], over the replicas, and then over frames."""
     every, alone, of_alone = pairs[:, :, 0].mean(axis=1), pairs[:, :, 1], None
     alone = np.nanmean(alone[~np.isnan(alone).all(axis=(1, 2))], axis=1)
     if len(alone):
@@ -331,7 +331,7 @@ def _difference(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> tuple
 
 @dataclass(frozen=True, slots=True)
 class _Counts:
-    """The job of comparing counts with equation 2.1: piece n is the reading at index n, run for a number of cycles."""
+    """The job of comparing counts with equation 2.1: piece n is the reading at index n, run for `cycles` cycles."""
 
     boards: EmulatedBoards
     readings: Readings
@@ -339,7 +339,7 @@ class _Counts:
     cycles: int
 
     def prepare(self) -> Work:
-        """Return the function for a reading: sums over its counts of z^2, z, 1, and |z| > 3, float64[4]."""
+        """Return the function that sums z^2, z, 1 and |z| > 3 over the counts of a reading: float64[4]."""
 
         def compared(place: int) -> NDArray[np.float64]:
             boards, prior, cycles = self.boards, self.priors[place], self.cycles

@@ -1,7 +1,7 @@
 """Advice on the machine for a question: BM1, BM2, and exact inference on this host, at one accuracy (thesis 5.2).
 
-Both machines are emulated on readings drawn from the model, and run longer until the mean total variation from exact
-inference is as asked. A machine that does not reach it within `MOST_CYCLES` says how near it came, and why.
+Both machines are emulated on readings drawn from the model, and run longer until their mean total variation from exact
+inference is small enough. For a machine that needs more than `MOST_CYCLES`, the advice says how near it came, and why.
 """
 
 import json
@@ -34,13 +34,13 @@ from toolchain.models.network import NetworkModel
 MOST_CYCLES: Final = 30_000_000
 """Maximum number of cycles of a frame, because their emulation takes time."""
 _NEAR: Final = 0.8
-"""A machine is not much better than asked below this share of the accuracy."""
+"""A value is near its limit from this share of it on: an error near the accuracy, cycles near `MOST_CYCLES`."""
 _ATTEMPTS: Final = 8
 _WIDTHS: Final = (8, 12, 16)
 
 
 _Run: TypeAlias = tuple[int, tuple[int, float, float], int, Estimate]
-"""Bits of a code; setting, total variation and cycles; boards, and the resources of one of them."""
+"""Bits of a code; setting, total variation and cycles; number of boards; resources of one board."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +51,8 @@ class Candidate:
         refused: The reason why it cannot answer the question; empty if it can.
         setting: Its target count (BM1) or samples (BM2).
         total_variation: Mean distance from exact inference with this setting; 1 for a frame without a posterior.
-        cycles: Cycles of a frame, in the median.
-        seconds: The time of these cycles at the clock.
+        cycles: Median cycles of a frame.
+        seconds: The time of these cycles at the clock frequency.
         alms, blocks: Estimated logic and memory blocks of one of its boards.
         unfit: The reason why a board of this device cannot hold it; empty if it can.
     """
@@ -156,7 +156,7 @@ def advise(
 
 
 def _candidate(machine: str, clock_hz: float, run: Callable[[], _Run]) -> Candidate:
-    """Return a machine from the function that runs it."""
+    """Return the results of `run`, which runs a machine, or why the machine is refused if it raises an error."""
     try:
         prob_bits, (setting, variation, cycles), boards, cost = run()
     except ToolchainError as reason:
@@ -221,9 +221,9 @@ def _bm2(
 def _run_until(
     run: Callable[[int], tuple[float, float]], setting: int, accuracy: float
 ) -> tuple[int, float, float]:
-    """Return the setting for an accuracy, or the most accurate one, with its total variation and its cycles.
+    """Return the lowest setting tried that is accurate enough, or the most accurate, with total variation and cycles.
 
-    The error falls with the root of the setting, so every run predicts the next setting.
+    The error is inversely proportional to the square root of the setting, so every run predicts the next setting.
     """
     tried: dict[int, tuple[float, float]] = {}
     while len(tried) < _ATTEMPTS and setting not in tried:
@@ -238,13 +238,13 @@ def _run_until(
 
 
 def _why_short(machine: Candidate, accuracy: float) -> str:
-    """Return the sentence about a machine that is less accurate than asked, with what to change."""
+    """Return the sentence that says why a machine is less accurate than asked, and what to change."""
     if machine.cycles < _NEAR * MOST_CYCLES:
         return (
             f"{machine.machine}: its codes of {machine.prob_bits} bits, not its cycles, limit its accuracy; ask for less with "
             "--accuracy."
         )
-    # the error falls with the root of the setting
+    # the error is inversely proportional to the square root of the setting
     enough = float(f"{machine.setting * (machine.total_variation / accuracy) ** 2:.1e}")
     flag = "--samples" if machine.machine == "BM2" else "--target-count"
     return (

@@ -1,9 +1,9 @@
-"""The Markov chain of a BM2, exactly: its law, its cycles and its correlations, for few unknown bits.
+"""The Markov chain of a BM2, exactly: its law (the distribution of its state), cycles and correlations, for few bits.
 
-With ideal random numbers, a try at a pointed bit agrees on 1 with the product of its CDEs' chances, and on 0 with the
-product of their complements. This gives the matrix of a sweep, from state to state, and with it everything that long
-runs approach. The codes are those of the machine, so all that quantising and clipping changed is included. A
-sample is taken as the state after a sweep, also where a machine takes one after every move.
+With ideal random numbers, the CDEs of a pointed bit agree on 1 in one try with the product of their chances of a 1, and
+on 0 with the product of the complements. This gives the matrix of a sweep, from state to state, and with it everything
+that long runs approach. The codes are those of the machine, so the effects of quantising and clipping are included. The
+samples are the states after each sweep, even if a machine takes one after every move.
 """
 
 import itertools
@@ -26,15 +26,15 @@ MOST_BITS: Final = 9
 """Maximum number of unknown bits: the matrix of a sweep has 2**bits rows and columns."""
 _MOST_READINGS: Final = 64
 _WORK: Final = 2**27
-"""Maximum number of products for one matrix product of all readings together: a few seconds in all."""
+"""Maximum number of multiplications of one matrix product, summed over all readings: a few seconds in all."""
 
 
 def agreement(
     machine: BM2Machine, bit: int, values: Mapping[int, NDArray[np.int64]]
 ) -> list[tuple[int, NDArray[np.float64]]]:
-    """Return each CDE that a pointed bit concerns, and its chances of a 1, float64[states].
+    """Return each CDE whose factor contains a pointed bit, with its chance of a 1 in each state, float64[states].
 
-    `values` are the other bits of these CDEs' factors in each state, int64[states], by bit.
+    `values` has the value of every other bit of these factors in each state, int64[states], by bit.
     """
     p, found = machine.parameters, []
     variable = next(at for at, mask in enumerate(p.masks) if mask >> bit & 1)
@@ -69,7 +69,7 @@ class ExactChain:
             for bit in range(p.state_bits)
         }
         self._one = np.ones((len(self._unknown), len(index)))
-        """The chance that all CDEs concerned say 1 in one try at each unknown bit."""
+        """The chance that one try at a pointed bit agrees on 1: float64[unknown bits, states]."""
         self._zero = np.ones_like(self._one)
         for at, bit in enumerate(self._unknown):
             concerned = agreement(machine, bit, self._values)
@@ -87,7 +87,7 @@ class ExactChain:
         return laws
 
     def _tries(self, move: Sequence[int]) -> NDArray[np.float64]:
-        """Return the mean number of cycles of a move in each state: until the last of its bits has agreed."""
+        """Return the mean number of cycles of a move in each state: until its CDEs have agreed on all of its bits."""
         agree = self._one[move] + self._zero[move]
         total = np.zeros(agree.shape[1])
         for count in range(1, len(move) + 1):
@@ -135,7 +135,7 @@ class ExactChain:
 
     @cached_property
     def _searched(self) -> NDArray[np.int64]:
-        """int64[states]: the place in the joint of the searched variables; -1 if any variable is at an unused code."""
+        """int64[states]: the index of the searched values together; -1 if any variable has an unused code."""
         bits = np.stack([self._values[bit] for bit in range(self._parameters.state_bits)], axis=1)
         packed = np.packbits(bits.astype(np.uint8), axis=1, bitorder="little")
         words = np.pad(packed, ((0, 0), (0, -packed.shape[1] % 4))).view("<u4")
@@ -150,11 +150,11 @@ class ExactChain:
 
     @cached_property
     def _fundamental(self) -> NDArray[np.float64]:
-        """float64[states, states]: sums of the deviations of all later laws from the stationary one."""
+        """float64[states, states]: the fundamental matrix, the sum of all later laws' deviations from `law`."""
         return np.asarray(np.linalg.inv(np.eye(len(self.law)) - self.sweep + self.law))
 
     def effective(self) -> NDArray[np.float64]:
-        """Return the number of independent samples that a sweep is worth, for each searched value: float64[values]."""
+        """Return how many independent samples a sweep is worth, for each searched value: float64[values]."""
         places = np.arange(len(self.posterior(self.law)))
         values = (self._searched[:, np.newaxis] == places).astype(np.float64)
         centred = values - self.law @ values
@@ -163,7 +163,7 @@ class ExactChain:
         return np.asarray(np.divide(own, total, out=np.ones_like(own), where=own > 0))
 
     def frame(self, state: int, burn_in: int, sweeps: int) -> NDArray[np.float64]:
-        """Return the mean law after each sweep of a frame that starts in a packed state and burns in."""
+        """Return the mean law over the sweeps of a frame after its burn-in, from a packed start state: float64[states]."""
         first = np.linalg.matrix_power(self.sweep, burn_in + 1)[
             sum((state >> bit & 1) << at for at, bit in enumerate(self._unknown))
         ]
@@ -173,7 +173,7 @@ class ExactChain:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChainError:
-    """The expected error of a frame, in the mean over readings, computed without running one.
+    """The expected error of a frame, averaged over readings, and computed without a run.
 
     Distances are total variations of the searched variables' posterior.
     """
@@ -181,17 +181,17 @@ class ChainError:
     share: float
     """The probability of the readings that were examined, the likeliest ones."""
     quantising: float
-    """Distance of the stationary law from exact inference."""
+    """Mean distance of the stationary law from exact inference."""
     worst: float
-    """The largest of these distances."""
+    """The largest of these distances, over readings."""
     worst_reading: tuple[int, ...]
-    """The addresses where it occurs."""
+    """The reading with this distance: an address per known variable."""
     start: float
-    """Distance of a frame's mean law from the stationary one: what its burn-in did not forget."""
+    """Mean distance of a frame's mean law from the stationary one: the effect of the start that outlasts the burn-in."""
     sampling: float
     """Mean distance of a frame's posterior from its mean law, because samples are finite and correlated."""
     cycles: float
-    """Cycles of a sweep."""
+    """Mean cycles of a sweep."""
     effective: float
     """Effective samples per sweep, for the reading and the searched value that mix most slowly."""
 
@@ -202,9 +202,9 @@ def distance(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> float:
 
 
 def chain_error(machine: BM2Machine, model: NetworkModel, *, samples: int) -> ChainError | None:
-    """Return the expected error of a frame in which all known variables have readings; None if it is too large.
+    """Return the expected error of a frame with readings of all known variables; None if the chain is too large.
 
-    The model must be that of the machine. All boards start in the same state here.
+    `machine` must have been built from `model`. All boards are taken to start in the same state.
     """
     p = machine.parameters
     unknown = p.state_bits - sum(p.bits[variable] for variable in p.known)

@@ -19,12 +19,12 @@ from toolchain.errors import BuildError
 Inputs: TypeAlias = "tuple[int, ...] | NDArray[np.int64]"
 """Inputs of a frame: an address per column, or int64[sensors, all lines] if lines have their own readings."""
 WrittenPrior: TypeAlias = "NDArray[np.uint16] | None"
-"""Codes of the prior of a frame, uint16[all lines]; None if the machines have it."""
+"""Codes of the prior of a frame, uint16[all lines]; None to use the prior of the machines."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameRun:
-    """uint32[lines] counts, cycles and stop reason of each board in one frame."""
+    """The counts (uint32[lines]), the cycles and the stop reason of each board in one frame."""
 
     counts: tuple[NDArray[np.uint32], ...]
     cycles: tuple[int, ...]
@@ -83,7 +83,7 @@ class EmulatedBoards:
         return self.machines[0].parameters
 
     def parts(self, inputs: Inputs, prior: WrittenPrior) -> Iterator[tuple[Inputs, WrittenPrior]]:
-        """Return for each board its inputs of a frame, and its part of a written prior; None without one.
+        """Return each board's inputs of a frame and its part of a written prior, which is None without one.
 
         Inputs of lines are split among the boards; addresses of columns go to all boards.
         """
@@ -92,7 +92,7 @@ class EmulatedBoards:
         return zip(of_boards, [None] * count if prior is None else np.split(prior, ends), strict=True)
 
     def run(self, addresses: Inputs, prior_address: int, bank: int, prior: WrittenPrior = None) -> FrameRun:
-        """Run a frame like the host: in slices of 256 * 2^k cycles until a board overflows, or each board alone.
+        """Run a frame as the host does: in slices of 256 * 2^k cycles until a board overflows, or each to its own end.
 
         `prior` is a written prior, uint16[all lines].
         """

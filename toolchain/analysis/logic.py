@@ -65,7 +65,7 @@ _BOARD_REGISTERS: Final = 1032
 _REPLICA_BITS: Final = 5
 """Registers of bm1_control for each replica: its stop reason, whether it runs and whether it is halted."""
 _FEW_WORDS: Final = 8
-"""Memories of at most this many words are in memory LABs, whose output needs registers, unlike that of a memory block."""
+"""A memory of at most this many words is built from memory LABs, which, unlike a block, need registers for output."""
 
 
 class Of(StrEnum):
@@ -76,7 +76,7 @@ class Of(StrEnum):
     CODE_BIT = "code bit"
     """bm1_stochastic_bitstream_generator: r < code, all ones, all zeros; with the AND of bm1_tile_element."""
     COUNTER_BIT = "counter bit"
-    """bm1_counter and bm1_readout: increment, comparison with the target, and selection for the host; bm1_matrix."""
+    """bm1_counter, bm1_readout, bm1_matrix: increment, comparison with the target, and selection for the host."""
     STATE_BIT = "state bit"
     """bm1_lfsr: one bit of the state, which loads the seed or takes the steps of a cycle."""
     STEP = "step"
@@ -97,7 +97,7 @@ WORST_ERROR: Final = 0.06
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Logic of an FPGA for one unit: look-up tables, how many of them are in carry chains, and the ALMs that hold them."""
+    """Logic of an FPGA for one unit: look-up tables, including carry chains, and the ALMs that hold them."""
 
     aluts: float
     alms: float
@@ -120,7 +120,7 @@ COSTS: Final[Mapping[Of, Cost]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogicPart:
-    """A part of a machine: its name, units of look-up tables, and flip-flops."""
+    """A part of a machine: its name, its number of units of each kind, and its flip-flops."""
 
     name: str
     counts: Mapping[Of, float] = field(default_factory=dict)
@@ -167,7 +167,7 @@ def state_bits(p: BM1Parameters | BM2Parameters, table_length: int) -> int:
 def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH, inputs: int = 0) -> Logic:
     """Return the logic of a machine on a board, without memories; a BuildError if its generators are only emulated.
 
-    `inputs` are those of the interface, if it has more than the machine needs.
+    `inputs` is the number of inputs of the interface, if it has more than the machine needs.
     """
     p = parameters
     if p.rng is RngKind.IDEAL:
@@ -229,19 +229,19 @@ def _inputs(p: BM1Parameters, inputs: int) -> LogicPart:
 
 
 def _index_bits(count: int) -> int:
-    """Return the bits of a number below `count`, at least one."""
+    """Return how many bits hold a number below `count`, at least one."""
     return max(1, (count - 1).bit_length())
 
 
 MLAB_ALMS: Final = 10
 """Number of ALMs of a memory LAB."""
 MLAB_SHAPE: Final = (64, 10)
-"""Words and bits of a memory LAB, in the deeper of its two shapes."""
+"""Number of words and their width in a memory LAB, in the deeper of its two shapes."""
 MLAB_SHARE: Final = 0.5
 """Share of the LABs of a Stratix V that can be memories."""
 
 BLOCK_SHAPES: Final = ((512, 40), (1024, 20), (2048, 10), (4096, 5), (8192, 2), (16384, 1))
-"""Words and bits of an M20K, in its possible shapes."""
+"""Number of words and their width in an M20K, for each possible shape."""
 
 
 def blocks_of(words: int, width: int) -> int:
@@ -251,7 +251,7 @@ def blocks_of(words: int, width: int) -> int:
 
 @dataclass(frozen=True, slots=True, order=True)
 class EqualMemories:
-    """A number of memories of the same words and width."""
+    """Several memories with the same number of words and the same width."""
 
     words: int
     width: int
@@ -265,7 +265,7 @@ class EqualMemories:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memories:
-    """The memories of a machine; `logic_tables` are those in memory LABs, for which no block was left."""
+    """The memories of a machine; `logic_tables` of them are in memory LABs, because no block was left for them."""
 
     table_bits: int
     blocks: int
@@ -277,8 +277,8 @@ class Memories:
 def tables_of(p: BM1Parameters) -> list[EqualMemories]:
     """Return the tables: one per column with one address, otherwise one per cell.
 
-    Every replica has its own tables, because it uses its own addresses. A prior of one row, whose MIF has one word, is a
-    constant and no memory.
+    Every replica has its own tables, because it uses its own addresses. A prior of one row, whose MIF has one word, is
+    not a memory but a constant.
     """
     column, cell = (p.lines * p.prob_bits, p.replicas), (p.prob_bits, p.replicas * p.lines)
     tables = [EqualMemories(1 << p.prior_bits, *column)] if p.prior_bits else []
@@ -289,14 +289,14 @@ def tables_of(p: BM1Parameters) -> list[EqualMemories]:
 
 
 def random_memories_of(p: BM1Parameters | BM2Parameters, table_length: int) -> list[EqualMemories]:
-    """Return the seeds, and the table of random numbers, of which every generator has its own."""
+    """Return the memory of seeds and, for `rng = table`, each generator's copy of the table of random numbers."""
     seeds = EqualMemories(p.rng_banks * generators(p), state_bits(p, table_length), 1)
     table = EqualMemories(table_length, p.prob_bits, generators(p))
     return [seeds, table] if p.rng is RngKind.TABLE else [seeds]
 
 
 def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
-    """Return the words that the host writes (bm1_words), and the initial codes of a written prior."""
+    """Return the memories of the words that the host writes (bm1_words), and of a written prior's initial codes."""
     used = BM1.registers(p)
     depths = [max(inputs, used.input_words, 1)]
     initial = []

@@ -1,10 +1,10 @@
 """Frames that a BM1 gives no posterior, predicted from its codes before it runs, and the options that save them.
 
 A frame is lost if every line has a code 0, or if no line counts in any of its cycles. Frames are drawn from the
-model (a sample). The chance to lose one follows from its codes: with u, the probability that some line counts in a
-cycle, it is (1 - u)^cycles. Lines share the numbers of their columns, so u is the volume of a union of boxes, one for
-each line, whose sides are its codes. Karp and Luby's method estimates it: points are drawn in the boxes, and each
-counts as one over the number of boxes that contain it.
+model (a sample). The probability that a frame is lost is (1 - u)^cycles, where u is the probability that some line
+counts in a cycle. All lines use the same random number of each column, so u is the volume of a union of boxes: one for
+each line, with the codes of its cells as sides. Karp and Luby's method estimates it: points are drawn in the boxes, and
+each has a weight of one over the number of boxes that contain it.
 """
 
 from dataclasses import replace
@@ -25,18 +25,18 @@ from toolchain.errors import BuildError
 TOLERATED: Final = 0.01
 """Share of lost frames above which a build and a check warn."""
 _WORK: Final = 2**26
-"""Comparisons of points with codes for one machine, which take less than a second; more only for large models."""
+"""Comparisons of points with codes for one machine, which take less than a second; only large models need more."""
 _MOST_FRAMES: Final = 1000
 _LEAST_FRAMES: Final = 10
 _POINTS: Final = 16
-"""Number of points for a frame."""
+"""Number of points that are drawn for a frame."""
 _SEED: Final = 1
 _MOST_CYCLES: Final = 2**26
-"""Cycles above which no more are advised: 0.7 s at 100 MHz."""
+"""Cycles from which on advice does not try more: 0.7 s at 100 MHz."""
 
 
 class LostFrames(NamedTuple):
-    """The expected share of lost frames, what is lost as a clause, and what saves it; that is empty if few are lost."""
+    """The expected share of lost frames, a clause about them, and advice on saving them; no advice if few are lost."""
 
     share: float
     what: str
@@ -84,13 +84,13 @@ def _union(chances: NDArray[np.float64], random: np.random.Generator, *, shared:
 
 
 def _share(chances: NDArray[np.float64], options: BuildOptions, cycles: int) -> float:
-    """Return the expected share of lost frames; numbers that repeat add nothing."""
+    """Return the expected share of lost frames; cycles beyond the period of an LFSR do not make it smaller."""
     width = options.rng.lfsr_bits
     return float(((1 - chances) ** (cycles if width is None else min(cycles, 2**width - 1))).mean())
 
 
 def _advice(plan: MachinePlan, drawn: Readings) -> str:
-    """Return each option that saves enough frames by itself, or else all together, with fewer sensors if need be."""
+    """Advise each option that alone saves enough frames, or else all together, with fewer sensors if necessary."""
     options, sensors = plan.options, len(plan.model.known)
     may_scale = options.sensor_mode is SensorMode.COLUMN and options.scaling is not Scale.ADDRESS
     rng: dict[str, Any] = {"rng": RngKind.LFSR32} if options.rng.lfsr_bits not in {None, 32} else {}
@@ -119,7 +119,10 @@ def _advice(plan: MachinePlan, drawn: Readings) -> str:
 def _expected(
     plan: MachinePlan, changes: dict[str, Any], drawn: Readings, count: int, *, longer: bool
 ) -> tuple[str, float]:
-    """Return changed options as flags, with enough cycles if `longer`, and the share lost with the first `count` sensors."""
+    """Return changed options as flags, and the share of frames that they lose with only the first `count` sensors.
+
+    If `longer`, the maximum number of cycles is also raised until few frames are lost.
+    """
     model, options = replace(plan.model, known=plan.model.known[:count]), replace(plan.options, **changes)
     try:
         own = plan_machine(model, options)

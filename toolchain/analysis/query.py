@@ -1,4 +1,4 @@
-"""Answers about a network: the exact posterior for known states, and what a machine says; and what there is to ask."""
+"""Answers about a network: exact posteriors for known states, those of a machine, and the variables to ask about."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ class MachineAnswer:
 
     kind: str
     why: str
-    """The reason for the kind, as a clause."""
+    """The reason for this kind of machine, as a clause."""
     cycles: int
     stopped: str
     """The reason why the board stopped."""
@@ -48,7 +48,7 @@ class MachineAnswer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """The posterior of the searched variables together, the first one slowest."""
+    """The posterior of the searched variables together; the first variable varies slowest."""
 
     network: str
     searched: tuple[Symbol, ...]
@@ -62,7 +62,7 @@ class Answer:
         return list(product(*([each.shown(at) for at in range(each.size)] for each in self.searched)))
 
     def _most_probable(self) -> list[int]:
-        """Return the most probable line, and that of the machine if it has one."""
+        """Return the most probable line of the exact posterior and, if there is one, of the machine's posterior."""
         ours = self.machine.posterior if self.machine else None
         return [int(each.argmax()) for each in (self.exact, ours) if each is not None]
 
@@ -83,7 +83,7 @@ class Answer:
         return json.dumps(content | {"map": best[0], "posterior": rows, "machine": found}) + "\n"
 
     def report(self, *, best: bool = False) -> str:
-        """Return the answer as bars and sentences; with `best`, of the most probable states alone."""
+        """Return the answer as bars and sentences; with `best`, only the most probable states."""
         names, lines = [each.name for each in self.searched], self._lines
         given = ", ".join(f"{name}={state}" for name, state in self.known.items())
         columns = {"exact": self.exact}
@@ -170,12 +170,12 @@ def _machine_answer(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """The variables of a network and, for searched ones, which others a BM1 cannot know together."""
+    """The variables of a network and, if some are searched, which other variables a BM1 cannot know together."""
 
     joint: JointDistribution
     searched: tuple[str, ...] = ()
     apart: Mapping[str, Sequence[str]]
-    """For each candidate those that are not independent of it given the searched variables."""
+    """For each candidate, the other candidates that depend on it given the searched variables."""
 
     def as_json(self) -> str:
         """Return the contents as one JSON object."""
@@ -211,7 +211,7 @@ class Contents:
 
 
 def contents(joint: JointDistribution, searched: Sequence[str] = (), known: Sequence[str] = ()) -> Contents:
-    """Return the variables of a network; `known` are the candidates for known variables, all others if there are none.
+    """Return the variables of a network; `known` are the candidates for known variables; if empty, all others.
 
     Raises:
         ToolchainError: A variable does not exist or is named twice, or there are too many candidates.

@@ -84,7 +84,7 @@ def check_frames(frames: int) -> None:
 def sample_readings(
     model: Model, frames: int, *, seed: int, source: str = "", in_sequence: bool = False
 ) -> Readings:
-    """Draw a line from the prior, or from an equally probable selection, then its readings.
+    """Draw the line of each frame, then its readings; a `prior_select` gets equally probable values.
 
     With `in_sequence`, the lines of a model with a transition are drawn one after the other.
     """
@@ -150,8 +150,8 @@ def model_of_codes(
 ) -> Model:
     """Return a model that quantises to the codes of a machine, for drawing readings without the original.
 
-    Each row of a table was divided by its maximum before quantising. The factors are estimated so that the
-    column of every line sums to 1 as nearly as possible (expectation maximisation).
+    Each row of a table was divided by its maximum before quantising. These maxima are estimated so that
+    the column of every line sums to 1 as nearly as possible (expectation maximisation).
     """
     width = machine.parameters.prob_bits
     known = []
@@ -182,7 +182,7 @@ def _conditional(codes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _distribution(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Normalise ratios, also those of a distribution of a model, which sums to 1 only within 1e-6."""
+    """Return ratios with the sum 1; even a distribution of a model has this sum only within 1e-6."""
     total = ratios.sum()
     return ratios / total if total > 0 else np.full(ratios.shape, 1 / ratios.size)
 
@@ -198,7 +198,7 @@ def recorded_readings(
 ) -> Readings:
     """Return at most `frames` readings of a recording (CSV, MCAP or bag), spread over its length.
 
-    With `in_sequence`, they are the first ones, and a row that does not fit has no readings instead of being left out.
+    With `in_sequence`, these are the first rows, and one that does not fit is kept with all its readings missing.
 
     `given` are NAME=COLUMN for variables whose column has another name, with `*` for the same text in both;
     in a bag, messages of other topics may be `tolerance_s` apart from a row.
@@ -225,8 +225,8 @@ class Frames:
     """Rows of a recording.
 
     Attributes:
-        readings: Those of all rows; a row that does not fit has none.
-        fits: bool[rows], whether the readings are values that the machine takes; without, there is no posterior.
+        readings: The readings of all rows; all are missing in a row that does not fit.
+        fits: bool[rows], whether the machine takes all values of the row; a row that does not fit gets no posterior.
         stamps: int64[rows], nanoseconds: of the messages of a bag or the column of a CSV file, or else the numbers
             of the rows, 0, 1, 2, ...
         why: What is wrong with the first row that does not fit; empty if all do.

@@ -2,8 +2,9 @@
 
     recording ──rows──▶ addresses ──▶ Replay (a job: one piece per frame) ──▶ OUT.frames ──▶ OUT.npz or OUT.mcap
 
-`OUT.frames` has a place for the record of each frame, behind a line that names everything on which the results depend. A run
-that was killed goes on from it. `OUT` grows in the order of the rows, and has the same bytes whoever has computed them.
+`OUT.frames` begins with a line that identifies everything on which the results depend. After it, each frame has a place
+for its record, so that a killed run can be resumed. `OUT` grows in the order of the rows, and its bytes do not depend
+on where they were computed.
 """
 
 import fcntl
@@ -35,12 +36,12 @@ from toolchain.errors import BuildError
 
 _TOPIC: Final = "/BMresults"
 _TOGETHER: Final = 64
-"""Records that are written to the output at once."""
+"""Number of records that are written to the output together."""
 _CRC_BYTES: Final = 8
 
 _Posterior: TypeAlias = NDArray[np.float64] | None
 _Row: TypeAlias = Callable[[int, int, NDArray[np.uint16] | None], tuple[_Posterior, int]]
-"""A row, the bank of its frame, and its written prior, to posterior and cycles."""
+"""A function that takes a row, the bank of its frame, and its written prior, and returns its posterior and cycles."""
 _Write: TypeAlias = Callable[[NDArray[np.void]], None]
 
 
@@ -74,7 +75,7 @@ class Replay:
     machines: Sequence[Any]
     frames: Frames
     earlier: Callable[[int], tuple[_Posterior, int] | None] | None = None
-    """Of a filter, which goes through all rows: returns what an interrupted run has found for a row, if anything."""
+    """For a filter, which goes through all rows: returns what an interrupted run computed for a row, if anything."""
 
     @property
     def is_sequence(self) -> bool:
@@ -122,21 +123,21 @@ class PartFile:
     begin: int
     """Offset of the first record in bytes."""
     records: NDArray[np.void]
-    """All of them as they are in the file, also those that `add` writes later."""
+    """All records, mapped from the file, so that those which `add` writes later appear here too."""
     there: bytearray
     """For each row, 1 if it has its record."""
     written: int = 0
-    """Rows that were taken for the output."""
+    """Number of rows that `ready` has yielded."""
 
     @classmethod
     @contextmanager
     def opened(cls, path: Path, key: str, layout: "np.dtype[np.void]", frames: int) -> Iterator["PartFile"]:
         """Open or create the file, locked, and with room for all; remove it if the block ends without an error.
 
-        It begins with the key of the work. A place that was not written, or only in part, has a wrong checksum.
+        The file begins with `key`. A place that was not written, or only in part, has a wrong checksum.
 
         Raises:
-            BuildError: It cannot be written, or another run has it, or it is of other work.
+            BuildError: The file cannot be written, is locked by another run, or has another key.
         """
         heading, elsewhere = f"rosbayes infer {key}\n".encode(), "or name another file with -o"
         with file_errors(path, "written", BuildError):
@@ -153,7 +154,7 @@ class PartFile:
                     )
                 os.pwrite(file.fileno(), heading, 0)
                 os.posix_fallocate(file.fileno(), 0, len(heading) + frames * layout.itemsize)
-                # not of `file`, because it would keep the lock
+                # opened by its path, because a mapping of `file` would keep the lock
                 records = np.memmap(path, layout, "r", len(heading), (frames,))
                 whole = (crc32(each.tobytes()[_CRC_BYTES:]) == int(each["crc"]) for each in records)
                 there = bytearray(whole if found else frames)
@@ -173,7 +174,7 @@ class PartFile:
         return None if math.isnan(posterior[0]) else posterior, int(self.records[row]["cycles"])
 
     def ready(self) -> Iterator[NDArray[np.void]]:
-        """Yield the records after those that were yielded before, in order, as far as each has those before it."""
+        """Yield the next records in the order of their rows, up to the first row without a record."""
         rows = len(self.records)
         gap = self.there.find(0, self.written) % (rows + 1)  # -1, for none, becomes the number of rows
         while self.written + _TOGETHER <= gap or self.written < gap == rows:
@@ -192,9 +193,9 @@ def replay(
 ) -> tuple[int, int]:
     """Compute all frames that are not done, and write the output.
 
-    `begun` is called with the number of frames that an earlier run has left, `advance` after each other one. The frames
-    of a sequence are computed in this process. Return the numbers of frames that were computed, and of those without a
-    posterior.
+    `begun` is called with the number of frames that an earlier run has computed, and `advance` after each further one.
+    The frames of a sequence are computed in this process. Return the number of frames computed now, and the number of
+    all frames without a posterior.
 
     Raises:
         BuildError: A file cannot be written, or belongs to other work.
@@ -305,7 +306,7 @@ _WRITERS: Final = {".npz": _archive, ".mcap": _bag}
 
 
 def check_request(path: Path, deployment: Deployment) -> None:
-    """Raise a BuildError before a long run for an output that cannot be written, or machines that take arrays."""
+    """Raise a BuildError, before a long run, if the output cannot be written or the machines read arrays."""
     if not deployment.machine.is_plain or deployment.prior is not None:
         raise BuildError(
             f"{deployment.directory} reads arrays of numbers (for each line or replica, or a prior), but the columns of a "

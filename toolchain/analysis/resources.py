@@ -73,7 +73,8 @@ def estimate(
 ) -> Estimate:
     """Return the resources of a machine on a device, or raise a BuildError if it exists only in emulation.
 
-    `inputs` are those of the interface, if it has more than the machine needs; results are counters and take no memory.
+    `inputs` is the number of inputs of the interface, if it has more than the machine needs. Results take no memory,
+    because they are counters.
     """
     return Estimate(
         device=device,
@@ -87,7 +88,7 @@ def _why_not(
 ) -> str:
     """Return what the device or the interface of a board lacks for a machine, as a clause; empty if the machine fits.
 
-    `interface` is that of `--interface`; without it, the interface may be as large as the register map.
+    `interface` is the value of `--interface`; without it, the interface may be as large as the register map.
     """
     used = BM1.registers(machine)
     whose = "the map" if interface is None else "the interface"
@@ -109,7 +110,7 @@ def most_replicas(
     table_length: int = LENGTH,
     interface: tuple[int, int] | None = None,
 ) -> tuple[int, str]:
-    """Return how many machines with the lines of a board fit it, 0 if none does, and why no more, as a clause."""
+    """Return how many replicas of a board's machine fit the board (0 if none does), and why no more, as a clause."""
 
     def why_not(replicas: int) -> str:
         return _why_not(replace(board, replicas=replicas), device, table_length, interface)
@@ -198,7 +199,7 @@ class Energy:
     static_w: float
 
     def frame_j(self, cycles: float, clock_hz: float) -> tuple[float, float]:
-        """Return the energy of a frame in joules: that of toggles, and that of leakage."""
+        """Return the energy of a frame in joules, for toggles and for leakage."""
         return cycles * self.cycle_j, cycles / clock_hz * self.static_w
 
 
@@ -223,7 +224,7 @@ def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
 
 
 def _stream_toggles(machine: BM1Machine, readings: Readings, lines: slice) -> float:
-    """Toggles of cells, ANDs, counters and their comparators, averaged over frames."""
+    """Return the toggles per cycle of cells, ANDs, counters and their comparators, averaged over frames."""
     found = []
     for frame in range(min(len(readings), _FRAMES)):
         addresses, row = readings.of_machine(frame, machine)

@@ -42,7 +42,7 @@ Addresses = tuple[int, ...]
 
 
 def drawn_readings(model: NetworkModel, frames: int, seed: int) -> list[Addresses]:
-    """Draw readings of all known variables from the model, each one given those before it."""
+    """Draw readings of all known variables from the model, each given those drawn before it."""
     check_frames(frames)
     random = np.random.default_rng(seed)
     given_earlier = [
@@ -69,11 +69,11 @@ class Sampled:
         frames: All frames.
         without: Share of frames without a posterior.
         total_variation: Mean distance from exact inference, 1 for a frame without a posterior; None without a model.
-        alone: The same without these frames.
-        cycles: Cycles of the longest-running board, in frames with a posterior like everything below.
-        sweep_cycles: Cycles of a sweep, in the mean; 0 if samples are taken after every move.
-        effective_samples: Effective samples of a frame, in the median and at least; 0 if unknown.
-        r_hat: The median of frames; 0 for one board, 1e9 if it is infinite.
+        alone: The same over only the frames with a posterior, as is everything below but `reasons`.
+        cycles: Cycles of the longest-running board.
+        sweep_cycles: Mean cycles of a sweep; 0 if samples are taken after every move.
+        effective_samples: Median and minimum of the effective samples of a frame; 0 if unknown.
+        r_hat: Median R-hat of a frame; 0 for one board, 1e9 if it is infinite.
         reasons: How often boards stopped for each reason; `impossible` for readings without a possible state.
     """
 
@@ -89,7 +89,7 @@ class Sampled:
 
 
 _Frame: TypeAlias = tuple[list[str], tuple[float, ...] | None]
-"""Why each board stopped, and distance, effective samples, R-hat and cycles; None without a posterior."""
+"""Why each board stopped; then distance, effective samples, R-hat and cycles, or None without a posterior."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ def run_chains(
     advance: Callable[[], None] = lambda: None,
     run: Run = in_this_process,
 ) -> Sampled:
-    """Run every reading on boards with these machines; a BuildError if none of them gives a posterior."""
+    """Run every reading on boards with these machines; a BuildError if no reading gets a posterior."""
     p = machines[0].parameters
     if p.rng_reset is RngReset.FREE:
         run = in_this_process  # the generators run on from frame to frame

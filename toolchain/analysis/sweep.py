@@ -1,4 +1,4 @@
-"""Sweeps over the possible machines of a model: points, stored one by one in a file, their Pareto front, table and picture."""
+"""Sweeps over the possible machines of a model: points, stored in a file, with Pareto front, table and picture."""
 
 import fcntl
 import hashlib
@@ -46,21 +46,21 @@ class Point(BaseModel):
 
     Attributes:
         key: SHA-256 of everything on which the results depend.
-        total_variation: Compared with the model, mean over all frames, 1 for one without a posterior.
+        total_variation: Distance from the model's posterior, mean over all frames; 1 for a frame without a posterior.
         total_variation_low: Lower end of its 95 % interval.
         total_variation_high: Upper end of its 95 % interval.
-        quantising: The same for exact inference on the codes.
+        quantising: The same distance for exact inference on the codes.
         map_agreement: Share of all frames with a posterior and the same most probable line.
         alone_total_variation: The mean over frames with a posterior; None if no frame had one, as for the next two.
         alone_map_agreement: The share of these frames.
-        kl_bits: KL(machine || model), over these frames.
+        kl_bits: KL(machine || model) in bits, over these frames.
         z_rms: Root mean square of z-scores; 1 is ideal.
         without: Share of runs without a posterior.
         cycles_median: Cycles of a frame.
         cycles_95: Their 95th percentile.
         alms: ALMs of the largest board; None for generators that FPGAs do not have.
         blocks: Memory blocks of the largest board.
-        fits: Whether these fit the device.
+        fits: Whether the largest board fits the device.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -134,7 +134,7 @@ class Results:
 
     @contextmanager
     def _locked(self) -> Iterator[BinaryIO]:
-        """Open the file to append, alone among the sweeps that write it."""
+        """Open the file to append, and lock it against other sweeps."""
         while True:
             with self.path.open("a+b", buffering=0) as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
@@ -143,7 +143,7 @@ class Results:
                     return
 
     def sort(self, keys: Sequence[str]) -> None:
-        """Move the points of these keys to the end of the file, in this order, as a sweep in one process writes them."""
+        """Move the points of these keys to the end of the file, in this order, as if one process had written them."""
         with self._locked():
             points = Results(self.path).points  # with those of other sweeps
             last = dict.fromkeys(keys)
@@ -155,11 +155,11 @@ class Results:
 
 
 _MOST_LOST: Final = 0.5
-"""Maximum share of runs without a posterior on the Pareto front: beyond it, the median frame has no cycles to compare."""
+"""Maximum share of runs without a posterior on the Pareto front; above it, no median of cycles can be compared."""
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
-    """Return the Pareto front of total variation over all frames, cycles and ALMs, without machines that lose most frames."""
+    """Return the Pareto front of total variation, cycles and ALMs, without machines that lose most frames."""
     judged = [
         (each, (each.total_variation, each.cycles_median, math.inf if each.alms is None else each.alms))
         for each in points
@@ -219,7 +219,7 @@ _KINDS_INSIDE: Final = 5
 
 
 def check_plot(path: Path) -> None:
-    """Raise a BuildError before a long run if its picture cannot be drawn or written."""
+    """Raise a BuildError, before a long run, if the picture cannot be drawn or written."""
     if path.suffix not in _SUFFIXES:
         raise BuildError(
             f"{path} is not the name of a picture; expected a name that ends in {', '.join(_SUFFIXES)}"
@@ -419,7 +419,7 @@ class SweepJob:
 def run_sweep(job: SweepJob, run: Run, results: Results, advance: Callable[[Point], None]) -> None:
     """Measure the machines without a stored result, and store every point as soon as it is there.
 
-    At the end, the points of the sweep stand in the file in its order, whoever has measured them.
+    At the end, its points are in the file in the order of the sweep, wherever they were measured.
     """
     left = [number for number, task in enumerate(job.tasks) if task.key not in results.points]
     for key in (task.key for task in job.tasks if task.key in results.points):

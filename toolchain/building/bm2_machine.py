@@ -29,7 +29,7 @@ _MOST_CODES: Final = 1 << 27
 """Maximum number of codes of all CDEs, 2 bytes each."""
 
 BM2_KEYS: Final = tuple(key for key in BM2Section.model_fields if key in BM2Parameters.__dataclass_fields__)
-"""The parameters with the same names in `[machine]`."""
+"""The names of parameters that have the same names in `[machine]`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,7 +42,7 @@ class BM2Plan:
     model: NetworkModel
     options: BuildOptions
     parameters: BM2Parameters
-    """The parameters of the first board; the others differ only in their number."""
+    """The parameters of the first board; those of other boards differ only in `chain`, the number of the board."""
     target_count: int
     """The number of samples of each board."""
     max_cycles: int
@@ -116,7 +116,7 @@ def _check_sizes(model: NetworkModel) -> None:
 
 
 def chain_machines(plan: BM2Plan) -> tuple[BM2Machine, ...]:
-    """Return the machine of each board: the same tables, and seeds of its own; a BuildError if no state is possible."""
+    """Return each board's machine: common tables, but its own seeds; a BuildError if no state is possible."""
     parameters, table = plan.parameters, plan.options.rng_table
     if table is None and parameters.rng is RngKind.TABLE:
         table = random_table(parameters.prob_bits)
@@ -133,9 +133,9 @@ def chain_machines(plan: BM2Plan) -> tuple[BM2Machine, ...]:
 
 
 def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]:
-    """Return how many odds of a factor are clipped, how many of these by zeros, and the number of all odds.
+    """Return how many odds of a factor are clipped, how many of these because of zeros, and the number of all odds.
 
-    A CDE compares two values of a variable whose codes differ in one bit, the other variables being equal.
+    Odds compare two values of one variable whose codes differ in one bit, with all other variables unchanged.
     """
     clips = zeros = count = 0
     for axis, size in enumerate(factor.shape):
@@ -151,7 +151,7 @@ def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]
 
 
 def chain_layout(parameters: BM2Parameters, interface: tuple[int, int] | None) -> BoardLayout:
-    """Return the layout of the boards, each of which has a chain; a BuildError as for `fitted_layout`."""
+    """Return the layout of the boards, each of which has one chain; errors are those of `fitted_layout`."""
     check_seeds(parameters)
     what = (
         f"a state of {counted(parameters.state_bits, 'bit')}, {parameters.histogram_words} words of histograms and "

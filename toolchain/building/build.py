@@ -167,7 +167,8 @@ def build_date(model_file: Path) -> str:
 def _model_hash(plan: MachinePlan | BM2Plan, codes: Sequence[NDArray[Any]]) -> str:
     """Return the SHA-256 (hexadecimal) of the whole machine and its names.
 
-    It covers codes (and, of a BM2, what is possible), not probabilities, whose last bits depend on the mathematics library.
+    It covers codes and, for a BM2, which values are possible; it does not cover probabilities, because their last bits
+    depend on the mathematics library.
     """
     model, parameters = plan.model, plan.parameters
     words: dict[str, Any] = {
@@ -275,7 +276,7 @@ def read_images(deployment: Deployment) -> list[Image]:
 def check_agreement(
     deployment: Deployment, images: Sequence[Image], *, edited: Container[str] = frozenset()
 ) -> None:
-    """Raise a DeploymentError if `deployment.toml` describes another machine than its images; keys of `edited` may differ."""
+    """Raise a DeploymentError if `deployment.toml` contradicts its images, except in the keys in `edited`."""
     machine = deployment.machine
     total = machine.lines if machine.is_divided else len(images)
     for index, (board, image) in enumerate(zip(deployment.boards, images, strict=True)):
@@ -299,7 +300,7 @@ def check_agreement(
 def _parameter_pairs(
     deployment: Deployment, parameters: BM1Parameters | BM2Parameters
 ) -> dict[str, tuple[object, object]]:
-    """Return what a deployment says about the parameters of its machine, and what they are, by name."""
+    """Return each parameter by name, as a pair: its value in the deployment, and its value in the machine."""
     machine, sensors = deployment.machine, deployment.sensors
     pairs: dict[str, tuple[object, object]]
     if isinstance(parameters, BM1Parameters):

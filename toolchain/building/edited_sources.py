@@ -1,7 +1,7 @@
 """Programming files from edited sources: the MIFs and `bm1_parameters.vhd` of a deployment (thesis 3.2, 3.4).
 
-An edit is taken if the files that it gives are the sources again: what the new images would write is compared with
-what the person has written, so sources that contradict each other are refused.
+An edit is accepted if the sources, written again from the new images, are the same as the edited ones. So sources that
+contradict each other are refused.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,16 +46,16 @@ _PARAMETERS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
     "TARGET_COUNT": ("target_count", _number),
     "MAX_CYCLES": ("max_cycles", _number),
 }
-"""The constants that may be edited, each with its key in `[machine]` and the reading of its value.
+"""The constants that may be edited, each with its key in `[machine]` and the function that parses its value.
 
-The others are the sizes of memories and boards, and the generators, from which the seeds follow.
+The other constants are the sizes of memories and boards, and the generators, which determine the seeds.
 """
 _SHOWN: Final = 3
-"""Number of codes of a memory that are listed."""
+"""Maximum number of changed codes of a memory that are listed."""
 
 
 def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Change]]]:
-    """Write the images again from the memories and parameters; return the edits, as sentences, and the files.
+    """Write the images again from the memories and parameters; return the edits, as sentences, and the changed files.
 
     Edited sources are written in canonical form, and `deployment.toml` gets the hashes and parameters. An interrupted
     call may leave new images whose hashes are not in `deployment.toml` yet; the next call accepts them and finishes.
@@ -95,7 +95,7 @@ def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Chang
 def _with_parameters(
     directory: Path, deployment: Deployment, images: Sequence[Image]
 ) -> tuple[Deployment, list[Image], list[str]]:
-    """Return deployment and images with the parameters of the VHDL package, and its edits."""
+    """Return deployment and images with the parameters of the VHDL package, and the edits in it."""
     found = PackageTokens.read(directory / PARAMETERS_FILE)
     built = PackageTokens.of(parameters_vhd(deployment, images))
     values: dict[str, Any] = {}

@@ -29,7 +29,7 @@ _MOST_CODES: Final = 1 << 30
 MACHINE_KEYS: Final = tuple(
     key for key in BM1Section.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
 )
-"""The parameters with the same names in `[machine]`; its `lines` are those of all boards."""
+"""The names of parameters that have the same names in `[machine]`, except `lines`, which counts all boards there."""
 
 
 def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) -> dict[str, Any]:
@@ -53,7 +53,7 @@ class MachinePlan:
     """The reason for a BM1, as a clause."""
     model: Model
     options: BuildOptions
-    """The options; the number of boards may still change, and that of replicas, if they fill a device."""
+    """The options; the numbers of boards and replicas may still be changed, to fit the boards' device."""
     parameters: BM1Parameters
     """The parameters of the whole machine, with the lines of all boards."""
     target_count: int
@@ -171,7 +171,7 @@ class LineBlock:
 
 
 def partition_lines(lines: int, count: int) -> tuple[LineBlock, ...]:
-    """Return the blocks of `lines` lines on `count` boards, in order; the first `lines` mod `count` are one longer."""
+    """Return blocks of `lines` lines for `count` boards, in order; the first `lines` mod `count` have one more line."""
     if not 1 <= count <= lines:
         raise BuildError(
             f"{lines} lines cannot be divided among {count} boards: expected 1 to {lines} partitions"
@@ -183,7 +183,7 @@ def partition_lines(lines: int, count: int) -> tuple[LineBlock, ...]:
 
 
 def split(machine: BM1Machine, count: int) -> tuple[BM1Machine, ...]:
-    """Return the machine of each board of a whole machine; a BuildError as for the lines."""
+    """Return the machine of each board of a whole machine; errors are those of `partition_lines`."""
     return tuple(
         BM1Machine(
             replace(machine.parameters, lines=block.lines),
@@ -216,8 +216,8 @@ def board_layout(
 ) -> BoardLayout:
     """Return the layout of a machine's boards, before any table is computed.
 
-    Without an `interface`, it has the inputs and results that the largest board needs, because every word of it takes
-    resources (thesis 3.2); 20 x 1200 is the thesis's example.
+    Without an `interface`, the registers have the inputs and results that the largest board needs, because every word
+    takes resources (thesis 3.2); 20 x 1200 is the thesis's example.
 
     Raises:
         BuildError: There are more boards than lines, the machine is larger than the interface, the interface is
@@ -240,7 +240,7 @@ def fitted_layout(
     what: str,
     advice: str = "",
 ) -> BoardLayout:
-    """Return the layout of boards that use these registers; a BuildError if the interface does not fit."""
+    """Return the layout of boards, or raise a BuildError if the registers that they use don't fit the interface."""
     needed, room = (used.input_words, used.result_words), interface_room(used)
     sentence = f"a board needs {counted(needed[0], 'input')} and {counted(needed[1], 'result')} ({what})"
     if not _is_within(needed, room):
@@ -270,7 +270,7 @@ def _is_within(needed: tuple[int, int], room: tuple[int, int]) -> bool:
 
 
 def _advice(parameters: BM1Parameters, used: UsedRegisters) -> str:
-    """Return advice on fitting the register map, after a colon; empty if there is none."""
+    """Return advice on fitting the register map, beginning with a colon; empty if there is none."""
     room = interface_room(used)
     lines = room[1] // parameters.replicas
     if parameters.sensor_mode is not SensorMode.COLUMN and parameters.sensors:

@@ -124,7 +124,7 @@ class MachineChoice(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """The flags of a build about machines of every kind; None for the default of the kind."""
+    """The flags of a build that both kinds of machines have; None stands for the default of the kind."""
 
     machine: Annotated[
         MachineChoice,
@@ -234,7 +234,7 @@ class BM2Options:
 
 
 def given_flags(options: CommonOptions, group: type[BM1Options | BM2Options]) -> list[str]:
-    """Return the flags of a group that do not have their defaults; `--thesis` has some for both machines."""
+    """Return the flags of a group that have neither their default nor the value that `--thesis` gives them."""
     preset = THESIS if options.thesis else {}
     return [
         _flag(each.name)
@@ -257,7 +257,7 @@ class BuildOptions(MachineOptions, TargetOptions):
     topic: str = "/readings"
     type: str = "std_msgs/Float64MultiArray"
     interface: tuple[int, int] | None = None
-    """Inputs and results of the boards' registers; None for those that the largest board needs."""
+    """Numbers of inputs and results of the boards' registers; None for as many as the largest board needs."""
     rng_table: NDArray[np.uint32] | None = None
     """uint32[length], the random numbers for `rng = table`; None to generate them."""
     sources: SourcesFile | None = None
@@ -297,7 +297,7 @@ class BuildOptions(MachineOptions, TargetOptions):
 
 
 def refused_parameter(reason: ParameterError) -> BuildError:
-    """Return the error for parameters of which there is no machine, with flags instead of keys."""
+    """Return the error for parameters that no machine can have, with flags instead of keys."""
     keys = "|".join(each.name for each in fields(MachineOptions))
     named = re.sub(rf"\b({keys})(?= is | = )", lambda found: _flag(found[1]), str(reason).rstrip("."))
     return BuildError(named.replace(" = true", "").replace(" = ", " "))

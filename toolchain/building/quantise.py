@@ -59,12 +59,12 @@ class Quantised:
     """The codes of a model for all lines, before they are divided among boards."""
 
     prior: NDArray[np.uint16]
-    """uint16[rows, lines]: one row, or one per address that selects a prior. Then the top one is the prior
-    without a selection, and unsupported ones contain 0.
+    """uint16[rows, lines]: one row, or one per address that selects a prior. In the latter case, the top row is
+    the prior without a selection, and rows of unsupported addresses contain 0.
     """
     tables: tuple[NDArray[np.uint16], ...]
-    """uint16[2**bits, lines] per known variable; unsupported addresses contain 0, and the top one, for a
-    missing reading, all-ones codes. Empty with `threshold`.
+    """uint16[2**bits, lines] per known variable; unsupported addresses contain 0, and the top address, for
+    missing readings, contains all-ones codes. No tables with `threshold`.
     """
     losses: tuple[ColumnLoss, ...]
     """The loss of the prior, and one per known variable."""
@@ -154,7 +154,7 @@ def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
 
 
 def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[np.float64]) -> ColumnLoss:
-    """Compare P(S, K) with its quantised form, float64[values, lines], each row of which may have any factor."""
+    """Compare P(S, K) with its quantised form, float64[values, lines], in which each row may have any scale."""
     weight = exact.sum(axis=1)
     remaining = quantised.sum(axis=1)
     alive = (remaining > 0) & (weight > 0)

@@ -80,8 +80,9 @@ def regenerate_memories(
 ) -> Changes:
     """Write the memories, and a BM1's `bm1_parameters.vhd`, again, from the images, or with new tables from a model.
 
-    With a model, read with these flags, the images (with this date), the report and the hashes of `deployment.toml` are updated, and
-    the columns get the order of the model; sizes, widths and everything about topics do not change.
+    With a model, which was read with `flags`, the images (dated `build_date`), the report and the hashes of
+    `deployment.toml` are written too, and the columns get the order of the model. Sizes, widths and everything about
+    topics do not change.
 
     Raises:
         BuildError: The model now needs another machine, so a new build is necessary.
@@ -220,7 +221,7 @@ def _listed(values: Sequence[object]) -> str:
 def _with_places(new: Deployment, old: Deployment, *, keeps_built: bool) -> Deployment:
     """Return the new deployment with the servers, topics, order, paths and endpoints of the old one.
 
-    With `keeps_built`, an image that is not the one that was built keeps the hash of that one.
+    With `keeps_built`, the entry of an edited image keeps the hash of the image that was built.
     """
     before = {variable.table_of or variable.name: variable for variable in old.variables}
     kept = ("sources", "outputs", "topics", "queue", "tolerance_s", "prior", "directory")

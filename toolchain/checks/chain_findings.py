@@ -1,7 +1,7 @@
 """Findings about a BM2: clipped factors and their error, states that are not connected, wide factors, random numbers.
 
 Zeros of a factor are clipped to the smallest chance that a code can express, so the chain crosses them, but rarely.
-What that costs is computed exactly where the states are few; elsewhere a finding says that it was not.
+The error that results is computed exactly if there are few states; otherwise a finding says that it was not computed.
 """
 
 import math
@@ -28,20 +28,20 @@ from toolchain.models.network import NetworkModel
 _LARGE_ERROR: Final = 0.01
 """Total variation from which an error is a warning."""
 _STATE_BITS: Final = 20
-"""Maximum number of bits of states whose connection is checked."""
+"""Maximum number of bits of a state for which it is checked whether all states are connected."""
 _PATTERN_BITS: Final = 24
-"""The same with a bit more for each known variable whose reading may be missing."""
+"""The same maximum for these bits plus one for each known variable whose reading may be missing."""
 _BLANKET_BITS: Final = 16
-"""Maximum number of bits that share a factor with a pointed bit, whose values are tried for clips."""
+"""Maximum number of bits sharing a factor with a pointed bit; the search for clips tries all their values."""
 _RELATED_BITS: Final = 2048
-"""Maximum number of bits of random numbers of a board whose relations are searched, because all pairs are kept."""
+"""Maximum number of a board's random bits among which relations are searched, because all pairs are kept."""
 _TIMEOUT_RISK: Final = 1e-6
 _MOVE_CYCLES: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedChain:
-    """A BM2 to check, as its first board has it; without a model, hidden variables have no names of states."""
+    """A BM2 to check, as it is on its first board; without a model, the states of hidden variables have no names."""
 
     deployment: Deployment
     machine: BM2Machine
@@ -54,7 +54,7 @@ class CheckedChain:
 
     @property
     def titles(self) -> tuple[str, ...]:
-        """The names of its factors."""
+        """The names of the machine's factors."""
         if self.model is not None:
             return self.model.titles
         scopes = [", ".join(self.names[at] for at in scope) for scope in self.machine.parameters.factors]
@@ -93,7 +93,7 @@ def chain_findings(chain: CheckedChain) -> Iterator[Finding]:
 
 
 def _clips(chain: CheckedChain) -> Iterator[Finding]:
-    """Name every clipped factor; without the model, those that are clipped because of zeros."""
+    """Find every clipped factor; without the model, only factors that are clipped because of zeros."""
     width, model = chain.machine.parameters.prob_bits, chain.model
     for at, (title, support) in enumerate(zip(chain.titles, chain.machine.supports, strict=True)):
         clips, zeros, count = clipped(
@@ -108,7 +108,7 @@ def _clips(chain: CheckedChain) -> Iterator[Finding]:
 
 
 def _error(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
-    """Find what the codes, the start state and the number of samples cost."""
+    """Find the errors due to the codes, the start state and the number of samples."""
     p = chain.machine.parameters
     if found is None:
         what = "the error that they cause was not computed, because too many bits are unknown"
@@ -161,9 +161,9 @@ def _opposite_clips(chain: CheckedChain) -> Iterator[Finding]:
 
 
 def _slowest(machine: BM2Machine, bit: int, blanket: Sequence[int]) -> tuple[float, int, int]:
-    """Return the longest mean time of a move at a bit that two CDEs clip in opposite directions, and these two.
+    """Return the longest mean cycles of a move at a bit that two CDEs clip in opposite directions, and these CDEs.
 
-    All used codes are tried for the bits that share a factor with it; the time is 0 if there are no such clips.
+    All used codes of the bits that share a factor with it (`blanket`) are tried; the time is 0 if no such clips exist.
     """
     p, index = machine.parameters, np.arange(1 << len(blanket))
     values = {other: index >> at & 1 for at, other in enumerate(blanket)}
@@ -185,7 +185,7 @@ def _slowest(machine: BM2Machine, bit: int, blanket: Sequence[int]) -> tuple[flo
 
 
 def _connections(chain: CheckedChain) -> Iterator[Finding]:
-    """Find possible states that single-bit moves do not connect, whichever readings are there or missing."""
+    """Find possible states that single-bit moves do not connect, for any choice of missing readings."""
     p = chain.machine.parameters
     optional = [at for at in p.known if at not in chain.always_known]
     if p.state_bits > _STATE_BITS or p.state_bits + len(optional) > _PATTERN_BITS:

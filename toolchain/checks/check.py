@@ -86,7 +86,7 @@ def check_deployment(directory: Path) -> list[Finding]:
 
 
 def refusal(reason: Exception, about: str) -> Finding:
-    """Return the finding that a model cannot be built, or a deployment cannot be read."""
+    """Return the finding for an exception: a model cannot be built, or a deployment cannot be read."""
     return error(Check.CANNOT_BE_BUILT, about, str(reason).rstrip("."))
 
 
@@ -205,7 +205,7 @@ _WITHOUT_HEADER: Final = frozenset(
 )  # fmt: skip
 """Types without a header, in packages in which most types have one; no type of std_msgs has one."""
 _LEAST_TOLERANCE_S: Final = 0.005
-"""Minimum tolerance in seconds at which messages that were sent together pair by their times of receipt."""
+"""Minimum tolerance in seconds for messages sent together to be paired by their times of receipt."""
 
 
 def source_findings(deployment: Deployment) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Findings about a machine, and those about its codes: lines that never count, readings without a posterior."""
+"""Findings about a machine, and the checks of its codes: lines that never count, readings without a posterior."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -41,7 +41,10 @@ def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def fresh_numbers(p: BM1Parameters | BM2Parameters, effect: str) -> Iterator[Finding]:
-    """Find random numbers that every frame uses again, or that share bits with those of the next cycle, to this effect."""
+    """Find random numbers that every frame uses again, or that share bits with the numbers of the next cycle.
+
+    `effect` is what shared bits do to the results, as a clause.
+    """
     if p.rng_banks == 1 and p.rng_reset is RngReset.BANK:
         what = (
             "every frame uses the same random numbers, so averaging over frames does not remove their error"

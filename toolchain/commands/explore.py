@@ -16,7 +16,7 @@ from toolchain.errors import BuildError, NotFusionError, counted
 from toolchain.flags import Bits
 
 RESULTS = Path("build/explore.jsonl")
-"""The file of results, unless a flag names another: beside the usual deployments, which version control ignores."""
+"""The default file of results, in the folder of most deployments, which version control ignores."""
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The commands about a network file without a model of one's own: `query` answers, `show` lists what can be asked."""
+"""The commands about a network file: `query` prints posteriors, `show` lists the variables that can be asked about."""
 
 import re
 import sys

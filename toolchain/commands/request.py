@@ -57,7 +57,7 @@ class ModelFlags:
     )
 
     def over(self, built: ModelSection) -> "ModelFlags":
-        """Return the flags of a build, and in their place those that are given here."""
+        """Return these flags, with the values of a build for flags that are not given."""
         found = {
             each.name: getattr(self if getattr(self, each.name) != each.default else built, each.name)
             for each in fields(ModelFlags)
@@ -172,7 +172,7 @@ def build_options(
 ) -> BuildOptions:
     """Return the options of a build; `sources` is a file that assigns variables to topics, instead of one topic.
 
-    If the model is only checked, a robot may be missing.
+    With `is_checked`, the flags that name a robot's topic may be missing.
     """
     from toolchain.outputs.mif import read_table
 
@@ -210,7 +210,7 @@ def build_options(
 
 
 def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
-    """Return the plan with as many boards as the lines need on a device, and machines that fill them, and why."""
+    """Return the plan with as many boards (and, for `fill`, replicas) as a device needs or holds, and the reason."""
     if name is None:
         return plan, ""
     from toolchain.analysis.logic import device_named

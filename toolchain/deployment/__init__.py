@@ -1,4 +1,4 @@
-"""The deployment: everything for the services that follows from the model."""
+"""The deployment: everything that follows from the model and that the services need."""
 
 from toolchain.deployment.deployment import (
     FILE_NAME,

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 FORMAT: Final = 1
 FILE_NAME: Final = "deployment.toml"
 FORMER_KEYS: Final = frozenset({"integrity", "integrity_frames"})
-"""Keys of a check that was taken out; the format did not change, because they were not part of the hash."""
+"""Keys of a check that no longer exists; removing them kept the format, because they were not part of the hash."""
 MOST_TRANSITIONS: Final = 2**24
 """Maximum number of transitions of a filter, lines x lines (128 MiB as float64)."""
 REPLICA: Final = "replica"
@@ -160,7 +160,7 @@ class Deployment(DeploymentFile):
 
     @property
     def state_dimensions(self) -> tuple[Dimension, ...]:
-        """The variables of a sampled state, in the order of their bits; none if one of them is not described here."""
+        """The variables of a sampled state, in the order of their bits; none if the deployment lacks one of them."""
         keys = {"offset", "step", "unit", "states"}
         known = (Dimension(label=v.name, size=v.values, **v.model_dump(include=keys)) for v in self.variables)
         described = {each.label: each for each in (*known, *self.searched, *self.hidden)}
@@ -192,7 +192,7 @@ class Deployment(DeploymentFile):
         return self.directory / self.boards[board].image
 
     def new_filter(self) -> "Filter | None":
-        """Return a filter that begins, from the file of `[filter]`, or raise a DeploymentError; None without this section."""
+        """Return a new filter from the file of `[filter]`, or raise a DeploymentError; None without this section."""
         if self.filter is None:
             return None
         # here, because a subscriber loads a deployment without NumPy
@@ -242,9 +242,9 @@ def load_deployment(
 ) -> Deployment:
     """Read and check the deployment in a folder written by `toolchain build`.
 
-    Without `images`, they are not read and compared with their hashes, and a process starts without NumPy. With
-    `edited`, a `deployment.toml` whose hash does not match its content is accepted. With `interrupted`,
-    images and a filter may differ from the hashes in `deployment.toml`, because they are written before it.
+    Without `images`, the images are not read or compared with their hashes, and NumPy is not imported. With `edited`, a
+    `deployment.toml` whose hash does not match its content is accepted. With `interrupted`, images and a filter may
+    differ from their hashes, because an interrupted call has written them but not yet `deployment.toml`.
 
     Raises:
         DeploymentError: The deployment is absent, not TOML, or has a wrong key or value.
@@ -290,7 +290,7 @@ def load_deployment(
 
 
 def other_image(path: Path, found: str, named: str) -> DamagedDeploymentError:
-    """Return the error for an image that `deployment.toml` does not name, with both hashes."""
+    """Return the error for an image whose hash is not the one in `deployment.toml`; it contains both hashes."""
     return DamagedDeploymentError(
         f"{path} is another board's or another build's image: its hash is {found[:16]}, {FILE_NAME} names {named[:16]}; "
         "if 'toolchain regenerate' was interrupted, run it again, otherwise build again with 'toolchain build'"

@@ -29,12 +29,12 @@ _HEADER_BYTES: Final = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transition:
-    """The searched variable from frame to frame; a ModelError if a distribution does not sum to 1."""
+    """How the searched variable changes between frames; a ModelError if a distribution does not sum to 1."""
 
     start: NDArray[np.float64]
     """P(S) before the first frame, float64[lines]."""
     table: NDArray[np.float64]
-    """P(S | its value one frame before), float64[lines, lines]; a row for each value before."""
+    """P(S | its value one frame before), float64[lines, lines]; a row for each earlier value."""
 
     def __post_init__(self) -> None:
         lines = np.shape(self.start)
@@ -92,7 +92,7 @@ class Transition:
 
 
 def _header(shape: tuple[int, int]) -> bytes:
-    """Return the beginning of a NumPy file. It is compared, because NumPy's reading of a hostile one fails in many ways."""
+    """Return the header that the file must have; NumPy's reader of headers fails in many ways on hostile ones."""
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
     return file.getvalue()
@@ -101,8 +101,8 @@ def _header(shape: tuple[int, int]) -> bytes:
 def prediction_codes(prediction: NDArray[np.float64], prob_bits: int) -> NDArray[np.uint16]:
     """Return the codes of a predicted prior, uint16[lines], relative to its maximum.
 
-    A code is at least 1 where the prediction is above 0. With 0, no reading could ever bring back a value that was
-    refuted once, if it is rarely left or entered.
+    A code is at least 1 where the prediction is above 0. With a code of 0, no reading could bring back a value that an
+    earlier frame excluded, if the searched variable rarely changes to it.
     """
     codes = encode_probability(prediction / prediction.max(), prob_bits)
     codes[(codes == 0) & (prediction > 0)] = 1
@@ -117,12 +117,12 @@ class Filter:
         self.transition: Final = transition
         self._prob_bits = prob_bits
         self.most_steps: Final = max(1, _MOST_WORK // transition.table.size)
-        """Maximum number of frames of a prediction; for more, as many are predicted."""
+        """Maximum number of frames that a prediction moves on; after a longer gap, it still moves on only by these."""
         self.belief: NDArray[np.float64] = transition.start
         """P(S | all readings so far), float64[lines]; after `predict` that of the next frame before its readings."""
 
     def predict(self, steps: int = 1) -> NDArray[np.uint16]:
-        """Move the belief some frames on, and return its codes, the prior of the frame: uint16[lines]."""
+        """Move the belief `steps` frames on, and return its codes as the prior of that frame: uint16[lines]."""
         self.belief = self.transition.after(self.belief, min(steps, self.most_steps))
         return prediction_codes(self.belief, self._prob_bits)
 

@@ -156,9 +156,9 @@ class Stop(StrEnum):
     """The stop rule for the boards of a partitioned machine."""
 
     SLICES = "slices"
-    """All at the end of the slice in which the first one overflows."""
+    """All boards stop at the end of the slice in which the first one overflows."""
     OWN = "own"
-    """Each at its own overflow, as in the thesis."""
+    """Each board stops at its own overflow, as in the thesis."""
 
 
 class Queue(StrEnum):
@@ -321,7 +321,7 @@ class BM1Section(CommonSection):
     is_divided: ClassVar[bool] = True
     """True if each board has a part of the lines, False if each has the whole machine."""
     stream: ClassVar = 0
-    """States that a board buffers for the topic of samples; 0: there is none."""
+    """Number of states that a board buffers for the topic of samples; always 0, because a BM1 has no such topic."""
     variables: ClassVar[tuple[str, ...]] = ()
     """Names of the machine's variables, if its results need them."""
 
@@ -354,7 +354,7 @@ class BM1Section(CommonSection):
 
 
 class BM2Section(CommonSection):
-    """`[machine]` of a BM2: its parameters, its interface, and its stop conditions; each board runs a chain of it."""
+    """`[machine]` of a BM2: its parameters, its interface, and its stop conditions; each board runs one chain."""
 
     type: Literal["BM2"] = "BM2"
     prob_bits: int = Field(default=16, ge=2, le=16)
@@ -432,7 +432,7 @@ class BoardSection(Section):
 
 
 class Output(Section):
-    """`[[output]]`: a topic of posteriors; an empty URI means that of the first source."""
+    """`[[output]]`: a topic of posteriors; an empty URI means the URI of the first source."""
 
     topic: Topic = "/BMresults"
     type: Literal["std_msgs/Float64MultiArray"] = "std_msgs/Float64MultiArray"

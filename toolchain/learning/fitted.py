@@ -253,7 +253,7 @@ def _member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> NDArray[np.float64]:
-    """Read an array without allocating more memory than the file has numbers."""
+    """Read an array, allocating no more memory than the numbers in the file need."""
     with archive.open(name) as file:
         if np.lib.format.read_magic(file) != (1, 0):
             raise ValueError(name)

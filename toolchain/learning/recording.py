@@ -127,7 +127,7 @@ def _read_csv(path: Path, columns: Sequence[str], *, stamped: bool) -> Recording
 
 
 def _stamp(text: str, column: str, where: str) -> int:
-    """Return a stamp in nanoseconds, exactly, which a float would not be."""
+    """Return a stamp in nanoseconds, computed without floats, which would round it."""
     with suppress(ArithmeticError):  # not a number, or NaN
         stamp = Decimal(text.strip()) * _STAMP_UNITS[column]
         if 0 <= stamp < 1 << 63:

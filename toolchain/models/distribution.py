@@ -255,7 +255,7 @@ class Distribution:
     symbol: Symbol
     """The symbol of the distribution."""
     given: tuple[Symbol, ...]
-    """The symbols that it depends on."""
+    """The symbols on which `symbol` depends."""
     table: NDArray[np.float64]
     """float64[size of the symbol, size of each given], summing to 1 over the first axis."""
     normal: Normal | None = None

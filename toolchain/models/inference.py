@@ -28,7 +28,7 @@ _MOST_COUNTED: Final = 64
 """Maximum number of neighbours of a name whose pairs are counted."""
 
 _Graph: TypeAlias = dict[str, set[str]]
-"""The names that share a term with each name."""
+"""For each name, the other names in its terms."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,7 +104,7 @@ class _Plan:
 
 
 def _order(terms: Iterable[Term], names: set[str], sizes: Mapping[str, int]) -> tuple[str, ...]:
-    """Return the cheaper order of two rules, or raise a ModelError."""
+    """Return the cheaper of the orders that the two rules plan, or raise a ModelError."""
     graph: _Graph = {name: set() for name in names}
     for term in terms:
         for name in term.scope:
@@ -201,7 +201,7 @@ _SHOWN: Final = 4
 class Links:
     """Links between symbols that share a factor, without the searched and given ones.
 
-    Symbols in different components are independent given the removed ones (moral graph criterion).
+    Symbols in different components are independent given these symbols (moral graph criterion).
     """
 
     def __init__(self, factors: Iterable[Factor], cut: set[str]) -> None:
@@ -237,7 +237,7 @@ class Links:
         return path[::-1]
 
     def lengths(self, start: str, ends: Sequence[str]) -> dict[str, int]:
-        """Return the number of symbols on the shortest path to each of these symbols that is connected."""
+        """Return, for each of `ends` that is connected to `start`, the number of symbols on the shortest path."""
         before = self._reached(start)
         count = {start: 1}
         for name in before:  # nearer ones are first

@@ -37,7 +37,7 @@ from toolchain.models.network import NetworkModel, network_model
 
 Named: TypeAlias = Symbol | str
 _ROUNDING: Final = 1e-12
-"""Largest difference from 1 that the rounding of a distribution's sum explains."""
+"""Largest difference from 1 that rounding causes in the sum of a distribution."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +206,7 @@ class Question:
         return replace(model, prior=None, transition=self._transition()) if self.previous else model
 
     def _transition(self) -> Transition:
-        """Return the start and the transition of the filter, or a ModelError if the question is not one."""
+        """Return the start and the transition of the filter, or raise a ModelError if the question has no filter."""
         name, lines = self.joint.name, math.prod(symbol.size for symbol in self.searched)
         pairs = list(zip(self.searched, self.previous, strict=False))
         if len(self.previous) != len(self.searched):
@@ -266,7 +266,7 @@ class Question:
                         )
 
     def network(self) -> NetworkModel:
-        """Return the network that a BM2 samples, or raise a ModelError; what selects the prior is one of the known."""
+        """Return the network that a BM2 samples, or raise a ModelError; `prior_select` becomes a known symbol."""
         joint = self.joint
         return network_model(
             joint.name, joint.factors, joint.symbols, self.searched, self.observed, self.given
@@ -294,10 +294,10 @@ class Question:
         return factors, Links(factors, cut)
 
     def _pairs(self) -> tuple[list[Factor], list[tuple[int, str, str]]]:
-        """Return the factors of all observed symbols, and the pairs that these join, with the lengths of their paths.
+        """Return the factors of all observed symbols, and the pairs of symbols that they join, with lengths of paths.
 
-        The factors of two symbols are among those of all, so no other pair is dependent, and the path of a pair is not
-        shorter than that among all.
+        A pair is to be tested with its own factors, which are some of these. So no other pair can be dependent, and a
+        path among its own factors is at least as long.
         """
         observed = [symbol.name for symbol in self.observed]
         factors, links = self._linked(self.joint.active, observed)
@@ -388,7 +388,7 @@ class Question:
 
 
 def _sums(table: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the sum of each line, float64[lines], as exactly 1 where only rounding keeps it from that."""
+    """Return the sum of each line, float64[lines], set to exactly 1 if it differs from 1 only by rounding."""
     sums: NDArray[np.float64] = table.sum(axis=0)
     sums[np.abs(sums - 1) < _ROUNDING] = 1
     return sums
@@ -397,9 +397,10 @@ def _sums(table: NDArray[np.float64]) -> NDArray[np.float64]:
 def _given_line(
     together: NDArray[np.float64], total: NDArray[np.float64], prior: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return P(K | S) from any multiple of it, float64[values, lines].
+    """Return P(K | S) from a table of which each line is a multiple of it, float64[values, lines].
 
-    An impossible line gets P(K), which does not change the codes of other lines. A distribution stays as it is, to the bit.
+    An impossible line gets P(K), which does not change the codes of other lines. If all lines sum to 1, the table is
+    returned unchanged.
     """
     if np.all(total == 1):
         return together

@@ -74,7 +74,7 @@ class TabulatedVariable:
     step: float = 1.0
     """Difference between adjacent addresses, in the unit of the variable."""
     unit: str = ""
-    """The unit of its readings, such as m; for people, who see it next to them."""
+    """The unit of its readings, such as m, which is shown next to them."""
     period: int | None = None
     """The number of addresses after which the readings repeat (a turn of a bearing), or None."""
     on_range: Literal["error", "clamp", "missing"] = "error"
@@ -161,11 +161,11 @@ class Model:
     known: tuple[Known, ...]
     """The known variables in the order of the machine's columns 1..N."""
     prior: NDArray[np.float64] | None = None
-    """P(S), float64[lines] summing to 1; None for a uniform one or, with a `prior_select`, for the mean of its rows."""
+    """P(S), float64[lines] summing to 1; None for a uniform prior, or for the mean of the rows of `prior_select`."""
     prior_select: PriorSelect | None = None
     """The variable that selects the prior; then `prior` is the prior without a selection."""
     transition: Transition | None = None
-    """The searched variable from frame to frame, for a filter; then `prior` is the prediction for the first frame."""
+    """How the searched variable changes between frames, for a filter; then `prior` predicts the first frame."""
 
     def __post_init__(self) -> None:
         name = self.name if isinstance(self.name, str) else ""  # a user's file is not type-checked

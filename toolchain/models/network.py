@@ -1,7 +1,7 @@
 """The network that a BM2 samples: the relevant factors of a question and their symbols (thesis 2.1.3).
 
 Known symbols remain variables, because a reading may be missing; given ones are fixed in the tables. Symbols that
-sum to 1 in every answer are left out.
+change no answer, because their distributions sum to 1, are left out.
 """
 
 import math

@@ -22,8 +22,8 @@ class Scanner:
     def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str) -> None:
         """Scan the bytes of a file.
 
-        Each of `signs` is a token, and ends a word. `comments` is a regular expression for comments; of /* ... */ only
-        for the beginning.
+        Each of `signs` is a token, and ends a word. `comments` is a regular expression for comments; for a comment
+        /* ... */, it matches only the beginning.
         """
         self._path = path
         try:
@@ -167,7 +167,7 @@ class Scanner:
         return self._signs.fullmatch(piece) is not None
 
     def _floats(self, words: list[str], wanted: int, what: str, begin: int) -> NDArray[np.float64]:
-        """Return words as numbers; a last word beyond those wanted may be the rest of the text, and is only counted."""
+        """Return words as numbers, or raise an error for a wrong count; a word too many is only counted."""
         values = []
         for word in words[:wanted]:
             try:

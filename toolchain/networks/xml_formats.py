@@ -52,7 +52,7 @@ def _decimals(words: Sequence[str], child: str, line: XmlLine) -> NDArray[np.flo
 
 @dataclass(slots=True)
 class Element:
-    """An element of an XML file; its text is that after its last child, so all of it if there are none."""
+    """An element of an XML file; its text is what follows the last child, or all of it if there are no children."""
 
     name: str
     attributes: dict[str, str]

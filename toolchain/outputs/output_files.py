@@ -100,7 +100,7 @@ class OutputFiles:
     contents: dict[str, Iterable[bytes]]
     """The content in pieces, to be consumed once, by the path in the deployment's folder."""
     own: re.Pattern[str]
-    """Paths of this part; files that are not in `contents` are removed."""
+    """Pattern of the paths of this part; matching files that are not in `contents` are removed."""
 
 
 _MEMORIES: Final = re.compile(
@@ -202,7 +202,7 @@ def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change
 
 
 def _stale(directory: Path, files: OutputFiles) -> list[str]:
-    """Return the paths of this part that an earlier build wrote, and that it no longer has."""
+    """Return the paths that an earlier build wrote for this part, and that are not in its `contents` now."""
     folders = ("", "boards", PARAMETERS_FILE.partition("/")[0], MEMORIES_FOLDER)
     paths = [path for folder in folders for path in (directory / folder).glob("*")]
     names = [path.relative_to(directory).as_posix() for path in paths]

@@ -211,7 +211,7 @@ def _memory_files(images: Sequence[Image]) -> str:
 _TOKEN: Final = re.compile(r'\n|--[^\n]*|\w*"[^"\n]*"|[\w.]+|:=|=>|[^\s]')
 _MOST_BYTES: Final = 4 << 20
 _FLAGS: Final = {"RNG_KIND": " --rng", "RNG_SHARED": " --per-cell", "RNG_BANKS": " --rng-banks"}
-"""The flags of a build for constants of the generators, which somebody might wish to edit."""
+"""The flags of a build to name in the error if somebody edits these constants of the generators."""
 _IMAGE_HASH: Final = re.compile(r'(image_hash\s*=>\s*)x"[0-9a-f]{64}"')
 
 
