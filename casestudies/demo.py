@@ -37,7 +37,7 @@ app = CommandLine()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """A case study as the demo runs it; its commands get `--uri` besides their options."""
+    """A case study in the form that the demo runs; its commands get `--uri` besides the options given here."""
 
     name: str
     topic: str
@@ -203,7 +203,7 @@ def _check_port(whose: str, port: int, otherwise: str) -> None:
 
 
 async def _load_kernels() -> None:
-    """Load the boards' kernels while the deployment is built; master and boards inherit them from this process."""
+    """Load the boards' kernels in a thread; master and boards, which are forked from this process, inherit them."""
     loop, loaded = asyncio.get_running_loop(), asyncio.Event()
 
     def load() -> None:
@@ -219,7 +219,7 @@ async def _load_kernels() -> None:
 
 
 def _ends(case: Case, count: int | None, master: Process, viewer: Process) -> list[asyncio.Future[Any]]:
-    """Return the ends of master and viewer; if that master has no count, also the viewer's line before it draws."""
+    """Return futures of the ends of master and viewer, and of the viewer's last line if the master does not count."""
     ends: list[asyncio.Future[Any]] = [asyncio.ensure_future(each.succeed()) for each in (master, viewer)]
     if count is not None and not case.is_frame:
         ends.append(asyncio.ensure_future(viewer.line(rf"^ *{count} ")))
@@ -235,9 +235,9 @@ async def _run(
     page_port: int | None,
     options: Sequence[str],
 ) -> int:
-    """Build, start everything, wait for the viewer's last picture, and end everything; no count: run until Ctrl-C.
+    """Build, start everything, wait until the viewer has drawn its pictures, and end everything.
 
-    The options are the master's.
+    Without a count, run until Ctrl-C. `options` are options of the master.
     """
     started = time.monotonic()
     screen = Screen()

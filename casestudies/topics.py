@@ -59,7 +59,7 @@ class Readiness:
 
 @contextlib.asynccontextmanager
 async def connected(name: str, work: str, uri: str) -> AsyncIterator[tuple[Ros, Readiness]]:
-    """Connect to a server in the context, and report the readiness for the `work` in the run directory."""
+    """Within the context, connect to a server, and report in the run directory how recently the `work` was done."""
     started, readiness = time.monotonic(), Readiness(work)
 
     def answer() -> bytes:
@@ -79,7 +79,7 @@ async def connected(name: str, work: str, uri: str) -> AsyncIterator[tuple[Ros, 
 
 
 def run_viewer(watching: Coroutine[Any, Any, None], finish: Callable[[], None]) -> None:
-    """Run a viewer, and finish it when it ends, also by Ctrl-C or because no more results come."""
+    """Run a viewer, and call `finish` when it ends, also if Ctrl-C or a lack of results ends it."""
     try:
         run_async(watching)
     except (NoResultError, StoppedError) as ended:
@@ -96,7 +96,7 @@ SETTLED_S: Final = 3.0
 async def report_refused(
     ros: Ros, topic: str, type_: str, otherwise: str = "publish arrays with --array"
 ) -> None:
-    """Warn if, according to rosapi, the server does not forward an advertised topic; `otherwise` is what to do then."""
+    """Warn if, according to rosapi, the server rejects an advertised topic; `otherwise` is the user's alternative."""
     await asyncio.sleep(SETTLED_S)
     known = await ros.topic_type(topic)
     if known is None or (known and same_type(known, type_)):
@@ -213,8 +213,8 @@ _PATIENCE_S: Final = 1.0
 class Listener:
     """The frames of a stack, each with its true position; created by `listen`.
 
-    If no truth has exactly the frame's stamp, the newest older one is used, if it is at most `tolerance_ns` older: a
-    message without a header is stamped only when it reaches the host.
+    If no true pose has exactly the frame's stamp, the newest earlier one is used if it is at most `tolerance_ns` older.
+    This serves messages without a header, which are stamped only when they reach the host.
 
     Attributes:
         route: The true positions received, the newest last.
@@ -300,7 +300,7 @@ async def listen(
 ) -> AsyncIterator[Listener]:
     """Subscribe to `/bm/frame`, `/BMresults` and, if given, a geometry_msgs/PoseStamped topic of true poses.
 
-    A true pose belongs to a frame if it has the same stamp, or one older by at most the tolerance.
+    A true pose belongs to a frame if it has the same stamp, or is older by at most the tolerance.
     """
     async with contextlib.AsyncExitStack() as stack:
         heard = await stack.enter_async_context(posteriors(ros, queue_size=_QUEUE_SIZE))

@@ -51,7 +51,7 @@ def deployment_axes(deployment: "Deployment") -> list[Axis]:
 
 
 def reading_order(labels: Sequence[str]) -> list[int]:
-    """Return the places of labels in the order in which a person reads them: x before y, whatever the array's order."""
+    """Return the indices of labels in the order in which people read them: x before y, whatever the array's order."""
     coordinates = [at for at, label in enumerate(labels) if label.lower() in {"x", "y", "z"}]
     moved = dict(zip(coordinates, sorted(coordinates, key=lambda at: labels[at].lower()), strict=True))
     return [moved.get(at, at) for at in range(len(labels))]
@@ -65,7 +65,7 @@ def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
 
 
 def state_in_words(dimensions: "Sequence[Dimension]", codes: Sequence[int]) -> str:
-    """Return a sampled state in words, `rain=yes  grass=wet`; without dimensions, its words in hexadecimal."""
+    """Return a sampled state as text, `rain=yes  grass=wet`; without dimensions, its machine words in hexadecimal."""
     if not dimensions:
         return " ".join(f"{word:08x}" for word in reversed(codes))
     axes = [Axis(each.label, each.size, each) for each in dimensions]

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class EmulatedPosterior(Posterior):
-    """A posterior of `posterior`, which can be compared with the exact one for the same readings."""
+    """The result of the function `posterior`, which can be compared with the exact posterior for the same readings."""
 
     deployment: Deployment = field(compare=False)
     machines: tuple[Any, ...] = field(compare=False)
@@ -33,16 +33,16 @@ class EmulatedPosterior(Posterior):
         """Return the exact posterior for the same readings, by inference in float64.
 
         Args:
-            model: The model from which the deployment was built: a folder with `model.py`, a network file, or what
-                these give. Without it, the result is that of the rounded probabilities in the machine's memories, which
-                differ from the model by what quantising lost; only a BM1 has these.
+            model: The model from which the deployment was built: a folder with `model.py`, a network file, or the
+                object that either gives. Without it, the rounded probabilities in the memories of a BM1 are used, which differ
+                from the model by the loss of quantising. A BM2 has no such probabilities.
             settings: Parameters of `model()`, as `--set` gave them to the build.
 
         Returns:
-            The posterior, whose `details` say of what it is: `exact` is `model` or `codes`.
+            The posterior; in its `details`, `exact` says from what it was computed: `model` or `codes` (the memories).
 
         Raises:
-            PosteriorError: There is no model for a BM2, or there are settings that nothing takes.
+            PosteriorError: There is no model for a BM2, or there are settings without a model.
             ToolchainError: The model has an error, or the deployment was not built from it.
         """
         from toolchain.analysis.emulation import joined
@@ -116,7 +116,7 @@ class EmulatedPosterior(Posterior):
 def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int = 0) -> EmulatedPosterior:
     """Run the machines of a deployment, without boards, processes or a rosbridge server.
 
-    Those of a filter run for its first frame.
+    The machines of a filter compute its first frame.
 
     Args:
         folder: The folder that `toolchain build` wrote.

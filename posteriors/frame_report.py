@@ -96,18 +96,19 @@ class FrameReport:
 
     @property
     def is_biased(self) -> bool:
-        """True if boards of a BM2 ended by their maximum number of cycles; `outcome` says which."""
+        """True if boards of a BM2 reached their maximum number of cycles; `outcome` says which boards."""
         return "ended_early" in self.details
 
     def link_us(self, rate: str) -> float | None:
-        """Return the microseconds of the frame's transfers, one after another, on a link of this --link-rate."""
+        """Return the modelled microseconds of the frame's transfers, one after another, on a link of rate `rate`
+        (--link-rate); None if the report has no bytes."""
         if self.link_bytes is None or self.link_transfers is None:
             return None
         return 1e6 * WIRES[rate].seconds(self.link_bytes, self.link_transfers)
 
 
-# Keys of the message's values and their formats. The key of a number is the name of its field; that of a
-# stage has the suffix `_us`.
+# Keys of the message's values and their formats. The key of a number is the name of its field; the
+# key of a stage has the suffix `_us`.
 _STAGES: Final = tuple(each.name for each in fields(StageTimes))
 _FRAME_KEYS: Final = {
     "number": "%d",
@@ -136,13 +137,13 @@ _times: Final = attrgetter(*_STAGES)
 # Every result is preceded by a report, so a template is formatted once and only filled in for each frame.
 @cache
 def _template(keys: tuple[str, ...]) -> str:
-    """Return a DiagnosticStatus as JSON, with `%` for level, name, message, hardware and the values of these keys."""
+    """Return a DiagnosticStatus as a JSON format, with `%` in place of level, name, message, hardware and values."""
     pairs = ",".join(f'{{"key":"{key}","value":"{_FORMS[key]}"}}' for key in keys)
     return f'{{"level":%d,"name":"rosbayes: %s","message":%s,"hardware_id":%s,"values":[{pairs}]}}'
 
 
 def _status(keys: tuple[str, ...], head: tuple[object, ...], values: tuple[object, ...]) -> str:
-    """Return a DiagnosticStatus as JSON; `head` is all before the values, of which those that are None are left out."""
+    """Return a DiagnosticStatus as JSON; `head` is everything before the values; values of None are left out."""
     if None in values:
         keys = tuple(key for key, value in zip(keys, values, strict=True) if value is not None)
         values = tuple(value for value in values if value is not None)
@@ -191,7 +192,7 @@ def write_frame_report(report: FrameReport, ros_version: Literal[1, 2]) -> dict[
 
 @cache
 def _reading_begin(name: str) -> str:
-    """Return the pair of a reading up to its value; the names are those of a deployment, so they are few."""
+    """Return the JSON pair of a reading up to its value; cached, because a deployment has few names."""
     return f',{{"key":{_quoted(_READING + name)},"value":"'
 
 

@@ -21,9 +21,9 @@ class Pairing:
     """Pairing of posteriors with reports, whichever of the two arrives first.
 
     Servers preserve the order within a topic, but not always between topics. So the next posterior belongs to
-    the next report of a published frame, unless their times of arrival (`heard_ns`) show that one of the two has
-    lost its counterpart: if the report arrived more than `disorder_ns` after the posterior, the posterior's report was
-    lost; if it arrived more than `disorder_ns` before, and the next report fits, the report's posterior was lost.
+    the next report of a published frame, unless their times of arrival (`heard_ns`) show a loss. If the report arrived
+    more than `disorder_ns` after the posterior, the posterior's own report was lost. If it arrived more than
+    `disorder_ns` before, and the next report fits the posterior, the posterior of the first report was lost.
 
     Attributes:
         announced_only: Number of reports whose posterior never arrived.

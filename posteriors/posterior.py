@@ -95,10 +95,10 @@ class Posterior:
         )
 
     def with_units(self, deployment: "Deployment | Path | str") -> "Posterior":
-        """Return this posterior with the units and states of the deployment that publishes it, or of that folder.
+        """Return this posterior with the units and states of a deployment, given as an object or as its folder.
 
         Raises:
-            LabelError: Its dimensions are others.
+            LabelError: The deployment's posteriors have other dimensions.
             ToolchainError: There is no deployment in the folder.
         """
         from toolchain.deployment import Deployment, load_deployment
@@ -334,13 +334,14 @@ def samples_layout(samples: int, sample_bytes: int) -> dict[str, Any]:
 
 
 def read_samples(message: dict[str, Any], sizes: Sequence[int] = (), newest: int = 0) -> "NDArray[np.int64]":
-    """Return the values of the variables in the states of a message on `/bm/samples`, int64[samples, variables].
+    """Return the sampled states in a message on `/bm/samples` as values of variables, int64[samples, variables].
 
-    `sizes` are their numbers of values, in the order of the machine; a value beyond is an unused code. Without sizes,
-    return the words of the states, int64[samples, words]. `newest` limits the number of samples, unless it is 0.
+    `sizes` are the variables' numbers of values, in the order of the machine; a value of at least its size is an unused
+    code. Without sizes, return the states' machine words, int64[samples, words]. If `newest` is not 0, return at most so
+    many samples, the newest.
 
     Raises:
-        BadResultError: These are not such states.
+        BadResultError: The message does not hold states of this machine.
     """
     import numpy as np
 

@@ -26,7 +26,7 @@ _LONGEST: Final = 8
 
 
 def _plane(axes: Sequence[Axis], values: NDArray[Any]) -> tuple[list[Axis], NDArray[np.float64], list[str]]:
-    """Return the one or two longest axes, the marginal over them, and what was summed out; x is the last axis."""
+    """Return the one or two longest axes, the marginal over them, and the labels of the others; x is the last axis."""
     kept = sorted(sorted(range(len(axes)), key=lambda at: -axes[at].size)[:2])
     others = tuple(at for at in range(len(axes)) if at not in kept)
     drawn, marginal = [axes[at] for at in kept], values.sum(axis=others)
@@ -39,7 +39,7 @@ def _plane(axes: Sequence[Axis], values: NDArray[Any]) -> tuple[list[Axis], NDAr
 
 
 def as_html(axes: Sequence[Axis], values: NDArray[np.float64], facts: Iterable[str]) -> str:
-    """Return a table of the axes, facts, and a picture, without scripts or styles, which a viewer would remove."""
+    """Return HTML with a table of the axes, facts and a picture, without scripts or styles, which viewers remove."""
     best = np.unravel_index(values.argmax(), values.shape)
     rows = [
         (
@@ -137,7 +137,7 @@ def _step(axis: Axis) -> float:
 
 
 def _place(axis: Axis, index: float) -> float:
-    """Return the coordinate of an index: its value, or the index itself of a state."""
+    """Return the coordinate of an index: its value, or the index itself if it stands for a named state."""
     return index if axis.dimension is None or axis.has_states else axis.dimension.value(index)
 
 

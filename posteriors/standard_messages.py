@@ -53,7 +53,7 @@ class Plane(NamedTuple):
 
     @classmethod
     def of(cls, dimensions: Sequence[Dimension], *, square: bool = False) -> Self:
-        """Return the plane of the dimensions of a result, with `square` cells, or a ValueError that says why not.
+        """Return the plane of a result's dimensions, or raise a ValueError: there is none, or none with `square` cells.
 
         x and y are the variables of these names; with other names, the last one is x.
         """
@@ -82,7 +82,7 @@ class Plane(NamedTuple):
 
 
 def has_coordinates(dimensions: Sequence[Dimension]) -> bool:
-    """Return whether the searched variables are two lengths or numbers without unit, more than mere indices."""
+    """Return whether there are two searched variables, each a length or a number without unit that is not an index."""
     return len(dimensions) == 2 and all(
         not each.states and (each.unit in _METRES or (not each.unit and (each.offset, each.step) != (0, 1)))
         for each in dimensions
@@ -221,7 +221,7 @@ def decision_statuses(
 
 
 def _best(row: NDArray[np.float64], dimensions: Sequence[Dimension]) -> dict[str, str]:
-    """Return the most probable value of each variable, x before y: the name of a state, or a number with its unit."""
+    """Return the most probable cell, x before y: for each variable the name of a state, or a number with its unit."""
     indices = np.unravel_index(int(row.argmax()), [each.size for each in dimensions])
     ordered = [(dimensions[at], indices[at]) for at in reading_order([each.label for each in dimensions])]
     return {

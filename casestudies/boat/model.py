@@ -42,7 +42,7 @@ def model(
     array: bool = False,
     on_missing: Literal["error", "missing"] = "missing",
 ) -> Question:
-    """Return the question: where is the boat, given what it measures? The likelihood of a cell is that of its centre.
+    """Return the question: where is the boat, given what it measures? Likelihoods are those at the cells' centres.
 
     Args:
         width: Cells along x; the thesis ran 32 and describes 64.

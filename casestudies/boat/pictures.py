@@ -46,7 +46,7 @@ def _reported(field: str) -> Callable[[Instance], float | None]:
 
 
 def _of_computing(instance: Instance) -> tuple[float | None, float | None]:
-    """Return the time of computing and that of the link, both before the boards' answers; None if not known."""
+    """Split the wait for the boards into the time of computing and the time of the link, in us; None if not known."""
     if instance.report is None or (waited := instance.report.stages.compute) is None:
         return None, None
     own = instance.report.stages.boards_compute
@@ -81,10 +81,10 @@ def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
 
 
 def projected_shares(instances: Iterable[Instance], clock_hz: float) -> tuple[StageShare, ...]:
-    """Return the stages with boards of hardware instead of emulated ones; empty if frames do not report what that needs.
+    """Return the stages as they would be with real boards; empty if the frames do not report cycles and bytes.
 
-    Computing takes the cycles that the boards have counted, at this clock, and the link the modelled time of the
-    bytes that have moved, over PCIe. Host and rosbridge are those measured here.
+    The time of computing is the boards' count of cycles at this clock. The time of the link is modelled: PCIe, with the
+    bytes that have moved. The times of host and rosbridge are measured.
     """
     stages = (
         _STAGES[0],
@@ -98,7 +98,7 @@ def projected_shares(instances: Iterable[Instance], clock_hz: float) -> tuple[St
 
 
 def mean_link_us(instances: Iterable[Instance], rate: str) -> float:
-    """Return the mean time of a frame's transfers on a link of this --link-rate; 0 if no frame reports them."""
+    """Return the mean microseconds of a frame's transfers on a link of rate `rate` (--link-rate); 0 if not reported."""
     return sum(share.mean_us for share in _shares(instances, (("", StageKind.REGISTERS, _link_us(rate)),)))
 
 
@@ -202,7 +202,7 @@ def draw_shares(
 ) -> None:
     """Draw figure 4.5, the mean time of each stage and its share of a frame's time, or raise an OutputError.
 
-    The note is below the axis. The legend has the share of each part, and that in the thesis if it is in `beside`.
+    The note is below the axis. The legend shows the share of each part, and its share in the thesis if `beside` has it.
     """
     figure = new_figure(8.4, 1.5 + 0.42 * max(len(shares), 1))
     axes = figure.subplots()

@@ -83,7 +83,7 @@ class Boat:
     Attributes:
         heading: Where the bow points, in radians counter-clockwise from the x axis.
         switches: Whether each of `SWITCHES` is on. `put` and `drive` turn `sail` off.
-        changed: Set when somebody has moved the boat or set a switch, until the next reading shows it.
+        changed: Set when somebody moves the boat or sets a switch, and cleared when the next reading is published.
     """
 
     def __init__(self, seed: int, speed: float) -> None:
@@ -100,25 +100,25 @@ class Boat:
         self.changed = asyncio.Event()
 
     def put(self, x: float, y: float) -> None:
-        """Put the boat at (x, y), or on the nearest shore if that is outside the map; it lies still there."""
+        """Put the boat at (x, y), or on the nearest shore if that is outside the map, and stop it there."""
         self._place(x, y)
         self._driven = 0.0
         self.switch("sail", on=False)
 
     def drive(self, forward: float, turn: float) -> None:
-        """Move at this velocity for `DRIVE_TIMEOUT` seconds, no faster than the boat can; `turn` is in radians a second."""
+        """Move at this velocity for `DRIVE_TIMEOUT` seconds, at most at top speed; `turn` is in radians a second."""
         self._forward, self._turn = min(max(forward, -self._speed), self._speed), turn
         self._driven = DRIVE_TIMEOUT
         self.switches["sail"] = False
 
     def switch(self, name: str, *, on: bool) -> str:
-        """Set one of `SWITCHES`, and return what now holds."""
+        """Set one of `SWITCHES`, and return a sentence about the new state."""
         self.switches[name] = on
         self.changed.set()
         return SWITCHES[name][0 if on else 1]
 
     def sail(self, seconds: float) -> None:
-        """Sail along the waypoints for that many seconds, or as it is driven, unless the boat lies still."""
+        """Move the boat for that many seconds: along the waypoints, or as it is driven if `sail` is off."""
         if not self.switches["sail"]:
             driven = min(seconds, self._driven)
             self._driven -= driven
@@ -178,9 +178,9 @@ async def simulate(
 ) -> None:
     """Sail and publish `count` readings, or until cancelled; a BridgeError if no server answers at the URI.
 
-    Each step publishes true pose, compass and then the readings, with the same stamp, on `topic`: `boat_msgs/Raw`, or
-    with `array` std_msgs/Float64MultiArray. So does a change of the boat from outside, at once. While the server is away
-    the boat sails on.
+    Each step publishes true pose, compass and then the readings, with the same stamp. The readings on `topic` are a
+    `boat_msgs/Raw`, or with `array` a std_msgs/Float64MultiArray. A change of the boat from outside is published at
+    once, between steps. While the server is away, the boat sails on.
     """
     from bridge.stamps import header
     from casestudies.topics import LossyPublication, connected, report_refused
@@ -220,7 +220,7 @@ async def simulate(
 
 
 async def _is_changed_before(due: float, boat: Boat) -> bool:
-    """Wait until somebody changes the boat, at most until `due` (monotonic seconds), and return whether one did."""
+    """Wait until the boat is changed, at most until `due` (monotonic seconds); return whether it was changed."""
     try:
         async with asyncio.timeout(due - time.monotonic()):
             await asyncio.sleep(_SHORTEST)
@@ -231,7 +231,7 @@ async def _is_changed_before(due: float, boat: Boat) -> bool:
 
 
 async def _show_beacons(ros: "Ros") -> None:
-    """Publish the beacons as markers, for those who come later too."""
+    """Publish the beacons as latched markers, so that later subscribers get them too."""
     from bridge.stamps import header
     from casestudies.topics import LossyPublication
 
@@ -240,7 +240,7 @@ async def _show_beacons(ros: "Ros") -> None:
 
 
 async def _follow(ros: "Ros", topic: str, type_: str, take: Callable[[dict[str, Any]], None]) -> None:
-    """Move the boat as the messages of a topic say; the first unusable ones of each kind are reported."""
+    """Move the boat as the messages of a topic say; report the first unusable value of each field."""
     from bridge.errors import TopicLeftOutError
 
     reported: set[str] = set()

@@ -105,7 +105,7 @@ class BoatViewer:
 
     Attributes:
         instances: The frames, the newest last; only the last `KEPT` if the viewer runs until Ctrl-C.
-        numbers: The numbers of each.
+        numbers: The numbers of each of these frames.
         frames: The number of frames.
         results: The number of frames with a posterior.
     """

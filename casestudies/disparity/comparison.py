@@ -1,4 +1,4 @@
-"""The machines' disparities beside those of float64 fusion, the truth and the thesis's time: a line a pair, and a picture."""
+"""Comparison of the machines' disparities with float64 fusion, the truth and the thesis: lines and a picture."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +31,7 @@ def bad_share(disparity: NDArray[np.float64], truth: NDArray[Any]) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matched:
-    """A stereo pair with its posteriors, float64[disparities, height, width], and what they took."""
+    """A stereo pair with its posteriors, float64[disparities, height, width], and the times they took."""
 
     left: NDArray[np.uint8]
     truth: NDArray[Any] | None
@@ -39,13 +39,13 @@ class Matched:
     exact: NDArray[np.float64]
     """The posteriors of float64 fusion."""
     posterior: NDArray[np.float64]
-    """Those of the machines; zeros for a pixel without one."""
+    """The posteriors of the machines; zeros for a pixel without one."""
     host_s: float
     """CPU time for filters, costs and likelihoods."""
     total_s: float
     """Time from the pair to the last posterior."""
     boards_s: float
-    """Time of the boards' cycles at the clock of real ones, without links."""
+    """Time of the boards' cycles at the clock of real boards, without their links."""
     cycles: int
 
     @property
@@ -67,7 +67,7 @@ class Matched:
         )
 
     def summary(self) -> str:
-        """Return the times beside the thesis's."""
+        """Return a sentence with the times, next to the time in the thesis."""
         height, width = self.left.shape
         return (
             f"a pair of {width} x {height} pixels takes {self.host_s:.3f} s on the host ({THESIS_S} s in the thesis, of "

@@ -125,7 +125,7 @@ class ImagePairs:
     def add(self, side: int, message: Mapping[str, Any]) -> StereoImages | None:
         """Add an image of the left (0) or right (1) camera; return the pair that it completes, or raise a BadImageError.
 
-        Older images of both cameras are given up; newer ones, of a camera that is ahead, wait for the other's.
+        A pair discards the older images of both cameras; newer images of one camera wait for those of the other.
         """
         stamp_ns = header_stamp_ns(message)
         if stamp_ns is None:

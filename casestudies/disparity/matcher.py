@@ -63,7 +63,7 @@ _SILENT_S: Final = 5.0
 def tiles_of(codes: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
     """Return the bytes of an image, [filters, disparities, height, width], as uint8[tiles, filters, pixels, disparities].
 
-    The last tile is filled with pixels whose disparities are all alike; their machines stop first.
+    The last tile is filled up with pixels whose likelihoods are all 255; their machines stop first.
     """
     filters, disparities = codes.shape[:2]
     flat = codes.reshape(filters, disparities, -1)
@@ -86,13 +86,16 @@ class Stack:
         self._answers = False
 
     async def posteriors(self, tiles: NDArray[np.uint8]) -> tuple[NDArray[np.float64], int]:
-        """Return the posteriors of uint8[tiles, filters, pixels, disparities], float64[tiles, pixels, disparities], and the cycles.
+        """Send the tiles, uint8[tiles, filters, pixels, disparities], and return their posteriors and the cycles.
 
-        Each tile has a stamp of its own, by which its result is recognised; late results of an earlier image are skipped.
+        Each tile has its own stamp, which identifies its result; late results of an earlier image are skipped.
+
+        Returns:
+            The posteriors, float64[tiles, pixels, disparities], and the sum of the cycles of all tiles.
 
         Raises:
             NoResultError: Nothing came in time.
-            BadResultError: A posterior is not that of a tile.
+            BadResultError: A posterior does not have the size of a tile.
         """
         count, _, pixels, disparities = tiles.shape
         found = np.zeros((count, pixels, disparities))
@@ -156,7 +159,7 @@ class Matcher:
         self._warned: set[str] = set()
 
     def _warn_once(self, sentence: str, of: str = "") -> None:
-        """Warn, unless a sentence of this topic, or the same one, was said before."""
+        """Warn, unless a warning about the topic `of`, or without a topic the same sentence, was printed before."""
         if (key := of or sentence) not in self._warned:
             self._warned.add(key)
             warn(sentence)
@@ -180,7 +183,7 @@ class Matcher:
             self._warn_once(f"an image on {message.topic} is skipped: {error}", message.topic)
 
     async def next_pair(self, limit_s: float) -> StereoImages:
-        """Return the newest pair, once, or wait for one; a NoResultError if none comes in time."""
+        """Return the newest pair that was not returned before, or wait for one; raise a NoResultError if none comes."""
         end = time.monotonic() + limit_s
         while self._newest is None:
             self._news.clear()
@@ -234,7 +237,7 @@ class Matcher:
     ) -> None:
         """Match pairs until `count` are done, or until cancelled, and print a line for each.
 
-        `as_message` is `disparity_message`, with what is known about the cameras.
+        `as_message` is `disparity_message` with its arguments about the cameras already filled in.
 
         Raises:
             NoResultError: No pair of images, or no posterior, came in time.

@@ -80,7 +80,7 @@ def likelihoods(costs: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def as_bytes(likely: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return likelihoods as the machine gets them: relative to the likeliest disparity of their pixel, 255 for that."""
+    """Return likelihoods as bytes for the machine, scaled so that the likeliest disparity of each pixel has 255."""
     codes: NDArray[np.uint8] = np.rint(likely * (255 / likely.max(axis=1, keepdims=True))).astype(np.uint8)
     return codes
 

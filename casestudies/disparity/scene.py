@@ -45,7 +45,7 @@ class _Sphere:
     radius: float
 
     def distance(self, origin: Array, rays: Array) -> Array:
-        """Return the multiples of the rays, float64[pixels, 3], at which they hit the sphere first; infinite for a miss."""
+        """Return the factor by which each ray, float64[pixels, 3], first hits the sphere; infinite for a miss."""
         away = origin - self.centre
         a, b = (rays**2).sum(axis=1), rays @ away
         root = b**2 - a * (away @ away - self.radius**2)
@@ -59,7 +59,7 @@ class _Box:
     high: Array
 
     def distance(self, origin: Array, rays: Array) -> Array:
-        """Return the multiples of the rays, float64[pixels, 3], at which they enter the box; infinite for a miss."""
+        """Return the factor by which each ray, float64[pixels, 3], enters the box; infinite for a miss."""
         with np.errstate(divide="ignore"):
             first, second = (self.low - origin) / rays, (self.high - origin) / rays
         enters = np.minimum(first, second).max(axis=1)
@@ -131,8 +131,8 @@ class Scene:
     def _texture(self, points: Array, pixel: Array) -> Array:
         """Return the brightness, about -1 to 1, of points, float64[points, 3]: noise of several periods.
 
-        Periods below two pixels, whose size in metres at each point is given, are left out; each camera would see
-        something else of them.
+        `pixel` is the size of a pixel at each point, in metres. Periods below two pixels are left out, because the two
+        cameras would sample them differently.
         """
         brightness = np.zeros(len(points))
         for octave, period in enumerate(_OCTAVES):

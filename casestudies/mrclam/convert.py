@@ -88,7 +88,7 @@ class Window:
 
 
 def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Yield the place of each line, for error messages, and its numbers, or raise a ModelError.
+    """Yield for each line its path and line number, for error messages, and its values, or raise a ModelError.
 
     In the files of the data set, numbers are separated by spaces, and comments begin with `#`.
     """
@@ -161,7 +161,7 @@ def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[l
 
 
 def windows(track: Track, measured: Sequence[Measured]) -> tuple[list[Window], Counter[str]]:
-    """Return the seconds of a track in which the robot hardly moved and saw enough landmarks, and why others are not."""
+    """Return the seconds in which the robot hardly moved and saw enough landmarks, and count the others by reason."""
     kept: list[Window] = []
     left_out: Counter[str] = Counter()
     if not measured:

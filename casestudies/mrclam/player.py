@@ -183,7 +183,7 @@ async def _take_turn(
     limit_s: float,
     repeat_s: float,
 ) -> Instance | None:
-    """Publish a frame until its result arrives, and return the result, or None after the limit; skip late results of other frames."""
+    """Publish a frame, again every `repeat_s`, until its result arrives; return the result, or None after `limit_s`."""
     stamps: set[int] = set()
     end = time.monotonic() + limit_s
     while (now := time.monotonic()) < end:

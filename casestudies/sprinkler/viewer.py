@@ -41,11 +41,11 @@ _WAITING: Final = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameSummary:
-    """The samples of a frame in summary."""
+    """A summary of a frame's samples."""
 
     number: int
     grass: int
-    """G."""
+    """G, the value of the grass."""
     share: float
     """P(R = 1) on `/BMresults`."""
     error: float
@@ -53,11 +53,11 @@ class FrameSummary:
     effective: float
     """Effective samples on `/bm/frame`; 1 if they are not stated."""
     curve: NDArray[np.int64]
-    """int64[points, 2]: the number of samples so far, and of those with R = 1; the last point is the whole frame."""
+    """int64[points, 2]: the number of samples so far, and how many have R = 1; the last point is the whole frame."""
 
 
 def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> FrameSummary:
-    """Return a frame from its posterior and its samples, int64[samples, variables]."""
+    """Summarise a frame's posterior and samples, int64[samples, variables]."""
     rained = np.cumsum(samples[:, _R])
     at = np.unique(np.geomspace(1, len(samples), _POINTS).astype(np.int64))
     details = posterior.report.details if posterior.report else {}
@@ -109,8 +109,8 @@ class SamplesViewer:
     """The frames of a run, from which estimates and picture are made.
 
     Attributes:
-        frames: The frames that say something new, the newest last.
-        results: The number of results, with those whose samples are lost or those of an earlier frame.
+        frames: The frames whose samples differ from those of all earlier frames, the newest last.
+        results: The number of all results, including those whose samples are lost or repeated.
     """
 
     def __init__(self, count: int | None) -> None:
