@@ -39,7 +39,7 @@ _LAST_PORT: Final = 65535
 _PORT: Final = re.compile(r"[0-9]+(/.*)?")
 """A port: `robot:9090` is a URI without its ws://, and does not name a robot."""
 _TIMEOUT: Final = 10.0
-"""Seconds in which a robot must answer, unless the caller has another limit; that of `connect` is the same."""
+"""Default time in seconds in which a robot must answer, the same as `connect_timeout` of `connect`."""
 _TAKEN_TIME: Final = 3.0
 """Seconds to wait for an objection from another owner of a name."""
 _LOOPBACK: Final = ["127.0.0.1"]
@@ -135,7 +135,7 @@ async def resolve(name: str, timeout: float = _TIMEOUT) -> str:
 
 
 async def announced_uri(uri: str, timeout: float = _TIMEOUT) -> str:
-    """Return a URI unchanged, or for `robot:NAME` that of the robot's server; errors are those of `resolve`."""
+    """Return a URI unchanged, but for `robot:NAME` the URI of that robot's server; errors as for `resolve`."""
     return await resolve(uri.removeprefix(ROBOT), timeout) if uri.startswith(ROBOT) else uri
 
 

@@ -48,11 +48,11 @@ class WrongThreadError(UsageError):
 
 
 class ActionlibError(UsageError):
-    """Raised for an action of a ROS 1 server: these are topics (actionlib), which this client does not handle."""
+    """Raised for an action of a ROS 1 server: its actions are topics (actionlib), which this client does not handle."""
 
 
 class EncodeError(UsageError):
-    """Raised when an object cannot be encoded: its type, a NaN, an infinity, its depth or its size."""
+    """Raised when an object cannot be encoded because of a type, a NaN, an infinity, its depth or its size."""
 
 
 class MessageTooLargeError(EncodeError):
@@ -84,7 +84,7 @@ class AccessRefusedError(UsageError):
 
 
 class DisconnectedError(BridgeError):
-    """Raised when there is no connection, or when it was lost while something waited for it."""
+    """Raised when there is no connection, or when it was lost while the caller waited."""
 
 
 class StateTimeoutError(BridgeError):
@@ -134,7 +134,7 @@ class PathError(UsageError):
 
 
 class FieldMissingError(BridgeError):
-    """Raised when a message does not have the field; the sentence lists its fields."""
+    """Raised when a message does not have a field; the sentence lists the fields that it has."""
 
     exit_code = 4
 

@@ -88,7 +88,7 @@ class Field:
         return True, value
 
     def missing(self, message: dict[str, Any]) -> FieldMissingError:
-        """Return the error for a message without the variable, which lists its fields."""
+        """Return the error for a message without the variable; it lists the message's fields."""
         return FieldMissingError(f"the message has no field {self.name!r}{self._reason(message)}")
 
     def _reason(self, message: dict[str, Any]) -> str:
@@ -116,7 +116,7 @@ class Field:
 
 
 def all_missing(fields: Sequence[Field], message: dict[str, Any]) -> FieldMissingError:
-    """Return the error for a message without these variables, which names all of them and lists its fields."""
+    """Return the error for a message without these variables; it names all of them, and lists the message's fields."""
     first, *others = fields
     if not others:
         return first.missing(message)
@@ -216,7 +216,7 @@ def _length(value: Any) -> int | None:
 
 
 def _element(value: Any, index: int) -> Any:
-    """Return one element; None if the text is not base64 at this place."""
+    """Return one element of an array in any form; None if base64 text is malformed at this index."""
     # Decodes only the four characters with this byte, and not the whole image.
     if isinstance(value, str):
         four = value[index // 3 * 4 : index // 3 * 4 + 4]

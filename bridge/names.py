@@ -46,7 +46,7 @@ def ros2_type(name: str, kind: Kind = "msg") -> str:
 
 
 def same_type(one: str, other: str) -> bool:
-    """Return whether two names of any form denote the same type. Malformed names must be equal."""
+    """Return whether two names, each in either form, denote the same type; malformed names only if they are equal."""
     if one == other:
         return True
     try:

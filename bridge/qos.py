@@ -23,7 +23,7 @@ class Qos:
     """Quality of service of a topic between ROS nodes.
 
     Attributes:
-        history: Whether the last `depth` messages are queued for a slow reader, or all.
+        history: Whether all messages are queued for a slow reader, or the last `depth` ones.
         depth: Number of queued messages.
         reliability: Whether lost messages are sent again.
         durability: Whether a late subscriber gets earlier messages (`transient_local`).

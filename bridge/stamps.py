@@ -10,7 +10,7 @@ _KEYS: Final = (("sec", "nanosec", 2), ("secs", "nsecs", 1))
 
 
 def stamp(time_ns: int, ros_version: Literal[1, 2] | None = None) -> dict[str, int]:
-    """Return nanoseconds since 1970 as a `stamp` for a ROS version; None for the keys of both."""
+    """Return nanoseconds since 1970 as a `stamp` with the keys of a ROS version, or for None with the keys of both."""
     seconds, nanoseconds = divmod(time_ns, _NS)
     time: dict[str, int] = {}
     for second, nanosecond, version in _KEYS:
@@ -49,7 +49,7 @@ def header_stamp_ns(msg: Mapping[str, Any]) -> int | None:
 
 
 def ros_version_of_message(msg: Mapping[str, Any]) -> Literal[1, 2] | None:
-    """Return the ROS version of a message according to its header; None without a header, or with both forms."""
+    """Return the ROS version that a message's stamp shows; None without a header, or if the stamp has both forms."""
     head = msg.get("header")
     time = head.get("stamp") if isinstance(head, Mapping) else None
     if not isinstance(time, Mapping) or ("sec" in time) == ("secs" in time):

@@ -44,7 +44,7 @@ class Goal:
     """One active goal: `async for feedback in goal`, then `await goal.result(timeout)`.
 
     The iteration ends with the goal. If the connection is lost, iteration and result fail, because the server then
-    never reports the end of the goal; they also fail once an `async with` was left before the end.
+    never reports the end of the goal. They also fail if `async with` is left before the goal ends, which cancels it.
 
     Attributes:
         action: Name of the action.
@@ -102,7 +102,7 @@ class Goal:
         return self._ended.done()
 
     async def cancel(self) -> None:
-        """Ask the server to cancel the goal, if it is active; `result` returns whether it did."""
+        """Ask the server to cancel the goal, if it is active. The status in `result` shows whether the server did."""
         self._session.check_thread()
         self._session.core.goals.cancel(self._identity)
         self._session.flush()
@@ -229,7 +229,7 @@ GoalHandler = Callable[[GoalRequest], Awaitable[Mapping[str, Any] | None]]
 
 
 async def execute(goal: GoalRequest, handler: GoalHandler, action: str) -> None:
-    """Have a handler execute a goal, which ends even if the handler fails."""
+    """Run a goal's handler, and end the goal with its result; if the handler fails, abort the goal."""
     # The handler may have ended the goal already; then the end here has no effect.
     try:
         values = await handler(goal)

@@ -45,7 +45,7 @@ _log = logging.getLogger("bridge")
 
 
 class Handle:
-    """Base of handles, which are closed once: explicitly, by leaving their `async with`, or with the client."""
+    """Base of handles. A handle is closed once: by `close`, at the end of its `async with`, or with its client."""
 
     def __init__(self, session: Session) -> None:
         session.check_thread()
@@ -56,7 +56,7 @@ class Handle:
         self._closed = False
 
     def _register(self) -> None:
-        """Register the handle for closing with its client, and send its operation."""
+        """Register the handle, so that the client closes it when it is closed itself, and send its operation."""
         self._session.on_closed.add(self.end)
         self._session.flush()
 
@@ -227,8 +227,8 @@ class Subscription(Handle):
         """Wait for one message, at most `timeout` seconds.
 
         Raises:
-            NoMessageError: None arrived in time; the sentence names topic, server and time, and information
-                about the topic from rosapi, if any (which takes up to half a second more).
+            NoMessageError: No message arrived in time. The text names topic, server and time, and what rosapi
+                knows about the topic (asking it takes up to half a second more).
             TopicLeftOutError: The topic's messages are too large for the connection.
             DisconnectedError: The subscription or the client is closed.
             ConcurrentReadError: Another task is already waiting.
@@ -261,7 +261,7 @@ class Subscription(Handle):
         )
 
     async def _why_silent(self, begun: float) -> str:
-        """Return why the topic has been silent, as a clause that ends the sentence of an error."""
+        """Return why the topic has been silent, as the last clause of an error's sentence."""
         session = self._session
         # First what is known here, because asking the server takes time, and the server may be the reason.
         if self.discarded:

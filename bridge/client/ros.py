@@ -284,7 +284,7 @@ class Ros:
             type: Its type: `example_interfaces/action/Fibonacci`, or without the middle.
             goal: Fields of the goal.
             feedback: Whether to receive feedback.
-            timeout: Timeout in seconds for a slow server.
+            timeout: Maximum time in seconds until the server has accepted the message.
 
         Returns:
             The active goal: `async for feedback in goal`, `await goal.result(timeout)`, and `async with goal`, which
@@ -319,12 +319,12 @@ class Ros:
         Args:
             action: Name of the action.
             type: Its type: `example_interfaces/action/Fibonacci`, or without the middle.
-            handler: Coroutine function that is called with each goal, and executes it: it may send feedback,
-                and should check whether the goal has been cancelled. The goal succeeds with the fields that it
-                returns, or is cancelled with them if the sender asked for that, unless the handler has ended
-                the goal differently. If it raises an error, the goal is aborted, and the error is logged; so is
-                a result or feedback that does not fit the type. Up to 64 goals are executed concurrently. It is
-                cancelled when the connection is lost.
+            handler: Coroutine function that is called with each goal, and executes it. It may send feedback,
+                and should check whether the goal has been cancelled. The fields that it returns become the
+                result: the goal succeeds, or counts as cancelled if the sender asked for that, unless the
+                handler has already ended it. If the handler raises an error, or a result or feedback does not
+                fit the type, the goal is aborted, and the error is logged. Up to 64 goals are executed
+                concurrently. Handlers are cancelled when the connection is lost.
 
         Raises:
             NameFormError: The name or the type is malformed.
@@ -400,7 +400,7 @@ class Ros:
         return found if isinstance(found, str) else None
 
     async def _ask_names(self, limit: float, question: str, **args: str) -> list[str] | None:
-        """Return a list of names, in the field of the question's name; None if there is none."""
+        """Ask rosapi a question, and return the names in the answer's field of that name; None without an answer."""
         names = (await self._session.ask_rosapi(question, args, limit)).get(question)
         return [name for name in names if isinstance(name, str)] if isinstance(names, list) else None
 
@@ -430,7 +430,7 @@ def connect(
     Args:
         uri: `ws://host:port`, or `wss://` for TLS, whose certificate is always verified; or `robot:NAME`, which is
             looked up when the client is opened (`bridge.discovery`).
-        connect_timeout: Timeout of the first connection in seconds, and before it of looking up a robot.
+        connect_timeout: Timeout in seconds of the first connection, and of looking up a robot before it.
         retry: Whether to repeat the first attempt until `connect_timeout` is over, while nothing answers at the URI;
             `on_state` is then called with `CONNECTING` and the reason, once.
         ros_version: ROS version of type names on the wire. `auto` uses ROS 1, which ROS 2 servers accept too,

@@ -52,7 +52,7 @@ STEADY: Final = 5.0
 SILENCE: Final = 2.0
 """Seconds without a message after which a subscription is checked."""
 LONGEST_SILENCE: Final = 30.0
-"""Maximum delay in seconds between two checks; it doubles with each."""
+"""Maximum delay in seconds between two checks; it doubles up to this one."""
 _ROSAPI_TIMEOUT: Final = 1.0
 KEPT_STATUSES: Final = 16
 """Number of status messages of the server that are stored."""
@@ -334,7 +334,7 @@ class Session:
         return f"; the largest so far was one of {largest}, with {size} bytes" if size else ""
 
     def why_left_out(self) -> str:
-        """Return why a topic is left out, as a clause that ends the sentence of an error."""
+        """Return why a topic is left out, as the last clause of an error's sentence."""
         return (
             f"is left out: a message of it has more than the {self.core.wire.max_size} bytes (max_size) that this "
             f"client of {self.uri} accepts"
@@ -416,7 +416,7 @@ class Session:
         return websocket is not None and websocket.is_open and not websocket.is_closing
 
     def check_thread(self) -> None:
-        """Raise an error if this is not the thread of the event loop, because the data is not locked."""
+        """Raise an error unless this is the event loop's thread, because no lock protects the client's data."""
         if get_ident() != self._thread and self._thread is not None:
             raise WrongThreadError(
                 f"the client of {self.uri} belongs to the thread of its event loop: call it there with "
@@ -470,7 +470,7 @@ class Session:
             self._waiting -= 1
 
     def flush(self) -> None:
-        """Send the output of the core without waiting: it is small and rare, unless a server floods the client."""
+        """Send the core's output without waiting, since it is small and rare unless a server floods the client."""
         for message in self.core.data_to_send():
             websocket = self._websocket
             if websocket is not None and self.is_open:
@@ -551,7 +551,7 @@ class Session:
         return answer.values
 
     def context_since(self, since: float) -> str:
-        """Return a clause for an error: the lost connection, or the last status message since a time."""
+        """Return a clause about events after `since`: a lost connection, or a status message; empty if none."""
         if self._lost_at > since:
             return f"; meanwhile the connection was lost: {self.last_error}"
         return f"; the server reported: {self.statuses[-1].text[:200]}" if self._status_at > since else ""

@@ -22,7 +22,7 @@ from bridge.names import absolute, ros2_type
 _ROSAPI_TIMEOUT: Final = 1.0
 _ROSAPI: Final = "/rosapi/"
 _MAX_SERVICES: Final = 1000
-"""Maximum number of services whose types are remembered; those of others are asked for again."""
+"""Maximum number of services whose types are remembered; for others, each call asks for the type again."""
 
 _log = logging.getLogger("bridge")
 

@@ -43,9 +43,9 @@ WRITE_LIMIT: Final = 1 << 16
 CLOSE_TIMEOUT: Final = 1.0
 """Timeout in seconds of the closing handshake."""
 _OVERSLEPT: Final = 0.5
-"""If the watchdog wakes this many seconds late, this process was suspended, not the server."""
+"""If the watchdog wakes this many seconds late, this process was suspended, and the server was not silent."""
 _SIZE: Final = re.compile("[1-9][0-9]{2,17}")
-"""A limit that a server may announce: no operation fits into less than 100 bytes."""
+"""Form of a size limit that a server announces: 100 bytes or more, because no operation fits into less."""
 
 
 class _NoDebug(logging.LoggerAdapter[logging.Logger]):
@@ -165,7 +165,7 @@ class WebSocket(WebSocketTransport):
             self._on_messages(early)
 
     async def close(self) -> None:
-        """Close the connection after sending what was written before."""
+        """Close the connection after sending everything written so far."""
         if self.is_open:
             self.start_closing(CloseCode.NORMAL_CLOSURE)
         # Otherwise the last messages of a program would be lost in the write buffer.

@@ -39,7 +39,7 @@ TYPED_ARRAYS: Final = {
     85: ("<f4", "f"),
     86: ("<f8", "d"),
 }
-"""Element types by tag, in the notation of NumPy and in that of the modules `array` and `struct`."""
+"""Element types by tag: their names in NumPy, and in the modules `array` and `struct`."""
 _BYTES_TAG: Final = 64
 _TAGS: Final = {name[1:]: tag for tag, (name, _code) in TYPED_ARRAYS.items()}
 _TEXT: Final = frozenset({str})
@@ -57,8 +57,8 @@ def decode(
     Args:
         data: A whole WebSocket message.
         max_size: Maximum of bytes.
-        max_depth: Maximum nesting of maps, arrays and tags, including the outermost (an empty one inside
-            the last does not count).
+        max_depth: Maximum nesting of maps, arrays and tags, including the outermost (an empty map or array at
+            the innermost level does not count).
         arrays: Form of typed arrays and byte strings: `list` makes lists of numbers, and bytes of `uint8[]`;
             `numpy` makes read-only one-dimensional arrays that share the message's memory.
 

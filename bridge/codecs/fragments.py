@@ -62,8 +62,8 @@ class Reassembler:
     def __init__(self, *, max_size: int = MAX_SIZE) -> None:
         """Start without fragments.
 
-        `max_size` is the maximum size of a complete message in bytes; all incomplete ones together may occupy four
-        times as many, including overhead.
+        `max_size` is the maximum size of a complete message in bytes; all incomplete messages together may
+        occupy four times as much, including overhead.
         """
         self.waiting_bytes = 0
         """Number of bytes that incomplete messages occupy."""
@@ -76,7 +76,7 @@ class Reassembler:
 
     @property
     def deadline(self) -> float:
-        """Time at which `expire` is due; infinity for never."""
+        """Time at which to call `expire`; infinity for never."""
         return min((begun.touched for begun in self._sets.values()), default=math.inf) + MAX_AGE
 
     def take(self, fragment: Mapping[str, Any], now: float) -> bytes | None:

@@ -125,7 +125,7 @@ def is_deeper(data: bytes, limit: int) -> bool:
 
 
 def _has_more_brackets(data: bytes, limit: int) -> bool:
-    """Return whether JSON has more than `limit` opening brackets, which most messages do not have."""
+    """Return whether JSON has more than `limit` opening brackets; few messages do, so most are known to be shallow."""
     if len(data) <= _COUNTED:
         return data.count(b"{") + data.count(b"[") > limit
     # Searching for the next bracket skips long arrays of numbers forty times faster than counting.
@@ -168,9 +168,9 @@ def encode(message: Mapping[str, Any], *, max_size: int = MAX_SIZE, max_depth: i
     """Write one message, whose values may be NumPy arrays and scalars, as JSON without white space.
 
     Raises:
-        EncodeError: A type that JSON does not have, an integer beyond 64 bits, a key that is not a string, a NaN
-            or infinity (the sentence gives its path), or too deep.
-        MessageTooLargeError: It is too large.
+        EncodeError: The message is too deep, or contains a type that JSON does not have, an integer beyond 64
+            bits, a key that is not a string, or a NaN or infinity (the sentence gives its path).
+        MessageTooLargeError: The JSON is too large.
     """
     try:
         try:
@@ -270,7 +270,7 @@ def _all_finite(value: Any) -> bool:
 
 
 def envelope_of(data: bytes) -> bytes:
-    """Return what may be the envelope of an operation: everything up to its first key `msg`, or nothing."""
+    """Return everything up to an operation's first key `msg`, which may be its envelope; empty without that key."""
     key = _KEY if data[:1] < b"\x80" else _CBOR_KEY
     at = data.find(key, 0, LONGEST)
     return data[: at + len(key)] if at > 0 else b""
@@ -279,8 +279,8 @@ def envelope_of(data: bytes) -> bytes:
 def topic_of(envelope: bytes) -> str | None:
     """Return the topic of an envelope, or None if it is not one.
 
-    An envelope followed by an empty message and a brace is a publish operation with the keys `op`, `topic` and
-    `msg` only. The empty message is the value of the last key, so that key is `msg`, and whatever object
+    Completed with an empty message and a brace, an envelope is a publish operation with only the keys `op`,
+    `topic` and `msg`. The empty message is the value of the last key, so that key is `msg`, and any object that
     follows the envelope is the message.
     """
     try:
@@ -294,7 +294,7 @@ def topic_of(envelope: bytes) -> str | None:
 
 
 def topic_in(beginning: bytes) -> str | None:
-    """Return the topic of a publish operation from its beginning, in JSON or CBOR; None if it is not there."""
+    """Return the topic of a publish operation from its first bytes, in JSON or CBOR; None if they do not contain it."""
     match = _JSON_TOPIC.search(beginning.split(b'"msg"', 1)[0])
     if match is not None:
         return match[1].replace(b"\\/", b"/").decode(errors="replace")

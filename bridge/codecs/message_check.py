@@ -1,6 +1,6 @@
 """Checks of outbound messages against the definition of their type: names of fields, and shapes of arrays.
 
-They find mistakes of a program (a misspelt field, nested arrays), which show in its first message already. The values
+They find mistakes in a program (a misspelt field, nested arrays), which its first message already shows. The values
 of scalars are not checked.
 """
 
@@ -12,7 +12,7 @@ from bridge.errors import MessageTypeError, NameFormError
 from bridge.names import ros1_type, ros2_type
 
 SCALAR: Final = -1
-"""Length of a field that is not an array; 0 is an array of any length."""
+"""Stands for the length of a field that is not an array; 0 stands for an array of any length."""
 _MAX_TYPES: Final = 1000
 _MAX_FIELDS: Final = 1000
 _MAX_LENGTH: Final = (1 << 32) - 1
@@ -37,7 +37,7 @@ class FieldType(NamedTuple):
 
 
 _TIME_FIELDS: Final = {name: FieldType("int32", SCALAR) for name in ("secs", "nsecs", "sec", "nanosec")}
-"""A time in the spelling of either ROS version, which servers accept."""
+"""The fields of a time in both ROS versions; servers accept either spelling."""
 
 Definitions = dict[str, dict[str, FieldType]]
 """The fields of types, by the types' names in the form of ROS 1."""
@@ -87,7 +87,7 @@ def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
 
 
 def element_of(kind: Any, content: Any) -> tuple[str, int]:
-    """Return the type of a field of rosbags, or of its elements, and its length: `SCALAR`, 0 for any, or fixed."""
+    """Return the element type and the length of a field as rosbags describes it: `SCALAR`, 0 for any, or fixed."""
     match kind.name:
         case "BASE":
             return str(content[0]), SCALAR
@@ -167,7 +167,7 @@ class MessageCheck:
 
 
 def check_from_rosapi(answer: Any) -> MessageCheck | None:
-    """Return the check of the first type in rosapi's answer, whose parts the others are; None if it cannot be read."""
+    """Return the check of the first type in rosapi's answer (the others are its parts); None if it cannot be read."""
     definitions = definitions_from_rosapi(answer)
     match answer:
         case {"typedefs": [{"type": str(name)}, *_]} if (key := _key(name)) in definitions:

@@ -34,7 +34,7 @@ _MAX_TOKENS: Final = 1000
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccessPolicy:
-    """The credentials that the hub expects, and those that it presents.
+    """The credentials that the hub expects from clients, and the certificate that it presents.
 
     Attributes:
         tokens: A client must present one of them; without tokens every client may connect.

@@ -65,7 +65,7 @@ class Broker:
         rosapi = Rosapi(self.graph, self.limits, self.definitions, wall_clock)
         self._dispatcher = Dispatcher(self.limits)
         self.take_ready = self._dispatcher.take_ready
-        """Returns the clients that have output or must be closed, if they were not returned before."""
+        """Returns the clients that have had output, or must be closed, since the last call."""
         self._topics = Topics(self.graph, self.limits, self._dispatcher, self.definitions, self._refuse)
         self._actions = Actions(self.graph, self.limits, self._dispatcher, self.definitions)
         self._calls = Calls(
@@ -101,12 +101,12 @@ class Broker:
 
     @property
     def full(self) -> bool:
-        """Return whether the maximum of clients is connected."""
+        """Return whether the maximum number of clients is connected."""
         return len(self.graph.clients) >= self.limits.clients
 
     @property
     def deadline(self) -> float:
-        """Time of the next possible work of `wake` (monotonic seconds), infinity for never."""
+        """Time at which to call `wake` next (monotonic seconds), infinity for never."""
         return self._dispatcher.deadline
 
     def connect(self, address: str) -> Client:
@@ -137,7 +137,7 @@ class Broker:
         self._reassembling.pop(client, None)
 
     def receive(self, client: Client, data: bytes, now: float) -> None:
-        """Perform the operation in a whole WebSocket message, text or binary, with any content."""
+        """Perform the operation in a whole WebSocket message, text or binary; invalid content is refused."""
         self._now, self._operation_id = now, None
         self._dispatcher.work += _OPERATION_WORK + (len(data) >> 7)
         try:
@@ -148,8 +148,8 @@ class Broker:
     def receive_turn(self, client: Client, messages: list[bytes], now: float) -> int:
         """Perform a client's messages in order, as many as one turn allows; each has at most `limits.message_bytes`.
 
-        Returns the number of messages performed. The others need another turn, after the client has read its answers
-        if its outbox is congested.
+        Returns the number of messages performed. Call again with the others, but while the client's outbox is
+        congested, only after the client has read its answers.
         """
         self._now, self._operation_id = now, None
         dispatcher, outbox = self._dispatcher, client.outbox
@@ -166,7 +166,7 @@ class Broker:
         return number
 
     def _perform(self, client: Client, data: bytes, now: float, *, is_whole: bool) -> None:
-        """Perform the operation in a message; `is_whole` is False for a reassembled one, which cannot be a fragment."""
+        """Perform the operation in a message; a reassembled one (`is_whole` is False) must not be a fragment."""
         operation: Any = None
         raw: bytes | None = data
         if len(data) <= self.limits.message_bytes:
@@ -193,7 +193,7 @@ class Broker:
             handler(client, operation, now)
 
     def wake(self, now: float) -> None:
-        """Release throttled messages, fail calls and drop incomplete messages that are due at `now`."""
+        """Release messages that throttles admit at `now`, and end calls and incomplete messages that are too old."""
         throttle_deadline = self._dispatcher.release(now)
         self._calls.expire(now)
         if now >= self._fragment_deadline:

@@ -61,7 +61,7 @@ _CANCEL_ALL: Final = "/_action/cancel_goal"
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """A client that waits for an answer, with the id, name and encoding in its request."""
+    """A client that waits for an answer, and the id, name and encoding that its request named."""
 
     client: Client
     id: OperationId
@@ -81,13 +81,13 @@ class Caller:
         )
 
     def operation(self, op: str, kind: str, **fields: object) -> bytes:
-        """Return an operation for this client, with the name in its request under the key `kind` (service or action)."""
+        """Return an operation for this client; its key `kind` (service or action) has the name that the client used."""
         identity = {} if self.id is None else {"id": self.id}
         return orjson.dumps({"op": op, kind: self.name, **fields, **identity})
 
 
 def _filled(filler: Filler | None, values: Any, room: int) -> Any:
-    """Return arguments or results as an object with absent fields filled in, growing by at most `room` bytes."""
+    """Return arguments or results as an object, after filling absent fields with at most `room` bytes."""
     if values is None:
         values = {}
     if filler is not None:
@@ -125,7 +125,7 @@ class _Exchange:
         self._numbers = itertools.count(1)
 
     def _offer(self, client: Client, operation: Operation, type_name: str) -> None:
-        """Add an offer, or take it over from another client."""
+        """Add a client's offer of a name, which replaces any other client's offer of it."""
         name = checked_name(text(operation, self.kind))
         key, names = absolute(name), self._names_of(client)
         if key not in names and len(names) >= self._limits.services_per_client:
@@ -143,7 +143,7 @@ class _Exchange:
         names.add(key)
 
     def unadvertise(self, client: Client, operation: Operation, _now: float) -> None:
-        """Withdraw an offer; open calls or goals may still be answered."""
+        """Withdraw an offer; the client may still answer open calls or goals."""
         name = text(operation, self.kind)
         names = self._names_of(client)
         if absolute(name) not in names:
@@ -157,7 +157,7 @@ class _Exchange:
             self._offers.pop(name, None)
 
     def ask(self, client: Client, operation: Operation, now: float) -> None:
-        """Perform `call_service` or `send_action_goal`: pass it on to the server, or answer that it failed."""
+        """Perform `call_service` or `send_action_goal`: pass the request on to its server, or answer that it failed."""
         caller = Caller.of(client, operation, self.kind)
         try:
             self._start(caller, operation, now)
@@ -168,7 +168,7 @@ class _Exchange:
         raise NotImplementedError
 
     def _succeed(self, caller: Caller, filler: Filler | None, values: Any, **more: object) -> None:
-        """Send the answer in the requested encoding; one that is too large becomes a failure."""
+        """Send the answer in the requested encoding, or a failure if the answer is too large."""
         try:
             values = _filled(filler, values, self._limits.message_bytes)
             payload = caller.operation(self.answer, self.kind, values=values, **more, result=True)
@@ -213,7 +213,7 @@ class Calls(_Exchange):
         rosapi: Rosapi,
         answer_here: Callable[[Client, str], dict[str, Any] | None],
     ) -> None:
-        """Start without services; `answer_here` returns an answer for the hub's own services only."""
+        """Start without services; `answer_here` answers calls of the hub's own services, or returns None."""
         super().__init__(limits, dispatcher, definitions, graph.services, lambda client: client.services)
         self._graph = graph
         self._rosapi = rosapi
@@ -225,7 +225,7 @@ class Calls(_Exchange):
 
     @property
     def deadline(self) -> float:
-        """Time of the next possible work of `expire`, infinity for never."""
+        """Time at which to call `expire` next, infinity for never."""
         return self._deadlines[0][0] if self._deadlines else inf
 
     def leave(self, client: Client) -> None:
@@ -395,7 +395,7 @@ class Actions(_Exchange):
         self._dispatcher.send(server, payload)
 
     def cancel(self, client: Client, operation: Operation, _now: float) -> None:
-        """Perform `cancel_action_goal`: ask the server, whose result ends the goal."""
+        """Perform `cancel_action_goal`: pass it on to the server; the goal ends when the server sends its result."""
         name = text(operation, "action")
         goal_id = operation.get("id")
         key = client.goals.get(goal_id) if isinstance(goal_id, str | int | None) else None

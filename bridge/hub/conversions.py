@@ -119,7 +119,7 @@ class Builder:
 
 
 def fields_of(store: "Typestore", name: str) -> list[Any]:
-    """Return the fields of a type, without the one that ROS 2 adds to an empty message."""
+    """Return the fields of a type, without the field that ROS 2 adds to an empty message."""
     return [entry for entry in store.fielddefs[name][1] if entry[0] != DUMMY]
 
 
@@ -137,7 +137,7 @@ def _scalar(value: Any, element: str, place: str) -> Any:
 
 
 def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | bytes:
-    """Return an array's numbers after checking their types, their range and, unless `length` is 0, their count."""
+    """Return an array's numbers, after checking their types, range and, unless `length` is 0, number."""
     if element == "float64" and not length:
         try:  # much faster than comparing types, it refuses the same ones
             return msgspec.convert(values, list[float])
@@ -169,7 +169,7 @@ def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | 
 def cbor_encoder(
     store: "Typestore", name: str, defaults: Callable[[str], dict[str, Any]], known: dict[str, Encode | None]
 ) -> Encode | None:
-    """Return the function that encodes a message, its arrays of numbers as typed arrays; None for a type without any.
+    """Return the function that encodes a message with typed arrays; None if no field has an array of numbers.
 
     `defaults` returns a type's defaults, and `known` stores the functions of the types that occur inside this one.
     """
@@ -209,7 +209,7 @@ def _each(encode: Encode) -> Encode:
 
 
 def _unless_default(default: Any) -> Encode:
-    """Return the encoder of a field that most messages lack: what it was filled with is encoded once."""
+    """Return the encoder of a field that most messages lack, in which the default is encoded only once."""
     encoded = cbor2.dumps(default)
     return lambda value: encoded if value is default else cbor2.dumps(value)
 
@@ -228,7 +228,7 @@ def _text(text: str) -> bytes:
 
 
 def _head(kind: int, size: int) -> bytes:
-    """Return what precedes the content of a map or an array (RFC 8949, 3.)."""
+    """Return the CBOR bytes before the content of a map or an array (RFC 8949, section 3)."""
     if size < _INLINE:
         return bytes((kind | size,))
     return bytes((kind | _FOUR_BYTES,)) + size.to_bytes(4, "big")

@@ -1,8 +1,8 @@
 """Message definitions (the fields of each type) from `rosbags`, if it is installed.
 
 The hub forwards JSON without them. They are needed to fill absent fields, for CBOR with typed arrays, for serialised
-messages (cbor-raw) and for rosapi's descriptions of types. `rosbags` is imported by the first operation that needs it;
-without it CBOR packs only floats, and the last two are refused.
+messages (cbor-raw) and for rosapi's descriptions of types. The first operation that needs `rosbags` imports it. Without
+`rosbags`, CBOR has typed arrays only for floats, and cbor-raw and descriptions of types are refused.
 """
 
 import contextlib
@@ -57,7 +57,7 @@ class MessageDefinitions:
         self._defaults: dict[str, dict[str, Any]] = {}
 
     def load(self) -> None:
-        """Import rosbags and its types, unless that was done; it takes a tenth of a second."""
+        """Import rosbags and its types, unless they are loaded already; this takes a tenth of a second."""
         if not self._is_loaded:
             self._is_loaded = True
             with contextlib.suppress(ImportError):
@@ -78,7 +78,7 @@ class MessageDefinitions:
         return self._filler(known)
 
     def fillers(self, type_name: str, kind: Literal["srv", "action"]) -> dict[str, Filler]:
-        """Return the fillers of the parts of a service or an action, such as `Request`, without unknown parts."""
+        """Return the fillers of the known parts of a service or an action, by part, such as `Request`."""
         fillers = {part: self.filler(part_name(type_name, part, self.ros_version)) for part in PARTS[kind]}
         return {part: filler for part, filler in fillers.items() if filler is not None}
 
@@ -95,14 +95,14 @@ class MessageDefinitions:
         return self._fillers[name]
 
     def fields(self, name: str) -> Mapping[str, tuple[str, int]]:
-        """Return the type and length of each field of a known message, as `element_of` gives them."""
+        """Return the element type and length of each field of a known message type, as from `element_of`."""
         if name in TIMES:
             return dict.fromkeys(_TIME_FIELDS[self.ros_version], ("uint32", -1))
         store, known = self._known(name)
         return {field: element_of(kind, content) for field, (kind, content) in fields_of(store, known)}
 
     def defaults(self, name: str) -> dict[str, Any]:
-        """Return the default of a known message, which must not be changed."""
+        """Return the defaults of a known message type's fields; the caller must not change them."""
         if name not in self._defaults:
             self._defaults[name] = {
                 field: self._default(name, field, element, length)
@@ -140,7 +140,7 @@ class MessageDefinitions:
         }
 
     def encode(self, type_name: str, message: dict[str, Any]) -> bytes | None:
-        """Return a message as CBOR with typed arrays, or None if its type is unknown or does not fit."""
+        """Return a message as CBOR with typed arrays, or None if its type is unknown or the message does not fit it."""
         try:
             if type_name not in self._encoders:
                 store, known = self._known(type_name)
@@ -232,7 +232,7 @@ def _store(name: "Stores") -> "Typestore":
 
 
 def _define(store: "Typestore", name: str, ros_version: RosVersion) -> bool:
-    """Return whether a type is known, after adding its definition and those of its parts if rosbags lacks them."""
+    """Return whether a type is known; if rosbags lacks it, first add the definitions of the type and its parts."""
     if name in store.fielddefs:
         return True
     text = message_texts(ros_version).get(name)

@@ -38,14 +38,14 @@ class Dispatcher:
             self._ready.append(client)
 
     def take_ready(self) -> list[Client]:
-        """Return the clients that have output or must be closed, if they were not returned before."""
+        """Return the clients that have had output, or must be closed, since the last call."""
         ready, self._ready = self._ready, []
         for client in ready:
             client.is_ready = False
         return ready
 
     def checked(self, payload: bytes, what: str) -> bytes:
-        """Return a payload, or raise a RefusedOperationError if it exceeds the limit; `what` names it."""
+        """Return a payload, or raise a RefusedOperationError, in which `what` names it, if it exceeds the limit."""
         if len(payload) > self._limits.message_bytes:
             raise RefusedOperationError(f"{what} has more than {self._limits.message_bytes} bytes")
         return payload
@@ -61,7 +61,7 @@ class Dispatcher:
         self.mark_ready(client)
 
     def as_png(self, payload: bytes) -> bytes:
-        """Return an operation as a picture, or unchanged if the picture is too large, because no answer may be lost."""
+        """Return an operation as a picture, or unchanged if the picture is too large, since no answer may be lost."""
         wrapped = as_png(payload)
         return wrapped if len(wrapped) <= self._limits.message_bytes else payload
 
@@ -73,7 +73,7 @@ class Dispatcher:
         self.mark_ready(client)
 
     def schedule(self, deadline: float) -> None:
-        """Have the broker woken at `deadline`, or earlier."""
+        """Make sure that the broker is woken at `deadline` or earlier."""
         self.deadline = min(self.deadline, deadline)
 
     def schedule_release(self, client: Client) -> None:
@@ -84,7 +84,7 @@ class Dispatcher:
             self.schedule(deadline)
 
     def release(self, now: float) -> float:
-        """Queue the messages that throttles admit at `now`, and return when others are due."""
+        """Queue the messages that throttles admit at `now`, and return the time at which the next one is admitted."""
         for client in [client for client in self.throttled if client.outbox.deadline <= now]:
             client.outbox.release(now)
             self.mark_ready(client)

@@ -41,10 +41,10 @@ def encoding_of(requested: object) -> Encoding:
 
 
 def as_png(payload: bytes) -> bytes:
-    """Wrap an operation in an operation `png`: its JSON is the pixels of a picture, in base64.
+    """Wrap an operation in an operation `png`: the bytes of its JSON are the pixels of a picture, in base64.
 
-    As on the reference server, the picture is nearly square, with three bytes a pixel, and filled up with newlines,
-    which JSON ignores (source: https://www.w3.org/TR/png-3/, chapters 5, 9 and 11).
+    As on the reference server, the picture is nearly square, with three bytes a pixel. Newlines, which JSON ignores,
+    fill it up (source: https://www.w3.org/TR/png-3/, chapters 5, 9 and 11).
     """
     pixels = -(-len(payload) // 3)
     width = math.isqrt(pixels)
@@ -80,7 +80,7 @@ class OutgoingMessage:
     """One published message, encoded on demand."""
 
     json: bytes
-    """The message as JSON, from `_begin` on, and a brace: its own copy would only be used by a few encodings."""
+    """Bytes that contain the message as JSON, from `_begin` on, and a brace. Few encodings need a copy of it."""
     _begin: int
     _parsed: dict[str, Any] | None
     """The parsed message, or None if it was not parsed yet."""
@@ -90,11 +90,11 @@ class OutgoingMessage:
     """Its receipt in nanoseconds since 1970, for cbor-raw."""
     _definitions: MessageDefinitions
     _max_size: int
-    """Maximum of bytes on the wire."""
+    """Maximum number of bytes on the wire."""
     _payloads: dict[tuple[Encoding, str], bytes | BridgeError] = field(default_factory=dict)
 
     def payload(self, compression: Encoding, name: str) -> bytes:
-        """Return the message in one encoding, under the topic's name as a client uses it, or raise a BridgeError."""
+        """Return the message in one encoding, under the topic's name as a client spells it, or raise a BridgeError."""
         # Payloads and failures are kept: each encoding is tried once, however many subscribers want it.
         payload = self._payloads.get((compression, name))
         if payload is None:

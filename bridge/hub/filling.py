@@ -23,10 +23,10 @@ from bridge.hub.limits import RefusedOperationError
 _KNOWN: Final = 32
 
 _Parts = tuple[tuple[str, "Filler", bool], ...]
-"""The fields of a message that are messages or arrays of messages, and whether they are arrays."""
+"""The fields of a message that are messages or arrays of messages: name, filler, and whether it is an array."""
 
 _Absent = tuple[dict[str, Any], bytes, _Parts]
-"""The absent fields of a message and their defaults, which must not be changed; their tail; the present parts."""
+"""A message's absent fields with their defaults, which must not be changed; their tail; its present parts."""
 
 
 class Filler:
@@ -99,7 +99,7 @@ class Filler:
         return grown
 
     def _look_up(self, message: dict[str, Any]) -> _Absent:
-        """Return what a message lacks, and remember it."""
+        """Return what a message lacks, and remember it for messages with the same fields."""
         varying, defaults = self._varying, self._defaults
         absent = {
             field: varying[field](message) if field in varying else default

@@ -1,7 +1,7 @@
 """Definitions of services, actions and messages that `rosbags` does not have, in ROS's own notation.
 
-They are those that clients of rosbridge use most: the services of `std_srvs` and of rosapi, the actions of the
-tutorials, `tf2_msgs`. Sources: the packages' own `.srv`, `.action` and `.msg` files.
+Clients of rosbridge use these most: the services of `std_srvs` and of rosapi, the actions of the tutorials, and
+`tf2_msgs`. Sources: the packages' own `.srv`, `.action` and `.msg` files.
 """
 
 from functools import cache

@@ -47,7 +47,7 @@ class Lane:
         self.throttle = 0.0
         """Minimum seconds between two messages, 0 for none."""
         self.queue_length = queue_length
-        """Maximum of queued messages; with a throttle, 0 drops those that come too early."""
+        """Maximum number of queued messages; with a throttle, 0 drops messages that come too early."""
         self.fragment_size = 0
         """Maximum bytes of a message in one fragment, 0 for whole messages."""
         self.next_time = -inf
@@ -81,7 +81,7 @@ class Outbox:
     )
 
     def __init__(self, max_bytes: int, largest: int = 0) -> None:
-        """Bound the queue to `max_bytes`; a single payload has at most `largest`."""
+        """Bound the queue to `max_bytes` bytes; a single payload has at most `largest` bytes."""
         self._max_bytes = max_bytes
         self._largest = largest
         # All queued messages in order. `_droppable` and each lane's `queued` have the same entries of topics, in the
@@ -98,7 +98,7 @@ class Outbox:
         # Ids of fragmented messages.
         self._numbers = itertools.count(1)
         self.wire: list[bytes] | None = None
-        """Payloads of this turn for the socket; None while it accepts nothing, when everything is queued."""
+        """Payloads for the socket in this turn; None while the socket accepts nothing and everything is queued."""
         self.size = 0
         """Bytes in the queue."""
         self.undroppable = 0
@@ -107,7 +107,7 @@ class Outbox:
         """True if output that cannot be dropped exceeds the bound: the client does not read its answers.
         """
         self.deadline = inf
-        """Time of the next possible work of `release` (monotonic seconds), infinity for never."""
+        """Time at which to call `release` next (monotonic seconds), infinity for never."""
 
     def __len__(self) -> int:
         return len(self._entries) - self._gaps
@@ -119,7 +119,7 @@ class Outbox:
 
     @property
     def congested(self) -> bool:
-        """Return whether one more answer could exceed the bound, so the client must read first."""
+        """Return whether one more answer could exceed the bound: the client must read its answers first."""
         return self.undroppable > 0 and self.undroppable + self._largest > self._max_bytes
 
     def put(self, payload: bytes, fragment_size: int = 0) -> None:
@@ -150,7 +150,7 @@ class Outbox:
             wire.append(payload)
 
     def offer_all(self, lane: Lane, payloads: list[bytes], now: float) -> None:
-        """Do as `offer` for each message of a list, which costs hardly more than one while the socket accepts data."""
+        """Offer each message of a list; while the socket accepts data, many cost hardly more than one."""
         if self.wire is None or lane.throttle or lane.fragment_size or not self.empty:
             for payload in payloads:
                 self.offer(lane, payload, now)
@@ -188,7 +188,7 @@ class Outbox:
         return None
 
     def accepts(self, lane: Lane, now: float) -> bool:
-        """Return whether `offer` would keep a message, which is then worth encoding."""
+        """Return whether `offer` would keep a message now, so that it is worth encoding."""
         return not lane.throttle or bool(lane.queue_length) or (now >= lane.next_time and not lane.held)
 
     def release(self, now: float) -> None:

@@ -93,7 +93,7 @@ class Rosapi:
                 self._services[f"{kind}_{part.lower()}_details"] = details
 
     def offers(self, service: str) -> bool:
-        """Return whether a service (its absolute name) is one of these."""
+        """Return whether the hub itself offers a service, given by its absolute name."""
         return service.startswith(PREFIX) and service.removeprefix(PREFIX) in self._services
 
     def call(self, service: str, args: object) -> Values:
@@ -308,7 +308,7 @@ class Rosapi:
 
 
 def _of_type(types: Iterable[tuple[str, str]], type_name: str, normalise: Callable[[str], str]) -> list[str]:
-    """Return the names that have this type, in either form of the type's name."""
+    """Return the names, of (name, type) pairs, with this type; the type may be in the form of ROS 1 or ROS 2."""
     try:
         wanted = normalise(type_name)
     except NameFormError:

@@ -246,8 +246,8 @@ class _Hub:
     def stay_awake(self, now: float) -> None:
         """Poll the sockets for a moment after a response at `now`, if responses are prompt.
 
-        Otherwise client and hub sleep in turn while one message is on its way, and waking up takes longer than all the
-        rest. The hub does not poll for a publisher that waits for nothing, since that may need the core.
+        Without polling, client and hub sleep in turn while a message is on its way, and waking up takes longer than all
+        the rest. The hub does not poll for a publisher that waits for no response, which may need the processor core.
         """
         is_prompt, self._prompt_until = now < self._prompt_until, now + _AWAKE
         if self._is_polling:
@@ -383,7 +383,7 @@ class _Connection(WebSocketTransport):
                 self._hub.stay_awake(self.last_heard)
 
     def close_expected(self) -> None:
-        """Give the client limited time to end the connection."""
+        """Limit the time in which the client must end the connection."""
         error = self._server_protocol.parser_exc
         if error is not None and self._client is not None and not isinstance(error, EOFError):
             self._hub.warn("the connection from %s is closed: %s", self._address, error)

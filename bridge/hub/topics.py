@@ -116,8 +116,8 @@ class Topics:
     def publish_known(self, client: Client, messages: Sequence[bytes], first: int, now: float) -> int:
         """Perform `publish` operations with known envelopes: only their messages are parsed, and forwarded as received.
 
-        `messages` are any data, performed from index `first` on. The result is the index of the first one that was
-        not performed, because it must be parsed in full or exceeds a turn.
+        `messages` are any data, performed from index `first` on. Returns the index at which it stopped: at the end, at
+        data that must be parsed in full, or when the turn was over.
         """
         advertisement = client.last_published
         while advertisement is not None and first < len(messages) and self._dispatcher.work <= TURN_WORK:
@@ -321,7 +321,7 @@ class Topics:
     # --- joining and leaving
 
     def _join(self, name: str, type_name: str | None, *, type_needed: bool) -> Topic:
-        """Return the topic, created if it is new, after all checks."""
+        """Return the topic after all checks; create it if it does not exist."""
         if type_name is not None:
             split_type(type_name)
             type_name = self._definitions.name(type_name)
@@ -381,7 +381,7 @@ class Topics:
 
 
 def _learn_envelope(advertisement: Advertisement, name: str, raw: bytes) -> None:
-    """Store the bytes before a topic's messages, if they suffice to recognise its next publish operations."""
+    """Store an operation's bytes before its message, if the topic's next operations can be recognised by them."""
     client, envelope = advertisement.client, envelope_of(raw)
     if envelope and topic_of(envelope) == name:
         _forget_envelope(advertisement)

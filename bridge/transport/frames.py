@@ -36,9 +36,9 @@ _KEPT_HEADERS: Final = 4096
 _KEYS: Final = 1024
 
 UNKNOWN: Final = 0
-"""Value instead of a frame's end: the header is incomplete."""
+"""Result of `frame_end` for a frame whose header is incomplete."""
 UNSOUND: Final = -1
-"""Value instead of a frame's end: the frame is invalid, and the library must refuse it."""
+"""Result of `frame_end` for an invalid or too large frame, which the library must refuse."""
 
 
 def whole_messages(
@@ -90,7 +90,7 @@ def whole_messages(
 def only_message(data: bytes, *, masked: bool, largest: int) -> bytes | None:
     """Return the payload if the data is exactly one single-frame message, otherwise None.
 
-    This is `whole_messages` for the most frequent case.
+    It does the same as `whole_messages`, faster, in the most frequent case.
     """
     size = len(data)
     if size < _LONGEST_HEADER or data[0] not in _WHOLE:
@@ -133,7 +133,7 @@ def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
 
 
 def unmasked(payloads: Sequence[bytes]) -> bytes:
-    """Return the frames of a server for whole messages: text for JSON objects, binary for CBOR."""
+    """Return a server's frames, unmasked, for whole messages: text frames for JSON objects, binary frames for CBOR."""
     parts: list[bytes] = []
     for payload in payloads:
         headers = _TEXT_HEADERS if payload[0] == _BRACE else _BINARY_HEADERS

@@ -51,7 +51,7 @@ class WebSocketTransport(asyncio.Protocol):
     slice_bytes: ClassVar[int] = sys.maxsize
 
     def __init__(self, protocol: ClientProtocol | ServerProtocol, *, max_size: int, write_limit: int) -> None:
-        """Prepare the connection: `max_size` is that of `protocol`; `write_limit` bytes set `paused`."""
+        """Prepare the connection; `max_size` equals the protocol's. `paused` is set when `write_limit` bytes wait."""
         # Monotonic seconds of the last data from the peer, whatever it was.
         self.last_heard = time.monotonic()
         # True while messages can be sent. It copies the library's state, which takes longer to look up, after each
@@ -132,7 +132,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @property
     def is_blocked(self) -> bool:
-        """Return whether to stop reading now, because the peer causes output and does not read it."""
+        """Return whether to stop reading now, because the peer does not read the output that it causes."""
         return self._pongs_unread
 
     @property
@@ -201,7 +201,7 @@ class WebSocketTransport(asyncio.Protocol):
             self._flush()
 
     def _flush(self) -> None:
-        """Write everything that the library has to send, and copy its state."""
+        """Write everything that the library has to send, and copy its state to `is_open`."""
         self.is_open = self._protocol.state is _OPEN
         if self._held is not None:
             return  # `together` does this at its end
@@ -225,7 +225,7 @@ class WebSocketTransport(asyncio.Protocol):
         self._transport.set_write_buffer_limits(high=self._write_limit)
 
     def data_received(self, data: bytes) -> None:
-        """Handle bytes from the socket, including all answers to them."""
+        """Handle bytes from the socket, and write all answers to them."""
         self.last_heard = time.monotonic()
         at = 0
         if self._rest:

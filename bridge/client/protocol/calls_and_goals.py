@@ -210,7 +210,7 @@ class ServedServices(_Served):
         return self._wire.type_name(type_name, "srv")
 
     def answer(self, ticket: int, values: Mapping[str, Any] | str, *, ok: bool = True) -> None:
-        """Answer a request with fields, or without `ok` with a reason as text; no effect if its connection was lost.
+        """Answer a request with fields, or with a reason as text if `ok` is False; no effect after a lost connection.
 
         The reference server drops an answer whose `values` are not an object, and the caller waits for ever
         (rosbridge_library/capabilities/service_response.py, `service_response_msg_fields`), so the text is sent in an

@@ -71,10 +71,10 @@ class ClientCore:
         return self.wire.take()
 
     def receive(self, data: bytes, now: float) -> Event | None:
-        """Return the event in a WebSocket message of any content; `now` is in monotonic seconds.
+        """Return the event in a WebSocket message; `now` is in monotonic seconds.
 
-        It is None for requests that were refused here, and for messages of topics or calls that no longer
-        exist.
+        It is None for requests that were refused here, for messages of topics or calls that no longer exist,
+        and for all fragments of a message but the last. Invalid data gives an `UnusableReceived`.
         """
         # The usual case: a message of a topic that had one before.
         known, subscriptions = self.receive_known((data,), 0, 0, 0)

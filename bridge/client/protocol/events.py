@@ -27,7 +27,7 @@ class Message(NamedTuple):
         """The serialised bytes of a message of a `cbor-raw` subscription.
 
         Raises:
-            DecodeError: There are none, because the subscription or the server does not use cbor-raw.
+            DecodeError: The message has no such bytes: the subscription or the server does not use cbor-raw.
         """
         data = self.msg.get("bytes")
         if type(data) is not bytes:
@@ -39,7 +39,7 @@ class Message(NamedTuple):
 
 
 class MessageReceived(NamedTuple):
-    """A message for these subscriptions of the client."""
+    """A message, and the numbers of the client's subscriptions that get it."""
 
     topic: str
     msg: dict[str, Any]
@@ -48,7 +48,7 @@ class MessageReceived(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MessageDiscarded:
-    """A message above its topic's limit: its size, the limit, and how many there were so far."""
+    """A message above its topic's limit: its size, the limit, and the number of such messages so far."""
 
     topic: str
     size: int

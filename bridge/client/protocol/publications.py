@@ -105,7 +105,7 @@ class Publications:
         return ros1_type(type_name) in self._definitions
 
     def define(self, type_name: str, definitions: Definitions) -> None:
-        """Store a type's definition, if it is among these, and check the next message of each publication of the type."""
+        """Store a type's definitions; if the type is among them, each publication of it checks its next message."""
         self._definitions[ros1_type(type_name)] = definitions
         for advertised in self._advertised.values():
             if same_type(advertised.type, type_name):

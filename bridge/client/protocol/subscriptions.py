@@ -37,13 +37,13 @@ class Delivery:
     Attributes:
         throttle_rate: Minimum number of milliseconds between two messages.
         queue_length: Number of throttled messages that the server queues.
-        compression: `cbor` for long arrays, `cbor-raw` for only the serialised bytes. Many servers ignore an unknown
+        compression: `cbor` for long arrays, `cbor-raw` for the serialised bytes alone. Many servers ignore an unknown
             value and send JSON.
         arrays: Python type of arrays of numbers, regardless of the encoding.
         fragment_size: Maximum number of characters in a fragment; None for whole messages. Servers apply the
             last value that a client requested to everything they send to it.
         qos: Quality of service in ROS 2.
-        max_bytes: Maximum size of a message in bytes; larger ones are discarded. None for that of the connection.
+        max_bytes: Maximum size of a message in bytes; larger ones are discarded. None for the connection's limit.
     """
 
     throttle_rate: int = 0
@@ -124,8 +124,8 @@ _UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, _DEFAULT, "", sys
 class Subscriptions:
     """All subscriptions of a client.
 
-    Receiving messages is the client's busiest path: `receive_known` handles those with the envelope of an earlier one,
-    and `receive` the others, after parsing. Both use values that are computed when subscriptions change.
+    Receiving messages is the client's busiest path: `receive_known` handles messages whose envelope is known from an
+    earlier message, and `receive` all others, after parsing. Both use values computed when subscriptions change.
     """
 
     def __init__(self, wire: Wire) -> None:
@@ -211,7 +211,7 @@ class Subscriptions:
 
     @property
     def largest(self) -> tuple[str, int]:
-        """The topic with the largest message so far, and its size in bytes; 0 before the first message."""
+        """The topic with the largest message so far, and that message's size in bytes (0 before the first message)."""
         known = [(subscribed.topic, subscribed.largest) for subscribed in self._subscribed.values()]
         return max(known, key=itemgetter(1), default=("", 0))
 
@@ -251,7 +251,7 @@ class Subscriptions:
         self._wire.write(op="unsubscribe", id=subscribed.wire_id, topic=subscribed.topic)
 
     def retry_untyped(self) -> bool:
-        """Repeat subscriptions without a type to topics that have no messages yet; return whether there are any.
+        """Repeat each subscription that names no type and has had no message yet; return whether there is any.
 
         Servers drop such a subscription if they do not know the topic yet, most of them silently.
         """
@@ -271,7 +271,7 @@ class Subscriptions:
         ]
 
     def renew(self, topic: str) -> bool:
-        """Renew the subscription of a topic that is silent although published; return whether it stops asking for CBOR.
+        """Subscribe again to a published topic that is silent; return True if the subscription now changes to JSON.
 
         rosbridge for ROS 2 fixes the quality of service when it subscribes, so it gets nothing from a best-effort
         publisher that starts later. Servers fail to write some types as CBOR, so the second and later renewals request
@@ -295,8 +295,8 @@ class Subscriptions:
     ) -> tuple[list[Message], tuple[int, ...]]:
         """Decode the messages from index `first` on that have the known envelope; return them, and their subscriptions.
 
-        It ends before the first message with another envelope; there are none if `ClientCore.receive` has to handle the
-        first one.
+        Decoding stops at the first message with another envelope. If that is already the message at `first`, nothing
+        is returned, and `ClientCore.receive` must handle it.
         """
         envelope, size, topic, subscribed = self._known
         depth = self._wire.max_depth - 1  # of a message inside its operation

@@ -29,7 +29,10 @@ class Wire:
         self.sendable = max_size
 
     def type_name(self, name: str, kind: Kind = "msg") -> str:
-        """Return a type name in the form of the server's ROS version; while unknown, of ROS 1, which all servers accept."""
+        """Return a type name in the form of the server's ROS version; while that is unknown, in the form of ROS 1.
+
+        All servers accept the form of ROS 1.
+        """
         return ros2_type(name, kind) if self.ros_version == 2 else ros1_type(name)
 
     def write(self, **operation: Any) -> None:
@@ -37,7 +40,7 @@ class Wire:
         self.write_bytes(encode(operation, max_size=self.sendable, max_depth=self.max_depth))
 
     def limit(self, size: int) -> None:
-        """Refuse messages of more bytes from now on."""
+        """From now on, refuse messages of more than `size` bytes."""
         self.sendable = min(self.sendable, max(size, SMALLEST_LIMIT))
 
     def write_bytes(self, data: bytes) -> None:
