@@ -45,7 +45,7 @@ class Endpoint:
 
     @property
     def is_loopback(self) -> bool:
-        """True if only programs of this machine can reach it."""
+        """True if only programs on this machine can reach the endpoint."""
         if not self.host or self.host == "localhost":
             return True
         try:
@@ -55,7 +55,7 @@ class Endpoint:
 
     @property
     def programming(self) -> Endpoint:
-        """The programming port: `board0.program.sock` next to `board0.sock`, or the next TCP port."""
+        """The programming port of a board: `board0.program.sock` next to `board0.sock`, or the next TCP port."""
         if self.path:
             path = Path(self.path)
             return Endpoint(path=str(path.with_name(f"{path.stem}.program{path.suffix}")))

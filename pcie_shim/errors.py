@@ -60,7 +60,7 @@ class LinkTimeoutError(LinkError):
 
 
 class FramingError(LinkError):
-    """Bytes that are not a frame: another program is listening there, or the stream is damaged."""
+    """Bytes that are not a frame: another program listens at the endpoint, or the stream is damaged."""
 
 
 class CrcError(FramingError):
@@ -92,7 +92,7 @@ class GreetingMismatchError(LinkError):
 
 
 class AccessError(LinkError):
-    """An access that was refused by the board.
+    """An access that the board has refused.
 
     Attributes:
         code: The board's error code, a `register_map.ErrorCode` (or an unknown number).
@@ -110,13 +110,13 @@ class HeldError(AccessError):
 
 
 class StaleHandleError(AccessError):
-    """A handle of a board that was programmed after it was opened."""
+    """A handle of a board that was programmed again after the handle was opened."""
 
 
 class BoardError(PcieShimError):
-    """Board number `board`, from 0, of the mini-cluster, on which a frame failed, or that cannot be opened.
+    """A board of the mini-cluster, with its number `board` from 0, that cannot be opened or on which a frame failed.
 
-    `__cause__` is the LinkError or ImageError, which also decides the exit code.
+    `__cause__` is the LinkError or ImageError, whose exit code this error takes over.
     """
 
     def __init__(self, sentence: str, *, board: int, exit_code: int = 5) -> None:

@@ -1,7 +1,7 @@
 """Frames of the link, without sockets: encoding and decoding (docs/reference/boards.md has the wire format).
 
 All numbers are little-endian. The CRC covers the other 16 bytes of the header and the words. Read requests and
-replies to writes have a count and no words. The framing corresponds to the data link layer of thesis 2.3, which adds
+replies to writes have a count, but no words. The framing corresponds to the data link layer of thesis 2.3, which adds
 sequence numbers and CRCs to read and write requests. `FrameDecoder` uses one buffer as long as the link is open.
 """
 
@@ -23,13 +23,13 @@ READ: Final = 2
 WRITE: Final = 3
 """Host to board: write the payload from `address` on; acknowledged, unless posted."""
 IRQ: Final = 4
-"""Board to host: the machine has stopped; the payload is the block from DONE on, and with CAP_LINK.SENDS_RESULTS the answer."""
+"""Board to host: the machine has stopped. The payload is DONE to COMPUTE_NS; results follow if the board sends them."""
 ERROR: Final = 5
 """Board to host: the request of this sequence number was refused (`encode_error`)."""
 PROGRAM: Final = 6
 """Loader to the programming port: a part of a programming file; `address` is its offset in bytes."""
 AUTHENTICATE: Final = 7
-"""Board to host, before GREET: a challenge. The host requests with nonce and proof; the reply is the board's proof."""
+"""Board to host before GREET: a challenge. The host answers with nonce and proof, the board with its own proof."""
 
 REPLY: Final = 1
 """Flag: the answer to the request of the same sequence number."""
@@ -42,7 +42,7 @@ END: Final = 8
 
 PROTOCOL_VERSION: Final = 1
 MAX_PAYLOAD_WORDS: Final = 8448
-"""Maximum payload in words: more than INPUTS, the longest block, and than RESULTS and STREAM in one answer."""
+"""Maximum payload in words. INPUTS, the longest block, is shorter, and so are RESULTS and STREAM in one answer."""
 
 _MAGIC: Final = 0x4D42
 _HEAD: Final = struct.Struct("<HBBIII")
@@ -113,7 +113,7 @@ class FrameDecoder:
         return self._buffer[self._end :]
 
     def received(self, count: int) -> None:
-        """Account for `count` bytes at the beginning of `room`."""
+        """Record that `count` bytes were received at the beginning of `room`."""
         self._end += count
 
     def next_frame(self) -> Frame | None:
@@ -202,11 +202,11 @@ def decode_error(frame: Frame) -> tuple[int, str]:
 
 _PROGRAM_BEGIN: Final = struct.Struct("<Q32s8s")
 NO_TOKEN: Final = bytes(8)
-"""The token of a loader without a link."""
+"""The token of a loader whose host has no link to the board."""
 
 
 class ProgramBegin(NamedTuple):
-    """A loader's announcement of a file of `size` bytes; the token is that of its link to the board, or `NO_TOKEN`."""
+    """A loader's announcement of a file of `size` bytes, with its host's token from the greeting, or `NO_TOKEN`."""
 
     size: int
     sha256: bytes

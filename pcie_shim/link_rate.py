@@ -2,8 +2,9 @@
 
     frame ──▶ waits until the wire is free ──▶ occupies it for bits / rate ──▶ latency ──▶ arrives
 
-The board's side delays both what it receives and what it sends. The time is real and comes on top of what the socket
-takes; it changes no counts, and COMPUTE_NS does not contain it. Programming has its own port, which is not delayed.
+The board's side delays the frames that it receives and those that it sends. It really waits, in addition to the time
+that the socket takes. The delay changes no counts, and is not in COMPUTE_NS. Programming has its own port, which is
+not delayed.
 """
 
 import fcntl
@@ -16,18 +17,18 @@ from typing import Final
 from pcie_shim.wires import WIRES, LinkFigures, LinkRate
 
 _SPIN_NS: Final = 150_000
-"""The last nanoseconds of a wait, which are not slept, because Linux wakes a process some 60 us late."""
+"""Length of the last part of a wait, in which the CPU spins, because Linux wakes a process some 60 us late."""
 
 
 def wait_until(tick_ns: int) -> None:
-    """Return at this time of the monotonic clock, to a few microseconds; sleep if it is far away."""
+    """Wait until this time of the monotonic clock, to a few microseconds; sleep for most of a long wait."""
     while (left := tick_ns - time.monotonic_ns()) > 0:
         if left > _SPIN_NS:
             time.sleep((left - _SPIN_NS) / 1e9)
 
 
 class LinkModel:
-    """The wire to a board or, if it is shared, to all boards that are forked after its creation."""
+    """The wire to a board; a shared wire leads to all boards whose processes are forked after its creation."""
 
     def __init__(self, wire: LinkFigures, wait: Callable[[int], None] = wait_until) -> None:
         self._wire = wire
@@ -39,7 +40,7 @@ class LinkModel:
         self._lock = os.memfd_create("wire") if wire.shared else None
 
     def carry(self, size: int, sent_ns: int) -> None:
-        """Return when `size` bytes that were sent at this monotonic time have arrived."""
+        """Wait until `size` bytes that are sent at this monotonic time would have arrived."""
         if self._lock is not None:
             fcntl.lockf(self._lock, fcntl.LOCK_EX)
         leaves_ns = max(sent_ns, self._free_ns[0]) + round(8e3 * size / self._wire.mbps)

@@ -42,7 +42,7 @@ _Word: TypeAlias = Annotated[int, Field(ge=0, lt=2**32)]  # a number in a file i
 
 @dataclass(frozen=True)
 class Partition:
-    """The lines of the model on board `index`, from 0, of `count`; they begin at `line_offset`, of `total_lines`."""
+    """The lines of a model of `total_lines` lines that are on board `index` of `count`: those from `line_offset` on."""
 
     index: _Word
     count: _Word
@@ -63,7 +63,7 @@ class Image:
         build_date: Date of the build, ISO 8601.
 
     Raises:
-        ImageError: The machine is larger than the interface, or the interface than the register map, or the
+        ImageError: The machine is larger than the interface, the interface is larger than the register map, or the
             partition does not match the lines.
     """
 
@@ -119,7 +119,7 @@ class Image:
 
     @property
     def map_hash(self) -> str:
-        """SHA-256 (hex) of the register map of this software, for which the image is built."""
+        """SHA-256 (hex) of this software's register map, for which the image is built."""
         return register_map.MAP_SHA256
 
     @cached_property
@@ -176,13 +176,13 @@ class _Manifest(_Checked, Generic[_Parameters]):
 
 
 class _Named(BaseModel):
-    """The field of `_Identity` that names the kind of machine."""
+    """The only field of `_Identity` that is read at first: the name of the kind of machine."""
 
     machine: _Quoted
 
 
 class _Kind(BaseModel):
-    """The part of `_Manifest` that is read before the kind of machine is known."""
+    """The part of a `_Manifest` that is read first, to learn the kind of machine."""
 
     identity: _Named
 
@@ -193,7 +193,7 @@ def tool_version() -> str:
 
 
 def image_bytes(image: Image) -> bytes:
-    """Return the bytes of the programming file, which are always the same for the same image."""
+    """Return the bytes of an image's programming file; equal images give equal bytes."""
     sections = image.kind.sections(image.machine)
     manifest = _canonical(_manifest(image, sections).model_dump(mode="json"))
     header = _HEADER.pack(MAGIC, len(manifest), 0, hashlib.sha256(manifest).digest())
@@ -359,5 +359,5 @@ def _manifest(image: Image, sections: list[tuple[str, npt.NDArray[Any]]]) -> _Ma
 
 
 def _canonical(value: object) -> bytes:
-    """Return readable JSON, which is always the same for the same value."""
+    """Return a value as readable JSON; equal values give equal bytes."""
     return json.dumps(value, indent=1, sort_keys=True, ensure_ascii=False).encode() + b"\n"

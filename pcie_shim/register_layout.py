@@ -11,7 +11,7 @@ ALL_ONES: Final = 0xFFFFFFFF
 """The word of all ones, which every read returns if no device answers."""
 
 WORD: Final = struct.Struct("<I")
-"""One register."""
+"""A register of 32 bits."""
 
 SETTINGS: Final = struct.Struct("<IQII")
 """TARGET_COUNT, MAX_CYCLES, BANK and PRIOR_SELECT, followed by RUN_UNTIL and the doorbells."""
@@ -26,17 +26,17 @@ def next_doorbell(number: int) -> int:
 
 
 def in_field(mask: int, value: int) -> int:
-    """Return the word with a value in the field of a mask."""
+    """Return a word that has a value in the field with this mask, and zeros elsewhere."""
     return value * (mask & -mask)
 
 
 def field_of(mask: int, word: int) -> int:
-    """Return the value in the field of a mask."""
+    """Return the value of a word's field with this mask."""
     return (word & mask) // (mask & -mask)
 
 
 def register_values(fields: Mapping[str, int]) -> dict[int, int]:
-    """Return register values by address, given those of registers (`CAP_LINES`) or fields (`CAP_MACHINE.RNG`)."""
+    """Return register values by address, given values by register (`CAP_LINES`) or by field (`CAP_MACHINE.RNG`)."""
     values: dict[int, int] = {}
     for name, value in fields.items():
         register, _, field = name.partition(".")
@@ -47,5 +47,5 @@ def register_values(fields: Mapping[str, int]) -> dict[int, int]:
 
 
 def interface_room(registers: UsedRegisters) -> tuple[int, int]:
-    """Return the maximum numbers of input words and result words in the map, if the inputs use these registers."""
+    """Return how many input words and result words the map has room for, with the block `registers.inputs`."""
     return rm.BLOCKS[registers.inputs].words, rm.RESULTS.words

@@ -1,4 +1,4 @@
-"""Figures of the links to a board whose time can be modelled: rates, latencies and what is shared."""
+"""Figures of the kinds of links whose time can be modelled: rate, latency, and whether all boards share a wire."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ class LinkFigures:
 
     Attributes:
         mbps: Rate in 10^6 bits per second.
-        latency_us: Microseconds of a transfer in one direction, besides its bits.
+        latency_us: Microseconds of a transfer in one direction, in addition to the time for its bits.
         shared: True if one wire connects all boards, so that their transfers queue.
     """
 
@@ -21,7 +21,7 @@ class LinkFigures:
     shared: bool
 
     def seconds(self, size: int, transfers: int = 1) -> float:
-        """Return the time of so many bytes in so many transfers, one after another."""
+        """Return the time in seconds of `size` bytes in this many transfers, one after another."""
         return 8e-6 * size / self.mbps + 1e-6 * transfers * self.latency_us
 
 

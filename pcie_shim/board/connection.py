@@ -1,7 +1,7 @@
 """Connections to the two ports of a board: frames in order, refusals, and the proof of the key.
 
-`pcie_shim.host.socket_link` shows the frames. A connection is closed after ERROR BAD_FRAME (the bytes are not a frame,
-or it is out of order), but stays after the other refusals.
+`pcie_shim.host.socket_link` shows the frames. After ERROR BAD_FRAME (the bytes are not a frame, or the frame is out of
+order), the connection is closed; after all other refusals it stays open.
 """
 
 import hmac
@@ -23,18 +23,18 @@ from pcie_shim.register_map import ErrorCode
 SEND_S: Final = 5.0
 """Seconds after which the link of a host that does not read the board's frames is closed."""
 _TOGETHER: Final = 1 << 16
-"""Answers to requests that arrived together leave together, in pieces of about so many bytes."""
+"""Answers to requests that arrived together are collected, and sent whenever they reach this many bytes."""
 KEEPALIVE_S: Final = 5
-"""Interval of TCP keep-alive probes in seconds; three unanswered ones close the link."""
+"""Interval of TCP keep-alive probes in seconds; three unanswered probes close the link."""
 
 
 class Connection:
-    """A connection of a host or loader, which begins with the board's challenge or greeting."""
+    """A connection of a host or loader; the board's challenge or greeting is its first frame."""
 
     def __init__(
         self, connection: socket.socket, key: bytes, greeting: bytes, link: LinkModel | None = None
     ) -> None:
-        """Send the greeting, or if the board has a key, first a challenge; `link` delays the frames."""
+        """Send the greeting, or a challenge before it if the board has a key; `link` delays all frames."""
         no_delay(connection)
         if connection.family != socket.AF_UNIX:
             # a host whose machine or cable failed must not hold the board forever
@@ -87,7 +87,7 @@ class Connection:
         return self.open
 
     def answer(self, handle: Callable[[Frame], None]) -> None:
-        """Handle all complete frames with `handle`, and answer its refusals with ERROR."""
+        """Pass all complete frames to `handle`, and answer its RefusedErrors with ERROR."""
         self._answering = True
         self._handle_all(handle)
         self._answering = False
@@ -133,7 +133,7 @@ class Connection:
         self.send(reply + self._greeting)
 
     def send(self, data: bytes) -> None:
-        """Send all bytes, those for requests together; a connection that accepts none for SEND_S is closed."""
+        """Send all bytes, collecting those of one `answer`; close a connection that accepts none for SEND_S."""
         self._unsent += data
         if not self._answering or len(self._unsent) >= _TOGETHER:
             self._flush()
@@ -151,7 +151,7 @@ class Connection:
 
 
 class HostConnection(Connection):
-    """A link to a host, which holds the board from its first request on."""
+    """A link to a host, which holds the board after its first request."""
 
     def __init__(
         self,
@@ -162,7 +162,7 @@ class HostConnection(Connection):
         programmed: int,
         link: LinkModel | None,
     ) -> None:
-        """Store the token of the greeting, and the number of images loaded so far."""
+        """Store the greeting's token, and `programmed`, the number of images that the board has loaded so far."""
         super().__init__(connection, key, greeting, link)
 
         # A loader that shows this token may program the board although this host holds it: it is the same host.
@@ -176,7 +176,7 @@ class HostConnection(Connection):
 
 
 class LoaderConnection(Connection):
-    """A connection to the programming port, which programs the board from its first request on."""
+    """A connection of a loader to the programming port, which excludes other loaders after its first request."""
 
     def __init__(self, connection: socket.socket, key: bytes, greeting: bytes) -> None:
         super().__init__(connection, key, greeting)

@@ -53,18 +53,18 @@ class EmulatedBoard:
     """A board: blank until an image is loaded, then a machine with registers (docs/reference/registers.md)."""
 
     def __init__(self, make: Callable[[Any], Any] | None = None, *, sends_results: bool = True) -> None:
-        """Create a blank board; `make` returns the kernel of a machine instead of its kind.
+        """Create a blank board; `make`, if given, makes the kernel of a machine instead of `MachineKind.kernel`.
 
-        Without `sends_results`, its interrupts announce results that the host has to read, as on hardware.
+        Without `sends_results`, its interrupts do not contain the results, and the host must read them, as on hardware.
         """
         self._make = make
         self._sends_results = sends_results
         self.turned = 0.0
-        """Monotonic time at which its server last polled for requests; 0 before the first time."""
+        """Monotonic time at which the board's server last polled for requests; 0 before the first poll."""
         self.programmed = 0
         """Number of images loaded so far."""
         self.done = 0
-        """The number of the last start or resume that has stopped (register DONE)."""
+        """Doorbell number of the last start or resume after which the machine has stopped (register DONE)."""
         self.running = False
         """True while the machine is running and `step` must be called; registers are then read-only."""
 
@@ -180,9 +180,9 @@ class EmulatedBoard:
             self._allow(rm.BLOCKS[name], count, _READ_WRITE)
 
     def _measured_speed(self, image: Image, machine: BoardMachine) -> float:
-        """Return the cycles per second of the slowest frame, and leave its inputs in the registers.
+        """Return the cycles per second of the slowest frame, whose inputs stay in the registers.
 
-        It measures CPU time of the thread, so that load at this moment does not make the board appear slow for ever.
+        It measures the thread's CPU time, so that other load at this moment does not make the board appear slow.
         """
         host = image.kind.on_host([image.machine])
         course = host.begin(host.slowest())
@@ -200,7 +200,7 @@ class EmulatedBoard:
     # ---- registers ------------------------------------------------------------------------------------
 
     def read(self, address: int, count: int) -> bytes:
-        """Return `count` words from `address` on; a RefusedError if one is not in the map, or not implemented."""
+        """Return `count` words from `address` on; a RefusedError if a word is not in the map, or not implemented."""
         end = address + 4 * count
         outside = end > rm.BAR_SIZE or self._access.find(_NO_ACCESS, address >> 2, end >> 2) >= 0
         if address & 3 or not count or outside:
@@ -357,7 +357,7 @@ class EmulatedBoard:
             self._publish(BoardState.DONE, machine.reason, cycles)
 
     def _chunk_end(self, cycles: int, max_cycles: int) -> int:
-        """Return the end of the next chunk, or of the slice if that is nearer, in cycles; 0 for none."""
+        """Return the cycle at which the next chunk ends, at the latest the slice's end; 0 for the frame's end."""
         end = cycles + self._chunk
         if end - cycles > _ALIGNMENT:
             end -= end % _ALIGNMENT
@@ -365,7 +365,7 @@ class EmulatedBoard:
         return run_until if end >= max_cycles or end >= run_until > 0 else end
 
     def _publish(self, state: BoardState, reason: int, cycles: int) -> None:
-        """Write the outcome to the registers."""
+        """Write state, stop reason and cycles to the registers from DONE on."""
         status = (
             in_field(rm.STATUS_STATE_MASK, state)
             | in_field(rm.STATUS_STOP_REASON_MASK, reason)
@@ -391,4 +391,4 @@ _LONG_LOW: Final = frozenset({rm.CYCLES, rm.COMPUTE_NS})
 _DATA: Final = tuple(
     range(block, block + 4 * block.words) for block in rm.BLOCKS.values() if block >= rm.SENSORS
 )
-"""The blocks after the registers, of which a board has the words that its image uses."""
+"""Addresses of the blocks from SENSORS on; a board implements only the words of them that its image uses."""

@@ -29,7 +29,7 @@ _DETAILS: Final = {
 
 
 class RtlBoard:
-    """A board like `EmulatedBoard`, whose registers and machine are those of simulated hardware.
+    """A board like `EmulatedBoard`, but its registers and its machine are simulated hardware.
 
     While it is blank, there is no hardware, and an emulated blank board answers. If the simulation ends,
     hangs or answers garbage, a SimulationError is raised, and the board is unusable from then on.
@@ -87,7 +87,7 @@ class RtlBoard:
             raise self._preparation.error
 
     def load(self, content: bytes) -> None:
-        """Program the board, or raise a RefusedError, also if its hardware is not compiled after LOAD_S seconds."""
+        """Program the board; a RefusedError as in `Board.load`, or if the hardware is not compiled within LOAD_S."""
         if self.running:
             raise RefusedError(ErrorCode.BUSY, "the machine is running; reset it before programming")
         try:
@@ -128,7 +128,7 @@ class RtlBoard:
     # ---- registers ------------------------------------------------------------------------------------
 
     def read(self, address: int, count: int) -> bytes:
-        """Return `count` words from `address` on; a RefusedError if one is not in the map, or not implemented."""
+        """Return `count` words from `address` on; a RefusedError if a word is not in the map, or not implemented."""
         simulation = self._simulation
         if simulation is None:
             return self._blank.read(address, count)
@@ -178,7 +178,7 @@ class RtlBoard:
             raise RefusedError(ErrorCode.TOO_LONG, f"{count} words from {address:#06x} on exceed the map")
 
     def _refuse(self, address: int, *, is_first: bool) -> NoReturn:
-        """Refuse an access with the error that the hardware reports for one of its words."""
+        """Refuse an access whose word at `address` the hardware refused, with the error that the hardware reports."""
         status = self._word(rm.STATUS)
         code = ErrorCode(field_of(rm.STATUS_ERROR_MASK, status))
         if code is ErrorCode.OUTSIDE and not is_first:
@@ -226,7 +226,7 @@ class RtlBoard:
 
 
 class _Preparation(threading.Thread):
-    """The compilation and start of an image's hardware, in a thread; then there is a simulation, or an error."""
+    """The compilation and start of an image's hardware, in a thread; it ends with a simulation or an error."""
 
     def __init__(self, simulate: Callable[[Image], Simulation], image: Image) -> None:
         super().__init__(daemon=True, name="compilation")

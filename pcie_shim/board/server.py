@@ -34,7 +34,7 @@ from pcie_shim.register_map import ErrorCode
 _LOG: Final = logging.getLogger(__name__)
 
 PROGRAMMING_SILENCE_S: Final = 10.0
-"""Seconds without a frame of the loader after which another loader may program the board."""
+"""Seconds without a frame from the loader, after which another loader may program the board."""
 MAX_SILENT: Final = 16
 """Maximum number of connections without a request per port; a new one replaces the oldest."""
 
@@ -48,11 +48,11 @@ class Board(Protocol):
     """Registers and a machine, without sockets: blank until an image is loaded (docs/reference/registers.md)."""
 
     turned: float
-    """Monotonic time at which its server last polled for requests; 0 before the first time."""
+    """Monotonic time at which the board's server last polled for requests; 0 before the first poll."""
     programmed: int
     """Number of images loaded so far."""
     done: int
-    """The number of the last start or resume that has stopped (register DONE)."""
+    """Doorbell number of the last start or resume after which the machine has stopped (register DONE)."""
     running: bool
     """True while the machine is running and `step` must be called."""
 
@@ -87,7 +87,7 @@ class Board(Protocol):
         """Stop a running machine and disable interrupts, because the host has disconnected."""
 
     def close(self) -> None:
-        """End what runs outside of this process, such as a simulation."""
+        """End the board's other processes, such as a simulation."""
 
 
 class StopSignal:
@@ -257,7 +257,7 @@ class BoardServer:
         self._epoll.register(host.socket.fileno(), _READABLE)
 
     def _is_held(self) -> bool:
-        """Return whether a host holds the board, after handling the last frames of one that has disconnected."""
+        """Return whether a host holds the board; if its host has disconnected, first handle the frames that it sent."""
         host = self._host
         # the end of its connection may have arrived, and not been handled yet
         if host is not None and _has_left(host, self._access):
@@ -271,7 +271,7 @@ class BoardServer:
             self._drop_host(host)
 
     def _access(self, host: HostConnection, frame: Frame) -> None:
-        """Handle a frame of a host, which then holds the board if it is free."""
+        """Handle a frame of a host; if the board is free, the host holds it from then on."""
         operation, flags, sequence, address, count, payload = frame
         board = self.board
         if host is not self._host:

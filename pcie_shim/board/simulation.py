@@ -20,7 +20,7 @@ from pcie_shim.errors import SimulationError
 MOST_WORDS: Final = 256
 """Maximum number of words that one request reads."""
 ACCESS_CLOCKS: Final = 8
-"""Upper bound of an access in clocks, once the memories are filled."""
+"""Maximum number of clocks of an access, once the memories are filled."""
 ANSWER_S: Final = 20.0
 """Timeout of an answer in seconds, in addition to ten times the usual duration of its clocks."""
 START_S: Final = 600.0
@@ -36,11 +36,11 @@ class SimulatorAnswer(NamedTuple):
     """The answer to one request."""
 
     response: int
-    """Of an access: 0, or the error of the last word, SLVERR or DECERR. Of a run: 1 if an interrupt ended it."""
+    """For an access: 0, or the last word's error (SLVERR or DECERR). For a run: 1 if an interrupt ended it, else 0."""
     clocks: int
     """Clocks that the request took."""
     words: bytes
-    """The words that were read before a refusal, little-endian."""
+    """The words read, up to the first refused word, little-endian."""
 
 
 class Simulation:
@@ -97,11 +97,11 @@ class Simulation:
         self._execute("z", 0, 0, 2, START_S)
 
     def run(self, clocks: int) -> SimulatorAnswer:
-        """Run until an interrupt, at most this number of clocks."""
+        """Run until an interrupt, for at most this number of clocks."""
         return self._execute("c", clocks, 0, clocks)
 
     def read(self, address: int, count: int) -> SimulatorAnswer:
-        """Read up to MOST_WORDS words, ending with the first that is refused."""
+        """Read up to MOST_WORDS words, and stop at the first word that is refused."""
         answer = self._execute("r", address, count, ACCESS_CLOCKS * count)
         if len(answer.words) != 4 * count and not (answer.response and len(answer.words) < 4 * count):
             self._fail("answered a read with another number of words")

@@ -1,4 +1,4 @@
-"""A board of the mini-cluster as its host drives it: link, known contents of the registers, part of a frame."""
+"""A board of the mini-cluster as its host drives it: its link, its registers' known contents, its part of a frame."""
 
 import select
 import struct
@@ -173,7 +173,7 @@ class DrivenBoard:
 
     @property
     def open_link(self) -> SocketLink:
-        """The link of an open board; a LinkClosedError without one."""
+        """The link of an open board; a LinkClosedError if the board is not open."""
         if self.link is None:
             raise LinkClosedError(
                 f"The link to the board at {self.endpoint} is closed ({self.broken}): reopen the board"
@@ -209,7 +209,7 @@ class DrivenBoard:
         return writes
 
     def _changed_settings(self, settings: FrameSettings) -> bytes:
-        """Return the settings to write, from the first changed one to the last, and record them as known."""
+        """Return the settings from the first changed one on (empty without changes), and record them as known."""
         known = self.settings
         if settings == known:
             return b""
@@ -232,7 +232,7 @@ class DrivenBoard:
         link.post(writes)
 
     def receive(self) -> bool:
-        """Receive once, after a poll; return whether the board is done. A LinkError if it broke, or the answer is wrong."""
+        """Receive once, after a poll; return whether the board is done. Raise a LinkError for a wrong answer, too."""
         link = self.open_link
         done = link.receive_done()
         is_done = done is not None
@@ -243,7 +243,7 @@ class DrivenBoard:
         return is_done
 
     def _take(self, done: Done) -> None:
-        """Check what an interrupt says, and store it."""
+        """Check the contents of an interrupt, and store them."""
         if not self.waiting or done.number != self.number:
             raise SequenceError(
                 f"The board at {self.endpoint} answered doorbell {done.number} where {self.number} was due once"
@@ -271,8 +271,8 @@ class DrivenBoard:
         """Store the answer of a board that is done, which the interrupt carried or `ask` has requested.
 
         This host holds the board, so nobody else starts it; but a reset, or a power cycle, between the interrupt and
-        the reads would clear the results. DONE to COMPUTE_NS is therefore asked for last: if it is still what the interrupt
-        announced, the machine has stood still since, and the blocks are those of the frame.
+        the reads would clear the results. `ask` therefore reads DONE to COMPUTE_NS last: if they still equal the
+        interrupt's values, the machine has not run since, and the blocks contain this frame's results.
         """
         done = self._answered()
         words = done.results
@@ -316,5 +316,5 @@ class DrivenBoard:
 
 
 def board_error(board: DrivenBoard, error: PcieShimError) -> BoardError:
-    """Return the error of a board for an error of its link or image, to be raised from it."""
+    """Return the BoardError to raise from an error of a board's link or image."""
     return BoardError(f"Board {board.index}: {error}", board=board.index, exit_code=error.exit_code)

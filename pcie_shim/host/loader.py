@@ -17,10 +17,11 @@ PART_BYTES: Final = 4 * framing.MAX_PAYLOAD_WORDS
 def program(
     endpoint: Endpoint | str, image: Image | Path, *, timeout: float = 30.0, token: bytes = framing.NO_TOKEN
 ) -> str:
-    """Program the board whose registers are at an endpoint, and return the image hash that it reads back.
+    """Program the board with the given register endpoint, and return the image hash that the board then reports.
 
     The file and the board's register map are checked before the board is changed. Connecting, transferring the file
-    and loading the machine may each take `timeout` seconds. `token` is that of this host's link to the board, if any.
+    and loading the machine may each take `timeout` seconds. `token` comes from
+    the greeting of this host's link to the board, if it has one.
 
     Raises:
         ImageError: The file is missing, damaged, or for another register map.

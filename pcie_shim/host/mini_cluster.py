@@ -47,13 +47,13 @@ class FrameOutput:
     Attributes:
         boards: One result per board, in the order of the partition.
         register_writes_ns: Time for posting settings, sensors, starts and resumes.
-        compute_ns: Time of waiting for the boards: their computing, and the transport.
+        compute_ns: Time spent waiting for the boards: their computing time, and the transport.
         reads_ns: Time for reading the results, or for copying those that came with the interrupts.
         boards_compute_ns: Computing time of the slowest board, summed over the slices. The rest of
-            `compute_ns` is transport, or other boards on the same core.
+            `compute_ns` is transport, or waiting for other boards on the same core.
         slices: Number of slices.
         link_bytes: Bytes between the host and all boards, in both directions, with the headers of the link.
-        link_transfers: Number of transfers that they were moved in.
+        link_transfers: Number of transfers of these bytes.
     """
 
     boards: tuple[BoardResult, ...]
@@ -125,9 +125,9 @@ class MiniCluster:
     ) -> Self:
         """Open all boards: check identity, liveness and image, program blank boards, and reset the machines.
 
-        The endpoints are in the order of the partition. A board has `timeout` seconds to listen, and for each answer;
-        a frame has `slack` seconds beyond the time for its cycles at the speed of the boards. With `reprogram`, boards
-        with another image are programmed, now and whenever they are reopened, instead of being refused.
+        The endpoints are in the order of the partition. A board has `timeout` seconds to listen, and for each answer.
+        A frame may take `slack` seconds more than its cycles take at the boards' measured speed. With `reprogram`,
+        boards with another image are programmed, now and whenever they are reopened, instead of being refused.
 
         Raises:
             EndpointError: An endpoint is invalid.
@@ -173,8 +173,8 @@ class MiniCluster:
     def run(self, frame: FrameInput) -> FrameOutput:
         """Compute one frame on all boards.
 
-        After an error the frame is lost. The failed board must be reopened (`reopen`), unless it only refused
-        an access; the others are usable at once.
+        After an error the frame is lost. Unless the failed board only refused an access, it must be reopened
+        (`reopen`); the other boards are usable at once.
 
         Raises:
             FrameInputError: The frame does not fit the machine; no board was accessed.
@@ -324,7 +324,7 @@ class MiniCluster:
         )
 
     def _abandon(self) -> None:
-        """Drop the frame, and close the links of boards that are still computing it, or answering."""
+        """Drop the frame, and close the links of boards that are still computing or sending an answer."""
         self._progress = None
         # only closing its link stops a board, or drops its answers; those that are done stay open
         for board in self._boards:
@@ -333,7 +333,7 @@ class MiniCluster:
                 self._interrupted.append(board)
 
     def _fail(self, board: DrivenBoard, error: LinkError) -> NoReturn:
-        """Fail the frame because of this board, which is closed unless it only refused an access."""
+        """Raise a BoardError for this board, after closing its link unless the board only refused an access."""
         if isinstance(error, AccessError) and not isinstance(error, StaleHandleError):
             board.waiting = True  # it may have started anyway: the next frame reopens it
         else:

@@ -10,8 +10,8 @@
       │◀─ ERROR 3 ──────────────────────────────────────│   instead of the IRQ, if write 3 was refused
 
 A host with one board reads, writes and waits. A host with many boards posts to each of them, polls their
-descriptors and receives what has arrived. Every method raises `LinkError`: `AccessError` if the board refused the
-access (the link stays open), and any other error if the link is broken (it is closed).
+descriptors and receives what has arrived. Every method may raise a `LinkError`: an `AccessError` if the
+board refused the access (the link stays open), or another one if the link is broken (it is closed).
 """
 
 import hmac
@@ -55,12 +55,12 @@ class Done(NamedTuple):
     """The answer of a board when its machine has stopped.
 
     Attributes:
-        number: The number of the start or resume that has stopped.
+        number: Doorbell number of the start or resume that has ended.
         status: The STATUS register.
         cycles: Cycles run in this frame.
         compute_ns: Computing time since that start or resume, in nanoseconds.
-        results: The words of the blocks that the image names, RESULTS first, from a board that sends them; as bytes,
-            valid until the link receives again.
+        results: If the board sends results, the words of the blocks in `UsedRegisters.answer`, RESULTS first; otherwise
+            empty. The bytes are valid until the link receives again.
     """
 
     number: int
@@ -81,7 +81,7 @@ class Done(NamedTuple):
 
 
 _ENDS_S: Final = 1.0
-"""On a network, a board may learn this many seconds too late that this host's previous link has ended."""
+"""Over a network, a board may take this many seconds to notice that this host's previous link has ended."""
 _RETRY_S: Final = 0.02
 _CLOSING_CODES: Final = (ErrorCode.STALE, ErrorCode.HELD, ErrorCode.BAD_FRAME)
 
@@ -93,7 +93,7 @@ class SocketLink:
         """Connect and receive the greeting; use `open`, which also checks it."""
         self.endpoint = endpoint
         self.timeout = timeout
-        """Seconds that the board may take for an answer, and to accept data."""
+        """Maximum time in seconds for an answer of the board, and for accepting data."""
 
         # Why the link was closed, which later calls report; empty while it is open.
         self._closed = ""
@@ -172,8 +172,8 @@ class SocketLink:
             LinkUnreachableError: Nothing listens there.
             HeldError: Another host holds the board.
             KeyRefusedError: Host and board do not have the same key.
-            GreetingMismatchError: It has another protocol version, register map or BAR size.
-            LinkError: It does not greet, or is not a board.
+            GreetingMismatchError: The board has another protocol version, register map or BAR size.
+            LinkError: The peer does not greet, or is not a board.
         """
         # the greeting is the board's word; `DrivenBoard` compares the registers too
         link = cls._opened(endpoint, timeout, timeout if connect_timeout is None else connect_timeout)
@@ -235,7 +235,7 @@ class SocketLink:
         self.write_block(address, WORD.pack(value))
 
     def read_block(self, address: int, count: int) -> bytes:
-        """Read `count` words from `address` on, as little-endian bytes; a ShortReadError for fewer or more."""
+        """Read `count` words from `address` on, as little-endian bytes; a ShortReadError if fewer or more arrive."""
         self.ask([(address, count)])
         return self.answers()[0]
 
@@ -257,7 +257,7 @@ class SocketLink:
     def answers(self) -> list[bytes]:
         """Return the words of the requested blocks in order, as `read_block` does.
 
-        After an AccessError, answers to the other requests may still come: then close the link.
+        After an AccessError, close the link, because answers to the other requests may still arrive.
         """
         asked, self._asked = self._asked, []
         blocks = []
@@ -279,7 +279,7 @@ class SocketLink:
         self._send(b"".join(self._posted(framing.WRITE, address, words) for address, words in writes))
 
     def post_part(self, offset: int, part: Octets) -> None:
-        """Send a part of a programming file, from this offset on, without waiting; errors as for `post`."""
+        """Send the part of a programming file that begins at `offset`, without waiting; errors as for `post`."""
         self._send(self._posted(framing.PROGRAM, offset, part))
 
     def _posted(self, operation: int, address: int, words: Octets) -> bytes:
@@ -359,7 +359,7 @@ class SocketLink:
     # ---- receiving ------------------------------------------------------------------------------------
 
     def _receive(self, deadline: float, timeout: float, what: str) -> Frame:
-        """Return the next frame of any kind, or raise a LinkTimeoutError after the deadline."""
+        """Return the next frame of any kind; after the deadline, raise the `timeout_error` of `timeout` and `what`."""
         while (frame := self._next_frame()) is None:
             left = deadline - time.monotonic()
             # an event loop that watches the descriptor may have made it non-blocking (uvloop does)
@@ -375,7 +375,7 @@ class SocketLink:
         return frame
 
     def _fill(self) -> None:
-        """Receive once, what is there."""
+        """Receive once into the decoder, without waiting; nothing happens if no data has arrived."""
         try:
             count = self._socket.recv_into(self._decoder.room())
         except BlockingIOError:
@@ -442,7 +442,7 @@ class SocketLink:
         self._give_up(self._closed_error(error.strerror or str(error)))
 
     def timeout_error(self, timeout: float, what: str) -> LinkTimeoutError:
-        """Return the error that the board did not `what` within `timeout` seconds."""
+        """Return the error that the board did not do `what` (a verb phrase) within `timeout` seconds."""
         rest = ": a frame is incomplete" if self._decoder.inside_frame else ""
         return LinkTimeoutError(
             f"The board at {self.endpoint} did not {what} within {timeout:.3g} s{rest}: the link is closed"
@@ -464,7 +464,7 @@ class SocketLink:
             raise LinkClosedError(f"The link to the board at {self.endpoint} is closed: {self._closed}")
 
     def _limit(self, seconds: float) -> None:
-        """Set a timeout of blocking calls in the kernel, because Python's timeouts cost a system call each."""
+        """Set the socket's timeouts in the kernel, because each of Python's timeouts would cost a system call."""
         # 0 microseconds would mean no limit
         value = struct.pack("@ll", *divmod(max(1, round(seconds * 1e6)), 10**6))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
