@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from machines.kind import MachineKind
 
 FAST_CODES_MAX: Final = 2**24
-"""Maximum number of different codes, over all columns, for the fast kernel, which has a table of them."""
+"""Maximum number of codes over all columns (columns * 2**prob_bits) for the fast kernel, which has a table of them."""
 
 
 def make_kernel(machine: "BM1Machine", *, boards: int = 1) -> "BM1Kernel":
-    """Return the fastest kernel that can run the machine in a bounded memory; the boards of a process share it."""
+    """Return the fastest kernel that can run the machine; `boards` kernels of a process share one bounded cache."""
     parameters = machine.parameters
     codes = parameters.columns << parameters.prob_bits
     if parameters.shared and parameters.rng.lfsr_bits is not None and codes <= FAST_CODES_MAX:
@@ -68,7 +68,7 @@ def _bm2() -> "MachineKind":
 
 
 KINDS: Final[dict[str, Callable[[], "MachineKind"]]] = {"BM1": _bm1, "BM2": _bm2}
-"""Functions that import and return the kinds of machines, by name; the subscriber must not import NumPy."""
+"""Functions that import and return the kinds of machines, by name. Not imported here: the subscriber avoids NumPy."""
 
 
 def kind_of(parameters: object) -> "MachineKind":

@@ -16,7 +16,7 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 class MachineContents:
-    """Parameters and tables of a machine, equal to those with the same contents."""
+    """Parameters and tables of a machine; two are equal if their contents are equal."""
 
     __slots__: tuple[str, ...] = ()
     parameters: Any
@@ -96,7 +96,7 @@ class BM1Machine(MachineContents):
 
 
 SHORTEST_SLICE: Final = 256
-"""Minimum end of the first slice, in cycles; each later slice ends at twice the cycle at which the previous one ended."""
+"""Minimum end of the first slice, in cycles. Each later slice ends at twice the cycle of the previous slice's end."""
 
 
 def first_slice(target_count: int) -> int:
@@ -133,8 +133,8 @@ _SLICE: Final = StopReason.SLICE
 def joint_reason(reasons: Sequence[StopReason], halted: Collection[int] = ()) -> StopReason:
     """Return one stop reason for several replicas.
 
-    It is `SLICE` while a replica that is not halted can continue; otherwise the first of `OVERFLOW`,
-    `MAX_CYCLES` and `IMPOSSIBLE` that applies to a replica.
+    It is `SLICE` while a replica that is not halted can continue; otherwise it is the first of `OVERFLOW`,
+    `MAX_CYCLES` and `IMPOSSIBLE` that any replica has.
     """
     if _SLICE in reasons and any(
         reason is _SLICE and replica not in halted for replica, reason in enumerate(reasons)
@@ -218,7 +218,7 @@ def checked_codes(
 
 
 def checked_rng_table(given: npt.NDArray[np.uint32] | None, rng: RngKind) -> npt.NDArray[np.uint32] | None:
-    """Return `given` as a read-only uint32 array; it must exist if and only if the generator uses a table."""
+    """Return `given` as a read-only uint32 array. A generator with a table needs it; for others it must be None."""
     if rng is not RngKind.TABLE:
         if given is not None:
             raise ParameterError(f"There is a table of random numbers, but rng = {rng} does not use one.")

@@ -50,7 +50,7 @@ class BM1Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM1Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield those of the prior, of each column (each a MIF of the thesis), and of a table of random numbers."""
+        """Yield the sections of the prior, of each column (a MIF of the thesis), and of a table of random numbers."""
         yield "prior", "<u2", (parameters.prior_addresses, parameters.lines)
         if parameters.has_tables:
             for column, bits in enumerate(parameters.sensor_bits, start=1):
@@ -128,7 +128,7 @@ class BM1Kind(MachineKind):
         return _OnHost(machines)
 
     def joint_reason(self, reasons: Sequence[int]) -> int:
-        """Return one stop reason for replicas: SLICE if all of them stopped only because of other boards."""
+        """Return one stop reason for replicas: SLICE if all of them overflowed only on other boards."""
         joint = joint_reason([StopReason(reason) for reason in reasons], range(len(reasons)))
         return joint if joint is not StopReason.NONE else StopReason.SLICE
 
@@ -159,7 +159,7 @@ class BM1Kind(MachineKind):
     def posterior(
         self, machines: Sequence[BM1Machine], frame: FrameInput, _: Sequence[str] = ()
     ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
-        """Run the machines as `machines.posterior.posterior` does; there are no details."""
+        """Run the machines as `machines.posterior.posterior` does; the details are empty."""
         values = posterior(
             machines,
             frame.addresses,
@@ -282,7 +282,7 @@ class _Course(FrameCourse):
     def proceed(
         self, reasons: Sequence[Sequence[int]], _: Sequence[memoryview]
     ) -> tuple[Sequence[int], Blocks]:
-        """With `slices`, a machine that has overflowed on a board ends on all; with `own`, there is one slice."""
+        """With `slices`, a replica that has overflowed on one board ends on all; with `own`, there is one slice."""
         over = {
             replica
             for of_board in reasons
@@ -372,7 +372,7 @@ class _OnHost(HostMachine):
         return self._sensor_words.pack(*words)
 
     def _prior_selects(self, frame: FrameInput) -> tuple[int, bytes]:
-        """Return the prior's address (of several, the one farthest out of range) and the words of PRIOR_SELECTS."""
+        """Return the prior's address (of several, one out of range if there is any), and the words of PRIOR_SELECTS."""
         given = frame.prior_address
         if isinstance(given, tuple):
             if self._replicas == 1 or len(given) != self._replicas:
@@ -389,7 +389,7 @@ class _OnHost(HostMachine):
         return worst, np.array(given, dtype="<u4").tobytes() if fits else b""
 
     def _input_words(self, inputs: npt.NDArray[np.integer]) -> list[bytes]:
-        """Return the words of INPUTS for each board: with inputs per cell, those of its lines."""
+        """Return the words of INPUTS for each board; with inputs per cell, only the inputs of its lines."""
         parameters = self._parameters
         per_cell = parameters.sensor_mode is not SensorMode.COLUMN
         replicas, sensors, lines = self._replicas, parameters.sensors, self._total_lines

@@ -26,28 +26,28 @@ from machines.parameters import (
 )
 
 STATE_BITS_MAX: Final = 2048
-"""Maximum number of bits of the state: the register map has 64 words for it."""
+"""Maximum number of bits of the state: the register map has 64 words for a state."""
 
 FACTOR_BITS_MAX: Final = 20
-"""Maximum number of bits of a factor's variables: a table of 20 * 2**19 codes has 20 MB."""
+"""Maximum number of bits of all variables of a factor: then its table has 20 * 2**19 codes, or 20 MB."""
 
 RESULT_WORDS_MAX: Final = 4096
-"""Maximum number of words of histograms and joint: the result memory of the register map."""
+"""Maximum number of words of histograms and joint together: the register map's memory for results."""
 
 CHAINS_MAX: Final = 65536
 """Maximum number of boards that run chains of one model."""
 
 SAMPLES_MAX: Final = 2**32 - 1
-"""Maximum number of samples of a frame; no 32-bit histogram overflows."""
+"""Maximum number of samples of a frame, so that no 32-bit count in a histogram overflows."""
 
 CDES_MAX: Final = 8192
 """Maximum number of factors."""
 
 FACTOR_VARIABLES_MAX: Final = 32
-"""Maximum number of variables of a factor: the axes of its array."""
+"""Maximum number of variables of a factor: its array has an axis for each."""
 
 SEARCH_MAX: Final = 150_000
-"""Maximum work of the search for a start state, which takes about a second for it; it has no unit."""
+"""Maximum work, without a unit, of the search for a start state; this much takes about a second."""
 
 
 class BM2StopReason(IntEnum):
@@ -76,11 +76,11 @@ class BM2Parameters:
     Attributes:
         cardinalities: Number of values of each variable, in the model's order.
         factors: Variables of each factor, in rising order; every variable is in a factor.
-        searched: Variables whose joint is counted, slowest first.
-        known: Variables of a frame's addresses, in that order.
+        searched: Variables whose joint is counted, in the order of its axes (the first varies slowest).
+        known: Variables to which a frame's addresses belong, in the order of the addresses.
         prob_bits: Bits of a code (W), 2 to 16.
         sequencer: Default order of the sequencer.
-        literal: All CDEs are compared, as the thesis draws it, not only those whose factor has the pointed bit.
+        literal: Whether all CDEs must agree, as the thesis draws it, or only those whose factor has the pointed bit.
         sample_every: Moves after which a sample is taken.
         burn_in: Default number of whole sweeps before the first sample.
         ops_timeout: Default maximum number of cycles of a move.
@@ -218,12 +218,12 @@ class BM2Parameters:
 
     @property
     def histogram_words(self) -> int:
-        """Number of words of all histograms: one per code of every variable, also of unused codes."""
+        """Number of words of all histograms: one per code of every variable, including unused codes."""
         return sum(1 << bits for bits in self.bits)
 
     @property
     def joint_words(self) -> int:
-        """Number of words of the joint of the searched variables; 0 if it does not fit behind the histograms."""
+        """Number of words of the joint of the searched variables; 0 if there is no room for it after the histograms."""
         words = 1 << sum(self.bits[variable] for variable in self.searched) if self.searched else 0
         return words if self.histogram_words + words <= RESULT_WORDS_MAX else 0
 
@@ -251,9 +251,9 @@ class BM2Parameters:
 
     @property
     def colours(self) -> tuple[int, ...]:
-        """The colour of each variable; variables of one colour are in no common factor.
+        """The colour of each variable, a number from 0; no factor has two variables of one colour.
 
-        Variables are coloured by falling number of neighbours, and each gets the smallest colour that no neighbour has.
+        Variables with more neighbours are coloured first, and each gets the smallest colour that no neighbour has.
         """
         neighbours: list[set[int]] = [set() for _ in self.cardinalities]
         for factor in self.factors:
@@ -266,7 +266,10 @@ class BM2Parameters:
         return tuple(colours[variable] for variable in range(len(neighbours)))
 
     def moves(self, known: int, sequencer: Sequencer) -> tuple[tuple[int, ...], ...]:
-        """Return the bits of each move of a sweep, rising and without a mask of known ones; `random` draws from these."""
+        """Return the bits of each move of a sweep, in rising order, without the bits in the mask `known`.
+
+        For `random`, these are the moves from which the sequencer draws.
+        """
         if sequencer is not Sequencer.COLOURED:
             return tuple((bit,) for bit in range(self.state_bits) if not known >> bit & 1)
         unknown = [
@@ -286,7 +289,7 @@ class BM2Parameters:
 
 @lru_cache(64)
 def _layout(cardinalities: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the number of bits of each variable, and its first bit."""
+    """Return each variable's number of bits, and each variable's first bit."""
     bits = tuple((cardinality - 1).bit_length() for cardinality in cardinalities)
     return bits, tuple(accumulate(bits, initial=0))[:-1]
 
@@ -299,7 +302,7 @@ class BM2Machine(MachineContents):
         parameters: Variables, factors, widths and generators.
         tables: One uint16[n * 2**(n - 1)] per CDE whose factor has n bits: the codes at the addresses
             j * 2**(n - 1) + others, of the pointed local bit j and the other local bits.
-        supports: One bool[cardinalities of the variables] per factor: True where it is not 0.
+        supports: One bool[cardinalities of the variables] per factor: True where the factor is not 0.
         rng_table: uint32[length], the random numbers for all CDEs if `rng` is `table`; otherwise None.
 
     Raises:
@@ -344,7 +347,7 @@ class BM2Machine(MachineContents):
         factors: Sequence[npt.ArrayLike],
         rng_table: npt.NDArray[np.uint32] | None = None,
     ) -> "BM2Machine":
-        """Return the machine of a product of factors: float64[cardinalities of the factor's variables] each.
+        """Return the machine of a product of factors, each a float64[cardinalities of its variables].
 
         Raises:
             ParameterError: A factor has a wrong shape, a negative or non-finite entry, or only zeros.
@@ -383,11 +386,11 @@ class BM2Start:
 
 
 def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np.uint16]:
-    """Return the codes of a CDE: of the odds factor(bit = 1) / factor(bit = 0), for each pointed bit.
+    """Return the codes of a CDE, which stand for the odds factor(bit = 1) / factor(bit = 0) of each pointed bit.
 
-    The odds of a used code against an unused one (cardinality no power of two) are clipped towards the used one; if
-    both are unused, or another variable is at an unused code, they are 1. The factor is float64[cardinalities of the
-    variables]; the result for n bits is uint16[n * 2**(n - 1)].
+    If a cardinality is no power of two, some codes are unused. Between a used and an unused code, the odds favour the
+    used one as far as a code can; if both are unused, or another variable is at an unused code, the odds are 1. The
+    factor is float64[cardinalities of the variables]; the result for n bits is uint16[n * 2**(n - 1)].
     """
     # NaN at unused codes: what is computed with one is NaN, too
     padded = np.full([1 << (cardinality - 1).bit_length() for cardinality in factor.shape], np.nan)
@@ -405,12 +408,12 @@ def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np
 
 
 def pack(parameters: BM2Parameters, values: Sequence[int]) -> int:
-    """Return the state of one value per variable."""
+    """Return the packed state of the values, one per variable."""
     return sum(value << offset for value, offset in zip(values, parameters.offsets, strict=True))
 
 
 def unpack(parameters: BM2Parameters, state: int) -> tuple[int, ...]:
-    """Return the code of every variable in a state; with an unused code, it is no value."""
+    """Return the code of every variable in a packed state; an unused code is not a value of its variable."""
     return tuple(
         state >> offset & (1 << bits) - 1
         for offset, bits in zip(parameters.offsets, parameters.bits, strict=True)
@@ -430,8 +433,8 @@ def unpack_all(cardinalities: tuple[int, ...], states: npt.NDArray[np.uint32]) -
 def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bool = False) -> int | None:
     """Return the lexicographically smallest (or largest) state of non-zero probability; variable 0 comes first.
 
-    The evidence is the values of the known variables; without a state that agrees with it, the result is None. Every
-    other board starts from the largest state.
+    The state agrees with the evidence, the values of the known variables; if no state does, the result is None. Boards
+    with odd numbers start from the largest state.
 
     Raises:
         StartError: A value is out of range, or the search takes more than `SEARCH_MAX`.
@@ -463,7 +466,7 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
             )
 
     def propagate(domains: list[npt.NDArray[np.bool_]], changed: Sequence[int]) -> bool:
-        """Remove the values that a factor excludes, until nothing changes; return False if no value is left."""
+        """Remove values that a factor excludes, until nothing changes; return False if a variable has no value left."""
         due = dict.fromkeys(changed)  # numbers of factors that have a variable whose domain has changed
         while due:
             at, _ = due.popitem()

@@ -1,9 +1,10 @@
 """Many chains of a BM2 at a time, each with the same results as a kernel of its own, bit for bit.
 
 Chains of a small network are sliced: bit i of a vector belongs to chain i, and a cycle is a list of logical
-operations on vectors. Each CDE makes a bit in every context (values of the other bits of its factor), and a chain takes that
-of its own state; a bit is written in the chains that point at it. Chains of a large network go in step: they make the
-same move, each in cycles of its own, and 8 of them share what finds the first agreement. Others run one by one.
+operations on vectors. Each CDE makes a bit for every context (values of the other bits of its factor), and each chain
+takes the bit for the context in its own state. A bit is written in the chains that point at it. Chains of a large
+network go in step: all make the same move, each in its own cycles, and 8 chains at a time are searched for the first
+cycle in which CDEs agree. Other chains run one by one.
 """
 
 from collections.abc import Sequence
@@ -86,7 +87,7 @@ class Chains:
         self._kernels: list[BM2Kernel] = []
 
     def run(self, starts: Sequence[BM2Start]) -> tuple[ChainResult, ...]:
-        """Run a frame of every chain to its stop; starts that differ only in `state` and `bank` are fast.
+        """Run a frame of every chain to its stop; this is fast if the starts differ only in `state` and `bank`.
 
         Raises:
             StartError: There is not one start for each chain, or one does not fit; no chain has run.
@@ -107,7 +108,7 @@ class Chains:
         return tuple(results)
 
     def _run_together(self, starts: Sequence[BM2Start]) -> list[ChainResult] | None:
-        """Run the chains sliced or in step; None if they do not suit that, or if one may not draw all samples."""
+        """Run the chains sliced or in step; None if neither can run them, or if a chain may not draw all samples."""
         parameters, first, count = self._parameters, starts[0], len(starts)
         if (
             count < IN_STEP
@@ -191,7 +192,7 @@ class Chains:
     def _run_slice(
         self, circuit: _Circuit, moves: Moves, start: BM2Start, states: list[int], seeds: Words
     ) -> _Ran | None:
-        """Run 512 chains; None if one may not draw all samples."""
+        """Run up to 512 chains, sliced; None if a chain may not draw all samples."""
         parameters, unknown = self._parameters, circuit.unknown.tolist()
         lfsr, steps = LFSR(parameters.rng), parameters.steps_per_clock
         events = 1 << len(unknown)
@@ -238,7 +239,7 @@ class Chains:
         return fast.wiring_of(self._machines[0])
 
     def _run_in_step(self, moves: Moves, start: BM2Start, states: list[int], seeds: Words) -> _Ran | None:
-        """Run `IN_STEP` chains; None if one may not draw all samples."""
+        """Run `IN_STEP` chains in step; None if a chain may not draw all samples."""
         parameters, cdes, row = self._parameters, self._parameters.cdes, fast.row_size(self._parameters)
         numbers = aligned((IN_STEP, cdes, row), np.uint16)
         values, addresses, results, clock = (
@@ -260,17 +261,17 @@ class Chains:
 
 
 def _spread(value: int, bits: Sequence[int]) -> int:
-    """Return the state whose bits have those of a value."""
+    """Return the state in which bit `bits[i]` is bit i of a value, and all others are 0."""
     return sum((value >> i & 1) << bit for i, bit in enumerate(bits))
 
 
 def _vectors(bits: npt.NDArray[Any]) -> Words:
-    """Return the vectors of the bits [..., chains]: uint64[..., 8]."""
+    """Pack bits [..., chains] into vectors: uint64[..., 8]."""
     return np.packbits(bits.astype(np.bool_), axis=-1, bitorder="little").view(np.uint64)
 
 
 def _bits_of(vectors: Words) -> Integers:
-    """Return the bits of vectors: int64[..., chains]."""
+    """Unpack vectors into bits: int64[..., chains]."""
     return np.unpackbits(vectors.view(np.uint8), axis=-1, bitorder="little").astype(np.int64)
 
 
@@ -289,10 +290,10 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
     ends: Integers,
     limits: tuple[int, ...],
 ) -> bool:
-    """Run sliced chains to their ends, and set `ends`; return False if one may reach a limit before.
+    """Run sliced chains to their ends, and set `ends`; return False if a chain may reach a limit before that.
 
-    `counts` has the sweeps, which overflow at the end of the burn-in or of the chain, and the samples of each state but
-    0; `room` is for the contexts' bits or the events of a sample, and for carries.
+    `counts` has a counter of sweeps, which overflows at the end of the burn-in and of the chain, and counters of
+    samples for each state but 0. `room` is working space: for the contexts' bits or a sample's events, and for carries.
     """
     numbers, values, pointed, counts, room = vectors
     burn_in, samples, max_cycles, window, steps = limits
@@ -408,7 +409,7 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
 def _less_in_lanes(
     builder: Any, numbers: Any, row: Any, places: Any, lane: Any, codes: Any, base: Any, own: Any, first: Any
 ) -> Any:
-    """Compare the chunks at the places of 8 chains with their codes, as `less_in_chunk` does."""
+    """Compare a chunk with a code for each of 8 chains, at each chain's place in `numbers`, as `less_in_chunk` does."""
     masks = ir.Constant(ir.VectorType(lane.type, LANES), ir.Undefined)
     numbers, codes = builder.gep(numbers, [row]), builder.gep(codes, [base])
     for i in range(LANES):
@@ -427,10 +428,10 @@ def run_in_step(  # noqa: PLR0915 - vectors are not passed to functions
     vectors: tuple[Words, ...],
     limits: tuple[int, ...],
 ) -> bool:
-    """Run chains in step until their samples are drawn; return False if one may reach a limit before.
+    """Run chains in step until their samples are drawn; return False if a chain may reach a limit before that.
 
-    The rows of `clock` are the place in `numbers` of each chain's next cycle, the end of its block there, and the
-    number of the block's first cycle.
+    The rows of `clock` are, for each chain, the place of its next cycle in `numbers`, the place where its block ends,
+    and the number of the block's first cycle.
     """
     values, addresses, results, clock, room = vectors
     burn_in, samples, max_cycles, ops_timeout = limits

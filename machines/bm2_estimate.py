@@ -11,10 +11,10 @@ import numpy.typing as npt
 from machines.bm2 import BM2Parameters, BM2StopReason, unpack_all
 
 BATCHES_MIN: Final = 20
-"""Minimum number of batches from whose means the effective samples are computed."""
+"""Minimum number of batches for computing the effective samples from the batches' means."""
 
 AGREE: Final = 1.1
-"""R-hat above which boards have not seen the same distribution (Gelman and Rubin 1992)."""
+"""Maximum R-hat at which boards count as agreeing on one distribution (Gelman and Rubin 1992)."""
 
 Floats = npt.NDArray[np.float64]
 
@@ -39,13 +39,13 @@ class ChainEstimate:
     """The estimate of a frame from the chains of all boards.
 
     Attributes:
-        posterior: float64[values] of the searched joint; None if no board has a sample that counts.
+        posterior: float64[values] of the searched joint; None if all boards are left out.
         error: float64[values], the posterior's standard error; NaN where the effective samples are unknown, unless
             boards disagree.
-        effective_samples: Those of the value that has the fewest, over all boards that count; NaN if unknown, as for
-            a board whose samples all have the same value.
-        r_hat: The largest one of all values; NaN for one board, or if it is unknown.
-        left_out: Numbers of the boards that do not count: those that timed out, or have no sample.
+        effective_samples: Sum over the boards, for the value with the smallest sum; NaN if unknown, for example if
+            all samples of a board have the same value.
+        r_hat: The largest R-hat of all values; NaN for a single board, or if it is unknown.
+        left_out: Numbers of the boards that are left out, because they timed out or have no sample.
     """
 
     posterior: Floats | None
@@ -58,8 +58,8 @@ class ChainEstimate:
 def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
     """Return the counts of the searched joint's values, row-major: integers[..., product of the cardinalities].
 
-    The results are integers[..., result_words]. They must contain the joint, unless only one variable is searched:
-    then its histogram has the counts.
+    The results are integers[..., result_words]. Without a joint in them, only one variable may be searched: then its
+    histogram has the counts.
     """
     first = parameters.histogram_words
     if not parameters.joint_words:
@@ -73,7 +73,7 @@ def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer])
 
 
 def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
-    """Return the searched joint's values in a stream, uint32[samples, state_words]; -1 with a variable at an unused code."""
+    """Return the searched value of each state in a stream, uint32[samples, state_words]; -1 for unused codes."""
     codes = unpack_all(parameters.cardinalities, stream)
     values = np.zeros(len(stream), dtype=np.int64)
     for variable in parameters.searched:
@@ -84,8 +84,8 @@ def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -
 def estimate(chains: Sequence[BoardSamples]) -> ChainEstimate:
     """Return the estimate from the chains of all boards.
 
-    A board that timed out or has no sample is left out. The counts of the others are added, because all have drawn
-    as many samples; but if one ended by its maximum number of cycles, each board has the same weight.
+    Boards that timed out or have no sample are left out. The counts of the others are added, because all have drawn
+    the same number of samples. But if a board has reached its maximum number of cycles, all get the same weight.
     """
     left_out = tuple(
         board
@@ -115,16 +115,16 @@ def estimate(chains: Sequence[BoardSamples]) -> ChainEstimate:
 
 
 def standard_error(probabilities: Floats, effective: Floats | float) -> Floats:
-    """Return the standard error of probabilities that are shares of this many independent samples."""
+    """Return the standard error of probabilities that are estimated from `effective` independent samples."""
     # Laplace's rule: a value that was never seen has an error, too
     smooth = (effective * probabilities + 1) / (effective + 2)
     return np.asarray(np.sqrt(smooth * (1 - smooth) / effective))
 
 
 def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:
-    """Return the effective samples of each value's indicator, by Geyer's initial positive sequence (1992).
+    """Return the number of effective samples of each value's indicator, by Geyer's initial positive sequence (1992).
 
-    They are at most the samples; a value that is always or never there has as many. The values are
+    It is at most the number of samples, and equal to it for a value that all samples have, or none. The values are
     integers[samples] from 0 to `size` - 1; the result is float64[size].
     """
     samples = len(values)
@@ -143,11 +143,11 @@ def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:
 
 
 def batch_effective_samples(counts: npt.NDArray[np.integer]) -> Floats:
-    """Return the effective samples of each value, from the means of a chain's batches.
+    """Return the number of effective samples of each value, from the means of a chain's batches.
 
-    They are at most the samples; a value that is equally frequent in all batches has as many. The counts are
-    integers[batches, values], cumulative; the result is float64[values], NaN if fewer than `BATCHES_MIN` batches have
-    samples.
+    It is at most the number of samples, and equal to it for a value that is equally frequent in all batches. The counts
+    are integers[batches, values], cumulative; the result is float64[values], NaN if fewer than `BATCHES_MIN` batches
+    have samples.
     """
     of_batch = np.diff(counts.astype(np.float64), axis=0, prepend=0)
     of_batch = of_batch[of_batch.any(axis=1)]
@@ -166,8 +166,8 @@ def batch_effective_samples(counts: npt.NDArray[np.integer]) -> Floats:
 def split_r_hat(counts: npt.NDArray[np.integer]) -> Floats:
     """Return the split R-hat of each value's indicator (Gelman et al. 2013), from the counts of half chains.
 
-    If no half varies within itself, it is 1 where all are equal, else infinite. The counts are integers[halves,
-    values], with 2 or more samples in each half; the result is float64[values].
+    For a value that is constant within every half, R-hat is 1 if all halves agree, else infinite. The counts are
+    integers[halves, values], with 2 or more samples in each half; the result is float64[values].
     """
     n = counts.sum(axis=1, keepdims=True).astype(np.float64)
     means = counts / n
@@ -190,7 +190,7 @@ def _effective_samples_of(chain: BoardSamples) -> Floats:
 
 
 def _halves(chain: BoardSamples) -> npt.NDArray[np.integer]:
-    """Return the counts of a chain's two halves: of its samples, or of its batches without a stream."""
+    """Return the counts of each half of a chain: half of its samples, or without a stream, half of its batches."""
     counts = chain.counts
     if chain.values is not None:
         used = chain.values[chain.values >= 0]

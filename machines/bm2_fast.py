@@ -1,12 +1,13 @@
 """The fast BM2 for LFSRs, with the same results as the reference, bit for bit.
 
-A bit is written in the first cycle in which its CDEs agree. Until then the state, and so the codes, stay as they
-are: each code is compared with the numbers of 32 cycles at a time, and the first agreement is found in the masks.
+A bit is written in the first cycle in which its CDEs agree. Until then the state does not change, and so the codes do
+not either. Each code is therefore compared with the random numbers of 32 cycles at a time, which gives a mask of 32
+bits, and the masks of the CDEs show the first cycle in which they agree.
 
-The numbers of a block of cycles are kept for each CDE. A generator's number in cycle t is the XOR of its numbers in
-the cycles t - e, for the exponents e of its polynomial, since each bit of an LFSR's state shows the LFSR's sequence,
-and every 2**k-th bit of that sequence is the same sequence at another phase (`steps_per_clock` is a power of two).
-For the same reason it is the XOR of those in the cycles t - 32 * e, which makes 32 numbers at a time.
+The random numbers of a block of cycles are stored for each CDE. A generator's number in cycle t is the XOR of its
+numbers in the cycles t - e, for the exponents e of its polynomial. Reason: each bit of an LFSR's state goes through the
+LFSR's sequence, and every 2**k-th bit of that sequence is the same sequence at another phase (`steps_per_clock` is a
+power of two). For the same reason, it is the XOR of its numbers in the cycles t - 32 * e: so 32 are computed at a time.
 """
 
 from functools import lru_cache, partial
@@ -27,10 +28,10 @@ from machines.rng import LFSR, POLYNOMIALS, Words, jump_tables
 from machines.vectors import aligned, first_one, in_llvm, load, repeated, store
 
 CHUNK: Final = 32
-"""Number of cycles that are looked at together: the bits of a mask."""
+"""Number of cycles that are examined together: the bits of a mask."""
 
 STREAM_ROOM: Final = 4096
-"""Number of samples for which a stream's buffer has room at first; it grows when it must."""
+"""Initial size in samples of a stream's buffer, which grows when needed."""
 
 Integers = npt.NDArray[np.int64]
 
@@ -68,7 +69,7 @@ class Wiring(NamedTuple):
 
 
 class Moves(NamedTuple):
-    """The moves of a sweep, for an order and a set of known variables."""
+    """The moves of a sweep, for an order of the sequencer and a set of known variables."""
 
     first: Words  # [moves + 1]: place of a move's first bit in `bits`
     bits: Words
@@ -76,7 +77,7 @@ class Moves(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """A chain at the end of a cycle."""
+    """The state of a chain between two cycles."""
 
     control: Integers  # [13]
     values: Words  # [variables]: codes of the state
@@ -90,7 +91,7 @@ class Chain(NamedTuple):
 
 
 class FastBM2(BM2Kernel):
-    """A kernel that looks at many cycles at a time (thesis 2.1.3); a MachineError unless the generators are LFSRs."""
+    """A kernel that runs many cycles at a time (thesis 2.1.3); a MachineError unless the generators are LFSRs."""
 
     def __init__(self, machine: BM2Machine) -> None:
         super().__init__(machine)
@@ -184,12 +185,12 @@ def warm_up() -> None:
 
 
 def row_size(parameters: BM2Parameters) -> int:
-    """Return for how many numbers each CDE has room: a block of 32 times the LFSR's bits, and a chunk."""
+    """Return how many random numbers are stored for each CDE: a block of 32 times the LFSR's bits, and a chunk."""
     return (POLYNOMIALS[parameters.rng][0] + 1) * CHUNK
 
 
 def load_state(parameters: BM2Parameters, state: int, values: Words, addresses: Words) -> None:
-    """Write the codes of a packed state, and the local bits of every factor."""
+    """Write the codes in a packed state to `values`, and the local bits of every factor to `addresses`."""
     values[:] = unpack(parameters, state)
     bits = parameters.bits
     for cde, factor in enumerate(parameters.factors):
@@ -279,7 +280,7 @@ _NUMBERS: Final = ir.VectorType(ir.IntType(16), CHUNK)
 
 
 def compared(builder: Any, numbers: Any, place: Any, code: Any) -> Any:
-    """Compare the numbers of a chunk with a code: bit i is 1 if number `place` + i is less."""
+    """Compare the numbers of a chunk with a code: bit i is 1 if `numbers[place + i]` is less."""
     chunk = builder.load(builder.bitcast(builder.gep(numbers, [place]), _NUMBERS.as_pointer()))
     chunk.align = 2
     less = builder.icmp_unsigned("<", chunk, repeated(builder, code, _NUMBERS))
@@ -307,7 +308,7 @@ def fill(wiring: Wiring, numbers: npt.NDArray[np.uint16], generators: Words, one
 
 @jit
 def refill(exponents: Integers, numbers: npt.NDArray[np.uint16], first: int, rows: int) -> None:
-    """Replace a chain's numbers, whose first row is a place in vectors, by those of the next block."""
+    """Replace a chain's `rows` rows of numbers by the next block's; the rows begin at vector `first` of `numbers`."""
     top, near = exponents[0], exponents[2] == 2  # then the exponents are 32, 22, 2 and 1
     for row in range(first, first + rows * (top + 1), top + 1):
         last, older = load(numbers, row + top - 1), load(numbers, row + top - 2)

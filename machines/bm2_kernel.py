@@ -16,7 +16,7 @@ from machines.rng import Words, random_numbers, sequencer_seed
 class BM2Kernel(ABC):
     """A running machine: one chain of samples (thesis 2.1.3).
 
-    After each call, every kernel has the same results and state, bit for bit.
+    After the same calls, all kernels have the same results and state, bit for bit.
     """
 
     def __init__(self, machine: BM2Machine) -> None:
@@ -33,15 +33,15 @@ class BM2Kernel(ABC):
         # Set by each kernel's `_run`; counted since the frame's start.
         self.cycles = 0
         self.samples = 0
-        """Samples drawn, without those of the burn-in."""
+        """Number of samples drawn after the burn-in."""
         self.unused = 0
-        """Samples with an unknown variable at an unused code; they enter no histogram."""
+        """Number of samples with an unknown variable at an unused code; no histogram counts them."""
         self.reason = BM2StopReason.NONE
         self.timed_out_bit = -1
         """After `OPS_TIMEOUT`: the lowest-numbered bit of the move that was not written."""
         if restarts:
             self._states, self.sequencer_state = self._seeds(start.bank)
-            """The state of the sequencer's own generator, which only moves in `random` order."""
+            """The state of the sequencer's own generator, which steps only in the order `random`."""
         else:
             self._states = self.rng_state
         self._state = start.state
@@ -78,7 +78,7 @@ class BM2Kernel(ABC):
         )
 
     def start(self, start: BM2Start, pause_at: int = 0) -> BM2StopReason:
-        """Run a new frame, from its start state to a stop, or to a pause after cycle `pause_at` (0: no pause).
+        """Run a new frame from its start state, until it stops or pauses after cycle `pause_at` (0: no pause).
 
         Raises:
             StartError: The start does not fit the machine; nothing has changed.
@@ -93,7 +93,7 @@ class BM2Kernel(ABC):
         return self.reason
 
     def resume(self, samples: int, pause_at: int = 0) -> BM2StopReason:
-        """Continue the frame to a new total of samples without another burn-in, with an empty stream's buffer.
+        """Empty the stream's buffer, and continue the frame to a new total of samples, without another burn-in.
 
         Raises:
             StartError: The frame cannot be continued, or a value does not fit; nothing has changed.
@@ -109,7 +109,7 @@ class BM2Kernel(ABC):
         return self._continue(pause_at)
 
     def step(self, pause_at: int = 0) -> BM2StopReason:
-        """Continue after a pause; a StartError, and no change, without a pause or a later `pause_at`."""
+        """Continue after a pause; if the frame is not paused, or `pause_at` is not later, raise a StartError."""
         if self.reason is not BM2StopReason.PAUSED:
             raise StartError(
                 f"The machine is not paused: it has stopped with reason {self.reason.name.lower()}."
@@ -127,7 +127,7 @@ class BM2Kernel(ABC):
 
     @abstractmethod
     def _load(self, start: BM2Start) -> None:
-        """Prepare the frame; state, results, stream's buffer and generators are those of its start."""
+        """Prepare the frame: set state, results, the stream's buffer and the generators as at its start."""
 
     @abstractmethod
     def _empty_stream(self) -> None:
@@ -135,7 +135,7 @@ class BM2Kernel(ABC):
 
     @abstractmethod
     def _run(self, pause_at: int) -> None:
-        """Run one cycle or more, up to a stop; sets the public attributes."""
+        """Run at least one cycle, until the frame stops or pauses; set the public attributes."""
 
 
 def check_bm2_start(parameters: BM2Parameters, start: BM2Start) -> None:

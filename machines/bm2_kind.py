@@ -31,13 +31,13 @@ from machines.kind import (
 from machines.parameters import CYCLES_MAX, RngKind, RngReset, SampleEvery, Sequencer
 
 STREAM_WORDS_MAX: Final = 4096
-"""Maximum number of words of the stream's buffer: the window of the register map."""
+"""Maximum number of words of the stream's buffer: the size of the block STREAM in the register map."""
 
 BATCHES: Final = 20
-"""Parts of a frame without a stream, whose means tell how much the samples depend on each other."""
+"""Number of batches of a frame without a stream. Their means show how much the samples depend on each other."""
 
 STREAM_BYTES_MAX: Final = 3 << 20
-"""Maximum size of the streams of a frame, of all boards together: its result is one message between services."""
+"""Maximum size in bytes of a frame's streams, of all boards together: one message between services carries them."""
 
 _STARTS_KEPT: Final = 4096  # start states that a host remembers
 _ORDERS: Final = tuple(Sequencer)
@@ -63,7 +63,7 @@ class BM2Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM2Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield those of each CDE, of the non-zero entries of each factor, and of a table of random numbers."""
+        """Yield the sections of each CDE, of each factor's non-zero entries, and of any table of random numbers."""
         for at in range(parameters.cdes):
             bits = len(parameters.factor_bits(at))
             yield f"cde {at}", "<u2", (bits << bits >> 1,)
@@ -80,7 +80,7 @@ class BM2Kind(MachineKind):
         return BM2Machine(parameters, tables, supports, sections.get("rng"))
 
     def registers(self, parameters: BM2Parameters) -> UsedRegisters:
-        """Return the registers; the line of a board is its chain."""
+        """Return the registers; a board's chain counts as its only line."""
         words = parameters.state_words
         if parameters.stream * words > STREAM_WORDS_MAX:
             raise ParameterError(
@@ -118,7 +118,7 @@ class BM2Kind(MachineKind):
         )
 
     def contents(self, machine: BM2Machine) -> Blocks:
-        """Return the parameters of a frame that a host may overwrite."""
+        """Return the default settings of a frame, which a host may overwrite."""
         return _settings_blocks(machine.parameters)
 
     def kernel(self, machine: BM2Machine) -> BM2Kernel:
@@ -207,7 +207,7 @@ def _settings_blocks(parameters: BM2Parameters) -> Blocks:
 def _start_of(
     parameters: BM2Parameters, blocks: Mapping[str, bytes | memoryview], settings: FrameSettings
 ) -> BM2Start:
-    """Return the start that a host writes to the blocks of a board, some of which have room for a larger state."""
+    """Return the start that a host has written to a board's blocks, some of which are longer than the state."""
 
     def value(block: str) -> int:
         # a frame without a start state has no words for it
@@ -229,7 +229,7 @@ def _start_of(
 
 
 def kernels_of(machines: Sequence[BM2Machine]) -> list[BM2Kernel]:
-    """Return the kernels for `run_batches`; a stream changes nothing but the way of the samples to the host."""
+    """Return the kernels for `run_batches`. They have no stream, which would not change the samples."""
     return [
         make_bm2_kernel(replace(machine, parameters=replace(machine.parameters, stream=0)))
         for machine in machines
@@ -237,7 +237,7 @@ def kernels_of(machines: Sequence[BM2Machine]) -> list[BM2Kernel]:
 
 
 def run_batches(kernels: Sequence[BM2Kernel], frame: FrameInput) -> list[BoardResult]:
-    """Run a frame on the kernels of all boards, in the batches in which boards run it; a StartError if it does not fit."""
+    """Run a frame on the kernels of all boards, in batches as on boards; a StartError if the frame does not fit."""
     starts, settings = _OnHost([kernel.machine for kernel in kernels]).starts(frame)
     first, *others = _batch_ends(settings.target_count)
     results = []
@@ -257,12 +257,12 @@ def run_batches(kernels: Sequence[BM2Kernel], frame: FrameInput) -> list[BoardRe
 
 
 def _batch_ends(samples: int, batches: int = BATCHES) -> list[int]:
-    """Return the samples at which each batch ends; there are fewer batches if there are few samples."""
+    """Return the number of samples after which each batch ends; few samples have fewer batches."""
     return sorted({samples * (at + 1) // batches for at in range(batches)} - {0}) or [0]
 
 
 class _OnBoard(BoardMachine):
-    """A kernel that reads state, mask and settings from their blocks, and writes the blocks of its answer."""
+    """A kernel that reads start state, mask and settings from a board's blocks, and writes its answer to others."""
 
     def reset(self) -> None:
         self._kernel.reset()
@@ -311,10 +311,11 @@ class Kept(msgspec.Struct, array_like=True):
     """The record of one board's chain in a frame, in addition to its last result words.
 
     Attributes:
-        samples: Samples drawn so far.
-        unused: Those of them that are in no histogram.
-        timed_out_bit: The bit on which the CDEs did not agree; -1: none.
-        batches: The result words at the end of each batch without a stream; in a `BoardResult` without the last ones.
+        samples: Number of samples drawn so far.
+        unused: Number of samples that no histogram counts.
+        timed_out_bit: The bit on which the CDEs did not agree; -1 for none.
+        batches: Without a stream, the result words at the end of each batch; in a `BoardResult`, the last batch's
+            are left out.
         stream: The sampled states, `state_words` words each.
     """
 
@@ -385,7 +386,7 @@ class _Course(FrameCourse):
     def proceed(
         self, reasons: Sequence[Sequence[int]], answers: Sequence[memoryview]
     ) -> tuple[Sequence[int], Blocks]:
-        """Resume with the next batch the boards that have drawn all samples, and those whose streams are full."""
+        """Resume the boards whose streams are full, and for the next batch those that have drawn all samples."""
         going = {BM2StopReason.FULL} if not self._targets else {BM2StopReason.FULL, BM2StopReason.SAMPLES}
         for number in self._running:
             self._kept[number].add(answers[number])
@@ -395,7 +396,7 @@ class _Course(FrameCourse):
         return self._running, {}
 
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:
-        """Add what is known of the chains."""
+        """Add the records of the chains (`Kept`) to the results."""
         for kept in self._kept:
             del kept.batches[-1:]
         return [
@@ -417,7 +418,7 @@ class _OnHost(HostMachine):
         self._starts = lru_cache(_STARTS_KEPT)(self._blocks_of)
 
     def begin(self, frame: FrameInput) -> FrameCourse:
-        """Return the course of a frame; its boards start from the smallest and the largest state by turns."""
+        """Return the course of a frame; boards start alternately from the smallest and the largest state."""
         return _Course(*self.starts(frame), self._machines)
 
     def starts(self, frame: FrameInput) -> tuple[Sequence[Blocks], FrameSettings]:
@@ -448,7 +449,7 @@ class _OnHost(HostMachine):
         return FrameInput(addresses=known, target_count=samples, max_cycles=CYCLES_MAX)
 
     def _blocks_of(self, addresses: tuple[int | None, ...]) -> list[Blocks] | str:
-        """Return the blocks of each board for these readings; none if their probability is 0; or why there are none."""
+        """Return the blocks of each board; none if the readings have probability 0, or an error's text."""
         parameters = self._parameters
         if len(addresses) != len(parameters.known):
             raise StartError(

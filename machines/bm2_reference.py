@@ -79,7 +79,7 @@ class ReferenceBM2(BM2Kernel):
         return reason
 
     def _stochastic_bits(self, bit: int, random: list[int]) -> set[int]:
-        """Return the different bits that the compared CDEs make for a pointed bit."""
+        """Return the set of bits that the compared CDEs make for a pointed bit: one element if they agree."""
         concerned = self._concerned[bit]
         bits = {int(random[cde] < self._code(cde, bit)) for cde in concerned}
         if self._parameters.literal:
@@ -88,14 +88,14 @@ class ReferenceBM2(BM2Kernel):
         return bits
 
     def _code(self, cde: int, bit: int) -> int:
-        """Return the code in a CDE's table: at the pointed local bit, and at the values of the others."""
+        """Return the code in a CDE's table for the pointed local bit, at the values of the factor's other bits."""
         local_bits = self._factor_bits[cde]
         others = [self._state >> other & 1 for other in local_bits if other != bit]
         address = local_bits.index(bit) << len(others) | sum(value << at for at, value in enumerate(others))
         return int(self.machine.tables[cde][address])
 
     def _end_move(self) -> BM2StopReason:
-        """Take a sample if one is due, and point at the next bits."""
+        """Take a sample if this move ends with one, and point at the next bits."""
         ends_sweep = self._move == len(self._moves) - 1
         sampled = self._burn_in == 0 and (ends_sweep or self._parameters.sample_every is SampleEvery.MOVE)
         if sampled:

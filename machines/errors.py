@@ -18,6 +18,6 @@ class StartError(MachineError):
 
 
 class NoPosteriorError(MachineError):
-    """Raised if all counts are 0 for the readings, so that they cannot be normalised."""
+    """Raised if all counts are 0 for the readings, so that the counts cannot be normalised."""
 
     exit_code: ClassVar[int] = 4

@@ -37,17 +37,17 @@ from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
 from machines.rng import LFSR, LFSRNumbers, Words, jump_tables
 
 KEPT_BYTES: Final = 64 * 2**20
-"""Maximum size of the cache of a machine, in bytes; the system allocates only the used part."""
+"""Maximum size of a machine's cache in bytes; the operating system allocates only the part in use."""
 
 KEPT_CYCLES: Final = 2**17
-"""Number of cycles after which words are no longer cached."""
+"""Number of a frame's first cycles whose words may be cached."""
 
 PREPARED_CYCLES: Final = 2**14
 """Number of a frame's first cycles whose words `prepare` computes."""
 
 
 class FastBM1(BM1Kernel):
-    """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4); the cache may be of size 0.
+    """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4); it also runs without a cache.
 
     Raises:
         MachineError: The generators of the machine are not LFSRs, or are not shared.
@@ -102,7 +102,7 @@ class FastBM1(BM1Kernel):
 
     @property
     def kept_cycles(self) -> int:
-        """Number of a frame's first cycles, in every bank, whose words are cached."""
+        """Number of first cycles of a frame, in each bank, for which the cache has room."""
         return 0 if self._of_frame else self._kept_blocks * BLOCK_CYCLES
 
     def prepare(self) -> None:
@@ -160,7 +160,7 @@ class FastBM1(BM1Kernel):
         self._take_outcome()
 
     def _take_outcome(self) -> None:
-        """Set cycles and reasons from the frame's outcome; a halted replica keeps its previous ones."""
+        """Set cycles and reasons from the frame's outcome; halted replicas keep their previous cycles and reasons."""
         for replica, (live, _, cycles, overflow) in enumerate(self._frame.outcome.tolist()):
             self._cycles[replica] = cycles
             if live == 0:
@@ -173,7 +173,7 @@ class FastBM1(BM1Kernel):
                 self._reasons[replica] = StopReason.SLICE
 
     def _free_rows(self) -> None:
-        """Free the rows assigned by the last frame, and their words; the rows of the cache remain."""
+        """Free the rows, with their words, that the last frame was assigned; the rows of the cache remain."""
         if not self._rows:
             return
         assigned = self._store.row_column[: self._rows], self._store.row_code[: self._rows]
@@ -221,6 +221,6 @@ def _occurring_codes(machine: BM1Machine) -> npt.NDArray[np.bool_]:
 
 
 def _blocks_in(kept_bytes: int, rows: int) -> int:
-    """Return how many blocks of this many rows fit into the memory."""
+    """Return how many blocks of `rows` rows fit into `kept_bytes` bytes."""
     block_bytes = max(rows, 1) * (BLOCK_WORDS * WORD_BITS // 8 + 1)
     return min(kept_bytes // block_bytes, KEPT_CYCLES // BLOCK_CYCLES)

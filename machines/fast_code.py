@@ -1,6 +1,6 @@
 """Compiled functions of the fast kernel, which compute and count the words of a block, and their arrays.
 
-They are in one file because numba recompiles when this file changes, but not when an imported one does.
+They are in one file because numba recompiles a function when its own file changes, but not an imported file.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ def jit(function: _Function) -> _Function:
 
 
 class Generators(NamedTuple):
-    """Steps of the LFSRs of all columns, as linear maps of a state."""
+    """The steps of an LFSR as linear maps of its state, which all columns share."""
 
     jumps: Words  # [bits, bits / 8, 256]: the state 2**i clocks later
     bits: Words  # [prob_bits, bits / 4, 16, BLOCK_WORDS]: the next block of each output bit
@@ -124,7 +124,7 @@ def make_frame(parameters: BM1Parameters, rows: int) -> _Frame:
 
 @cache
 def bit_tables(kind: RngKind, steps_per_clock: int, prob_bits: int) -> Words:
-    """Return the map from state to output bits of a block: uint64[prob_bits, bits / 4, 16, BLOCK_WORDS].
+    """Return the map from a state to the output bits in the next block: uint64[prob_bits, bits / 4, 16, BLOCK_WORDS].
 
     Unlike `machines.rng.map_tables`, it has a table per 4 bits of the state, so that all tables fit into the
     processor's first caches.
@@ -160,7 +160,7 @@ _ALL: Final = np.uint64(2**64 - 1)
 
 @jit
 def image(maps: Words, which: int, state: np.uint64) -> np.uint64:
-    """Return the image of a state under one of several linear maps."""
+    """Return the image of a state under linear map number `which`."""
     found = _0
     for byte in range(maps.shape[1]):
         found ^= maps[which, byte, state & _BYTE]
@@ -170,7 +170,7 @@ def image(maps: Words, which: int, state: np.uint64) -> np.uint64:
 
 @jit
 def jump(jumps: Words, states: Words, clocks: int, later: Words) -> None:
-    """Write the states after `clocks` more clocks; `clocks` has at most as many bits as a state."""
+    """Write the states after `clocks` more clocks to `later`; `clocks` has at most as many bits as a state."""
     for column in range(states.shape[0]):
         state = states[column]
         for bit in range(jumps.shape[0]):
@@ -190,10 +190,10 @@ def _select(
     new_rows: bool,
     rows: int,
 ) -> int:
-    """Find a replica's lines that can count and the rows to AND for each, and clear their counters.
+    """Find a replica's lines that can count, and for each the rows to AND; clear their counters.
 
-    With `new_rows`, a code without a row gets the next one, from `rows` on. Returns the number of assigned
-    rows.
+    With `new_rows`, each code without a row is assigned the next free row, from `rows` on. Returns the number of
+    assigned rows.
     """
     columns, lines = codes.shape
     numbers, places, widths = frame.lines[replica], frame.places[replica], frame.widths[replica]
@@ -254,7 +254,7 @@ def _show(generators: Generators, frame: _Frame, clocks: int) -> None:
 
 @jit
 def _fill(code: int, inverted: Words, words: Words, row: int) -> None:
-    """Compute a row of a block for a code in a column: random number < code, from the lowest bit to the highest."""
+    """Compute a code's row in a block: ones in the cycles whose number is less, found from the lowest bit up."""
     less = splat(_0)
     for bit in range(inverted.shape[0]):
         zeros = load(inverted, bit)
@@ -265,7 +265,7 @@ def _fill(code: int, inverted: Words, words: Words, row: int) -> None:
 
 @jit
 def _count(words: Words, places: npt.NDArray[np.uint32], line: int, width: int, mask: Words) -> int:
-    """Count the ones of a line in a block, which are those in the AND of its rows and the mask."""
+    """Count a line's ones in a block: the ones in the AND of its rows and the mask."""
     made = load(mask, 0)
     for i in range(width):
         made = made & load(words, places[line, i])
@@ -276,7 +276,7 @@ def _count(words: Words, places: npt.NDArray[np.uint32], line: int, width: int, 
 def fill_blocks(
     generators: Generators, store: _Store, frame: _Frame, first_slot: int, blocks: int, period: int
 ) -> None:
-    """Compute the words of all codes for the first blocks of a bank, from the states in `frame.starts`."""
+    """Compute the words of all codes for a bank's first `blocks` blocks, from the states in `frame.starts`."""
     for block in range(blocks):
         words = store.words[first_slot + block]
         filled = store.filled[first_slot + block]
@@ -304,7 +304,7 @@ def _mask(first: int, end: int, mask: Words) -> None:
 def _cycle_of(
     words: Words, places: npt.NDArray[np.uint32], width: int, mask: Words, line: int, nth: int
 ) -> int:
-    """Return the cycle in a block in which a line makes its `nth` one (from 1) under the mask; it must exist."""
+    """Return the cycle of a block in which a line makes its `nth` one (from 1) under the mask; that one must exist."""
     word = 0
     while True:
         made = mask[word]
@@ -332,7 +332,7 @@ def _run(
     kept_blocks: int,
     period: int,
 ) -> None:
-    """Run a replica from its cycle to `limit`, or to the cycle in which a counter reaches the target."""
+    """Run a replica from its present cycle to `limit`, or until a counter reaches the target."""
     outcome, places, widths = frame.outcome[replica], frame.places[replica], frame.widths[replica]
     sums, used_rows, added, mask = frame.sums[replica], frame.used[replica], frame.added, frame.mask
     live, used, cycles = outcome[LIVE], outcome[USED], outcome[CYCLES]
@@ -421,6 +421,6 @@ def resume(
     kept_blocks: int,
     period: int,
 ) -> None:
-    """Continue the remaining replicas."""
+    """Run the next slice of the replicas `going`; the result is in `frame.outcome`."""
     for replica in going:
         _run(generators, store, frame, replica, limit, target_count, first_slot, kept_blocks, period)

@@ -28,7 +28,7 @@ class BM1Kernel(ABC):
 
     @property
     def cycles(self) -> int:
-        """Cycles of this frame: those of the generators and of the longest-running replica."""
+        """Cycles of this frame that the generators, and the longest-running replica, have run."""
         return max(self._cycles)
 
     @property
@@ -107,11 +107,11 @@ class BM1Kernel(ABC):
 
     @abstractmethod
     def _start(self, start: Start) -> None:
-        """Run the first slice of a checked start; sets cycles and reasons."""
+        """Run the first slice of a start that was checked; set cycles and reasons."""
 
     @abstractmethod
     def _resume(self, going: list[int], run_until: int) -> None:
-        """Run the next slice of these replicas; sets their cycles and reasons."""
+        """Run the next slice of the replicas `going`; set their cycles and reasons."""
 
     def _check_resume(self, run_until: int, halted: Collection[int], halts: Collection[int]) -> None:
         replicas = len(self._reasons)
@@ -164,7 +164,7 @@ def check_start(parameters: BM1Parameters, start: Start) -> None:
 
 
 def _are_plain_addresses(parameters: BM1Parameters, given: object) -> bool:
-    """Return whether the inputs are one integer per column, all in range; this is the fast path for most frames."""
+    """Return whether the inputs are one integer per column, all in range: a fast check, enough for most frames."""
     if type(given) is not tuple or parameters.input_shape != (len(given),):
         return False
     for address, bits in zip(given, parameters.sensor_bits, strict=True):  # noqa: SIM110 - all() of a generator would slow every frame

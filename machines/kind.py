@@ -5,8 +5,8 @@
     proceed(answers) ─ settings, blocks ───▶ resume ─▶ step, step, ... ─┤ until `proceed` resumes no board
     infer(results) ◀── results, cycles, reasons ────────────────────────┘
 
-Register words travel by the name of their block in the register map. This folder knows the names and what the
-words mean to a machine; `pcie_shim` knows the addresses.
+Words of registers are exchanged by the name of their block in the register map. This folder knows the names, and what
+the words mean to a machine; `pcie_shim` knows the addresses.
 """
 
 from abc import ABC, abstractmethod
@@ -36,15 +36,15 @@ class FrameInput:
         addresses: One table address per sensor column, in the order of the model; None for a missing reading.
             With inputs per cell or replicas: an array of integers in the `input_shape` of the whole machine,
             addresses or codes, with -1 in all lines of a missing reading.
-        prior_address: Row of the prior's table (prior select); with replicas one for all, or a tuple with one
-            for each.
+        prior_address: Row of the prior's table (prior select); with replicas one row for all, or a tuple with a
+            row for each.
         prior_codes: uint16[total lines], a written prior; with replicas the same for all, or uint16[replicas, total
-            lines]; None: the image's own.
+            lines]. None for the prior in the image.
         target_count: Count that stops the machines (thesis figure 3.3: number of target samples).
         max_cycles: Maximum number of cycles.
         bank: Set of seeds from which the RNGs restart.
         stop: `slices`: all boards stop at the end of the slice in which the first one overflows; `own`: each
-            independently.
+            board stops independently.
     """
 
     addresses: tuple[int | None, ...] | npt.NDArray[np.integer]
@@ -70,11 +70,11 @@ class BoardResult(msgspec.Struct, frozen=True, array_like=True, tag="board"):
 
     Attributes:
         words: The result words, 32 bits each, little-endian, as received; replica after replica.
-        cycles: Cycles of its machine; with replicas, of the longest-running one.
+        cycles: Cycles of the board's machine; with replicas, of the longest-running one.
         reason: Stop reason, a key of `MachineKind.reasons`; with replicas, their `joint_reason`.
         replica_cycles: Cycles of each replica; empty if the board has a single machine.
         replica_reasons: Stop reason of each replica; empty if the board has a single machine.
-        kept: What the course of the frame has kept for `MachineKind.infer`, in a form of the kind.
+        kept: Further results that `FrameCourse.conclude` adds for `MachineKind.infer`, encoded as the kind chooses.
     """
 
     words: bytes
@@ -102,8 +102,8 @@ class Inference(NamedTuple):
         totals: The sum of the counts of each board.
         outcome: `posterior`, or the reason why there is none, or why it is biased.
         details: Further values for the report of the frame, by their keys.
-        samples: The machine's states that were sampled, one after the other; empty if the kind or the image has none.
-        sample_bytes: Length of each of them.
+        samples: The sampled states of the machine, concatenated; empty if the kind or the image has no stream.
+        sample_bytes: Length of each sampled state in bytes.
     """
 
     boards: Sequence[BoardResult]
@@ -126,13 +126,13 @@ class UsedRegisters:
 
     Attributes:
         lines: Lines of the model on the board.
-        part: Number of the board and of all boards, where the parameters say so; None otherwise.
+        part: Number of the board, and number of all boards, if the parameters contain them; otherwise None.
         replicas: Machines on the board.
         inputs: Name of the block of inputs.
-        input_words: Inputs of all replicas, in words.
-        result_words: Results of all replicas, in words of the block RESULTS.
-        written: Words of the other blocks that a host may write, by name.
-        answer: Words of the blocks that a board sends when it has stopped, by name: RESULTS, then others.
+        input_words: Number of input words of all replicas.
+        result_words: Number of words of the block RESULTS, for all replicas.
+        written: Number of words of each other block that a host may write, by name.
+        answer: Number of words of each block that a stopped board sends, by name: RESULTS, then others.
         capabilities: Values of the capability registers (`CAP_LINES`) or their fields (`CAP_MACHINE.KIND`), by name.
         size: The size of the machine, described for a user.
     """
@@ -174,7 +174,7 @@ class BoardMachine(ABC):
 
     @abstractmethod
     def resume(self, end: int) -> None:
-        """Run the next slice of the frame; a StartError as for `start`."""
+        """Run the next slice of the frame, or raise a StartError as `start` does."""
 
     @abstractmethod
     def step(self, end: int) -> None:
@@ -207,8 +207,8 @@ class FrameCourse(ABC):
     Attributes:
         starts: For each board the blocks to write before the start.
         settings: The settings of the slice, for all boards.
-        begun: First cycle of the slice.
-        end: Last cycle of the slice; 0 for that of the frame.
+        begun: Cycle after which the slice begins.
+        end: Last cycle of the slice; 0 if it ends with the frame.
     """
 
     starts: Sequence[Blocks]
@@ -222,12 +222,12 @@ class FrameCourse(ABC):
     ) -> tuple[Sequence[int], Blocks]:
         """Return the numbers of the boards to resume (none: the frame is over), and the blocks to write before that.
 
-        It takes the last stop reasons of each board's replicas, and each board's words of `UsedRegisters.answer`, which
-        are valid until it is resumed.
+        `reasons` are the last stop reasons of each board's replicas. `answers` are each board's words of
+        `UsedRegisters.answer`, valid until that board is resumed.
         """
 
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:
-        """Return the results of the frame with what the course has kept of its slices."""
+        """Return the results of the frame, with what the course has stored of its slices in `BoardResult.kept`."""
         return results
 
 
@@ -246,7 +246,7 @@ class HostMachine(ABC):
 
     @abstractmethod
     def slowest(self) -> FrameInput:
-        """Return the frame that takes the most time per cycle, to measure the speed of a board."""
+        """Return the frame that takes the most time per cycle, for measuring the speed of a board."""
 
 
 class MachineKind(ABC):
@@ -256,7 +256,7 @@ class MachineKind(ABC):
         name: Its name in programming files and deployments.
         has_hardware: True if there is VHDL of such machines.
         parameters: The type of its parameters: a dataclass.
-        reasons: Its stop reasons by the number in the status register, in words for users; 0 is not started.
+        reasons: Its stop reasons, in words for users, by their number in the status register; 0 means not started.
     """
 
     name: ClassVar[str]
@@ -277,7 +277,7 @@ class MachineKind(ABC):
 
     @abstractmethod
     def machine(self, parameters: Any, sections: Mapping[str, npt.NDArray[Any]]) -> Any:
-        """Return the machine of a file; a MachineError if it cannot be built."""
+        """Return the machine with a file's parameters and sections; a MachineError if it cannot be built."""
 
     # ---- board ----------------------------------------------------------------------------------------
 
@@ -287,7 +287,7 @@ class MachineKind(ABC):
 
     @abstractmethod
     def contents(self, machine: Any) -> Blocks:
-        """Return the contents of registers after programming, except `UsedRegisters.capabilities`."""
+        """Return what programming writes to the registers, besides `UsedRegisters.capabilities`."""
 
     @abstractmethod
     def kernel(self, machine: Any) -> Any:
@@ -295,16 +295,16 @@ class MachineKind(ABC):
 
     @abstractmethod
     def on_board(self, kernel: Any, memory: Mapping[str, memoryview]) -> BoardMachine:
-        """Return a kernel behind the registers of a board: `memory` has every block of the map by name."""
+        """Return a board's machine, which runs a kernel on registers: `memory` has every block of the map by name."""
 
     # ---- host -----------------------------------------------------------------------------------------
 
     @abstractmethod
     def on_host(self, machines: Sequence[Any]) -> HostMachine:
-        """Return the machines of all boards, in the order of the partition, as their driver sees them."""
+        """Return the host's view of the machines of all boards, which are in the order of the partition."""
 
     def joint_reason(self, reasons: Sequence[int]) -> int:
-        """Return one stop reason for the replicas of a board whose frame is over: that of a single machine."""
+        """Return one stop reason for a board's replicas after a frame. Kinds without replicas have only one."""
         return reasons[0]
 
     @abstractmethod
@@ -321,6 +321,6 @@ class MachineKind(ABC):
         """Run the machines of all boards in this process, each to its own stop, and return the posterior and the details.
 
         Raises:
-            NoPosteriorError: There is none for these readings.
+            NoPosteriorError: The readings give no posterior.
             StartError: The frame does not fit the machines.
         """

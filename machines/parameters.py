@@ -22,7 +22,7 @@ RNG_BANKS_MAX: Final = 65536
 """Maximum number of seed sets."""
 
 REPLICAS_MAX: Final = 256
-"""Maximum number of machines on a board: the register map has room for so many outcomes."""
+"""Maximum number of machines on a board: the register map has room for the outcomes of this many."""
 
 CYCLES_MAX: Final = 2**63 - 1
 """Maximum of `max_cycles` and `run_until`: 64-bit registers whose values must fit into a signed number."""
@@ -48,14 +48,14 @@ _LFSR_BITS: Final = {RngKind.LFSR8: 8, RngKind.LFSR16: 16, RngKind.LFSR24: 24, R
 
 
 class RngReset(StrEnum):
-    """Start of a frame's random numbers: at the frame's bank, or at the end of the frame before (`free`)."""
+    """Where a frame's random numbers begin: at the frame's bank, or where the previous frame ended (`free`)."""
 
     BANK = "bank"
     FREE = "free"
 
 
 class PriorMode(StrEnum):
-    """Source of the prior's codes: a table with an address, or one code per line that the host writes."""
+    """Source of the prior's codes: a row of a table, or codes that the host writes, one per line."""
 
     TABLE = "table"
     WRITTEN = "written"
@@ -78,7 +78,7 @@ class Sequencer(StrEnum):
 
 
 class SampleEvery(StrEnum):
-    """Moves of a BM2 after which a state becomes a sample: the last one of every sweep, or every move."""
+    """Moves of a BM2 after which the state becomes a sample: the last move of each sweep, or every move."""
 
     SWEEP = "sweep"
     MOVE = "move"
@@ -187,7 +187,7 @@ class BM1Parameters:
 
     @property
     def input_shape(self) -> tuple[int, ...]:
-        """Shape of a frame's inputs: [sensors], or [sensors, lines] per cell; with [replicas, ...] in front."""
+        """Shape of a frame's inputs: [sensors], or with inputs per cell [sensors, lines]; replicas are a first axis."""
         shape = (self.sensors,) if self.sensor_mode is SensorMode.COLUMN else (self.sensors, self.lines)
         return shape if self.replicas == 1 else (self.replicas, *shape)
 
@@ -219,7 +219,7 @@ class BM1Parameters:
 
 
 def set_choices(parameters: object, **kinds: type[StrEnum]) -> None:
-    """Convert parameters to members of enumerations of strings, each to that of its name."""
+    """Convert parameters, given by name in `kinds`, to members of their enumerations, or raise a ParameterError."""
     for name, kind in kinds.items():
         given = getattr(parameters, name)
         try:

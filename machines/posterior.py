@@ -17,7 +17,7 @@ def joint_posterior(
     """Return the posterior over the lines of all boards, float64[all lines], normalised jointly (thesis equation 2.3).
 
     The probability of a line is proportional to its count divided by the cycles of its board; a board without
-    cycles (no line of it can count) has the weight 0. Counts must not be normalised for each board
+    cycles (none of its lines can count) has the weight 0. Counts must not be normalised for each board
     separately, because each board stopped at its own cycle. `counts` are uint32[lines] of each board, in the
     order of the model's lines. If every count is 0, the result is None.
 
@@ -52,7 +52,7 @@ def posteriors_of_replicas(
 ) -> npt.NDArray[np.float64] | None:
     """Return the `joint_posterior` of each replica, float64[replicas, all lines], or None if no replica has one.
 
-    There are uint32[replicas, lines], and the cycles of each replica, for each board. A replica without a posterior has
+    Each board has counts, uint32[replicas, lines], and the cycles of each replica. A replica without a posterior has
     zeros, so that the others keep their places.
     """
     joints = [
@@ -82,18 +82,18 @@ def posterior(
     """Run one machine, without boards or processes, and return the posterior for its readings (thesis 2.1.2).
 
     Args:
-        machine: The machine to run, or the machines of all boards, in the order of their lines: each is then
-            given the same readings, and stops at its own cycle.
+        machine: The machine to run, or the machines of all boards, in the order of their lines: then each
+            machine gets the same readings, and stops at its own cycle.
         readings: One address per sensor column, columns 1..N; None for a missing reading. With inputs per
             cell (`sensor_mode`), the reading of a column is a row with one address, or one code, per line.
-            With several replicas, a list of one such set for each; if no reading is missing, this may be one
-            array of integers of shape `machine.parameters.input_shape`.
+            With several replicas, a list with the readings of each replica. If no reading is missing, this may
+            be one array of integers of shape `machine.parameters.input_shape`.
         prior_address: Row of the prior's table; with replicas one for all, or a tuple with one for each.
         prior_codes: uint16[lines], a written prior, if the machine uses one; with replicas the same for all,
             or uint16[replicas, lines].
         target_count: The count at which the best line stops the machine.
         max_cycles: Maximum number of cycles.
-        bank: Set of seeds; each gives another draw of the same distribution.
+        bank: Set of seeds; each set gives another draw from the same distribution.
 
     Returns:
         float64[lines] with the sum 1. With several replicas float64[replicas, lines]; the row of a replica

@@ -25,7 +25,7 @@ GOLDEN: Final = 0x9E3779B97F4A7C15
 """2**64 divided by the golden ratio, rounded to an odd number: its multiples are evenly spread."""
 
 BASE_STATE: Final = 0x2545F4914F6CDD1D
-"""Its low bits are the state from which the seeds of every LFSR are computed."""
+"""The low bits of this number are the base state from which each LFSR's seeds are computed."""
 
 POLYNOMIALS: Final = {
     RngKind.LFSR8: (8, 6, 5, 4),
@@ -37,7 +37,7 @@ POLYNOMIALS: Final = {
 
 
 class RandomNumbers(Protocol):
-    """All generators of a machine: arrays have one element per generator."""
+    """All generators of a machine; arrays of states have one element per generator."""
 
     def restart(self, bank: int) -> Words:
         """Return the states at the start of a bank, in the parameters' `generator_shape`."""
@@ -60,7 +60,7 @@ def random_numbers(machine: BM1Machine | BM2Machine) -> RandomNumbers:
 
 
 def seed_set(parameters: RngParameters, bank: int) -> int:
-    """Return the set of seeds of a bank on a board; no other board of a BM2 has it in any bank."""
+    """Return the number of a bank's set of seeds on this board; the boards of a BM2 never share a set."""
     return bank * parameters.chains + parameters.chain
 
 
@@ -73,10 +73,10 @@ def generator_numbers(parameters: RngParameters, bank: int) -> Words:
 
 @dataclass(frozen=True, slots=True)
 class LFSR:
-    """A Fibonacci linear feedback shift register of `bits` bits (here all up to 32).
+    """A Fibonacci linear feedback shift register of `bits` bits, at most 32.
 
     A step shifts the state left and shifts in, at the low end, the parity of the bits e - 1 for every exponent e
-    of the polynomial. Its period is 2**bits - 1: every state but 0.
+    of the polynomial. Its period is 2**bits - 1: it runs through every state but 0.
     """
 
     kind: RngKind
@@ -102,7 +102,7 @@ class LFSR:
         return ((states << np.uint64(1)) & np.uint64(self.period)) | parity
 
     def jump(self, states: Words, steps: Words) -> Words:
-        """Return each state after its own number of steps, by a few table look-ups."""
+        """Return each state after its own number of steps, found with a few table look-ups."""
         steps = steps % np.uint64(self.period)
         for bit, tables in enumerate(jump_tables(self.kind, 1)):
             taken = (steps >> np.uint64(bit)) & np.uint64(1) == 1
@@ -112,9 +112,9 @@ class LFSR:
     def seeds(self, numbers: Words) -> Words:
         """Return the initial states of the generators with these numbers.
 
-        Their distances from a base state are scattered, not evenly spaced: evenly spaced phases of 3, 5
-        or 17 columns XOR to 0, because these numbers divide 2**32 - 1, and more cycles do not correct the AND of
-        such columns.
+        Their distances from a base state are scattered, not even: the states of 3, 5 or 17 columns at even
+        distances would XOR to 0, because these numbers divide 2**32 - 1. The AND of such columns is wrong
+        however many cycles are run.
         """
         base = BASE_STATE & self.period or 1
         distances = ((numbers + np.uint64(1)) * np.uint64(GOLDEN)) >> np.uint64(32)
@@ -122,7 +122,7 @@ class LFSR:
 
 
 def sequencer_seed(parameters: BM2Parameters, bank: int) -> int:
-    """Return the first state in a bank of the LFSR16 that a BM2's sequencer has for its random order."""
+    """Return the state at a bank's start of the LFSR16 with which a BM2's sequencer draws its random order."""
     return int(LFSR(RngKind.LFSR16).seeds(np.array([seed_set(parameters, bank)], dtype=np.uint64))[0])
 
 
@@ -158,8 +158,8 @@ class LFSRNumbers:
 class TableNumbers:
     """Generators that all repeat one table of recorded numbers; a state is an index.
 
-    Generator n of `count` starts at floor(n * length / count), and seed set s of `sets` adds s / sets of the
-    distance to the start of the next generator.
+    Generator n of `count` starts at floor(n * length / count) in seed set 0. In seed set s of `sets`, it starts
+    later by s / sets of the distance to the next generator's start.
     """
 
     parameters: RngParameters
@@ -184,7 +184,7 @@ class TableNumbers:
 
 @dataclass(frozen=True, slots=True)
 class IdealNumbers:
-    """Nearly ideal generators for comparison: splitmix64 of seed, generator and cycle.
+    """Nearly ideal generators, for comparison: splitmix64 of the seed and the numbers of generator and step.
 
     The state of generator n starts at mix(mix(`ideal_seed`) + (n + 1) * GOLDEN), a step adds GOLDEN, and the
     output is mix(state), all modulo 2**64.

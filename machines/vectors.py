@@ -1,7 +1,7 @@
-"""Vectors of 512 bits in compiled code: their type and operators for numba, and functions written in LLVM's terms.
+"""Vectors of 512 bits in compiled code: their type and operators for numba, and functions written as LLVM code.
 
-numba does not vectorise a loop as short as 8 words (it was 2.5 times slower), so hot loops use these vectors, which are
-values on any processor. They are not passed to functions.
+numba does not vectorise a loop over only 8 words (it was 2.5 times slower), so hot loops use these vectors. They work
+on any processor, but are not passed to functions.
 """
 
 import math
@@ -20,7 +20,7 @@ extending: Any = untyped_extending
 
 
 def aligned(shape: tuple[int, ...], dtype: type[np.generic]) -> npt.NDArray[Any]:
-    """Return zeros that begin at a multiple of 64 bytes, as vectors must."""
+    """Return zeros at an address that is a multiple of 64 bytes, as vectors need."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     room = np.zeros(size + 64, dtype=np.uint8)
     first = -room.ctypes.data % 64
@@ -32,7 +32,7 @@ _VECTOR: Final = ir.VectorType(_BITS, 8)
 
 
 class _VectorType(types.Type):
-    """512 bits of an array that is `aligned`, as numba's type of a local variable, with the operators below."""
+    """numba's type of a local variable that is a vector: 512 bits, loaded from an `aligned` array."""
 
 
 VECTOR: Final = _VectorType("Vector")
@@ -64,9 +64,9 @@ _define(operator.rshift, "lshr", 2)
 
 
 def in_llvm(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that makes a compiled function of one that writes its LLVM code.
+    """Return a decorator that turns a function that writes LLVM code into a function for compiled code.
 
-    `kinds` are the types of the arguments; None for any array, of which the code gets the address of the data.
+    `kinds` are the types of its arguments; None for any array, whose data's address is passed to the LLVM code.
     """
 
     def decorate(write: Callable[..., Any]) -> Any:
@@ -88,7 +88,7 @@ def in_llvm(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
 
 @in_llvm(VECTOR, None, types.int64)
 def load(builder: Any, data: Any, place: Any) -> Any:
-    """Return the vector at a place of an array, in vectors."""
+    """Return vector number `place` of an array."""
     vector = builder.load(builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [place]))
     vector.align = 64
     return vector
@@ -96,12 +96,12 @@ def load(builder: Any, data: Any, place: Any) -> Any:
 
 @in_llvm(types.void, None, types.int64, VECTOR)
 def store(builder: Any, data: Any, place: Any, vector: Any) -> None:
-    """Write a vector at a place of an array, in vectors."""
+    """Write a vector as vector number `place` of an array."""
     builder.store(vector, builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [place])).align = 64
 
 
 def repeated(builder: Any, value: Any, kind: Any) -> Any:
-    """Return the vector of a kind that repeats a value."""
+    """Return a vector of LLVM type `kind` that repeats a value."""
     unset = ir.Constant(kind, ir.Undefined)
     one = builder.insert_element(unset, value, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(one, unset, ir.Constant(ir.VectorType(ir.IntType(32), kind.count), None))
@@ -109,7 +109,7 @@ def repeated(builder: Any, value: Any, kind: Any) -> Any:
 
 @in_llvm(VECTOR, types.uint64)
 def splat(builder: Any, word: Any) -> Any:
-    """Return the vector that repeats a word."""
+    """Return a vector that repeats a word."""
     return repeated(builder, word, _VECTOR)
 
 
@@ -121,12 +121,12 @@ def first_one(builder: Any, word: Any) -> Any:
 
 @in_llvm(VECTOR, VECTOR, VECTOR)
 def below(builder: Any, left: Any, right: Any) -> Any:
-    """Compare word by word: all ones where the left one is less than the right one, else 0."""
+    """Compare two vectors word by word: all ones where the left word is less than the right word, else 0."""
     return builder.sext(builder.icmp_unsigned("<", left, right), _VECTOR)
 
 
 def _called(builder: Any, name: str, result: Any, *given: Any) -> Any:
-    """Call one of LLVM's own functions."""
+    """Return a call of LLVM's intrinsic function `name`, with this type of result."""
     kind = ir.FunctionType(result, [each.type for each in given])
     return builder.call(builder.module.declare_intrinsic(name, (), kind), given)
 
