@@ -266,7 +266,7 @@ def _noticing_loss() -> Iterator[None]:
 def _on_scheduler(
     address: str, connect: Callable[[], Any], job: Job, numbers: Sequence[int], keep: Keep
 ) -> None:
-    """Do the pieces on the workers of a scheduler; if it is lost, do the rest on the one that is started in its place.
+    """Do the pieces on the workers of a scheduler; if it is lost, go on when one answers there again.
 
     Raises:
         ClusterError: The workers cannot do them, or stay away for a minute.
@@ -316,11 +316,11 @@ def _do(address: str, client: Any, pickled: bytes, left: dict[int, None], keep: 
     """Do the pieces of a job on the workers of one scheduler; a `_LostError` if that cannot go on here."""
     from distributed import wait
 
-    # Numbers that are not on their way yet, in order; the numbers of each batch that is; the seconds of a piece of the
-    # last batch, 0 before; and when there was a worker (monotonic).
+    # Numbers that are not under way yet, in order; the numbers of each batch under way; the seconds of a piece in the
+    # last batch, at first 0; and when there last was a worker (monotonic).
     waiting, batches, piece_s, served_at = deque(left), dict[Any, list[int]](), 0.0, time.monotonic()
     with _noticing_loss():
-        # a copy for each worker, so that the job outlives each of them; one that comes later fetches it from these
+        # a copy for each worker, so that the job survives the loss of one; a later worker fetches it from the others
         table = client.scatter(pickled, broadcast=True, hash=False)
     try:
         while waiting or batches:

@@ -115,7 +115,7 @@ MEMORY_FOLDER: Final = "Memory_MIFs"
 
 
 def write_board_files(image: Image, folder: Path) -> None:
-    """Write the files of an image's hardware, as a build does; its generic BOARD is the partition's index."""
+    """Write the files of an image's hardware, as a build does; the VHDL generic BOARD must be the partition's index."""
     images = [image] * image.partition.count  # a board uses its own entry only
     (folder / PARAMETERS).write_text(parameters_vhd(_deployment(image), images), "ascii")
     (folder / MEMORY_FOLDER).mkdir(exist_ok=True)
@@ -134,7 +134,7 @@ def board_memories(image: Image) -> list[Memory]:
 
 
 def _deployment(image: Image) -> Deployment:
-    """Return a deployment of this image's model; an image has no names, only their numbers."""
+    """Return a deployment for an image; its variables are called by number, because an image has no names."""
     parameters = image.machine.parameters
     widths = [*parameters.sensor_bits, *([parameters.prior_bits] if parameters.prior_bits else [])]
     total = image.partition.total_lines

@@ -35,7 +35,7 @@ _Numbers: TypeAlias = tuple[int, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class ReadingOptions:
-    """The readings for a machine, and the hardware for the estimate of its costs."""
+    """The options that choose the readings for a machine, and the hardware for which its costs are estimated."""
 
     readings: Annotated[
         Path | None,

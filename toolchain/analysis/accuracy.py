@@ -371,7 +371,7 @@ def _z_scores(job: _Counts, run: Run) -> ZScores | None:
         cycles=job.cycles,
         counts=counts,
         draws=len(table),
-        # whole rows of the table are drawn, and stand one after the other
+        # the bootstrap draws whole rows of four sums, and puts them one after the other
         rms=bootstrap(table, lambda a, axis: np.sqrt(a[..., ::4].sum(axis) / a[..., 2::4].sum(axis))),
         mean=bootstrap(table, lambda a, axis: a[..., 1::4].sum(axis) / a[..., 2::4].sum(axis)),
         beyond_three=int(table[:, 3].sum()) / counts,

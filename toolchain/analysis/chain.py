@@ -73,7 +73,7 @@ class ExactChain:
         self._zero = np.ones_like(self._one)
         for at, bit in enumerate(self._unknown):
             concerned = agreement(machine, bit, self._values)
-            # the others agree by chance
+            # a literal machine also waits until the other CDEs agree, which they do by chance
             start = 0.5 ** (p.cdes - len(concerned)) if p.literal else 1.0
             self._one[at] = start * np.prod([chance for _, chance in concerned], axis=0)
             self._zero[at] = start * np.prod([1 - chance for _, chance in concerned], axis=0)
@@ -163,7 +163,7 @@ class ExactChain:
         return np.asarray(np.divide(own, total, out=np.ones_like(own), where=own > 0))
 
     def frame(self, state: int, burn_in: int, sweeps: int) -> NDArray[np.float64]:
-        """Return the mean law over the sweeps of a frame after its burn-in, from a packed start state: float64[states]."""
+        """Return the mean law over a frame's sweeps after its burn-in, from a packed start state: float64[states]."""
         first = np.linalg.matrix_power(self.sweep, burn_in + 1)[
             sum((state >> bit & 1) << at for at, bit in enumerate(self._unknown))
         ]
@@ -187,7 +187,7 @@ class ChainError:
     worst_reading: tuple[int, ...]
     """The reading with this distance: an address per known variable."""
     start: float
-    """Mean distance of a frame's mean law from the stationary one: the effect of the start that outlasts the burn-in."""
+    """Mean distance of a frame's mean law from the stationary one: the effect of the start after the burn-in."""
     sampling: float
     """Mean distance of a frame's posterior from its mean law, because samples are finite and correlated."""
     cycles: float

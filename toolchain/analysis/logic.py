@@ -245,7 +245,7 @@ BLOCK_SHAPES: Final = ((512, 40), (1024, 20), (2048, 10), (4096, 5), (8192, 2), 
 
 
 def blocks_of(words: int, width: int) -> int:
-    """Return the minimum number of M20Ks of a table."""
+    """Return the minimum number of M20Ks that hold a table."""
     return min(math.ceil(words / deep) * math.ceil(width / wide) for deep, wide in BLOCK_SHAPES)
 
 

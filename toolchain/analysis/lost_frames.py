@@ -68,7 +68,7 @@ def _chances(plan: MachinePlan, quantised: Quantised, drawn: Readings) -> NDArra
 
 
 def _union(chances: NDArray[np.float64], random: np.random.Generator, *, shared: bool) -> float:
-    """Return the probability that some line counts in a cycle, from that of each cell, float64[columns, lines]."""
+    """Return the probability that some line counts in a cycle; `chances` are of cells, float64[columns, lines]."""
     lines = np.prod(chances, axis=0)
     total = float(lines.sum())
     if total == 0:  # or so small that doubles underflow
@@ -90,7 +90,7 @@ def _share(chances: NDArray[np.float64], options: BuildOptions, cycles: int) -> 
 
 
 def _advice(plan: MachinePlan, drawn: Readings) -> str:
-    """Advise each option that alone saves enough frames, or else all together, with fewer sensors if necessary."""
+    """Return advice: each option that alone saves enough frames, or else all together, with fewer sensors if needed."""
     options, sensors = plan.options, len(plan.model.known)
     may_scale = options.sensor_mode is SensorMode.COLUMN and options.scaling is not Scale.ADDRESS
     rng: dict[str, Any] = {"rng": RngKind.LFSR32} if options.rng.lfsr_bits not in {None, 32} else {}

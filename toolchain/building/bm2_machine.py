@@ -46,7 +46,7 @@ class BM2Plan:
     target_count: int
     """The number of samples of each board."""
     max_cycles: int
-    """The maximum number of cycles: a safety stop, and the limit of the wait for a board."""
+    """The maximum number of cycles: a safety stop, which also limits how long the host waits for a board."""
 
 
 def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was asked for") -> BM2Plan:

@@ -78,7 +78,7 @@ def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Chang
         edits += edit
     boards = []
     for board, old, image in zip(changed.boards, images, new, strict=True):
-        # the package, and so images[0] of a BM1, has the hash of the model; of a BM2, what is possible has no source
+        # images[0] of a BM1 has the model's hash from the package; a BM2 has no source of which values are possible
         same_model = changed.machine.type == "BM1" and old.model_hash == images[0].model_hash
         if not same_model and old.image_hash not in {board.image_hash, image.image_hash}:
             raise other_image(changed.directory / board.image, old.image_hash, board.image_hash)
@@ -159,7 +159,7 @@ def _with_memory(path: Path, memory: Memory, images: Sequence[Image]) -> tuple[l
         old = before.reshape(found.shape) & (1 << bits) - 1
         if (found == old).all():
             continue
-        # where a code is as before, so are the bits of a random number above it
+        # where a code has not changed, the image keeps the bits above it, which a random number may have
         codes = np.where(found == old, before.reshape(found.shape), found).astype(before.dtype)
         new[board] = _with_section(path, image, memory.section, codes.reshape(before.shape))
         edits.append(_sentence(path, old, found, image.partition.line_offset))
@@ -175,7 +175,7 @@ def _with_section(path: Path, image: Image, section: str, codes: NDArray[Any]) -
 
 
 def _sentence(path: Path, old: NDArray[Any], new: NDArray[Any], offset: int) -> str:
-    """Return which codes of a memory have changed, and the first ones with their values."""
+    """Return a sentence: how many codes of a memory have changed, and the old and new values of the first ones."""
     places = np.argwhere(old != new)
     shown = []
     for address, line in places[:_SHOWN].tolist():

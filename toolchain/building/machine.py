@@ -39,7 +39,7 @@ def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) 
 
 
 def option(key: str, options: BuildOptions, section: type[BM1Section | BM2Section]) -> int:
-    """Return the value of an option, by default that of `[machine]`."""
+    """Return the value of an option; if it is None, the default in `[machine]`."""
     asked = getattr(options, key)
     return int(section.model_fields[key].default if asked is None else asked)
 
@@ -84,7 +84,7 @@ def with_bits(model: Model, bits: Iterable[str]) -> Model:
 
 
 def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
-    """Derive the parameters of the machine for the whole model, or raise a BuildError if model and options contradict."""
+    """Derive the parameters of the machine for the whole model, or raise a BuildError if an option contradicts it."""
     if model.transition is not None:
         options = _filter_options(options)
     if options.sensor_mode is not SensorMode.COLUMN and options.scaling is Scale.ADDRESS:

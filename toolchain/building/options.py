@@ -163,7 +163,7 @@ FILL: Final = 0
 
 
 def replica_count(text: str) -> int:
-    """Return the number of `--replicas`, or FILL; click also gives its default, a number."""
+    """Return the number of `--replicas`, or FILL; when click passes the default, `text` is a number."""
     if text == "fill":
         return FILL
     if re.fullmatch(r"\d{1,3}", str(text), re.ASCII) and 1 <= int(text) <= REPLICAS_MAX:

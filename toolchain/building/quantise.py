@@ -36,7 +36,7 @@ class ColumnLoss:
     values: int
     """Number of supported addresses."""
     mass: float
-    """Share of P(S, K) in cells whose code became 0: the probability that a reading selects such a cell on the true line."""
+    """Share of P(S, K) in cells whose code became 0: the probability that a reading selects one on the true line."""
     kl_bits: float
     """Divergence of the column's own posterior from the exact one, KL(Q(S | k) || P(S | k)) in bits, averaged
     over k; all lines read the same k. (KL(P || Q) would be infinite if a tail became 0.)

@@ -187,7 +187,7 @@ def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> tuple
 
 
 def _bit_words(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> NDArray[np.uint64]:
-    """Return each bit's values in as many first steps as the state has bits: uint64[groups, bits].
+    """Return each bit's values in its first steps, as many as the state has bits, as one word: uint64[groups, bits].
 
     Two bits with the same word are always the same, because so many steps determine a linear sequence.
     """

@@ -210,7 +210,7 @@ def build_options(
 
 
 def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
-    """Return the plan with as many boards (and, for `fill`, replicas) as a device needs or holds, and the reason."""
+    """Return the plan with enough boards of a device and, for `--replicas fill`, as many replicas as fit; and why."""
     if name is None:
         return plan, ""
     from toolchain.analysis.logic import device_named

@@ -1,4 +1,4 @@
-"""The deployment: everything that follows from the model, checked as a whole, with its hash and its file (thesis 3.3, 3.4)."""
+"""The deployment: everything that follows from the model, its checks, its hash and its file (thesis 3.3, 3.4)."""
 
 import hashlib
 import json
@@ -203,7 +203,7 @@ class Deployment(DeploymentFile):
 
     @property
     def edited_boards(self) -> tuple[int, ...]:
-        """The boards whose images were made from edited sources, so that they may not be the model's."""
+        """The boards whose images were made from edited sources, so that they may differ from the model."""
         return tuple(index for index, board in enumerate(self.boards) if board.built_hash)
 
     def output_uri(self, output: Output) -> str:

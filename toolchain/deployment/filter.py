@@ -117,9 +117,9 @@ class Filter:
         self.transition: Final = transition
         self._prob_bits = prob_bits
         self.most_steps: Final = max(1, _MOST_WORK // transition.table.size)
-        """Maximum number of frames that a prediction moves on; after a longer gap, it still moves on only by these."""
+        """Maximum number of frames by which one prediction moves the belief, even after a longer gap."""
         self.belief: NDArray[np.float64] = transition.start
-        """P(S | all readings so far), float64[lines]; after `predict` that of the next frame before its readings."""
+        """P(S | all readings so far), float64[lines]; after `predict`, P(S) of the next frame before its readings."""
 
     def predict(self, steps: int = 1) -> NDArray[np.uint16]:
         """Move the belief `steps` frames on, and return its codes as the prior of that frame: uint16[lines]."""

@@ -372,7 +372,7 @@ class BM2Section(CommonSection):
     stream: int = Field(default=0, ge=0, le=_WORD_MAX)
     variables: Sequence[Name] = ()
 
-    # what a BM1 may have and a BM2 never has, so that nobody needs to ask which one it is
+    # what a BM2 never has, with the values that a BM1 without them has, so that no caller needs to ask for the kind
     scale: ClassVar = Scale.NONE
     prior_bits: ClassVar = 0
     prior_mode: ClassVar = PriorMode.TABLE
@@ -424,7 +424,7 @@ class BoardSection(Section):
 
     image: OwnPath
     image_hash: Sha256
-    # the image of the build, if another was made from sources that a person has edited
+    # the hash of the image as it was built, if another image was made since from edited sources
     built_hash: Sha256 | None = Field(default=None, exclude_if=lambda built: built is None)
     line_offset: int = Field(ge=0)
     lines: int = Field(ge=1)

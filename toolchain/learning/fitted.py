@@ -41,7 +41,7 @@ class FittedRecording(Section):
 
 
 class FittedVariable(Section):
-    """A `[[variable]]`, a known variable; a counted one has only name and rows, because its table is an array elsewhere."""
+    """A `[[variable]]`, a known variable; with counts, only its name and rows, because its table is an array apart."""
 
     name: str
     rows: int = Field(ge=0)

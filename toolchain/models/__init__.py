@@ -1,4 +1,4 @@
-"""Models: searched and known variables, and the exact posterior (thesis 2.1.2, 3.4); the names for a `model.py`."""
+"""Models: searched and known variables, and the exact posterior (thesis 2.1.2, 3.4). A `model.py` imports from here."""
 
 from toolchain.models.distribution import (
     IntegerType,

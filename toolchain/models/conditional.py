@@ -1,6 +1,6 @@
 """Conditional distributions P(K | S): normals over the bins of a reading, wrapped for bearings.
 
-The address of a reading is that of the bin around it, from half a step below to half a step above. Its probability
+A reading gets the address of its bin, which extends half a step below and above its centre. The bin's probability
 is the integral of the Gaussian over the bin, not the density at the centre, so coarse bins are exact too.
 """
 
@@ -93,7 +93,7 @@ def _mass(
     tails_lower: NDArray[np.float64],
     tails_upper: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return Phi(upper) - Phi(lower) from the tails beyond |lower| and |upper|, without cancelling."""
+    """Return Phi(upper) - Phi(lower) from the tails beyond |lower| and |upper|, without cancellation."""
     same_side = np.abs(tails_lower - tails_upper)
     return np.where((lower < 0) & (upper > 0), 1 - tails_lower - tails_upper, same_side)
 

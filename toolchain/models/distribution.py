@@ -214,7 +214,7 @@ class Symbol:
         }
 
     def dimension(self) -> Dimension:
-        """Return it as a searched dimension, or raise a ModelError."""
+        """Return the symbol as a searched dimension, or raise a ModelError."""
         return dimension(
             self.name,
             size=self.size,
@@ -400,7 +400,9 @@ def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distrib
 
 
 def potential(symbols: Sequence[Symbol], values: ArrayLike) -> Potential:
-    """Return a factor that is not a distribution itself, as in a Markov network; its values are float64[size of each symbol], from 0.
+    """Return a factor that is not a distribution itself, as in a Markov network.
+
+    `values` are float64[size of each symbol], from 0.
 
     Raises:
         ModelError: The shape is wrong, or a number is negative, infinite or NaN.

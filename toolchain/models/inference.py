@@ -173,7 +173,7 @@ def _entries(graph: _Graph, name: str, sizes: Mapping[str, int]) -> int:
 
 
 def _fill(graph: _Graph, name: str) -> int:
-    """Return how many pairs of a name's neighbours are not neighbours of each other; an upper bound if there are many."""
+    """Return how many pairs of a name's neighbours are not neighbours themselves; an upper bound if there are many."""
     neighbours = graph[name]
     if len(neighbours) > _MOST_COUNTED:
         return len(neighbours) ** 2

@@ -288,7 +288,7 @@ class Question:
         ]
 
     def _linked(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], Links]:
-        """Return the relevant factors for some observed symbols, and their links without the searched and given ones."""
+        """Return the factors relevant for some observed symbols, and their links without searched and given symbols."""
         cut = {*(symbol.name for symbol in self.searched), *self.given}
         factors = relevant(active, cut | set(observed))
         return factors, Links(factors, cut)
@@ -334,7 +334,7 @@ class Question:
     def _fusion(
         self, own: Mapping[str, Sequence[Term]], weight: NDArray[np.float64], sizes: Mapping[str, int]
     ) -> Model:
-        """Return the model from the terms of the observed symbols and the weight of the searched ones, float64[lines]."""
+        """Return the model from the terms of observed symbols, and the weight of the searched ones, float64[lines]."""
         searched = [symbol.name for symbol in self.searched]
         tables = {
             name: product(terms, (name, *searched), sizes).reshape(sizes[name], -1)

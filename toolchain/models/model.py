@@ -21,12 +21,12 @@ from toolchain.deployment.sections import NAME_MAX
 from toolchain.errors import ModelError
 
 MAX_LINES: Final = 2**24
-"""Maximum number of values of all searched dimensions together: 4,096 boards with the maximum number of lines in the register
-map.
+"""Maximum number of values of all searched dimensions together: 4,096 boards, each with as many lines as the register
+map can have.
 """
 MAX_VALUES: Final = 2**16 - 1
-"""Maximum number of values of a known variable: a column has at most 16 address bits, and the top address means a missing
-reading.
+"""Maximum number of values of a known variable: a column has at most 16 address bits, and the top address means a
+missing reading.
 """
 MAX_ENTRIES: Final = 2**24
 """Maximum number of entries of a factor of a joint distribution (128 MiB as float64)."""
@@ -364,7 +364,7 @@ def exact_posterior(
 
 
 def fuse(prior: NDArray[np.float64], likelihoods: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the normalised product of a prior and likelihoods, float64[lines] each, up to factors.
+    """Return the normalised product of a prior and likelihoods, float64[lines]; each may have any scale.
 
     The product is a sum of logarithms, so that many small likelihoods don't underflow; a ModelError if it is
     0.

@@ -16,7 +16,7 @@ from toolchain.models.model import MAX_ENTRIES
 
 MAX_VARIABLES: Final = 20_000
 MAX_STATES: Final = 65_535
-"""Maximum number of states: that of a column, 2^16 - 1."""
+"""Maximum number of states: as many as a column can have values, 2^16 - 1."""
 MAX_PARENTS: Final = 30
 """Maximum number of parents: NumPy arrays have at most 64 axes, and no table of 2^24 entries needs as many."""
 MAX_TOTAL: Final = 2 * MAX_ENTRIES

@@ -123,7 +123,7 @@ class Scanner:
         return self._floats(piece.split(maxsplit=wanted), wanted, what, begin)
 
     def next_numbers(self, wanted: int, what: str) -> NDArray[np.float64]:
-        """Consume this many numbers separated by white space: float64[wanted]."""
+        """Consume `wanted` numbers, separated by white space: float64[wanted]."""
         begin, words = self._end, []
         for _ in range(wanted):
             word = self.next()

@@ -187,7 +187,7 @@ def read_xmlbif(data: bytes, builder: NetworkBuilder) -> None:
             if kind != "nature":
                 raise part.start.error(f"a variable of the type {kind[:40]!r}: only 'nature' can be read")
             builder.variable(part.only("NAME"), part.texts("OUTCOME"), part.end)
-    # after the last variable, because that of a definition may come later
+    # after the last variable, because a definition may come before its variable
     for part in parts:
         if part.name == "DEFINITION":
             child, table, parents = part.only("FOR"), part.only("TABLE"), part.texts("GIVEN")

@@ -83,7 +83,7 @@ def column_name(board: int, column: int, sensors: int) -> str:
 
 
 def seed_words(machine: BM1Machine | BM2Machine) -> NDArray[np.uint64]:
-    """Return the start of every generator in every bank: uint64[banks, columns], [banks, lines, columns] or [banks, CDEs]."""
+    """Return the seed of every generator: uint64[banks, columns], [banks, lines, columns] or [banks, CDEs]."""
     parameters = machine.parameters
     if parameters.rng in POLYNOMIALS:  # all banks at once
         every = np.stack([generator_numbers(parameters, bank) for bank in range(parameters.rng_banks)])

@@ -1,4 +1,4 @@
-"""The files of a deployment, including the Quartus project: their contents, and how writing changes each (thesis 3.2)."""
+"""The files of a deployment, including the Quartus project: their contents, and their changes (thesis 3.2)."""
 
 import filecmp
 import re
@@ -98,7 +98,7 @@ class OutputFiles:
     """A part of a deployment: its files, and a pattern for files of earlier builds."""
 
     contents: dict[str, Iterable[bytes]]
-    """The content in pieces, to be consumed once, by the path in the deployment's folder."""
+    """For each path in the deployment's folder, the pieces of the file's content, which can be consumed once."""
     own: re.Pattern[str]
     """Pattern of the paths of this part; matching files that are not in `contents` are removed."""
 
