@@ -47,11 +47,11 @@ FRAMES: Final = 5
 """Number of frames in a session; anything may happen between them."""
 
 _ACCESS_CLOCKS: Final = 14
-"""Upper bound of an access, in clocks, from the first address bit to its answer."""
+"""Maximum number of clocks of an access, from its first address bit to its answer."""
 
 _NS: Final = 10
 _NOT_COMPARED: Final = (rm.CAP_SPEED, rm.COMPUTE_NS, rm.COMPUTE_NS + 4)
-"""Registers that depend on the clock, which the emulated board measures itself."""
+"""Registers whose values depend on the clock. The emulated board measures its own, so they are not compared."""
 
 
 class SlowKernel:
@@ -119,7 +119,7 @@ class Both:
     # ---- accesses ----------------------------------------------------------------------------------------
 
     async def hardware_read(self, address: int) -> int | None:
-        """Return a word of the hardware, None if it refuses the read."""
+        """Read a word of the hardware; return None if it refuses the read."""
         answer = await self.axi.read(address, 4 - address % 4)
         if answer.resp == AxiResp.SLVERR:
             return None
@@ -127,7 +127,7 @@ class Both:
         return int.from_bytes(answer.data[:4], "little")
 
     async def read(self, address: int) -> int | None:
-        """Read a word of both, compare, and return it; None if both refuse."""
+        """Read a word of both boards, compare the answers, and return the word; None if both refuse."""
         found = await self.hardware_read(address)
         try:
             expected: int | None = int.from_bytes(self.board.read(address, 1), "little")
@@ -143,7 +143,7 @@ class Both:
         return found
 
     async def write(self, address: int, value: int) -> bool:
-        """Write a word to both, compare the answers, and return whether it was accepted."""
+        """Write a word to both boards, compare the answers, and return whether the word was accepted."""
         answer = await self.axi.write(address, value.to_bytes(4, "little")[: 4 - address % 4])
         try:
             self.board.write(address, value.to_bytes(4, "little"))
@@ -179,7 +179,7 @@ class Both:
         assert found == expected, f"generators: {found} instead of {expected}"
 
     async def compare_outcome(self) -> None:
-        """Compare the interrupt's message, every result, and the generators."""
+        """Compare status, cycles, doorbells, all results and outcomes, and the states of the generators."""
         for address in (rm.STATUS, rm.DONE, rm.CYCLES, rm.CYCLES + 4, rm.START, rm.RESUME):
             await self.read(address)
         results = BM1.registers(self.parameters).result_words
@@ -209,7 +209,7 @@ class Both:
     # ---- running -----------------------------------------------------------------------------------------
 
     def cycles_left(self) -> int:
-        """Return the number of cycles that remain for the emulated machine in this slice."""
+        """Return the number of cycles that the emulated machine has yet to run in this slice."""
         if not self.board.running:
             return 0
         kernel = copy.deepcopy(self.slow.kernel)
@@ -344,7 +344,7 @@ class Session:
         return drawn
 
     async def write_settings(self) -> None:
-        """Write target, limits and bank, often such that two stop reasons occur in the same cycle."""
+        """Write target, limits and bank, often so that two stop reasons occur in the same cycle."""
         p, both = self.parameters, self.both
         target = int(
             self.random.choice(
@@ -399,7 +399,7 @@ class Session:
     # ---- refused accesses -------------------------------------------------------------------------------
 
     async def wrong_accesses(self) -> None:
-        """Access words that do not exist, or that do not allow this access."""
+        """Access words that do not exist, or that do not allow the access made."""
         both = self.both
         inputs, results = both.case.image.interface_sensors, both.case.image.interface_results
         places = [
@@ -438,7 +438,7 @@ class Session:
         await both.read(rm.LIVENESS)
 
     async def wrong_start(self) -> None:
-        """Ring with a wrong number or wrong settings, then correct them."""
+        """Ring the doorbell with a wrong number or wrong settings, then correct them."""
         p, both = self.parameters, self.both
         due = next_doorbell(both.board.done)
         await both.write(rm.START, 0)
@@ -481,7 +481,7 @@ class Session:
     # ---- accesses while a frame runs --------------------------------------------------------------------
 
     async def while_running(self, number: int) -> bool:
-        """Try accesses while frame `number` runs, and return whether a reset ended the frame."""
+        """Try accesses while the frame of doorbell `number` runs, and return whether a reset ended it."""
         both = self.both
         left = both.cycles_left()
         if self.chance(0.15):
@@ -537,7 +537,7 @@ class Session:
         assert both.interrupts == both.expected_interrupts, "interrupts"
 
     async def resume(self) -> bool:
-        """Ring for the next slice, and return whether it runs."""
+        """Ring the doorbell for the next slice, and return whether the slice runs."""
         p, both = self.parameters, self.both
         due = next_doorbell(both.board.done)
         cycles = both.slow.cycles
@@ -567,7 +567,7 @@ class Session:
 
 @cocotb.test()
 async def same_as_the_emulated_board(dut: Any) -> None:
-    """Run a session on both boards; it is drawn from the seed of the case."""
+    """Run a session, drawn from the case's seed, on both boards."""
     case = random_case(int(os.environ["HDL_SEED"]))
     frames = int(os.environ.get("HDL_FRAMES", FRAMES))
     for channel in ("awvalid", "wvalid", "arvalid", "bready", "rready"):

@@ -36,7 +36,7 @@ _GOOD: Final = {
     "halt_i": 0,
     "bad_input_i": 0,
 }
-"""An access and a state in which both a start and a resume are allowed."""
+"""The guard's inputs, for an access and a state in which both a start and a resume are allowed."""
 
 
 async def verdict_on(dut: Any, **others: int) -> tuple[ErrorCode, bool]:
@@ -49,7 +49,7 @@ async def verdict_on(dut: Any, **others: int) -> tuple[ErrorCode, bool]:
 
 @cocotb.test()
 async def doorbells_are_numbers_that_go_round(dut: Any) -> None:
-    """Ring with the numbers around the expected one, which wraps from 2^32 - 1 to 1."""
+    """Ring the doorbell with the expected number, which wraps from 2^32 - 1 to 1, and the numbers around it."""
     for done in (0, 1, 2, 0x7FFFFFFF, 0xFFFFFFFE, 0xFFFFFFFF):
         due = next_doorbell(done)
         for number in {done, due, (due + 1) % 2**32, 1, 0xFFFFFFFF} - {0}:

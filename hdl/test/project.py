@@ -1,6 +1,6 @@
-"""Imports of the hardware's verification from the rest of the project.
+"""What the verification of the hardware imports from the rest of the project.
 
-Machines, their emulation, the emulated board and the toolchain are imported only here.
+Only this module imports machines, their emulation, the emulated board and the toolchain.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def reference_kernel(machine: BM1Machine) -> BM1Kernel:
 
 
 def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -> Image:
-    """Return a board's image of a machine; its interface has this many words more than the machine needs."""
+    """Return a board's image of a machine; its interface has `more_inputs` and `more_results` words to spare."""
     used = BM1.registers(machine.parameters)
     inputs, results = used.input_words, used.result_words
     return Image(

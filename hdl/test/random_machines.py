@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MOST_CELLS: Final = 450
-"""Maximum number of cells over all replicas; a simulator runs some thousand cycles per second of so many.
+"""Maximum number of cells over all replicas; of this many, a simulator runs some thousand cycles per second.
 """
 
 _KINDS: Final = (RngKind.LFSR32, RngKind.LFSR16, RngKind.TABLE, RngKind.LFSR24, RngKind.LFSR8)
@@ -100,7 +100,7 @@ def random_case(seed: int, most_cells: int = MOST_CELLS) -> Case:
 def _tables(
     random: np.random.Generator, parameters: BM1Parameters
 ) -> tuple[NDArray[np.uint16], tuple[NDArray[np.uint16], ...]]:
-    """Return the prior and the tables of the columns, which range from mostly zeros to mostly ones."""
+    """Return the prior and the columns' tables, whose codes range from mostly zeros to mostly ones."""
     zeros = float(random.choice([0.0, 0.02, 0.1]))
     typical = float(random.choice([0.3, 0.7, 0.9, 1.0]))
     prior = codes(random, parameters, parameters.prior_addresses, zeros, typical)
@@ -117,7 +117,7 @@ def _tables(
 def codes(
     random: np.random.Generator, parameters: BM1Parameters, rows: int, zeros: float, typical: float
 ) -> NDArray[np.uint16]:
-    """Return random codes, uint16[rows, lines], often with equal lines so that several overflow at once."""
+    """Return random codes, uint16[rows, lines]; often lines are equal, so that several overflow at once."""
     ones = parameters.ones_code
     shape = (rows, parameters.lines)
     spread = random.uniform(max(2 * typical - 1, 0), min(2 * typical, 1.1), shape)
@@ -131,7 +131,7 @@ def codes(
 
 
 def _numbers(random: np.random.Generator, parameters: BM1Parameters) -> NDArray[np.uint32] | None:
-    """Return a table of random numbers if the machine uses one; its length is seldom a power of two."""
+    """Return a table of random numbers, seldom with a power of two as length; None if the machine uses none."""
     if parameters.rng is not RngKind.TABLE:
         return None
     length = int(random.choice([1, 2, 17, 64, 199, 500]))

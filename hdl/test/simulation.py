@@ -48,7 +48,7 @@ def prepare(image: Image, folder: Path, hdl: Path = HDL, more_sources: Sequence[
         image: Image of the board.
         folder: Folder of the simulation.
         hdl: Folder of the VHDL, which differs for mutants.
-        more_sources: Further files, relative to `hdl`, after the others.
+        more_sources: Further VHDL files, relative to `hdl`, which are analysed last.
 
     Raises:
         HardwareToolError: GHDL is not installed or refused a file.
@@ -122,7 +122,7 @@ def run_bench(
 
 
 def unit_benches() -> dict[str, tuple[str, dict[str, int]]]:
-    """Return the benches of single units: the module of each, and the unit with its generics."""
+    """Return the benches of single units by module: for each, the unit and its generics."""
     from hdl.test.guard_generics import GENERICS
 
     return {

@@ -62,7 +62,7 @@ class Check:
 
 
 def sessions(count: int) -> list[Check]:
-    """Return the sessions of the first random machines."""
+    """Return the sessions on the first `count` random machines."""
     return [Check("session", str(seed)) for seed in range(count)]
 
 
