@@ -3,8 +3,6 @@
 import asyncio
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from bridge.client import connect
 from casestudies.topics import Listener, Truth, listen, read_truth
@@ -51,23 +49,6 @@ class Heard:
 
     async def next_frame(self, _limit_s):
         return self.frames.pop(0)
-
-
-@given(st.integers(1, 12), st.sets(st.integers(1, 12)))
-def test_frames_without_a_posterior_have_a_truth_too(frames, without):
-    async def hear():
-        listener = Listener(Heard(), 0)
-        heard = []
-        for number in range(1, frames + 1):
-            listener.add_truth(truth(number))
-            one = frame(number)
-            listener._heard.frames.append(one.report if number in without else one)
-            heard.append(await listener.next(PATIENCE))
-        return heard
-
-    heard = asyncio.run(hear())
-    assert told(heard) == [(n, n) for n in range(1, frames + 1)]
-    assert [i.posterior is None for i in heard] == [n in without for n in range(1, frames + 1)]
 
 
 async def test_a_late_truth_is_waited_for_until_a_newer_one_comes(monkeypatch):
@@ -146,21 +127,6 @@ async def test_frames_come_with_their_posterior_and_truth(heard):
     assert [i.posterior is None for i in instances] == [False, True, False]
     assert [i.posterior.probabilities.index(1.0) for i in instances[::2]] == [1, 3]
     assert [truth.x for truth in listener.route] == [1, 2, 3]
-
-
-async def test_a_truth_that_is_a_little_late_is_waited_for(heard, monkeypatch):
-    monkeypatch.setattr("casestudies.topics._PATIENCE_S", PATIENCE)
-    fake, listener = heard
-    await fake.publish(TRUTH, pose(1))
-    await say_frame(fake, 2)
-
-    async def late():
-        await asyncio.sleep(0.2)
-        await fake.publish(TRUTH, pose(2))
-
-    arriving = asyncio.create_task(late())
-    assert (await listener.next(PATIENCE)).truth.x == 2
-    await arriving
 
 
 async def test_a_truth_that_never_comes_is_not_waited_for_to_the_limit(heard):
