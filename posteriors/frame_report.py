@@ -100,8 +100,10 @@ class FrameReport:
         return "ended_early" in self.details
 
     def link_us(self, rate: str) -> float | None:
-        """Return the modelled microseconds of the frame's transfers, one after another, on a link of rate `rate`
-        (--link-rate); None if the report has no bytes."""
+        """Return the modelled microseconds of the frame's transfers, one after another, on a link of this --link-rate.
+
+        None if the report has no bytes.
+        """
         if self.link_bytes is None or self.link_transfers is None:
             return None
         return 1e6 * WIRES[rate].seconds(self.link_bytes, self.link_transfers)
