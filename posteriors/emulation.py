@@ -34,8 +34,8 @@ class EmulatedPosterior(Posterior):
 
         Args:
             model: The model from which the deployment was built: a folder with `model.py`, a network file, or the
-                object that either gives. Without it, the rounded probabilities in the memories of a BM1 are used, which differ
-                from the model by the loss of quantising. A BM2 has no such probabilities.
+                object that either gives. Without it, the rounded probabilities in the memories of a BM1 are used,
+                which differ from the model by the loss of quantising. A BM2 has no such probabilities.
             settings: Parameters of `model()`, as `--set` gave them to the build.
 
         Returns:

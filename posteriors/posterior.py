@@ -215,7 +215,7 @@ class Posterior:
         return abs(float((likely * np.log2(likely)).sum()))
 
     def total_variation(self, other: "Posterior") -> float:
-        """Return half the sum of the absolute differences, 0 to 1; a LabelError if the dimensions differ."""
+        """Return half the sum of the absolute differences, 0 to 1; raise a LabelError if the dimensions differ."""
         import numpy as np
 
         ours, theirs = (list(zip(each.labels, each.sizes, strict=True)) for each in (self, other))
@@ -337,8 +337,8 @@ def read_samples(message: dict[str, Any], sizes: Sequence[int] = (), newest: int
     """Return the sampled states in a message on `/bm/samples` as values of variables, int64[samples, variables].
 
     `sizes` are the variables' numbers of values, in the order of the machine; a value of at least its size is an unused
-    code. Without sizes, return the states' machine words, int64[samples, words]. If `newest` is not 0, return at most so
-    many samples, the newest.
+    code. Without sizes, return the states' machine words, int64[samples, words]. If `newest` is not 0, return at most
+    that many samples, the newest.
 
     Raises:
         BadResultError: The message does not hold states of this machine.

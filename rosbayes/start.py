@@ -48,7 +48,7 @@ COMMANDS = {
 
 
 def __getattr__(name: str) -> object:
-    """Return the function behind the entry point of a command: `pcie_app` is that of `pcie-app`."""
+    """Return the entry-point function of a command: `pcie_app` for `pcie-app`."""
     module, _ = COMMANDS.get(name.replace("_", "-"), ("rosbayes.__main__" if name == "rosbayes" else "", ""))
     if not module:
         raise AttributeError(name)

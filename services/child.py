@@ -1,4 +1,4 @@
-"""Child processes: starting, monitoring, restarting and stopping them, and their end with their parent.
+"""Child processes: starting, monitoring, restarting and stopping them, also when their parent ends.
 
 parent ◀─ standard error ──────── child   lines for the user, which are passed on
        ◀─ ROSBAYES_ERROR_DESCRIPTOR       {"error": "the sentence that explains its end"}
@@ -69,7 +69,7 @@ class _Pipe:
         asyncio.get_running_loop().add_reader(self._reader, self.read)
 
     def read(self, *, last: bool = False) -> None:
-        """Read what has arrived; the `last` line may lack its end."""
+        """Read what has arrived; with `last`, also pass on a final line without a line end."""
         while self._is_open:
             try:
                 data = os.read(self._reader, 1 << 16)
@@ -114,7 +114,7 @@ class Child:
         directory: LockedRunDirectory | None = None,
         ends: deque[float] | None = None,
     ) -> None:
-        """Store the command; `ends` holds one more entry than restarts are permitted, and may be shared with other children."""
+        """Store the command; `ends` keeps the last exit times (one more than permitted restarts) and may be shared."""
         self.name = name
         self._command = command
         # The run directory, whose lock the child holds too, so that the next run waits for its end.
@@ -208,7 +208,7 @@ class Child:
                 pipe.read(last=True)
 
     def failure(self) -> StackError:
-        """Return the exit of the process as an error, with its own sentence and exit code if it gave any."""
+        """Return the exit of the process as an error, with the sentence and exit code that it reported, if any."""
         code = self.exit_code
         # the exit code of an error decides whether a restart would help, so it must not be lost
         if self._error:
@@ -252,7 +252,7 @@ class ForkedChild(Child):
         return fork(partial(self._run_forked, environment, lines))
 
     def _run_forked(self, environment: dict[str, str], lines: int) -> NoReturn:
-        """Run the function in the child, which must never continue in the code of its parent."""
+        """Run the function in the child and exit, so that the child never continues in the parent's code."""
         code: int = ExitCode.BUG
         try:
             os.setsid()
@@ -273,9 +273,9 @@ class ForkedChild(Child):
 
 
 class ForkedCommand(Child):
-    """One of our commands. Its first start is a fork, which saves the imports; a restart executes it.
+    """One of our commands. Its first start is a fork, which saves the imports; a restart executes the command anew.
 
-    A fork takes a few milliseconds, and a new interpreter 0.3 s. But a later fork would copy a state that has grown.
+    A fork takes a few milliseconds, and a new interpreter 0.3 s. But a fork during the run would copy the run's state.
     """
 
     def __init__(
@@ -321,7 +321,7 @@ async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
 
 
 def end_with_parent() -> None:
-    """In a child of rosbayes: exit with the parent, even after SIGKILL; a StoppedError if it has already ended."""
+    """In a child of rosbayes: exit when the parent ends, even by SIGKILL; a StoppedError if it has already ended."""
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None or not parent.isdigit():
         return

@@ -214,7 +214,7 @@ def load_settings(**flags: Any) -> Settings:
 
 
 def _expected(name: str, message: str) -> str:
-    """Describe the expected value of a setting; for a timeout, both limits."""
+    """Describe the expected value of a setting in words; for a timeout, with both limits."""
     known = Settings.model_fields.get(name)
     if known is not None and known.annotation is float:
         return f"expected seconds from {SHORTEST_S:g} to {LONGEST_S:g}"

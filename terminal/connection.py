@@ -8,7 +8,7 @@ from terminal.output import say, warn
 
 
 def report_waits() -> Callable[[str, str, str], None]:
-    """Return a callback for the states of servers, by URI, that says at the start which of them are waited for."""
+    """Return a callback for the states of servers by URI; at the start, it prints which servers are waited for."""
     missing: set[str] = set()
 
     def on_state(uri: str, state: str, reason: str) -> None:
@@ -25,7 +25,7 @@ def report_waits() -> Callable[[str, str, str], None]:
 def report_connection(uri: str) -> Callable[[str, str], None]:
     """Return a callback for a client's `on_state` that reports each lost and restored connection once.
 
-    It hides the client's own warnings, which would repeat each loss.
+    It turns off the client's own warnings, which would report each loss a second time.
     """
     log_libraries(logging.ERROR, "%(name)s: %(message)s")
     missing = ""

@@ -37,7 +37,7 @@ class ReaderGoneError(Exception):
 
 
 class ProcessError(Exception):
-    """A process that a command or a script has started failed; it has that process's exit code."""
+    """A process that a command or a script started has failed; the error has that process's exit code."""
 
     exit_code: int = ExitCode.CHILD
 

@@ -3,8 +3,8 @@
     class Settings(BaseModel):                            def listen(settings: Settings, plot: ...)
         uri: Annotated[str, Flag(...)] = Field(...)  ──▶      listen --uri URI --plot
 
-Typer reads the flags of a command from its signature. `expanded` returns the command with a signature in which
-some parameters are replaced by several flags, and which composes those parameters again.
+Typer reads the flags of a command from its signature. `expanded` gives a command a signature with several flags in
+place of a parameter; a call composes the parameter from the values of the flags.
 """
 
 import functools
@@ -20,7 +20,7 @@ from pydantic import BaseModel
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """Properties of a flag that its field does not have: `names` other than `--field-name`, a word for its value, a text for its default."""
+    """What a field does not say of its flag: `names` other than `--field-name`, a word for the value, the default."""
 
     names: tuple[str, ...] = ()
     metavar: str | None = None
@@ -49,7 +49,7 @@ def default_of(model: type[BaseModel], name: str) -> str:
 
 
 def flags_of(model: type[BaseModel], names: Sequence[str], *, prefix: str) -> list[inspect.Parameter]:
-    """Return the flags of fields. The value of an omitted flag is None, and a variable `PREFIX...` or the default applies."""
+    """Return the flags of fields. An omitted flag is None: then a variable `PREFIX...` applies, or the default."""
     return [_flag_of(model, name, f"{prefix}{name.upper()}") for name in names]
 
 

@@ -32,7 +32,7 @@ _END_TIMEOUT = 2.0
 
 
 class NoHealthError(Exception):
-    """A status socket did not answer; the text is the rest of a sentence that begins with the process."""
+    """A status socket did not answer; the text continues a sentence that begins with the name of the process."""
 
 
 def status_socket(directory: str | os.PathLike[str], name: str) -> str:
@@ -61,7 +61,7 @@ def read_status(path: str, timeout: float) -> bytes:
 
 @contextlib.contextmanager
 def silence_explained(path: str, timeout: float) -> Iterator[None]:
-    """Turn an OSError or a TimeoutError of a query at a status socket into a NoHealthError, within the context."""
+    """Within the context, turn an OSError or a TimeoutError of a query into a NoHealthError with its reason."""
     try:
         yield
     except TimeoutError:
@@ -74,7 +74,7 @@ def silence_explained(path: str, timeout: float) -> Iterator[None]:
 
 
 def foreign_socket_error(path: str) -> NoHealthError:
-    """Return the error for an answer that is not a status."""
+    """Return the error for a socket whose answer is not a status of rosbayes."""
     return NoHealthError(f"is not a rosbayes process of this version, according to its answer at {path}")
 
 

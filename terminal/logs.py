@@ -82,7 +82,7 @@ def _now() -> str:
 
 
 def formatted(level: str, text: str, *, name: str = "") -> str:
-    """Return a text for the user in the current format: after `name: level: `, or as JSON with the level as a field."""
+    """Return a text for the user in the current format: `name: level: text`, or JSON with the level as a field."""
     if log_format() is LogFormat.JSON:
         return json_line(level, text)
     prefix = f"{name}: " if name else ""
@@ -110,13 +110,13 @@ def write_line(text: str) -> None:
 
 
 def write_progress(text: str) -> None:
-    """Show a text that the next line replaces."""
+    """Show a text on the terminal, which the next line replaces."""
     _write(text)
     _Process.shows_progress = True
 
 
 def _write(text: str) -> None:
-    """Write in place of the progress, if standard error still exists: a closed terminal must not end a robot's run."""
+    """Replace the progress line by a text; a closed standard error is ignored, because it must not end a run."""
     with suppress(OSError, ValueError):
         if _Process.shows_progress:
             _Process.shows_progress = False

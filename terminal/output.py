@@ -27,12 +27,12 @@ def say(text: str) -> None:
 
 
 def warn(sentence: str, *, name: str = "") -> None:
-    """Print a warning in one line on standard error; `name` is the name of the process, for text lines."""
+    """Print a warning in one line on standard error; in the text format, it begins with `name`, the process's name."""
     write_line(formatted("warning", one_line(sentence), name=name))
 
 
 def say_error(sentence: str) -> None:
-    """Print the error that ends this process, or report it to the parent that will print it."""
+    """Print the error that ends this process, or send it to the parent, which then prints it."""
     descriptor = os.environ.get(ERROR_DESCRIPTOR, "")
     if descriptor.isdigit():
         with contextlib.suppress(OSError):  # the parent may be gone
@@ -44,7 +44,7 @@ def say_error(sentence: str) -> None:
 def show_progress(text: str) -> None:
     """Show the progress of this command in one line of the terminal, which the next line replaces.
 
-    In JSON it is a line of its own.
+    In the JSON format, each progress is a separate line.
     """
     if log_format() is LogFormat.JSON:
         say(text)
@@ -71,7 +71,7 @@ def say_lines(text: str) -> None:
 
 
 def relay(line: str, process: str) -> None:
-    """Print a line that a child has printed on standard error."""
+    """Print on standard error a line that a child has printed there."""
     write_line(relayed(line, process))
 
 

@@ -46,7 +46,7 @@ def ask_for_end_with_parent() -> None:
 
 
 class Forked:
-    """A process that was forked or spawned here, with the part of the interface of `asyncio.subprocess.Process` that is used here."""
+    """A forked or spawned child process, with the part of the interface of asyncio's `Process` that is used here."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
@@ -63,21 +63,21 @@ class Forked:
         self._ended.set()
 
     async def wait(self) -> int | None:
-        """Wait for the end."""
+        """Wait until the process has ended, and return its exit code."""
         await self._ended.wait()
         return self.returncode
 
     def send_signal(self, number: int) -> None:
-        """Send a signal; the number cannot be another process's, because this one was not waited for."""
+        """Send a signal; the pid cannot be another process's yet, because this one's exit was not collected."""
         os.kill(self.pid, number)
 
     def kill(self) -> None:
-        """Kill it."""
+        """Kill the process."""
         self.send_signal(signal.SIGKILL)
 
 
 def fork(run: Callable[[], NoReturn]) -> Forked:
-    """Run a function in a forked process. It begins with the ending signals blocked, and must end the process."""
+    """Run a function in a forked process. The function starts with the ending signals blocked, and must exit."""
     # until the child has handlers of its own, a signal would reach the event loop of this process instead
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
     pid = os.fork()
@@ -98,8 +98,8 @@ def fork_command(
 ) -> Forked:
     """Run one of our commands in a fork of this process, which has most of its modules already.
 
-    It is as if it had been executed: in its own session, without standard input, and with no descriptors but its
-    output (None: /dev/null), its errors and those `kept`.
+    It runs as if it had been executed: in its own session, without standard input, and with no open descriptors but
+    `output` (None: /dev/null), `errors` and those in `kept`.
     """
     return fork(partial(_run_command, name, arguments, output, errors, kept, variables or {}))
 
@@ -112,7 +112,7 @@ def _run_command(
     kept: Collection[int],
     variables: Mapping[str, str],
 ) -> NoReturn:
-    """Become a command in a forked child, which must never continue in the code of its parent."""
+    """Run a command in a forked child and exit, so that the child never continues in the parent's code."""
     try:
         # Nothing of the parent's may end here: neither its open files, nor what it does at its exit.
         gc.freeze()
@@ -157,7 +157,7 @@ def _show_command(name: str, words: Sequence[str]) -> None:
 
 
 class Process:
-    """A process with its lines: they go to a log, and also to `show` if they are meant for the screen.
+    """A process and the lines it prints, which go to a log, and also to `show` if it is given.
 
     With `forks`, it is forked from this process, which is faster (see `fork_command`).
     """
@@ -274,7 +274,7 @@ class Process:
 
 
 class Screen:
-    """The output of a script: its lines, and between them, the work that it is waiting for.
+    """The output of a script: its lines, and between them the work that it is waiting for.
 
     On a terminal, this work is shown in a line with the time so far, which the next line replaces. Elsewhere it is a
     line followed by dots.

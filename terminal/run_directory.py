@@ -41,7 +41,7 @@ def default_run_directory() -> Path:
 
 
 def run_directory(given: Path | None) -> Path:
-    """Return the given directory, or that of this user, which is created; an OutputError if it is not private."""
+    """Return the given directory, or create this user's; raise an OutputError if the latter is not private."""
     if given is not None:
         return given.absolute()
     path = default_run_directory()
@@ -61,7 +61,7 @@ def run_directory(given: Path | None) -> Path:
 
 
 def status_directory(given: Path | None, name: str) -> Path | None:
-    """Return the run directory of a process without a master; after a warning None, because lacking one must not end the process."""
+    """Return the run directory of a process without a master; if there is none, warn and return None."""
     try:
         return run_directory(given)
     except OutputError as error:

@@ -52,13 +52,13 @@ def _stop(number: int, _frame: object) -> None:
 
 
 def _report_dropped(dropped: sys.UnraisableHookArgs) -> None:
-    """Report an exception that Python drops, except those of signals, which `check_signals` raises again."""
+    """Report an exception that Python drops; `check_signals` raises those of signals again instead."""
     if not isinstance(dropped.exc_value, StoppedError):
         sys.__unraisablehook__(dropped)
 
 
 def _report_printed(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-    """Print an exception that ends the program, except those of signals, which `terminal.ending` reports."""
+    """Print an exception that ends the program; exceptions of signals are left to `terminal.ending`."""
     if not isinstance(error, StoppedError):
         sys.__excepthook__(kind, error, traceback)
 
@@ -94,7 +94,7 @@ async def until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
 
 
 def run_async(main: Coroutine[Any, Any, int | None]) -> int:
-    """Run a coroutine on uvloop, and return its exit code; a StoppedError if a signal cancelled it.
+    """Run a coroutine on uvloop, and return its exit code; raise a StoppedError if a signal cancelled it.
 
     Its `finally` clauses clean up before this function returns.
     """

@@ -50,7 +50,7 @@ def normalise(raw: tuple[float | None, ...]) -> tuple[int | None, ...]:
 
 
 async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) -> None:
-    """Normalise messages until cancelled; a BridgeError if no server answers at the URI.
+    """Normalise messages until cancelled; raise a BridgeError if no server answers at the URI.
 
     A message with anything but finite numbers is dropped, and each cause is reported once. A missing reading stays
     missing.

@@ -176,7 +176,7 @@ async def simulate(
     array: bool = False,
     count: int | None = None,
 ) -> None:
-    """Sail and publish `count` readings, or until cancelled; a BridgeError if no server answers at the URI.
+    """Sail and publish `count` readings, or until cancelled; raise a BridgeError if no server answers at the URI.
 
     Each step publishes true pose, compass and then the readings, with the same stamp. The readings on `topic` are a
     `boat_msgs/Raw`, or with `array` a std_msgs/Float64MultiArray. A change of the boat from outside is published at

@@ -20,7 +20,7 @@ from terminal.signals import run_async
 async def publish_pairs(
     uri: str, *, seed: int, rate: float, width: int, height: int, count: int | None = None
 ) -> None:
-    """Publish `count` pairs, or pairs until cancelled; a BridgeError if no server answers at the URI."""
+    """Publish `count` pairs, or pairs until cancelled; raise a BridgeError if no server answers at the URI."""
     from bridge.stamps import header
     from casestudies.topics import LossyPublication, connected
 

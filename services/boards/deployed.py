@@ -79,7 +79,7 @@ class DeployedBoards:
         ]
 
     def run(self, frame: FrameRequest) -> FrameOutput:
-        """Compute one frame; a board that fails (a BoardError) is in `gone` until `recover` has reopened it."""
+        """Compute one frame, or raise a BoardError; a failed board is in `gone` until `recover` has reopened it."""
         try:
             return self._whole_cluster().run(self._input(frame))
         except BoardError as error:
@@ -87,7 +87,7 @@ class DeployedBoards:
             raise
 
     def post(self, frame: FrameRequest) -> None:
-        """Start a frame, whose result `collect` returns; after a BoardError call `find_lost_boards`."""
+        """Start a frame; `collect` returns its result. After a BoardError, call `find_lost_boards`."""
         self._whole_cluster().post(self._input(frame))
 
     def collect(self) -> FrameOutput | None:
@@ -114,7 +114,7 @@ class DeployedBoards:
         return driver_input(self.deployment, frame, self._settings.stop or self.deployment.machine.stop)
 
     def find_lost_boards(self, error: BoardError) -> None:
-        """Find all boards that are gone after a failure, so that several deaths at once fail one frame."""
+        """Find all boards that are gone after a failure, so that boards that die together fail only one frame."""
         # the error of a board that is already known to be gone
         if self._cluster is None or isinstance(error, BoardAwayError):
             return

@@ -1,4 +1,4 @@
-"""Conversion of frames to the input of the driver, and of its results to records."""
+"""Conversion of frames to input of the driver, and of the driver's results to records."""
 
 import math
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ class BoardAwayError(BoardError):
 
 
 def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> FrameInput:
-    """Return the driver's input for a frame, or raise a FrameInputError; `stop` is `slices` or `own`."""
+    """Return the driver's input for a frame that stops by `slices` or `own` (`stop`), or raise a FrameInputError."""
     machine = deployment.machine
     prior = np.frombuffer(frame.prior_codes, "<u2") if frame.prior_codes else None
     addresses: tuple[int | None, ...] | npt.NDArray[np.int64]
@@ -56,7 +56,7 @@ def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> Fram
 
 
 def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.NDArray[np.int64], PriorRow]:
-    """Return inputs (-1: missing) and the row of the prior, for a machine with several readings of a variable."""
+    """Return inputs (-1: missing) and the row of the prior, for a machine that takes arrays of readings."""
     variables = deployment.variables
     if len(addresses) != len(variables):
         raise FrameInputError(

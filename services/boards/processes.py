@@ -97,7 +97,10 @@ def serve_one(
 
 
 def _await_free(endpoint: Endpoint, limit: float) -> None:
-    """Wait until no other process listens at an endpoint, or raise an error, because a socket there counts as ours later."""
+    """Wait until no other process listens at an endpoint, or raise a SettingsError after `limit` seconds.
+
+    Later, a socket at this path is taken for our own.
+    """
     deadline = time.monotonic() + limit
     for each in (endpoint, endpoint.programming):
         while is_served(each.path):
@@ -207,7 +210,7 @@ class BoardProcesses:
         )
 
     def _sign(self, sign: int) -> None:
-        """Write a sign of a board, in the board's process; the parent reads the signs."""
+        """In a board's process, write a byte to the parent: that the board lives, or that it listens."""
         with suppress(OSError):
             os.write(self._write_sign, bytes([sign]))
 
@@ -217,7 +220,7 @@ class BoardProcesses:
         self._report()
 
     def _hear(self, at: int, *, listens: bool) -> None:
-        """Handle a sign of a board, and print when all boards are ready, or when one is back."""
+        """Handle a board's sign that it lives or listens; print when all boards are ready, or when one is back."""
         self._heard[at] = time.monotonic()
         if not listens:
             return
@@ -233,7 +236,7 @@ class BoardProcesses:
         say(f"board 0 listens at {first}" if count == 1 else f"{count} boards listen at {first} ... {last}")
 
     def _report(self) -> None:
-        """Tell the service manager how many boards listen, and that none of them is stuck."""
+        """Tell the service manager how many boards listen, and whether none of them is stuck."""
         # a board without a sign so far counts from its start
         count, now = len(self._endpoints), time.monotonic()
         self._manager.report(

@@ -72,7 +72,7 @@ def discover(
 
 
 def _picked(robots: list[Robot]) -> Robot:
-    """Return the robot whose number a person enters, or raise a SettingsError."""
+    """Ask the user for the number of a robot and return that robot, or raise a SettingsError."""
     check_signals()
     print(f"number of the server (1 to {len(robots)}): ", end="", file=sys.stderr, flush=True)
     # bounded, because a pipe may send a line without end

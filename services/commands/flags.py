@@ -15,7 +15,7 @@ from toolchain.deployment import Deployment, Source
 
 
 def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Give a command the flags of the named settings; its parameter `settings` gets all settings."""
+    """Return a decorator that gives a command the flags of the named settings; its parameter `settings` gets all."""
 
     def load(**flags: Any) -> Settings:
         end_with_parent()  # first, because the parent may have ended already
@@ -29,7 +29,7 @@ def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., i
 
 
 def refuse_with_deployment(settings: Settings, flags: Mapping[str, str | None]) -> None:
-    """Raise a SettingsError for a flag that describes a topic, if there is a deployment, which has its own."""
+    """Raise a SettingsError if there are both a deployment, which describes its topics, and flags that describe one."""
     given = [f"{flag} {value}" for flag, value in flags.items() if value]
     # if it were ignored, the command would use another topic than the user named
     if settings.deployment is not None and given:
@@ -39,7 +39,7 @@ def refuse_with_deployment(settings: Settings, flags: Mapping[str, str | None]) 
 
 
 def source_of(uri: str, topic: str, type_: str) -> Source:
-    """Return a topic, checked like one of a deployment, so that the same mistakes have the same errors."""
+    """Return a topic given by flags, checked like a topic of a deployment, or raise a SettingsError."""
     try:
         return Source(uri=uri, topic=topic, type=type_)
     except ValidationError as error:
@@ -50,7 +50,7 @@ def source_of(uri: str, topic: str, type_: str) -> Source:
 
 
 def results_of(settings: Settings, topic: str | None) -> tuple[Deployment | None, str | None, str]:
-    """Return the deployment in the settings if any, and server and topic of its results: flags apply before it."""
+    """Return the deployment in the settings, if any, and server and topic of the results; flags override it."""
     # here, because boards and `status` start without the bridge and deployments
     from posteriors.posterior import RESULTS_TOPIC
     from services.sockets.serving import deployment_for

@@ -124,7 +124,7 @@ def master(
 
 
 def _check(settings: Settings) -> None:
-    """Print that a run can start with these settings, or raise the error that would end it."""
+    """Check that a run can start with these settings, and say so, or raise the error that would end the run."""
     loaded = deployment_for(settings, images=True)
     # a run would notice only after its processes have started
     if settings.boards:

@@ -1,1 +1,1 @@
-"""The page in the browser: it reads topics and status sockets as anybody may, and no service imports it."""
+"""The page in the browser. It only reads public topics and status sockets; no service imports it."""

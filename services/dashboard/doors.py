@@ -90,7 +90,7 @@ class Doors:
         return self._policy.refusal(Request("/", presented), loopback=False)
 
     def _is_our_name(self, host: str) -> bool:
-        """Return whether a request is for this server, and not for a name that another site has let point to it."""
+        """Return whether a Host header names this server, not another site whose name resolves to its address."""
         if host in {origin.partition("://")[2] for origin in self._policy.origins}:
             return True
         name = _PORT.sub("", host).lower()

@@ -34,7 +34,7 @@ _MAX_REASONS: Final = 20
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeptFrame:
-    """A frame as it is kept, equal only to itself; `values` is None if it has no posterior."""
+    """A frame in the feed, equal only to itself; `values` is None if it has no posterior."""
 
     at: int
     """Place in the sequence of all frames that arrived, from 1."""
@@ -43,13 +43,13 @@ class KeptFrame:
     labels: tuple[str, ...] = ()
     report: FrameReport | None = None
     statistics: Mapping[str, str] = field(default_factory=dict)
-    """Of a BM2's samples, by their keys in `/bm/frame`."""
+    """Statistics of a BM2's samples, by their keys in `/bm/frame`."""
     truth: tuple[float, float] | None = None
     """The true x and y when the frame arrived."""
 
     @property
     def searched(self) -> tuple[str, ...]:
-        """The labels of the searched variables, without that of replicas."""
+        """The labels of the searched variables, without the label `replica`."""
         return tuple(label for label in self.labels if label != REPLICA)
 
     @property
@@ -101,7 +101,7 @@ class Feed:
     Attributes:
         frames: The last frames, at most `KEPT_FRAMES`.
         truth: The newest true x and y; None if there is none.
-        watchers: Called after each change; they only note it, because the feed is in the middle of a frame.
+        watchers: Functions called after each change; they must only note it, because a frame is still being added.
         lost: Number of frames without a posterior by reason, at most `_MAX_REASONS` of them.
     """
 
@@ -123,7 +123,7 @@ class Feed:
         return self.frames[-1] if self.frames else None
 
     def frame(self, at: int) -> KeptFrame | None:
-        """Return the frame at a place, or the nearest one that is kept; None before the first frame."""
+        """Return the frame numbered `at`, or the nearest one that is kept; None before the first frame."""
         if not self.frames:
             return None
         return self.frames[min(max(at - self.frames[0].at, 0), len(self.frames) - 1)]
@@ -155,7 +155,7 @@ class Feed:
         return frame
 
     def add_loss(self, reason: str) -> None:
-        """Count a frame that has no posterior; rare reasons are counted together if there are too many."""
+        """Count a frame that has no posterior; beyond `_MAX_REASONS` reasons, new ones are counted together."""
         known = reason in self.lost or len(self.lost) < _MAX_REASONS
         self.lost[reason if known else OTHER] += 1
 

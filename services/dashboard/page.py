@@ -1,7 +1,7 @@
 """The page, its socket and its files, as a web application.
 
 /          the page: layout, buttons and choices
-/live      WebSocket: what moves, as messages of `View`; poses and switches come back
+/live      WebSocket: messages of `View` to the browser, poses and switches from it
 /frames.*  the kept frames as files
 """
 
@@ -117,7 +117,7 @@ class Dashboard:
         live = Live(client.id)
 
         def offer() -> None:
-            """Offer the marginals of the newest posterior; an update is sent only if they are new."""
+            """Offer the marginals of the newest posterior; the list is updated only if it differs."""
             frame = self._feed.newest
             labels = frame.searched if frame is not None else ()
             # what goes across is named first, as in a position

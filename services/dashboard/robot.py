@@ -1,6 +1,6 @@
 """The robot and the stack as the page sees them: topics, services, and the status sockets of this machine.
 
-It connects again for ever, because the page is there before the robot, and after it.
+It reconnects for ever, because the page may start before the robot and outlive it.
 """
 
 import asyncio
@@ -53,14 +53,14 @@ _QUEUE_SIZE: Final = 64
 
 
 class WatchedRobot:
-    """Everything that the page reads and asks over rosbridge and status sockets.
+    """Everything that the page receives, and the calls it makes, over rosbridge and status sockets.
 
     Attributes:
         state: State of the connection in words.
-        connected: Whether it is there.
+        connected: Whether there is a connection.
         landmarks: x, y and name of each landmark.
-        switches: The services that switch the world, by name, with the value last set here; they start on.
-        can_set_pose: Whether somebody listens to the topic that moves the boat.
+        switches: The simulated world's switches by service name, with the value last set here; True before.
+        can_set_pose: Whether the topic that moves the boat has a subscriber.
         lost: Lost frames by reason, as the processes of the stack count them.
         boards: Endpoint, state and image of each board.
         why: Sentences about processes that are not ready.
@@ -106,7 +106,7 @@ class WatchedRobot:
     # Following
 
     async def follow(self) -> None:
-        """Follow the topics until cancelled; a server that is not there is tried again every second.
+        """Follow the topics until cancelled; retry every second if the server is not reachable.
 
         Raises:
             UsageError: The URI or a topic cannot be used.
@@ -234,7 +234,7 @@ class WatchedRobot:
             await asyncio.sleep(_STATUS_EVERY)
 
     async def _learn_axes(self, folder: Path) -> None:
-        """Take the units from the folder of the master on this machine; without them there are numbers of cells."""
+        """Read the units from the folder of the master on this machine; without it, cells have only numbers."""
         try:
             deployment = await asyncio.to_thread(load_deployment, folder, images=False)
         except (ToolchainError, OSError) as error:
@@ -244,7 +244,7 @@ class WatchedRobot:
         self._feed.changed()
 
     def axes_for(self, frame: KeptFrame) -> tuple[Axis, ...]:
-        """Return the axes of a frame's posterior; none if it is another deployment's, whose units would mislead."""
+        """Return the axes of a frame's posterior; none if the frame is of another deployment, with other units."""
         if self._deployment_of(frame) is None or frame.values is None:
             return ()
         ours = [(axis.label, axis.size) for axis in self._axes]
@@ -257,7 +257,7 @@ class WatchedRobot:
         return {each.name: (each.unit, each.states) for each in known}
 
     def _take_samples(self, message: dict[str, Any]) -> None:
-        """Keep the last states of a message in words; of an unknown machine, in hexadecimal."""
+        """Keep the last states of a message as text; in hexadecimal if the machine is unknown."""
         deployment = self._deployment_of(self._feed.newest)
         dimensions = deployment.state_dimensions if deployment is not None else ()
         states: list[list[int]] = []
@@ -275,7 +275,7 @@ class WatchedRobot:
     # Asking
 
     def set_pose(self, x: float, y: float) -> None:
-        """Put the boat somewhere; without a connection, or if nobody listens, nothing happens."""
+        """Move the boat to (x, y); do nothing without a connection or a subscriber."""
         ros, poses = self._ros, self._poses
         if ros is None or poses is None or not self.can_set_pose or not math.isfinite(x + y):
             return
@@ -287,7 +287,7 @@ class WatchedRobot:
             poses.publish_nowait({"header": head, "pose": pose_at(x, y)})
 
     async def switch(self, name: str, on: bool) -> str:
-        """Call a switch of the world; return what went wrong, empty if nothing did."""
+        """Call a switch of the simulated world; return the reason of a failure, empty on success."""
         if self._ros is None or name not in self.switches:
             return "this switch is not there now"
         try:
@@ -315,7 +315,7 @@ def _point(pose: Any) -> tuple[float, float] | None:
 
 
 def read_landmarks(message: Mapping[str, Any]) -> list[tuple[float, float, str]]:
-    """Return x, y and name of each marker that has a place."""
+    """Return x, y and name of each marker with a usable position."""
     markers = message.get("markers")
     found = [
         (*point, str(marker.get("text") or marker.get("id") or "")[:_MAX_NAME])

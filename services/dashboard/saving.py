@@ -1,4 +1,4 @@
-"""The kept frames as files: a NumPy archive, and a table with a column a cell."""
+"""The kept frames as files: a NumPy archive, and a table with a column for each cell."""
 
 import csv
 import io
@@ -12,7 +12,7 @@ from services.output.posterior_file import cell_names, write_archive
 
 
 def same_shape(frames: Sequence[KeptFrame], shown: KeptFrame | None) -> list[KeptFrame]:
-    """Return the frames whose posteriors have the variables of the one that is shown, or of the newest one."""
+    """Return the frames whose posteriors have the same variables as the `shown` frame, or else as the newest frame."""
     with_posterior = [each for each in frames if each.values is not None]
     if shown is None or shown.values is None:
         shown = with_posterior[-1] if with_posterior else None
@@ -34,7 +34,7 @@ def archive(frames: Sequence[KeptFrame], axes: Sequence[Axis]) -> bytes:
 
 
 def table(frames: Sequence[KeptFrame]) -> bytes:
-    """Return a table as CSV: a row a frame, with its most probable cell; frames must not be empty."""
+    """Return a CSV table with a row for each frame and its most probable cell; frames must not be empty."""
     labels, first = frames[0].labels, frames[0].values
     cells = cell_names(labels, first.shape) if first is not None else ()
     file = io.StringIO(newline="")

@@ -1,8 +1,8 @@
 """The view of one browser: the newest frame or an earlier one, and its marginals, as messages for the page.
 
-A message is binary: the length of its head (4 bytes, little-endian), the head (JSON), and the picture: a byte a
-cell of a heat map, relative to the highest cell, or a little-endian float32 a bar; the errors of a BM2's bars follow
-in the same form.
+A message is binary: the length of its head (4 bytes, little-endian), the head (JSON), and the picture. A heat
+map has a byte for each cell, relative to the highest cell. Bars have a little-endian float32 each; for a BM2, the
+errors of the bars follow in the same form.
 """
 
 import struct
@@ -54,7 +54,7 @@ class View:
         self._feed.changed()
 
     def step(self, frames: int) -> None:
-        """Pause, and go by this many frames, as far as they are kept."""
+        """Pause, and move by this many frames (back if negative), as far as frames are kept."""
         if (frame := self.frame) is not None:
             found = self._feed.frame(frame.at + frames)
             self.at = found.at if found is not None else None
@@ -66,7 +66,7 @@ class View:
         self._feed.changed()
 
     def labels(self, frame: KeptFrame) -> tuple[str, ...]:
-        """Return the labels that are shown of a frame, the vertical one first."""
+        """Return the labels of a frame's marginal that is shown, the vertical one first."""
         if self.chosen and set(self.chosen) <= set(frame.labels):
             return self.chosen
         return default_labels(frame)
@@ -99,20 +99,20 @@ def _in_words(reading: list[Any], unit: str, states: tuple[str, ...]) -> list[An
 
 
 def packed(head: dict[str, Any], picture: bytes = b"") -> bytes:
-    """Return a message."""
+    """Return the message with this head and picture."""
     # NaN would be no JSON; orjson writes null
     text = orjson.dumps(head, option=orjson.OPT_SERIALIZE_NUMPY)
     return b"".join((_LENGTH.pack(len(text)), text, picture))
 
 
 def default_labels(frame: KeptFrame) -> tuple[str, ...]:
-    """Return the first two searched variables, or the only one; `x` is the second, which goes across."""
+    """Return the first two searched variables, or the only one; `x` comes second, because the second is horizontal."""
     first = frame.searched[:2]
     return first[::-1] if first[:1] == (_ACROSS,) and len(first) == 2 else first
 
 
 def choices(labels: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Return the marginals that can be chosen: those of pairs, then those of single variables."""
+    """Return the label sets whose marginals can be chosen: pairs first, then single variables."""
     pairs: list[tuple[str, ...]] = [
         pair[::-1] if pair[0] == _ACROSS else pair for pair in combinations(labels, 2)
     ]
@@ -164,7 +164,7 @@ def _shown(number: int | None) -> int | str | None:
 
 
 def _axis(label: str, size: int, axes: tuple[Axis, ...]) -> dict[str, Any]:
-    """Return an axis for the page; without a deployment, its values are the numbers of cells."""
+    """Return an axis for the page; without a deployment, its values are the cells' indices."""
     known = next((axis.dimension for axis in axes if axis.label == label and axis.dimension), None)
     return {
         "label": label,

@@ -14,7 +14,7 @@ METRICS_PORTS = {"subscriber": 1, "publisher": 2, "pcie-app": 3, "board": 4}
 
 
 def _metrics(settings: Settings, role: str) -> list[str]:
-    """Return the flags for the metrics of a process; the master has checked who may read them."""
+    """Return the flags for the metrics of a process; `--insecure`, because the master has checked the access."""
     if not settings.metrics:
         return []
     return ["--metrics", shifted(settings.metrics, METRICS_PORTS[role]), "--insecure"]
@@ -36,7 +36,7 @@ def boards_arguments(boards: int, directory: Path, settings: Settings, *, once: 
 def dashboard_command(
     settings: Settings, deployment: Deployment, directory: Path | None, port: int
 ) -> list[str]:
-    """Return the command of the page in the browser for the results of a run, with the folder of its sockets."""
+    """Return the command of the page that shows a run's results; `directory` is the folder of the run's sockets."""
     command = [*own_command("dashboard"), "--deployment", str(deployment.directory)]
     values = {
         "uri": settings.uri,
@@ -63,7 +63,7 @@ _SETTINGS = {
 
 
 def service_arguments(role: str, endpoint: Endpoint, settings: Settings, *, reprogram: bool) -> list[str]:
-    """Return the arguments of a service's command."""
+    """Return the arguments of the command of a service, which listens at `endpoint`."""
     arguments = ["--listen", str(endpoint), *_metrics(settings, role)]
     for name in ("deployment", "log_level", *_SETTINGS[role]):
         value = getattr(settings, name)

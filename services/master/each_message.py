@@ -16,7 +16,7 @@ from services.sockets.records import AnyRecord, Outcome, Published, Reading, Rea
 
 
 class EachMessagePeers(Peers):
-    """The three services, of which each message has a subscriber and a publisher of its own."""
+    """The three services; each message gets a new subscriber and a new publisher."""
 
     # Those that have done their work and were told to end, until they have ended. What such a one still sends does not
     # count: a reading is one that arrived beside the one that was taken, and is missed as if nobody had subscribed.
@@ -27,7 +27,7 @@ class EachMessagePeers(Peers):
     _changed: asyncio.Event
 
     def prepare(self) -> None:
-        """Determine the peers; a SettingsError if subscriber or publisher is not this master's to start."""
+        """Determine the peers; raise a SettingsError if the master does not start subscriber and publisher."""
         self._done, self._publishing, self._changed = set(), False, asyncio.Event()
         super().prepare()
         if self.subscriber.child is None or self.publisher.child is None:
@@ -38,7 +38,7 @@ class EachMessagePeers(Peers):
 
     @property
     def not_ready(self) -> list[str]:
-        """The roles of peers that are not ready; subscriber and publisher come and go once the run has begun."""
+        """The roles of peers that are not ready; during the run, only pcie-app counts; the others come and go."""
         return [role for role in super().not_ready if role == self.app.role or not self.begun.is_set()]
 
     @property

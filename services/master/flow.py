@@ -69,7 +69,7 @@ _LOSSES = {
 class _WaitingReading:
     """A reading that waits for the boards, and the time of its arrival (monotonic, ns).
 
-    `steps` is 1 and the readings since the one before that no board gets: a filter predicts as many frames.
+    `steps` is 1 plus the number of readings dropped since the previous frame: a filter predicts that many frames.
     """
 
     reading: Reading
@@ -218,7 +218,7 @@ class FrameFlow:
     # --- events at the peers -------------------------------------------------------------------
 
     def ready(self, peer: Peer) -> None:
-        """Send the next frame if the run was waiting for a peer."""
+        """Handle a peer that has become ready: send the next frame if the run was waiting for it."""
         if peer is not self._peers.subscriber:
             self._send_next()
 
@@ -243,7 +243,7 @@ class FrameFlow:
                 self._log.warning(f"{where} sent a {what}, which only another service may send")
 
     def lost(self, peer: Peer) -> None:
-        """Count the frame or the results lost with a peer."""
+        """Handle the loss of a peer: count the frame or the results that are lost with it."""
         if peer is self._peers.app and self._computing is not None:
             self.losses[LossReason.WITH_APP] += 1
             if self._follows:
@@ -335,7 +335,7 @@ class FrameFlow:
             self._follow(number, bank, waiting)
 
     def _predict(self, own: "Filter", steps: int) -> bytes:
-        """Move the belief to the frame that is sent next, and return it as the codes of its prior."""
+        """Predict the filter's belief for the next frame, `steps` ahead, and return it as prior codes."""
         if self._number == 1:
             self._log.info("the filter begins with its start distribution")
             steps = 1  # nothing happened before the first frame
@@ -345,7 +345,7 @@ class FrameFlow:
         return own.predict(steps).astype("<u2").tobytes()
 
     def _follow(self, number: int, bank: int, waiting: _WaitingReading) -> None:
-        """Log a sent frame, and tell the subscriber its number, for its own log."""
+        """Log a sent frame, and send its number to the subscriber, which logs it too."""
         waited = (time.monotonic_ns() - waiting.arrived) // 1000
         self._log.debug("handed on to pcie-app", frame=number, bank=bank, waited_us=waited)
         subscriber, reading = self._peers.subscriber.protocol, waiting.reading

@@ -85,7 +85,7 @@ class Peer:
         self.missed = False
 
     def cut(self) -> None:
-        """Kill its process if the master started it, otherwise close the connection; the task of the peer restores either."""
+        """Kill its process if the master started it, otherwise close the connection; the peer's task restores both."""
         if self.child is not None:
             self.child.kill()
         elif self.protocol is not None:
@@ -230,7 +230,7 @@ class Peers:
             self._by_role[role] = Peer(role, None, None) if settings.fused else self._peer(role, text)
 
     def _peer(self, role: str, text: str) -> Peer:
-        """Return a service running at an endpoint, or without an endpoint a child to start."""
+        """Return the peer of a role: the service at the endpoint `text`, or, if that is empty, a child to start."""
         if text or self.directory is None:
             return Peer(role, endpoint_from(text, f"--{role}"), None)
         endpoint = endpoint_in(self.directory, role)
@@ -249,7 +249,7 @@ class Peers:
 
     @property
     def _compiling_time(self) -> float:
-        """Additional seconds to wait for boards to listen. An exit of the run's own boards is detected at once."""
+        """Additional seconds to wait for the run's own boards, which may compile; their exit is detected at once."""
         return 0.0 if self._boards is None else COMPILING_TIME
 
     async def start(self, events: PeerEvents) -> None:
@@ -272,7 +272,7 @@ class Peers:
                 self._begin_task(self._keep(peer))
 
     def _begin_task(self, work: Coroutine[Any, Any, Any], *, inside: bool = False) -> None:
-        """Run a coroutine whose error ends the run."""
+        """Start a task whose error ends the run; `inside` if it is a service in this process."""
 
         async def guarded() -> None:
             try:

@@ -44,7 +44,7 @@ _GRACE_PERIOD = 2.0
 
 
 class Master:
-    """A run with a deployment, once or in a loop; made inside the event loop, to which its futures belong."""
+    """A run with a deployment, once or in a loop. Create it inside the event loop, to which its futures belong."""
 
     def __init__(
         self,
@@ -214,7 +214,7 @@ class Master:
             )
 
     async def _expect_data(self) -> None:
-        """End the run if no message arrives in time after its start."""
+        """End the run with a NoDataError if no reading arrives in time after its start."""
         # not earlier, because nobody listens until then, and each phase of the start has its own limit
         await self._peers.begun.wait()
         limit = self._settings.first_data_timeout
@@ -269,8 +269,8 @@ class Master:
 class ChildrenWatch:
     """The progress of the processes that a master started, according to their status sockets.
 
-    Otherwise a child that is stopped or stuck while nothing is expected of it would go unnoticed. A child that is
-    being restarted does not count.
+    Without it, a child that is stopped or stuck while it has no work would go unnoticed. Children that are being
+    restarted are ignored.
     """
 
     def __init__(self, peers: Iterable[Peer], directory: Path) -> None:
@@ -281,11 +281,11 @@ class ChildrenWatch:
         self._answered = time.monotonic()
 
     def is_alive(self) -> bool:
-        """Return whether all of them have answered recently."""
+        """Return whether all running children have answered recently."""
         return time.monotonic() - self._answered < STUCK_S
 
     async def run(self) -> None:
-        """Ask until cancelled."""
+        """Query the status sockets regularly until cancelled."""
         while True:
             # one that is not ready has a time limit of its own
             running = [

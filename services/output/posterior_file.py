@@ -106,7 +106,7 @@ def cell_names(labels: Sequence[str], sizes: Sequence[int]) -> list[str]:
 def write_archive(
     file: IO[bytes], frames: Sequence[FrameReport | Posterior | None], axes: Sequence[Axis], **arrays: Any
 ) -> None:
-    """Write an archive for `numpy.load`: arrays, the numbers of frames as far as they are known, and values of axes."""
+    """Write an archive for `numpy.load`: the arrays, number, stamp and cycles of each frame, and the values of axes."""
     import numpy as np
 
     for name in ("frame", "stamp_ns", "cycles"):
@@ -146,7 +146,7 @@ class _Lines(ResultFile):
             raise self._error(error) from error
 
     def _take_back(self, written: int) -> None:
-        """Remove an incomplete line, unless another process has written since."""
+        """Remove an incompletely written line, unless another process has appended to the file since."""
         with contextlib.suppress(OSError):
             # after an append the position is behind our own bytes, whatever others have appended before
             end = os.lseek(self._file, 0, os.SEEK_CUR)
@@ -154,7 +154,7 @@ class _Lines(ResultFile):
                 os.ftruncate(self._file, end - written)
 
     def close(self) -> None:
-        """Close the file, which is complete."""
+        """Close the file; everything is already written."""
         os.close(self._file)
 
 

@@ -1,4 +1,4 @@
-"""Output of frames on standard output: a line, a JSON object or a picture each.
+"""Output of frames on standard output: each as a line, a JSON object or a picture.
 
 Pictures are bars for one dimension and a heat map for two, with or without colour.
 """

@@ -107,7 +107,7 @@ def _processes(stack: StackStatus) -> Table:
 
 
 def _stages(process: ProcessStatus) -> Table:
-    """Return the latencies of a process's published frames, that of the whole frame first."""
+    """Return the latencies of a process's published frames by stage; the whole frame comes first."""
     table = _table("latency of")
     for heading in ("p50 ms", "p99 ms", "frames"):
         table.add_column(heading, justify="right")
@@ -193,7 +193,7 @@ def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
 
 
 async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) -> int:
-    """Print the status of a run, once or every second; return 0 if everything is ready, otherwise 6.
+    """Print the status of a run, once or (with `watch`) every second; return 0 if everything is ready, otherwise 6.
 
     Raises:
         SettingsError: No process answers, or a master is needed and does not answer, and `watch` is false.

@@ -1,4 +1,4 @@
-"""The clock by which readings age: this computer's, or with `use_sim_time` that of a simulation on `/clock`."""
+"""The clock for stamps and ages of readings: this computer's, or with `use_sim_time` a simulation's on `/clock`."""
 
 import time
 from collections.abc import Callable
@@ -18,7 +18,7 @@ _MOST_NS: Final = 3600 * 10**9
 class Clock:
     """Times for stamps, and ticks for ages.
 
-    A simulation runs at any rate, pauses, and begins again. Its time then jumps back; ticks never do.
+    A simulation runs at any rate, and may pause or restart. A restart sets its time back, but never the ticks.
     """
 
     def __init__(self, *, simulated: bool) -> None:
@@ -30,11 +30,11 @@ class Clock:
         """When the last message came, at first when this began (monotonic seconds)."""
 
     def time_ns(self) -> int:
-        """Return the time as in stamps; that of a simulation is 0 before the first message."""
+        """Return the time for stamps (ns); 0 before the first message of a simulation."""
         return (self._time or 0) if self.simulated else time.time_ns()
 
     def tick(self) -> int:
-        """Return the nanoseconds of a clock that never goes back, with an arbitrary beginning."""
+        """Return the nanoseconds of a clock that never goes back, from an arbitrary origin."""
         return self._tick if self.simulated else time.monotonic_ns()
 
     async def follow(self, ros: Ros, moved: Callable[[], None] | None = None) -> None:

@@ -1,6 +1,6 @@
-"""Connections to the rosbridge servers of a deployment, and what these know about its topics.
+"""Connections to the rosbridge servers of a deployment, and what the servers know about its topics.
 
-`connect_all` connects each server once. If a server has rosapi, this tells whether a topic of readings has a
+`connect_all` connects each server once. If a server has rosapi, it is asked whether a topic of readings has a
 publisher, and whether results can be received.
 """
 
@@ -76,7 +76,7 @@ def reconnect_now(rosbridges: Mapping[str, Ros]) -> None:
 
 
 async def report_unpublished(ros: Ros, topic: str, report: Callable[[str], None]) -> None:
-    """Report a topic that has no publisher `AFTER` seconds from now, with the nearest names, if there is rosapi."""
+    """Report a topic, with the nearest names, if according to rosapi it has no publisher after `AFTER` seconds."""
     # a publisher that starts at the same time is not missing
     await asyncio.sleep(AFTER)
     if await ros.publishers(topic) != []:
@@ -89,7 +89,7 @@ async def report_unpublished(ros: Ros, topic: str, report: Callable[[str], None]
 
 
 async def report_unused_clock(ros: Ros, topic: str, report: Callable[[str], None]) -> None:
-    """Report `AFTER` seconds from now that a simulation publishes its time, which nobody here follows."""
+    """Report after `AFTER` seconds if `topic` (`/clock`) has a publisher although --use-sim-time is not set."""
     await asyncio.sleep(AFTER)
     if await ros.publishers(topic):
         report(f"{topic} is published at {ros.uri}: if it is a simulation, pass --use-sim-time")
@@ -137,7 +137,7 @@ def reported_refusals(topics: Iterable[AdvertisedTopic]) -> dict[str, str]:
 async def refusals(topics: Iterable[AdvertisedTopic], *, settled: bool) -> dict[str, str]:
     """Return, by topic, why topics cannot be received, according to rosapi.
 
-    `settled`: the servers have had time to register them.
+    With `settled`, the servers have had time to register the topics, so an unknown topic counts as refused.
     """
     asked = list(topics)
     found = await asyncio.gather(*(_refusal(topic, settled=settled) for topic in asked))
@@ -166,7 +166,7 @@ async def _refusal(topic: AdvertisedTopic, *, settled: bool) -> str:
 
 
 def _way_out(topic: AdvertisedTopic) -> str:
-    """Return what to do about a topic that cannot be received."""
+    """Return advice, for an error message, about a topic that cannot be received."""
     if topic.key:
         return f"set {topic.key} = false under [topics] in deployment.toml"
     return "choose another topic for the results"

@@ -71,7 +71,7 @@ class _SourceReader:
         return to_addresses(self._deployment, variable, value), None
 
     def _require_all(self, message: dict[str, Any]) -> None:
-        """Raise one error for everything that a message lacks, unless that is a single null."""
+        """Raise one error that names all missing readings of a message; do nothing if only a single one is null."""
         # often several are missing, such as all of one sensor
         needed = [field for variable, field in self._fields if variable.on_missing == "error"]
         if self._prior is not None and not self._prior_optional:
@@ -105,7 +105,7 @@ class _SourceReader:
 
 
 def _plain(value: object) -> float | str | None:
-    """Return a usable reading as a record carries it."""
+    """Convert a reading to a type that a record can hold; None if it is neither a number nor a text."""
     if isinstance(value, int | float):
         try:
             return float(value)
@@ -167,7 +167,7 @@ class FrameAssembler:
 
     @property
     def deadline(self) -> int | None:
-        """Tick at which `due` has a reading, unless messages complete it earlier; None if none waits."""
+        """Tick (ns) at which `due` must be called, unless messages complete the reading earlier; None if none waits."""
         return self._synchroniser.deadline
 
     def take(
@@ -175,7 +175,7 @@ class FrameAssembler:
     ) -> list[Reading]:
         """Add a message of a source (its index), and return the readings that are now complete.
 
-        It was received at `received_ns`, Unix time, and `received_tick`, monotonic ns.
+        `received_ns` and `received_tick` are the time of its receipt, in ns of Unix time and of the monotonic clock.
 
         Raises:
             VariableError: A variable is missing or unusable; the sentence names topic and variable.
@@ -236,7 +236,7 @@ class FrameAssembler:
         )
 
     def needs(self, source: int) -> bool:
-        """Return whether a frame needs a message of this source."""
+        """Return whether every frame needs a message of this source (its index)."""
         return self._readers[source].needed
 
     def stamp_gap(self) -> StampGap | None:

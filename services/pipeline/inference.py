@@ -23,8 +23,8 @@ def report_of(
 ) -> FrameReport:
     """Return the report of a frame.
 
-    `now` is the Unix time and the monotonic time, `previous_out_ns` the duration of sending the previous
-    result.
+    `now` is the Unix time and the monotonic time, in ns; `previous_out_ns` is how long the previous result took to
+    send.
     """
     result = publish.result
     sent_ns, tick = now

@@ -52,7 +52,7 @@ class PcieApp(RunService):
         self._last: tuple[int, int, FrameOutput] | None = None
 
     async def _serve(self) -> None:
-        """Keep the boards open, or raise a PcieShimError: one cannot be opened, or came back with another image."""
+        """Keep the boards open, or raise a PcieShimError if one cannot be opened or comes back with another image."""
         try:
             self._opened = await _in_thread(self._boards.open)
             self._link.keep(Ready(self._opened))
@@ -145,7 +145,7 @@ class PcieApp(RunService):
         self._post_next()
 
     def _fail(self, error: BoardError) -> None:
-        """Search for other lost boards, so that several deaths at once fail one frame, and then report it."""
+        """Search for other lost boards, so that boards that die together fail only one frame, then report it."""
         if self._posted is None:
             return
         (number, master), self._posted = self._posted, None
@@ -163,7 +163,7 @@ class PcieApp(RunService):
         self._searching = asyncio.ensure_future(search())
 
     def _answer(self, master: int, record: Record) -> None:
-        """Send the result of a frame, unless its master is gone; the next master's frames have the same numbers."""
+        """Send the result of a frame, unless its master is gone: frames of the next master have the same numbers."""
         if master == self._link.masters:
             self._link.send(record)
 

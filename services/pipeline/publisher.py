@@ -120,7 +120,7 @@ class Publisher(RunService):
         return msgspec.structs.replace(published, missed=max(published.missed, refused))
 
     async def _check_delivery(self, *, settled: bool) -> None:
-        """Report each topic that no server passes on, once; a NotReceivableError in a run of one frame."""
+        """Report once each topic that a server refuses; with `--once`, raise a NotReceivableError if it refuses all."""
         topics = self._topics.advertised
         asked = [*topics, *([self._topics.reports] if self._topics.reports else [])]
         # each question takes a server time, which the first result would have to wait for
@@ -142,7 +142,7 @@ class Publisher(RunService):
             await asyncio.sleep(CHECK_INTERVAL)
 
     async def _keep_looking(self) -> NoReturn:
-        """Report in each run of many frames whether the server passes results on; some discard them silently."""
+        """In each run with `--loop`, check whether the server passes results on, since some discard them silently."""
         while True:
             await self._first.wait()
             self._first.clear()

@@ -29,7 +29,7 @@ RESULTS_DEPTH = 64
 
 
 def same_numbers(received: Any, sent: list[float], *, rel_tol: float = 1e-12, abs_tol: float = 0.0) -> bool:
-    """Return whether an array equals the sent one, except for the last bit, which some servers lose."""
+    """Return whether a received array equals the sent one; tolerances, because some servers lose the last bit."""
     return (
         isinstance(received, list)
         and len(received) == len(sent)
@@ -94,7 +94,7 @@ class ResultTopics:
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
     def served_by(self, uri: str) -> tuple[str, str]:
-        """Return a server's topics and its name as texts; a single server is named `rosbridge`."""
+        """Return texts for messages: a server's topics, and the server's name (`rosbridge` if it is the only one)."""
         if len(self.rosbridges) == 1:
             return "", "rosbridge"
         topics = [publication.topic for ros, publication in self._outputs if ros is self.rosbridges.get(uri)]
@@ -102,7 +102,7 @@ class ResultTopics:
         return which, f"rosbridge at {uri}"
 
     def watch(self) -> None:
-        """Subscribe to the first output, so that a result can be seen on the wire."""
+        """Subscribe to the first output, so that `seen` can tell whether a result comes back."""
         if self._watched is None:
             output = self._deployment.outputs[0]
             self._watched = self._outputs[0][0].subscribe(output.topic, output.type, queue_size=RESULTS_DEPTH)

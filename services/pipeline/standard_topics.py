@@ -57,7 +57,7 @@ class StandardTopics:
     """The topics for robot tools on one server.
 
     Attributes:
-        advertised: Those that are published, once `open` has advertised them.
+        advertised: The topics that are published, once `open` has advertised them.
         refused: Names of topics that the server did not pass on when it was asked, which get no more messages.
     """
 
@@ -98,7 +98,7 @@ class StandardTopics:
             self.advertised.append(AdvertisedTopic(ros, uri, topic, type_name, key))
 
     def _chosen(self) -> Iterator[str]:
-        """Yield the keys of the topics that are on; log why one that is switched on stays off."""
+        """Yield the keys of the topics to publish; log why a topic that is switched on cannot be published."""
         dimensions = self._deployment.result_dimensions
         is_map = has_coordinates(dimensions)
         for key, wanted in dict(self._deployment.topics).items():
@@ -114,7 +114,7 @@ class StandardTopics:
             yield key
 
     def offer(self, publish: Publish, inference: Inference) -> None:
-        """Send the topics of a frame later, unless a newer one takes its place."""
+        """Send the topics of a frame later, unless a newer frame replaces it before."""
         self._last, self._waiting = (publish, inference, self._clock.tick()), True
         if self._timer is None and self._publications:
             loop = asyncio.get_running_loop()
@@ -122,7 +122,7 @@ class StandardTopics:
             self._timer = loop.call_soon(self._send) if wait <= 0 else loop.call_later(wait, self._send)
 
     def flush(self) -> None:
-        """Send now what waits, and the health, because the run is about to end."""
+        """Send a waiting frame and the health at once, because the run is about to end."""
         if self._timer is not None:
             self._timer.cancel()
         self._send()
@@ -154,7 +154,7 @@ class StandardTopics:
         return make | {"diagnostics": self._changed_health}
 
     def _publish(self, key: str, make: _Make) -> None:
-        """Publish a message, if there is one; a topic with a fault is left out from now on."""
+        """Publish the message that `make` returns, if any; after an unexpected error, stop publishing the topic."""
         publication = self._publications.get(key)
         if publication is None or publication.topic in self.refused:
             return
@@ -212,11 +212,11 @@ class StandardTopics:
         return diagnostics([*boards, *self._services()], self._clock.time_ns(), "", self._ros_version)
 
     def _changed_health(self) -> dict[str, Any] | None:
-        """Return the health if the level of a board differs from the published one, which is due only each second."""
+        """Return the health if a board's level has changed since the last message; None otherwise."""
         return None if [each["level"] for each in self._boards()] == self._levels else self._health()
 
     def _boards(self) -> Iterator[dict[str, Any]]:
-        """Yield the status of each board: its part of the last frame, and what pcie-app says of it."""
+        """Yield the status of each board: its result in the last frame, and its state according to pcie-app."""
         deployment = self._deployment
         processes = self._stack.processes if self._stack else []
         known = {each.index: each for process in processes for each in process.boards}

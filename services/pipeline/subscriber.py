@@ -43,7 +43,7 @@ _BACKLOG_LIMIT = min(1 << 18, MAX_RECORD)
 
 
 async def newest_message(subscription: Subscription, message: Message) -> tuple[Message, int]:
-    """Return the newest of the first messages of a subscription, and the number of older ones.
+    """Return the newest message that waits at the start of a subscription, and the number of older ones.
 
     ROS 2 servers first send a backlog from before the subscription in one burst, the oldest message first.
     """
@@ -266,7 +266,7 @@ class Subscriber(RunService):
         self._forward(self._assembler.due(self._clock.tick()))
 
     def _forward(self, readings: list[Reading]) -> None:
-        """Send readings to the master, and set the timer for those that wait."""
+        """Send readings to the master, and set the timer for incomplete ones."""
         for reading in readings:
             self._send(reading)
         deadline = self._assembler.deadline

@@ -52,7 +52,7 @@ class _Topic(Generic[Item]):
         return int(statistics.median(self.intervals)) if self.intervals else None
 
     def is_alive(self, tick: int, begun: int) -> bool:
-        """Return whether a message can be expected; before the first one, silence counts from `begun`."""
+        """Return whether another message is expected; silence counts from the last one, at first from `begun`."""
         silence = tick - (begun if self.heard is None else self.heard)
         return silence <= ALIVE_PERIODS * (self.period or _UNKNOWN_PERIOD_NS)
 
@@ -74,14 +74,14 @@ class Synchroniser(Generic[Item]):
 
     Each set has a *pivot*: the newest among the oldest waiting messages of the needed topics, or the oldest
     waiting message of all if none is needed. Every other topic adds its message nearest to the pivot. The
-    message of a needed topic must be within the tolerance; that of another topic must also be nearer to this
-    pivot than to the next message of the pivot's topic. While its topic is alive, a set waits for a nearer
+    message of a needed topic must be within the tolerance; the message of any other topic must also be nearer to
+    this pivot than to the next message of the pivot's topic. While its topic is alive, a set waits for a nearer
     message, for at most the tolerance. Each message is used once.
 
     Attributes:
         unpaired: number of messages that remained unpaired.
         deadline: tick at which `take_set` must be called again, or None.
-        absent: the topics that were alive and not in the last set.
+        absent: indices of the topics that were alive but are not in the last set.
     """
 
     def __init__(self, needed: Sequence[bool], tolerance_ns: int) -> None:
@@ -114,7 +114,7 @@ class Synchroniser(Generic[Item]):
         topic.waiting.append(Stamped(stamp, tick, item))
 
     def take_set(self, tick: int) -> dict[int, Item] | None:
-        """Return the next set at this time, by the topics' indices, or None."""
+        """Return the next set that is complete at this tick (ns), by the topics' indices, or None."""
         self.deadline = None
         while (found := self._pivot()) is not None:
             at, pivot = found

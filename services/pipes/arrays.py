@@ -113,7 +113,7 @@ class ArrayField:
         return message
 
     def holds(self, message: dict[str, Any], numbers: list[float]) -> bool:
-        """Return whether a received message has these numbers, apart from the rounding of a float32."""
+        """Return whether a received message has these numbers; float32 arrays may be rounded."""
         received: Any = message
         for step in self.place:
             received = received.get(step) if isinstance(received, dict) else None
@@ -124,10 +124,10 @@ class ArrayField:
 
 
 def array_field(definitions: Definitions, message_type: str, path: str | None) -> ArrayField:
-    """Return the array of numbers at a path in a message type, or its only one.
+    """Return the array of numbers at a path in a message type, or the type's only one.
 
     Raises:
-        SettingsError: There is none there, or without a path there are several.
+        SettingsError: There is no array of numbers at the path, or without a path there are none or several.
     """
     arrays: dict[str, ArrayField] = {}
     waiting: list[tuple[Place, str]] = [((), ros1_type(message_type))]
@@ -217,7 +217,7 @@ async def publish_arrays(settings: Settings, source: Source, path: str | None) -
 
 
 async def _raise_refusal(topic: AdvertisedTopic) -> None:
-    """Raise a NotReceivableError if the server says why it does not pass on a topic."""
+    """Raise a NotReceivableError if the server does not pass on the topic and says why."""
     if refused := await refusals([topic], settled=True) | reported_refusals([topic]):
         raise NotReceivableError(refused[topic.name])
 
@@ -241,7 +241,7 @@ class _Echoes:
         self._has_seen = False
 
     async def watch(self) -> None:
-        """Compare what the topic brings, until cancelled."""
+        """Compare the topic's messages with the waiting lines, until cancelled."""
         async for received in self._watched:
             for at, (_, numbers) in enumerate(self._waiting):
                 if self._field.holds(received.msg, numbers):
@@ -252,13 +252,13 @@ class _Echoes:
                     break
 
     async def add(self, number: int, numbers: list[float], *, most: int) -> bool:
-        """Add a published line; wait as `at_most` if any message was ever seen, or for the first one."""
+        """Add a published line; then act as `at_most`, waiting only for the first line or if any message was seen."""
         first = not self._waiting and not self.lost
         self._waiting.append((number, numbers))
         return await self.at_most(most) if first or self._has_seen else not self._give_up(most)
 
     async def at_most(self, most: int) -> bool:
-        """Return True as soon as at most so many lines wait, or give up the others and return False."""
+        """Wait until at most `most` lines wait and return True; at the limit, give up the others and return False."""
         while len(self._waiting) > most:
             self._seen.clear()
             try:
@@ -269,7 +269,7 @@ class _Echoes:
         return True
 
     def _give_up(self, most: int) -> bool:
-        """Regard all but the last so many lines as lost; return whether there were any."""
+        """Count all but the last `most` waiting lines as lost; return whether there were any."""
         lost = [self._waiting.popleft()[0] for _ in range(len(self._waiting) - most)]
         self.lost += lost
         return bool(lost)

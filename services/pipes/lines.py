@@ -30,7 +30,7 @@ class LineReading(msgspec.Struct):
 
 
 class LineBoard(msgspec.Struct, omit_defaults=True):
-    """The result of a board; `why` is the reason in words."""
+    """The result of a board; `reason` is its stop reason as a number, `why` the same in words."""
 
     counts: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]]
     cycles: _Unsigned
@@ -42,7 +42,7 @@ class LineBoard(msgspec.Struct, omit_defaults=True):
 
 
 class LineResult(msgspec.Struct, kw_only=True):
-    """A result with its reading, in which an array is one address, -1: from `pcie-app` to `publisher`."""
+    """A result with its reading: from `pcie-app` to `publisher`. A reading that is an array has the one address -1."""
 
     number: _Unsigned
     stamp_ns: int | None = None

@@ -1,7 +1,7 @@
 """Local sockets between services: length-prefixed MessagePack records, and the handshake.
 
 A framed record is its length in four bytes (little-endian), followed by that many bytes of MessagePack. The core does
-not perform I/O; `RecordProtocol` is its wrapper for asyncio.
+not perform I/O; `RecordProtocol` connects it to asyncio.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _decoder: msgspec.msgpack.Decoder[AnyRecord] = msgspec.msgpack.Decoder(AnyRecord
 
 
 def encode_record(record: Record) -> bytes:
-    """Return the bytes of one framed record; a LocalSocketError if it is larger than MAX_RECORD."""
+    """Return the bytes of one framed record; raise a LocalSocketError if it is larger than MAX_RECORD."""
     body = _encoder.encode(record)
     if len(body) > MAX_RECORD:
         raise LocalSocketError(
@@ -44,7 +44,7 @@ class RecordSplitter:
         self._pending = bytearray()
 
     def feed(self, data: bytes) -> list[AnyRecord]:
-        """Return the records that `data` completes, in order; a LocalSocketError if bytes are not a record."""
+        """Return the records that `data` completes, in order; raise a LocalSocketError if bytes are not a record."""
         pending = self._pending
         pending += data
         records: list[AnyRecord] = []

@@ -53,7 +53,7 @@ async def serve_metrics(
 
 
 class _StatusCollector(Collector):
-    """Collector of metrics from the status; the thread of a request asks the event loop, which owns the status."""
+    """Collector of metrics from the status. A request's thread asks the event loop, which owns the status."""
 
     def __init__(self, get_status: Callable[[], ProcessStatus]) -> None:
         # The function may be called only in the loop, whose state it reads.

@@ -32,7 +32,7 @@ VERSION = version("rosbayes")
 
 
 class LossReason(StrEnum):
-    """Reason why a reading has no result, or not on all topics, as shown by `status`."""
+    """Reason why a reading has no result, or has one not on all topics; shown by `status`."""
 
     PASSED_OVER = "passed over"
     """Replaced by a newer reading (`queue = latest`)."""
@@ -87,7 +87,7 @@ class Hello(Record, tag="hello", frozen=True):
 
 
 class Begin(Record, tag="begin", frozen=True):
-    """Master to a service: start of the run. With `once`, it ends after its first frame."""
+    """Master to a service: start of the run. With `once`, the run ends after its first frame."""
 
     once: bool
 
@@ -101,7 +101,7 @@ class Ready(Record, tag="ready", frozen=True):
 class Rosbridge(Record, tag="rosbridge", frozen=True):
     """Subscriber or publisher to the master: whether it is connected to a rosbridge server now.
 
-    If a server is back, the master tells the other service, which then reconnects at once.
+    When a service has reached a server again, the master tells the other service, which then reconnects at once.
     """
 
     connected: bool
@@ -139,11 +139,11 @@ reading, and for an array.
 
 
 class Reading(Record, tag="reading", frozen=True):
-    """Subscriber to master: one complete set of addresses, with the newest stamp or receipt.
+    """Subscriber to master: one complete set of addresses, with the newest stamp of its messages (or time of receipt).
 
     `prior_codes` is a written prior, two bytes per line (and replica); empty for the prior of the machine.
-    `passed_over` is the number of readings that the subscriber dropped since the last one it sent, `unpaired`
-    the number of unpaired messages.
+    `passed_over` is the number of readings that the subscriber dropped since the last one it sent; `unpaired` is the
+    number of unpaired messages.
     """
 
     # When it was read on the robot, when its last message arrived here, and when this record was sent.
@@ -161,7 +161,7 @@ class Reading(Record, tag="reading", frozen=True):
 
 
 class Unusable(Record, tag="unusable", frozen=True):
-    """Subscriber to master: an unusable message. Equal causes have equal `cause`."""
+    """Subscriber to master: an unusable message. `cause` is equal for messages with the same cause."""
 
     cause: str
     sentence: str
@@ -177,7 +177,7 @@ class FrameRequest(Record, tag="frame", frozen=True):
 
 
 class FrameResult(Record, tag="result", frozen=True):
-    """pcie-app to master: the results of the boards, durations, and what moved over the links.
+    """pcie-app to master: the results of the boards, durations, and the bytes and transfers on the links.
 
     `boards` is a list of `machines.kind.BoardResult`, which only its sender and the publisher read.
     """
@@ -207,7 +207,7 @@ class Publish(Record, tag="publish", frozen=True):
     """Master to publisher: a result, with the data of its frame."""
 
     result: FrameResult
-    # Those of its reading, for the report of the frame and its latency.
+    # Times of its reading, for the report of the frame and its latency.
     stamp_ns: int
     received_ns: int
     received_tick: int
@@ -223,10 +223,10 @@ class Publish(Record, tag="publish", frozen=True):
 class Published(Record, tag="published", frozen=True):
     """Publisher to master: the outcome of a result.
 
-    `seen` is whether it was seen on the wire (None if that was not checked). `best_probability` is that of `best_line`;
-    `total_ns` is the time from the reading's receipt to the result's sending. `missed` counts the outputs
-    whose servers were not connected, if there are several. `out_ns` is the duration of publishing. `why` is the sentence
-    of the report if there is no posterior or a biased one; equal causes have equal `cause`, the stop reasons of the boards.
+    `seen` is whether it was seen on the wire (None if that was not checked). `best_line` is the most
+    probable line. `total_ns` is the time from the reading's receipt to the result's sending. If there are several
+    outputs, `missed` counts those whose servers were not connected. `out_ns` is the duration of publishing. `why` is
+    the report's sentence if there is no posterior or a biased one; `cause` lists the stop reasons of the boards.
     """
 
     number: int
@@ -243,9 +243,9 @@ class Published(Record, tag="published", frozen=True):
 
 
 class Seen(Record, tag="seen", frozen=True):
-    """Publisher to master, with `--loop`: whether the server passed a result back to the publisher in time.
+    """Publisher to master, with `--loop`: whether the publisher received one of its own results back in time.
 
-    It is sent once after the first result, and again if a later one comes back.
+    If not, it is sent again as soon as a later result comes back.
     """
 
     seen: bool

@@ -45,7 +45,7 @@ GetStatus = Callable[[], ProcessStatus]
 class ServiceManager:
     """The service manager that started this process, if any (systemd's sd_notify).
 
-    A slow or absent one never delays or ends the process.
+    A slow or absent service manager never delays or ends the process.
     """
 
     def __init__(self) -> None:
@@ -93,7 +93,7 @@ class ServiceManager:
 class Report:
     """The status of a process with its identity, rate, CPU time, memory and latencies.
 
-    `is_alive` returns whether it makes progress; needed only if this is not evident from an answer. `stages` returns
+    `is_alive` returns whether the process makes progress, if its answers alone do not prove that. `stages` returns
     the latencies of the stages of its frames.
     """
 
@@ -184,7 +184,7 @@ def shifted(metrics: str, ports: int) -> str:
 async def serve_status(
     directory: Path | None, name: str, get_status: GetStatus, *, metrics: str = "", **more: Any
 ) -> AsyncIterator[None]:
-    """Report in the running loop within the context; `more` is passed to `Report`.
+    """Report the status from the running event loop within the context; `more` is passed to `Report`.
 
     The directory must exist; without one there is no status socket, and without `metrics` there is no HTTP
     server. A socket that cannot be opened only causes a warning, because it must not end a robot's run.

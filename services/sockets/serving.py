@@ -234,10 +234,10 @@ class RunService(ABC):
         self._logs_frames = settings.log_level == "debug"
 
     async def run(self) -> int:
-        """Serve until cancelled, or until an error, which the master is told.
+        """Serve until cancelled, or until an error, which is also sent to the master.
 
         Raises:
-            OutdatedError: A master uses the current content of the folder, and this service an earlier one.
+            OutdatedError: A master requires the deployment now in the folder, and this service loaded an earlier one.
         """
         settings = self._settings
         status = serve_status(settings.run_directory, self.role, self.status, metrics=settings.metrics)
@@ -259,7 +259,7 @@ class RunService(ABC):
 
     @abstractmethod
     async def _serve(self) -> None:
-        """Do the work; the link is open."""
+        """Do the work of the service, while the link is open."""
 
 
 async def report_failure(link: Link, error: BaseException) -> None:
@@ -274,7 +274,7 @@ async def report_failure(link: Link, error: BaseException) -> None:
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
-    """Return the error if a restart would give a service the deployment that it refused; otherwise None."""
+    """Return the error if a restart would load the deployment that a master required in `refused`; otherwise None."""
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None
     try:
@@ -302,7 +302,7 @@ def deployment_for(settings: Settings, *, images: bool = False) -> Deployment:
 
     Raises:
         SettingsError: The settings do not name a deployment.
-        ToolchainError: It is damaged, of another version, or missing.
+        ToolchainError: The deployment is damaged, of another version, or missing.
     """
     if settings.deployment is None:
         raise SettingsError(
@@ -341,7 +341,7 @@ def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint
 
 
 def board_endpoint(text: str, where: str, settings: Settings) -> Endpoint:
-    """Return the endpoint of a board, with the key of the settings on TCP; a SettingsError or CredentialsError if wrong."""
+    """Return the endpoint of a board, with the settings' key on TCP, or raise a SettingsError or CredentialsError."""
     endpoint = endpoint_from(text, where)
     if not endpoint.host or settings.key_file is None:
         return endpoint

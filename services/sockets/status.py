@@ -48,9 +48,9 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
     # computed frames. Publisher: requested, and published results.
     received: int
     completed: int
-    # The others, by `LossReason`.
+    # Readings or results that were lost, by `LossReason`.
     lost: dict[str, int]
-    # Of the last completed one: its number (None before the first one, and in the subscriber, which does not know
+    # Of the last completed frame: its number (None before the first one, and in the subscriber, which does not know
     # numbers), and its age.
     last_number: int | None
     last_age_s: float | None
@@ -68,7 +68,7 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
         last: tuple[int, int],
         without: Mapping[str, int] | None = None,
     ) -> FrameCounts:
-        """Return counts: `lost` without zeros; `last` is a number and a time (monotonic ns), each 0 if there is none."""
+        """Return the counts; `last` is the last frame's number and time (monotonic ns), each 0 if there is none."""
         number, tick = last
         return cls(
             received=received,
@@ -109,7 +109,7 @@ BUCKETS_S = tuple(digit * 10.0**exponent for exponent in range(-5, 1) for digit 
 
 
 class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
-    """The latencies of a stage of frames; `frame` is the whole frame."""
+    """The latencies of one stage of the frames; the stage `frame` is the whole frame."""
 
     stage: str
     # quantiles over the last 1000 published frames
@@ -227,7 +227,7 @@ async def read_process_status(path: str, timeout: float) -> ProcessStatus:
 
 
 def _connected(asking: socket.socket, path: str) -> bool:
-    """Try to connect; return False if the backlog is full, because an event loop cannot wait for room in it."""
+    """Try to connect; return False if the backlog is full, so that the caller can retry without blocking."""
     try:
         asking.connect(path)
     except BlockingIOError:
@@ -249,7 +249,7 @@ async def _ask(path: Path, turns: asyncio.Semaphore) -> ProcessStatus | SilentPr
 
 
 def _sort_key(name: str) -> tuple[int, int, str]:
-    """Return the sort key of a process: services in the order of a frame's path, then boards by number."""
+    """Return the sort key of a process: services in the order in which a frame passes them, then boards by number."""
     if name in _ORDER:
         return _ORDER.index(name), 0, name
     digits = name.removeprefix("board")
@@ -266,7 +266,7 @@ def _is_foreign_hub(process: ProcessStatus, others: Iterable[ProcessStatus]) -> 
 async def ask_stack(directory: Path, *, shared: bool = False) -> StackStatus:
     """Return the status of the processes in a run directory, queried in parallel.
 
-    Whoever is in a `shared` directory may be of several runs: a hub that no service uses is left out.
+    Processes in a `shared` directory may belong to several runs, so a hub that no service uses is left out.
     Up to 256 processes take at most about a second.
     """
     turns = asyncio.Semaphore(_AT_ONCE)
