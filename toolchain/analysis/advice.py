@@ -72,7 +72,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Advice:
-    """The machines for a question, the median time of exact inference, and a sentence."""
+    """The machines for a question, the median time of exact inference, and a recommendation."""
 
     model: str
     question: str

@@ -42,7 +42,7 @@ class FrameRun:
 
 
 class EmulatedBoards:
-    """Boards with the lines of one machine; a BuildError if the target does not fit the counters."""
+    """Boards that share the lines of one machine; a BuildError if the target does not fit the counters."""
 
     def __init__(
         self, machines: Sequence[BM1Machine], *, target_count: int, max_cycles: int, stop: Stop

@@ -196,7 +196,7 @@ def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH, inputs: i
 
 
 def _generators(p: BM1Parameters, table_length: int) -> LogicPart:
-    """Return the generators, and the logic that loads their seeds (bm1_generators)."""
+    """Return the logic of the generators, and the logic that loads their seeds (bm1_generators)."""
     count, width = generators(p), state_bits(p, table_length)
     lfsrs = {Of.STATE_BIT: count * width, Of.STEP: count * p.steps_per_clock}
     counts = lfsrs if p.rng.lfsr_bits else {Of.PLACE_BIT: count * width}
@@ -205,7 +205,7 @@ def _generators(p: BM1Parameters, table_length: int) -> LogicPart:
 
 
 def _inputs(p: BM1Parameters, inputs: int) -> LogicPart:
-    """Return the words that the host writes for a frame (bm1_words): readings, prior addresses of replicas, codes."""
+    """Return the logic of the words that a host writes for a frame (bm1_words): readings, prior addresses, codes."""
     used = BM1.registers(p)
     sensor_bits = sum(p.sensor_bits) * used.input_words // max(p.sensors, 1)
     # used words, their used bits, and the depth of the memory

@@ -44,7 +44,7 @@ class LostFrames(NamedTuple):
 
 
 def lost_frames(plan: MachinePlan, quantised: Quantised) -> LostFrames:
-    """Predict the lost frames of a machine, and compute what helps if there are too many."""
+    """Predict the lost frames of a machine, and find options that help if there are too many."""
     size = plan.model.lines * plan.parameters.columns
     frames = min(_MOST_FRAMES, max(_LEAST_FRAMES, _WORK // (_POINTS * size)))
     drawn = sample_readings(plan.model, frames, seed=_SEED)

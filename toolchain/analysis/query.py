@@ -116,7 +116,7 @@ def answer(
     known: Mapping[str, str],
     machine: MachineChoice | None = None,
 ) -> Answer:
-    """Return the exact posterior of the searched variables for known states, and that of a machine if one is given.
+    """Return the exact posterior of the searched variables for known states, and a machine's if one is asked for.
 
     Raises:
         ToolchainError: A variable or state does not exist, the states are impossible together, inference needs a table

@@ -76,7 +76,7 @@ class Readings:
 
 
 def check_frames(frames: int) -> None:
-    """Refuse, with a BuildError, a number of frames that is not 1 to `MOST_FRAMES`."""
+    """Raise a BuildError for a number of frames that is not from 1 to `MOST_FRAMES`."""
     if not 1 <= frames <= MOST_FRAMES:
         raise BuildError(f"--frames is {frames}, expected 1 to {MOST_FRAMES}")
 
@@ -119,7 +119,7 @@ def readings_of_lines(
     """Convert drawn readings for a machine whose lines have their own readings.
 
     The cell of the true line reads the drawn value. The model does not define the readings of the other
-    lines, which are drawn from the mean of all lines. With sensor_mode `threshold`, the likelihoods are
+    lines, so these are drawn from the mean over all lines. With sensor_mode `threshold`, the likelihoods are
     returned as codes.
 
     Raises:

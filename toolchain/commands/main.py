@@ -137,7 +137,7 @@ def deployment(directory: Directory, edits: DeploymentEdits, verbose: Verbose = 
 
 
 def _lines(directory: Path) -> list[str]:
-    """Return the lines of `deployment.toml`; none if it is missing, which is an error elsewhere."""
+    """Return the lines of `deployment.toml`; none if it is missing, which a later call reports."""
     file = directory / FILE_NAME
     return file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
 

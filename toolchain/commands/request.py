@@ -125,7 +125,7 @@ def model_file(path: Path) -> Path:
 
 
 def read_source(path: Path, flags: ModelFlags) -> "Model | Question":
-    """Return the model or question of a folder, or the question to a network file."""
+    """Return the model or question of a folder, or the question about a network file."""
     settings = key_values(flags.settings or ())
     return (_network_question if is_network(path) else _case_source)(path, flags, settings)
 

@@ -58,7 +58,7 @@ def _missing(variable: Variable, what: str) -> int | None:
 
 
 def _unserved(variable: Variable, value: float, beyond_top: bool | None) -> int | None:
-    """Apply `on_range` at the top or the bottom; `beyond_top` is None for a periodic variable."""
+    """Return the address that `on_range` gives a value out of range; `beyond_top` is None for a periodic variable."""
     if variable.on_range == "missing":
         return _missing(variable, f"is {_shown(value)}, out of range")
     if variable.on_range == "clamp" and beyond_top is not None:

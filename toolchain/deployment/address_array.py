@@ -49,9 +49,9 @@ def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Sc
 def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int = 1) -> NDArray[np.uint16]:
     """Return the codes of a written prior, uint16[lines]; only the ratios of its numbers matter.
 
-    The prior has one number per line of the machine, over all boards, such as a posterior of an earlier frame. With
-    replicas, it is the prior of all of them, unless there are `replicas` times as many numbers, one prior for each;
-    then uint16[replicas, lines] is returned.
+    The prior has one number per line of the machine, over all boards, such as a posterior of an earlier frame. All
+    replicas have this prior. With `replicas` times as many numbers, each replica has its own prior, and the codes are
+    uint16[replicas, lines].
 
     Raises:
         ReadingError: The number of values is wrong, a value is not a probability, or all values are 0.
@@ -83,9 +83,9 @@ MISSING: Final = -1
 def to_addresses(deployment: Deployment, variable: Variable, value: object) -> list[int] | None:
     """Return the addresses (`threshold`: codes) of one variable's readings in a frame; None if all are missing.
 
-    The value of the field is a flat array, or one with the shape `deployment.reading_shape(variable)`; bytes
-    (`uint8[]`) as bytes or as base64. With `None` or an empty array, all readings are missing; null and NaN are
-    single missing readings. There is one address per element of the shape, row by row; `MISSING` in all lines of a
+    The value of the field is a flat array, or one with the shape `deployment.reading_shape(variable)`; an
+    array `uint8[]` may be bytes or base64 text. With `None` or an empty array, all readings are missing; null and NaN
+    are single missing readings. There is one address per element of the shape, row by row; `MISSING` in all lines of a
     missing reading.
 
     Raises:

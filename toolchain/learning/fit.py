@@ -69,7 +69,7 @@ class Support:
     readings: int
     """Number of its readings in rows with a true position."""
     cells: int
-    """Number of lines with at least one of them."""
+    """Number of lines with at least one of these readings."""
     median: float
     """The median number of readings in such a line."""
     refused: int

@@ -40,7 +40,7 @@ class Recording:
     columns: dict[str, list[object]]
     """Values by name, one per row: a number, a text, or None if missing."""
     stamps: tuple[int, ...] = ()
-    """Nanoseconds of each row in a bag, or in a CSV file whose stamps were asked for and that has any."""
+    """Nanoseconds of each row of a bag, or of a CSV file with stamps if they were asked for; otherwise empty."""
 
 
 def read_recording(

@@ -32,8 +32,8 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
 def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
     """Return the model or the question of a folder with a `model.py`, or of that file itself, or raise a ModelError.
 
-    It defines `model(...)`, which returns a `toolchain.models.Question` or a `toolchain.models.Model`, and can import
-    modules in its folder. The settings are values for the parameters of `model()` as text; each is converted to the
+    The file defines `model(...)`, which returns a `toolchain.models.Question` or a `toolchain.models.Model`, and can
+    import modules in its folder. The settings are values for the parameters of `model()` as text; each is converted to the
     annotated type of its parameter (int, float, bool, str, Path, an Enum, a Literal).
     """
     path = existing_model_path(case)
@@ -65,7 +65,7 @@ def installed_models() -> dict[str, Path]:
 
 
 def model_path(case: Path) -> Path:
-    """Return the path of a case study's model: in its folder, the given file, or that of an installed model."""
+    """Return the path of a model: `model.py` in the given folder, the given file, or the file of an installed model."""
     case = Path(case)
     if case.name == FILE_NAME and case.is_file():
         return case

@@ -53,7 +53,7 @@ def reduced(term: Term, values: Mapping[str, int]) -> Term:
 
 
 def product(terms: Sequence[Term], scope: Sequence[str], sizes: Mapping[str, int]) -> NDArray[np.float64]:
-    """Return the product of terms over all their names, float64[size of each]; a ModelError above the limit."""
+    """Return the product of terms over all their names, float64[size of each]; a ModelError if it is too large."""
     _check_size(scope, sizes, "the answer")
     if len(terms) == 1 and terms[0].scope == tuple(scope):  # not copied: it may be large
         return terms[0].table
@@ -123,7 +123,7 @@ def _order(terms: Iterable[Term], names: set[str], sizes: Mapping[str, int]) -> 
 def _planned(
     graph: _Graph, names: set[str], sizes: Mapping[str, int], cost: Callable[[_Graph, str], int]
 ) -> _Plan:
-    """Return the order that eliminates the name with the lowest cost next."""
+    """Return the order in which each next name has the lowest `cost`."""
     graph = {name: set(neighbours) for name, neighbours in graph.items()}
     costs = {name: cost(graph, name) for name in names}
     # The name breaks ties, so the same question gives the same sums, bit for bit. A changed cost is a new
@@ -199,9 +199,9 @@ _SHOWN: Final = 4
 
 
 class Links:
-    """Links between symbols that share a factor, without the searched and given ones.
+    """Links between symbols that share a factor; the searched and given symbols, `cut`, are left out.
 
-    Symbols in different components are independent given these symbols (moral graph criterion).
+    Symbols in different components are independent given those in `cut` (moral graph criterion).
     """
 
     def __init__(self, factors: Iterable[Factor], cut: set[str]) -> None:

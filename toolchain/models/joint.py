@@ -109,7 +109,7 @@ class JointDistribution:
             given: Symbols with a fixed value, by name: the label or number of the value.
             prior_select: A known symbol that selects the prior instead of being a column (thesis 2.1.2).
             previous: For a filter: the searched symbols one frame earlier, in the same order. The arcs from them are
-                the transition, and their own distribution is that before the first frame.
+                the transition, and their own distribution is P(S) before the first frame.
 
         Raises:
             ModelError: A symbol does not exist, or is in the question twice.
@@ -172,7 +172,7 @@ class Question:
         Raises:
             NotFusionError: The question is not naive fusion; the sentence contains the path that joins two known
                 symbols.
-            ModelError: It is impossible, or needs a table above the limit.
+            ModelError: The question is impossible, or needs a table above the limit.
         """
         observed = [symbol.name for symbol in self.observed]
         searched = [symbol.name for symbol in self.searched]

@@ -279,7 +279,7 @@ def dimension(
     `unit` is that of offset and step, such as m; `states` are the names of the cells, if any.
 
     Raises:
-        ModelError: There are no cells, the name is empty, the number of states differs from that of cells, or
+        ModelError: There are no cells, the name is empty, the number of states is not the number of cells, or
             the step is 0.
     """
     check_size(f"searched dimension {str(label)[:NAME_MAX]!r}", size, MAX_LINES)
@@ -334,8 +334,8 @@ def exact_posterior(
     """Return P(S | readings) of the unquantised model, float64[lines].
 
     There is an address per known variable, in the order of the columns; None for a missing reading. If lines have
-    their own readings (`sensor_mode = cell`), it is int64[lines]. `prior_address` is the row of the selected prior;
-    None for the prior without a selection. `prior` replaces that of the model.
+    their own readings (`sensor_mode = cell`), an address is int64[lines]. `prior_address` is the row of the selected
+    prior; None for the prior without a selection. `prior` replaces the prior of the model.
 
     Raises:
         ModelError: The number of addresses is wrong, an address is not supported, or the readings are

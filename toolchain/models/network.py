@@ -59,7 +59,7 @@ class NetworkModel:
         return math.prod(each.size for each in self.searched)
 
     def exact(self, addresses: Sequence[int | None]) -> NDArray[np.float64]:
-        """Return the exact posterior of the searched variables together, float64[lines], the first one slowest.
+        """Return the exact posterior of the searched variables together, float64[lines]; the first varies slowest.
 
         There is an address per known variable; None for a missing reading. A ModelError if the readings have the
         probability 0, or inference needs a table above the limit.

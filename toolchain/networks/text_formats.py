@@ -411,7 +411,7 @@ def read_uai(data: bytes, builder: NetworkBuilder) -> None:
 
 
 def _reversed(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the table in the order of pgmpy: its axes are those of the scope from the last to the first."""
+    """Return the table as pgmpy wrote it: the same numbers, with the axes of the scope in reverse order."""
     return values.reshape(values.shape[::-1])
 
 

@@ -52,7 +52,7 @@ class Mif:
 def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[str] = ()) -> Iterator[str]:
     """Yield the lines of a file in canonical form: hexadecimal, with one entry per line.
 
-    `words` are all words from address 0, and `comments` lines for the beginning, in which unprintable
+    `words` are all words from address 0, and `comments` are lines for the beginning, in which unprintable
     characters are escaped.
     """
     for comment in comments:
@@ -72,7 +72,7 @@ def printable(text: str) -> str:
 def read_mif(path: Path, due: tuple[int, int] | None = None) -> Mif:
     """Read the contents of a memory from any form of MIF; a MifError contains the line.
 
-    `due` is the expected width and depth: then a memory of another size, or with a missing address, is refused.
+    `due` is the expected width and depth; if given, a memory of another size, or with a missing address, is refused.
     """
     data = read_bounded(path, MOST_BYTES, MifError)
     return parse_mif(data.decode("latin-1"), str(path), due)
