@@ -33,8 +33,8 @@ def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
     """Return the model or the question of a folder with a `model.py`, or of that file itself, or raise a ModelError.
 
     The file defines `model(...)`, which returns a `toolchain.models.Question` or a `toolchain.models.Model`, and can
-    import modules in its folder. The settings are values for the parameters of `model()` as text; each is converted to the
-    annotated type of its parameter (int, float, bool, str, Path, an Enum, a Literal).
+    import modules in its folder. The settings are values for the parameters of `model()` as text; each is converted to
+    the annotated type of its parameter (int, float, bool, str, Path, an Enum, a Literal).
     """
     path = existing_model_path(case)
     folder = str(path.parent.resolve())
