@@ -158,7 +158,7 @@ async def announced(
 
     `host` is the address on which the server listens; `0.0.0.0` and `::` mean all addresses of this machine,
     and a loopback address is announced only to this machine. With `tls`, clients get the host name of this
-    machine, which must be in the certificate; `token` says whether they need one.
+    machine, which must be in the certificate; `token` says whether clients need a token.
 
     Raises:
         DiscoveryError: `zeroconf` is not installed, there is no network, or another server has the name.

@@ -25,7 +25,7 @@ REPLICAS_MAX: Final = 256
 """Maximum number of machines on a board: the register map has room for the outcomes of this many."""
 
 CYCLES_MAX: Final = 2**63 - 1
-"""Maximum of `max_cycles` and `run_until`: 64-bit registers whose values must fit into a signed number."""
+"""Maximum of `max_cycles` and `run_until`: their registers have 64 bits, and their values must fit into an int64."""
 
 
 class RngKind(StrEnum):

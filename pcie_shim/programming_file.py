@@ -293,7 +293,7 @@ def _read_manifest(content: bytes, name: str) -> tuple[MachineKind, _Manifest[An
 def _read_sections(
     content: bytes, name: str, kind: MachineKind, manifest: _Manifest[Any], start: int
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return the tables by name; the parameters define the expected sections before anything is allocated."""
+    """Return the tables by name, after checking the sections against those that the parameters need."""
     sections: dict[str, npt.NDArray[Any]] = {}
     due = kind.due_sections(manifest.identity.parameters)
     for section in manifest.identity.sections:

@@ -39,7 +39,7 @@ class ErrorCode(IntEnum):
 
 
 class Block(int):
-    """The address of a register, an array of registers or a memory: of 32-bit words from there on."""
+    """The address in bytes of a register, an array of registers or a memory, which has `words` 32-bit words."""
 
     words: int
     writable: bool
@@ -131,4 +131,4 @@ STREAM: Final = Block(0xc000, 4096, writable=False)
 INPUTS: Final = Block(0x10000, 8192, writable=True)
 
 BLOCKS: Final = {name: each for name, each in tuple(globals().items()) if isinstance(each, Block)}
-"""All of them by name, in the order of their addresses."""
+"""All blocks by name, in the order of their addresses."""

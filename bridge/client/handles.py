@@ -61,7 +61,7 @@ class Handle:
         self._session.flush()
 
     def end(self) -> None:
-        """End without sending anything: the client was closed."""
+        """End without sending anything, because the client was closed."""
         self._closed = True
 
     def _withdraw(self) -> None:
@@ -160,7 +160,7 @@ class Subscription(Handle):
         self._wake()
 
     def add_blind_seconds(self, seconds: float) -> None:
-        """Count time without a connection, after a reconnection."""
+        """After a reconnection, add the time without a connection."""
         self.blind_seconds += min(seconds, time.monotonic() - self._begun)
 
     def __aiter__(self) -> Self:

@@ -71,7 +71,7 @@ class Ros:
         """Write everything published inside the block at once: `with ros.together(): ...`.
 
         Messages that belong together then wake up the server only once. Nothing is sent before the block
-        ends, so it should not wait for anything.
+        ends, so the block should not wait for anything.
         """
         return self._session.together()
 
@@ -93,7 +93,7 @@ class Ros:
         return self._session.reconnections
 
     def reconnect_now(self) -> None:
-        """Try at once to reach a server that is away, for example because another program has reached it."""
+        """Try at once to reach a lost server, for example when another program has just reached it."""
         self._session.reconnect_now()
 
     @property

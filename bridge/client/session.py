@@ -79,7 +79,7 @@ Server = Callable[[ServiceRequested], Coroutine[Any, Any, None]]
 
 
 class Reader(Protocol):
-    """One subscription."""
+    """Receiver of the messages of one subscription."""
 
     def receive(self, messages: list[Message]) -> None:
         """Queue messages."""
@@ -91,11 +91,11 @@ class Reader(Protocol):
         """End, because a message of the topic was too large for the connection."""
 
     def add_blind_seconds(self, seconds: float) -> None:
-        """Count time without a connection, after a reconnection."""
+        """After a reconnection, add the time without a connection."""
 
 
 class GoalReceiver(Protocol):
-    """Sender of one action goal."""
+    """Receiver of the events of one goal of this client."""
 
     def receive(self, event: GoalFeedback | GoalEnded) -> None:
         """Handle an event of the goal."""
@@ -105,7 +105,7 @@ class GoalReceiver(Protocol):
 
 
 class GoalExecutor(Protocol):
-    """Server of an action of this client."""
+    """Receiver of the goals of one action that this client serves."""
 
     def receive(self, event: GoalRequested | CancelRequested) -> None:
         """Start a goal, or ask to cancel it."""

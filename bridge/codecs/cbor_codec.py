@@ -56,7 +56,7 @@ def decode(
 
     Args:
         data: A whole WebSocket message.
-        max_size: Maximum of bytes.
+        max_size: Maximum number of bytes.
         max_depth: Maximum nesting of maps, arrays and tags, including the outermost (an empty map or array at
             the innermost level does not count).
         arrays: Form of typed arrays and byte strings: `list` makes lists of numbers, and bytes of `uint8[]`;

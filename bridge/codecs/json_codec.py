@@ -78,7 +78,7 @@ def decode(data: bytes, *, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH)
 
     Args:
         data: A whole WebSocket message.
-        max_size: Maximum of bytes.
+        max_size: Maximum number of bytes.
         max_depth: Maximum nesting of objects and arrays, including the outermost.
 
     Returns:

@@ -87,7 +87,7 @@ def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
 
 
 def element_of(kind: Any, content: Any) -> tuple[str, int]:
-    """Return the element type and the length of a field as rosbags describes it: `SCALAR`, 0 for any, or fixed."""
+    """Return the element type of a field in rosbags, and its length: `SCALAR`, 0 for any length, or a fixed one."""
     match kind.name:
         case "BASE":
             return str(content[0]), SCALAR

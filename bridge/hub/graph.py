@@ -47,13 +47,13 @@ class Client:
     refused: int = 0
     """Number of the client's operations that were refused."""
     takeovers: int = 0
-    """Number of services and actions that the client took over from others."""
+    """Number of offers of services and actions with which the client replaced those of other clients."""
     fragments: Reassembler | None = None
     """The client's incomplete messages, once it has sent a fragment."""
     wants_status: bool = False
     """True if the client requested status messages about refusals."""
     status_lane: Lane | None = None
-    """The queue of the client's status messages, once there was one."""
+    """The queue of the client's status messages, once there has been a message."""
     last_published: "Advertisement | None" = None
     """The advertisement of the client's last message with a known envelope."""
     envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)
@@ -111,7 +111,7 @@ class TopicSubscription:
     typed: bool = False
     """True if the client named a type, which becomes the type of the topic."""
     options: dict[OperationId, SubscribeOptions] = field(default_factory=dict)
-    """Options by operation; the smallest value of each applies, as on the reference server."""
+    """Options of each subscribe operation; the smallest value of each option applies, as on the reference server."""
 
 
 @dataclass(eq=False, slots=True)
@@ -119,7 +119,7 @@ class Topic:
     """A topic that has publishers or subscribers."""
 
     name: str
-    """Absolute."""
+    """Absolute name."""
     largest: int
     """Maximum bytes of a message as JSON, so that it fits into an operation of the largest size."""
     type: str = ""

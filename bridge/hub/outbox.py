@@ -220,7 +220,7 @@ class Outbox:
             self._take_held(lane)
 
     def _bypass(self, payload: bytes, fragment_size: int) -> bool:
-        """Put a payload on the wire list, if nothing waits before it and the socket accepts data."""
+        """Append a payload to `wire` and return True, if nothing waits before it and the socket accepts data."""
         if self.wire is None or fragment_size or self._entries or self._fragments is not None:
             return False
         self.wire.append(payload)

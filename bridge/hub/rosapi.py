@@ -253,7 +253,7 @@ class Rosapi:
     # --- parameters
 
     def _outcome(self, failure: str = "", **values: Any) -> Values:
-        """Return the answer about a parameter, or its failure, in this ROS version's form."""
+        """Return the answer of a service about parameters, or its failure, in this ROS version's form."""
         if self.ros_version == 2:
             return values | {"successful": not failure, "reason": failure}
         if failure:

@@ -92,7 +92,7 @@ async def serve_hub(
         access: access control and TLS; by default every program may connect, and web pages of this machine.
         ros_version: the ROS version that the hub emulates.
         on_ready: called with the port once clients can connect.
-        on_graph: called before that with the graph of clients and topics, which it may read but not change.
+        on_graph: called before `on_ready` with the graph of clients and topics, which it may read but not change.
         stop: event that ends the hub.
 
     Raises:
@@ -283,7 +283,7 @@ class _Hub:
 
 
 class _Connection(WebSocketTransport):
-    """One client's WebSocket: messages in, messages out, and the deadlines of both."""
+    """One client's WebSocket: it receives and sends messages, and has deadlines for both."""
 
     turn_frames = _TURN_FRAMES
     turn_bytes = _TURN_BYTES

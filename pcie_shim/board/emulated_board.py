@@ -214,7 +214,7 @@ class EmulatedBoard:
         return words
 
     def write(self, address: int, words: bytes | memoryview) -> None:
-        """Write words from `address` on, as `Board.write`; if a word is refused, earlier ones may be written."""
+        """Write words from `address` on, as `Board.write`; if a word is refused, earlier ones may have been written."""
         count = len(words) >> 2
         end = address + 4 * count
         first = address >> 2

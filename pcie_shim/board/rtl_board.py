@@ -149,7 +149,7 @@ class RtlBoard:
         return bytes(words)
 
     def write(self, address: int, words: bytes | memoryview) -> None:
-        """Write words from `address` on, as `Board.write`; if a word is refused, earlier ones may be written."""
+        """Write words from `address` on, as `Board.write`; if a word is refused, earlier ones may have been written."""
         simulation = self._simulation
         if simulation is None:
             self._blank.write(address, words)

@@ -349,7 +349,7 @@ class BoardServer:
             self._drop_loader(loader)
 
     def _program(self, loader: LoaderConnection, frame: Frame) -> None:
-        """Handle a frame of a loader, which excludes other loaders from its first request on."""
+        """Handle a frame of a loader; after its first request, no other loader may program the board."""
         if loader is not self._loader:
             if self._loader is not None:
                 raise RefusedError(ErrorCode.HELD, _PROGRAMMED)

@@ -8,7 +8,7 @@ cancel_action_goal (id)    ->                      ->  cancel_action_goal (id)
 action_feedback (id) ...  <-                      <-   action_feedback (id) ...
 action_result (id)        <-                      <-   action_result (id)
 
-Actions are those of ROS 2.
+Only actions of ROS 2 are supported.
 """
 
 from collections.abc import Mapping
@@ -292,7 +292,7 @@ class ServedActions(_Served):
     def receive(
         self, operation: dict[str, Any], data: bytes
     ) -> GoalRequested | CancelRequested | UnusableReceived | None:
-        """Handle a goal or its cancellation; return None if it was refused here, or has ended."""
+        """Handle a goal or its cancellation; return None if the goal was refused here, or has ended."""
         goal, action, args = operation.get("id"), operation.get("action"), operation.get("args")
         if not isinstance(goal, str) or not isinstance(action, str):
             return UnusableReceived(f"a goal without an action or an id arrived: {excerpt(data)}")

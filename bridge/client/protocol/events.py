@@ -59,7 +59,7 @@ class MessageDiscarded:
 
 @dataclass(frozen=True, slots=True)
 class CallAnswered:
-    """A service answered: its values, or the text of its refusal."""
+    """The answer of a service: its values, or the text of its refusal."""
 
     call: str
     ok: bool
