@@ -262,7 +262,7 @@ def _batch_ends(samples: int, batches: int = BATCHES) -> list[int]:
 
 
 class _OnBoard(BoardMachine):
-    """A kernel that reads start state, mask and settings from a board's blocks, and writes its answer to others."""
+    """A kernel that reads start state, mask and settings from a board's blocks, and writes the blocks of its answer."""
 
     def reset(self) -> None:
         self._kernel.reset()
@@ -449,7 +449,7 @@ class _OnHost(HostMachine):
         return FrameInput(addresses=known, target_count=samples, max_cycles=CYCLES_MAX)
 
     def _blocks_of(self, addresses: tuple[int | None, ...]) -> list[Blocks] | str:
-        """Return the blocks of each board; none if the readings have probability 0, or an error's text."""
+        """Return the blocks of each board (none if the readings have probability 0), or the text of an error."""
         parameters = self._parameters
         if len(addresses) != len(parameters.known):
             raise StartError(

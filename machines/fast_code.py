@@ -254,7 +254,7 @@ def _show(generators: Generators, frame: _Frame, clocks: int) -> None:
 
 @jit
 def _fill(code: int, inverted: Words, words: Words, row: int) -> None:
-    """Compute a code's row in a block: ones in the cycles whose number is less, found from the lowest bit up."""
+    """Compute a code's row in a block: a one in each cycle in which the random number is less than the code."""
     less = splat(_0)
     for bit in range(inverted.shape[0]):
         zeros = load(inverted, bit)

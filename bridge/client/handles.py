@@ -56,7 +56,7 @@ class Handle:
         self._closed = False
 
     def _register(self) -> None:
-        """Register the handle, so that the client closes it when it is closed itself, and send its operation."""
+        """Register the handle with its client, which closes it at its own end, and send its operation."""
         self._session.on_closed.add(self.end)
         self._session.flush()
 

@@ -231,7 +231,7 @@ class Ros:
             Fields of the answer.
 
         Raises:
-            ServiceError: The service refused; with the server's text.
+            ServiceError: The service refused the call; the error has the server's text.
             NoAnswerError: The service did not answer in time.
             SlowPeerError: The server did not accept the call in time.
             DisconnectedError: There is no connection, or it was lost meanwhile.

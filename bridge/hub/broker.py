@@ -148,8 +148,8 @@ class Broker:
     def receive_turn(self, client: Client, messages: list[bytes], now: float) -> int:
         """Perform a client's messages in order, as many as one turn allows; each has at most `limits.message_bytes`.
 
-        Returns the number of messages performed. Call again with the others, but while the client's outbox is
-        congested, only after the client has read its answers.
+        Returns the number of messages performed. Call it again with the others; if the client's outbox is
+        congested, not before the client has read its answers.
         """
         self._now, self._operation_id = now, None
         dispatcher, outbox = self._dispatcher, client.outbox

@@ -45,7 +45,7 @@ class Dispatcher:
         return ready
 
     def checked(self, payload: bytes, what: str) -> bytes:
-        """Return a payload, or raise a RefusedOperationError, in which `what` names it, if it exceeds the limit."""
+        """Return a payload; if it exceeds the limit, raise a RefusedOperationError that calls it `what`."""
         if len(payload) > self._limits.message_bytes:
             raise RefusedOperationError(f"{what} has more than {self._limits.message_bytes} bytes")
         return payload

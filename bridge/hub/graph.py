@@ -61,7 +61,7 @@ class Client:
     close_reason: str = ""
     """Reason why the client must be disconnected, or empty."""
     is_ready: bool = False
-    """True while the client is in the dispatcher's list of those with output."""
+    """True while the client is in the dispatcher's list of clients with output."""
 
     @property
     def node(self) -> str:

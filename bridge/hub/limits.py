@@ -1,6 +1,7 @@
 """Limits of the hub, its errors, and the validation of the fields of an operation.
 
-Functions that read a field raise a `RefusedOperationError` if it is invalid, which the broker logs or, for a call, answers.
+Functions that read a field raise a `RefusedOperationError` if it is invalid. The broker logs this error, and answers
+with it if the operation is a call or a goal.
 """
 
 import re

@@ -271,7 +271,7 @@ class Subscriptions:
         ]
 
     def renew(self, topic: str) -> bool:
-        """Subscribe again to a published topic that is silent; return True if the subscription now changes to JSON.
+        """Subscribe again to a topic that is published but silent; return True if this changes the encoding to JSON.
 
         rosbridge for ROS 2 fixes the quality of service when it subscribes, so it gets nothing from a best-effort
         publisher that starts later. Servers fail to write some types as CBOR, so the second and later renewals request
