@@ -44,7 +44,7 @@ class ConcurrentReadError(UsageError):
 
 
 class WrongThreadError(UsageError):
-    """Raised when a client is used from another thread than that of its event loop."""
+    """Raised when a client is used in a thread other than its event loop's."""
 
 
 class ActionlibError(UsageError):

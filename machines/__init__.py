@@ -68,7 +68,7 @@ def _bm2() -> "MachineKind":
 
 
 KINDS: Final[dict[str, Callable[[], "MachineKind"]]] = {"BM1": _bm1, "BM2": _bm2}
-"""Functions that import and return the kinds of machines, by name. Not imported here: the subscriber avoids NumPy."""
+"""Functions that import and return a kind of machine, by name; they need NumPy, which the subscriber must not load."""
 
 
 def kind_of(parameters: object) -> "MachineKind":

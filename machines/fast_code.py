@@ -1,6 +1,6 @@
 """Compiled functions of the fast kernel, which compute and count the words of a block, and their arrays.
 
-They are in one file because numba recompiles a function when its own file changes, but not an imported file.
+They are in one file because numba recompiles a function when its file changes, but not when an imported file does.
 """
 
 from collections.abc import Callable

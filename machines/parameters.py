@@ -13,7 +13,7 @@ ADDRESS_BITS_MAX: Final = 16
 """Maximum width of an address of a sensor or prior table in bits: 65,536 rows of one code per line."""
 
 COUNTER_BITS_MAX: Final = 32
-"""Maximum width of a counter in bits: that of a result register."""
+"""Maximum width of a counter in bits: the width of a result register."""
 
 STEPS_PER_CLOCK_MAX: Final = 256
 """Maximum number of steps per clock: hardware unrolls them, and the reference kernel executes them one by one."""

@@ -42,7 +42,7 @@ END: Final = 8
 
 PROTOCOL_VERSION: Final = 1
 MAX_PAYLOAD_WORDS: Final = 8448
-"""Maximum payload in words. INPUTS, the longest block, is shorter, and so are RESULTS and STREAM in one answer."""
+"""Maximum payload in words. INPUTS, the longest block, fits into it, and so do RESULTS and STREAM together."""
 
 _MAGIC: Final = 0x4D42
 _HEAD: Final = struct.Struct("<HBBIII")
@@ -206,7 +206,7 @@ NO_TOKEN: Final = bytes(8)
 
 
 class ProgramBegin(NamedTuple):
-    """A loader's announcement of a file of `size` bytes, with its host's token from the greeting, or `NO_TOKEN`."""
+    """A loader's announcement of a file of `size` bytes, with the token of its host's link, or `NO_TOKEN`."""
 
     size: int
     sha256: bytes

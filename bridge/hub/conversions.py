@@ -137,7 +137,7 @@ def _scalar(value: Any, element: str, place: str) -> Any:
 
 
 def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | bytes:
-    """Return an array's numbers, after checking their types, range and, unless `length` is 0, number."""
+    """Return an array's numbers, after checking their types and range and, unless `length` is 0, how many they are."""
     if element == "float64" and not length:
         try:  # much faster than comparing types, it refuses the same ones
             return msgspec.convert(values, list[float])

@@ -308,7 +308,7 @@ class Rosapi:
 
 
 def _of_type(types: Iterable[tuple[str, str]], type_name: str, normalise: Callable[[str], str]) -> list[str]:
-    """Return the names, of (name, type) pairs, with this type; the type may be in the form of ROS 1 or ROS 2."""
+    """Return the names from (name, type) pairs with this type, which is given in the form of ROS 1 or ROS 2."""
     try:
         wanted = normalise(type_name)
     except NameFormError:
