@@ -79,8 +79,7 @@ async def test_a_process_may_start_slowly_but_not_for_ever(peers, tmp_path, monk
 
 @pytest.mark.process
 async def test_a_process_that_dies_is_restarted_three_times(boat, tmp_path):
-    settings = Settings(restart_window=PROCESS_PATIENCE)
-    peers = Peers(settings, boat, get_logger("test"), once=False)
+    peers = Peers(Settings(restart_window=PROCESS_PATIENCE), boat, get_logger("test"), once=False)
     boards = Child("the boards' process", ["/bin/sh", "-c", f"echo >> {tmp_path}/starts; kill -KILL $$"])
     await boards.start()
     with pytest.raises(BoardFailedError, match="SIGKILL"):
@@ -155,33 +154,33 @@ async def test_boards_that_compile_give_services_more_time(peers, events, own_bo
 ROLES = ("subscriber", "publisher", "pcie-app")
 
 
-@pytest.mark.parametrize("given", [(), ("publisher",), ("pcie-app",), ROLES])
-def test_peers_that_are_not_given_are_started(boat, tmp_path, given):
-    settings = Settings(
-        run_directory=tmp_path, **{role.replace("-", "_"): f"unix:/tmp/{role}.sock" for role in given}
-    )
-    peers = Peers(settings, boat, get_logger("test"), once=True)
-    peers.prepare()
+def prepared(boat, directory, **settings):
+    """Peers that are known, and not started; their directory is free again."""
+    peers = Peers(Settings(run_directory=directory, **settings), boat, get_logger("test"), once=True)
     try:
-        assert [peer.role for peer in peers] == list(ROLES)
-        assert tuple(peer.role for peer in peers if peer.child is None) == given
-        assert (peers.directory is None) is (given == ROLES)
-        assert (peers._boards is None) is ("pcie-app" in given)
-        places = {endpoint_from(each, "").path for each in peers.board_endpoints}  # each board has its own
-        assert len(places) == (0 if "pcie-app" in given else len(boat.boards))
+        peers.prepare()
     finally:
         if peers._run is not None:
             peers._run.release()
+    return peers
+
+
+@pytest.mark.parametrize("given", [(), ("publisher",), ("pcie-app",), ROLES])
+def test_peers_that_are_not_given_are_started(boat, tmp_path, given):
+    peers = prepared(boat, tmp_path, **{role.replace("-", "_"): f"unix:/tmp/{role}.sock" for role in given})
+    assert [peer.role for peer in peers] == list(ROLES)
+    assert tuple(peer.role for peer in peers if peer.child is None) == given
+    assert (peers.directory is None) is (given == ROLES)
+    assert (peers._boards is None) is ("pcie-app" in given)
+    places = {endpoint_from(each, "").path for each in peers.board_endpoints}  # each board has its own
+    assert len(places) == (0 if "pcie-app" in given else len(boat.boards))
 
 
 @pytest.mark.parametrize("given", [{}, {"publisher": "unix:/tmp/publisher.sock"}])
 def test_a_fused_master_has_all_services_inside(boat, tmp_path, given):
-    settings = Settings(run_directory=tmp_path, fused=True, boards=("unix:/tmp/board.sock",) * 4, **given)
-    peers = Peers(settings, boat, get_logger("test"), once=True)
     with pytest.raises(SettingsError) if given else nullcontext():
-        peers.prepare()
-    peers._run.release()
-    assert [(peer.endpoint, peer.child) for peer in peers] == ([] if given else [(None, None)] * 3)
+        peers = prepared(boat, tmp_path, fused=True, boards=("unix:/tmp/board.sock",) * 4, **given)
+        assert [(peer.endpoint, peer.child) for peer in peers] == [(None, None)] * 3
 
 
 @pytest.mark.parametrize("given", [{"link_rate": "jtag"}, {"read_results": True}])
@@ -189,10 +188,8 @@ def test_a_fused_master_has_all_services_inside(boat, tmp_path, given):
     "where", [{}, {"boards": ("tcp://10.0.0.2:7000",) * 4}, {"pcie_app": "unix:/tmp/a.sock"}]
 )
 def test_flags_of_boards_that_are_started_elsewhere_are_refused(boat, tmp_path, given, where):
-    peers = Peers(Settings(run_directory=tmp_path, **given, **where), boat, get_logger("test"), once=True)
     with pytest.raises(SettingsError, match="board") if where else nullcontext():
-        peers.prepare()
-    peers._run.release()
+        prepared(boat, tmp_path, **given, **where)
 
 
 @pytest.fixture
@@ -205,7 +202,7 @@ def connected(peers):
 
 async def test_the_subscriber_begins_when_all_are_ready(peers, events):
     order = []
-    for role in ("subscriber", "publisher", "pcie-app"):
+    for role in ROLES:
         peer = peers._by_role[role] = Peer(role, None, None)
         peer.greeted = True
         peer.protocol = SimpleNamespace(send=lambda record, role=role: order.append((role, record)))
@@ -269,8 +266,7 @@ async def test_services_inside_get_a_grace_period_to_end(boat, tmp_path):
                 return
 
     stopped = asyncio.Event()
-    settings = Settings(stop_timeout=0.1)
-    peers = Peers(settings, boat, get_logger("test"), once=True)
+    peers = Peers(Settings(stop_timeout=0.1), boat, get_logger("test"), once=True)
     task = asyncio.ensure_future(stubborn())
     peers._inside.append(task)
     await asyncio.sleep(0)

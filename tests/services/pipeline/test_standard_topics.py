@@ -20,7 +20,7 @@ from services.sockets.status import BoardStatus, ProcessStatus, SilentProcess, S
 from tests.fake_rosbridge import FakeRosbridge
 from tests.services.conftest import until
 from tests.services.pipeline.conftest import running
-from tests.services.pipeline.test_publisher import REASON, result
+from tests.services.pipeline.test_publisher import REASON, publisher_of, result
 from toolchain.deployment import TopicsSection
 
 NAMES = ["/bm/counts", "/bm/decision", "/bm/posterior", "/bm/pose"]
@@ -124,8 +124,7 @@ async def test_a_type_that_the_server_lacks_is_one_warning(boat, link, monkeypat
     monkeypatch.setattr("services.pipeline.publisher.CHECK_INTERVAL", 0.01)
     async with FakeRosbridge(rosapi=True) as fake:
         fake.refused_topics = {"/bm/posterior"}
-        publisher = Publisher(Settings(uri=fake.uri), boat, link.make)
-        async with running(publisher, link):
+        async with publisher_of(boat, link, fake.uri):
             await link.until(lambda: link.of(Notice))
             link.take(result(boat, 1))
             await fake.wait_for_op("publish", topic="/bm/pose")
@@ -138,8 +137,7 @@ async def test_a_type_that_the_server_lacks_is_one_warning(boat, link, monkeypat
 async def test_a_server_without_rosapi_may_report_a_refusal(boat, link):
     async with FakeRosbridge(statuses=True) as fake:
         fake.refused_topics = {"/bm/posterior"}
-        publisher = Publisher(Settings(uri=fake.uri), boat, link.make)
-        async with running(publisher, link):
+        async with publisher_of(boat, link, fake.uri):
             (notice,) = link.of(Notice)
             assert "posterior = false under [topics]" in notice.sentence
             link.take(result(boat, 1))
@@ -148,14 +146,12 @@ async def test_a_server_without_rosapi_may_report_a_refusal(boat, link):
 
 
 async def test_a_run_of_one_frame_publishes_them_before_it_ends(boat, link):
-    async with FakeRosbridge() as fake:
-        publisher = Publisher(Settings(uri=fake.uri), boat, link.make)
-        async with running(publisher, link):
-            link.take(Begin(once=True))
-            link.take(result(boat, 1))
-            await link.until(lambda: link.of(Published))
-            assert link.of(Published)[0].seen
-            await fake.wait_for_op("publish", topic="/bm/posterior")
+    async with FakeRosbridge() as fake, running(Publisher(Settings(uri=fake.uri), boat, link.make), link):
+        link.take(Begin(once=True))
+        link.take(result(boat, 1))
+        await link.until(lambda: link.of(Published))
+        assert link.of(Published)[0].seen
+        await fake.wait_for_op("publish", topic="/bm/posterior")
 
 
 async def test_a_frame_without_a_posterior_is_a_decision_that_is_not_valid(boat):

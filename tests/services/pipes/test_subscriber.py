@@ -17,17 +17,21 @@ from tests.patience import PATIENCE
 from toolchain.deployment import Source
 
 
+def first_reading(fake, deployment):
+    """Print the first reading of the boat; without a deployment, its message."""
+    settings = Settings(uri=fake.uri, first_data_timeout=100 * PATIENCE)
+    if deployment is not None:
+        return print_addresses(settings, deployment, 1)
+    source = Source(uri=fake.uri, topic="/boat/sensors", type="boat_msgs/Sensors")
+    return print_variables(settings, source, [], 1)
+
+
 @pytest.mark.parametrize("of_deployment", [False, True])
 async def test_a_mistyped_topic_is_named_with_similar_ones(boat, capsys, monkeypatch, of_deployment):
     monkeypatch.setattr("services.pipeline.connections.AFTER", 0.05)
     async with FakeRosbridge(rosapi=True) as fake:
         fake.know("/boat/sensors2", "boat_msgs/Sensors")
-        settings = Settings(uri=fake.uri, first_data_timeout=PATIENCE)
-        source = Source(uri=fake.uri, topic="/boat/sensors", type="boat_msgs/Sensors")
-        printing = (
-            print_addresses(settings, boat, 1) if of_deployment else print_variables(settings, source, [], 1)
-        )
-        printing = asyncio.ensure_future(printing)
+        printing = asyncio.ensure_future(first_reading(fake, boat if of_deployment else None))
         said = ""
         async with asyncio.timeout(PATIENCE):
             while "/boat/sensors2" not in said:
@@ -44,13 +48,8 @@ async def test_a_mistyped_topic_is_named_with_similar_ones(boat, capsys, monkeyp
 async def test_a_topic_of_another_type_is_named_at_once(boat, of_deployment):
     async with FakeRosbridge(rosapi=True) as fake, connect(fake.uri) as robot:
         await robot.advertise("/boat/sensors", "std_msgs/String")
-        settings = Settings(uri=fake.uri, first_data_timeout=100 * PATIENCE)
-        source = Source(uri=fake.uri, topic="/boat/sensors", type="boat_msgs/Sensors")
-        printing = (
-            print_addresses(settings, boat, 1) if of_deployment else print_variables(settings, source, [], 1)
-        )
         with pytest.raises(NotReceivableError, match=r"is std_msgs/String at .*, not boat_msgs/Sensors; use"):
-            await printing
+            await first_reading(fake, boat if of_deployment else None)
 
 
 async def test_all_variables_that_are_not_found_are_named(capsys):

@@ -52,9 +52,9 @@ async def served(directory, **processes):
         yield
 
 
-def shown(stack):
+def shown(stack, width=140):
     out = io.StringIO()
-    Console(file=out, width=140).print(screen(stack))
+    Console(file=out, width=width).print(screen(stack))
     return out.getvalue()
 
 
@@ -163,12 +163,10 @@ async def test_a_hub_that_no_service_uses_is_of_another_run(tmp_path, uri, names
 
 def test_every_process_has_its_cpu_time():
     """Those of the boat report no recent one."""
-    shown = io.StringIO()
     boat = process(name="boat-simulator", version="", cpu_s=3.0, uptime_s=40.0)
     hub = process(name="hub", version="1", cpu_percent=2.5, cpu_s=9.0, uptime_s=40.0)
     stack = status.StackStatus(directory="here", ready=True, why=[], processes=[boat, hub], silent=[])
-    Console(file=shown, width=200).print(screen(stack))
-    rows = {line.split()[0]: line.split() for line in shown.getvalue().splitlines() if line[:1].isalpha()}
+    rows = {line.split()[0]: line.split() for line in shown(stack, 200).splitlines() if line[:1].isalpha()}
     assert "7.5" in rows["boat-simulator"]
     assert "2.5" in rows["hub"]
 
