@@ -200,13 +200,14 @@ def connected(peers):
     return peer
 
 
-async def test_the_subscriber_begins_when_all_are_ready(peers, events):
+@pytest.mark.parametrize("last", ROLES)
+async def test_the_subscriber_begins_when_all_are_ready(peers, events, last):
     order = []
     for role in ROLES:
         peer = peers._by_role[role] = Peer(role, None, None)
         peer.greeted = True
         peer.protocol = SimpleNamespace(send=lambda record, role=role: order.append((role, record)))
-    for role in ("subscriber", "pcie-app", "publisher"):
+    for role in sorted(ROLES, key=lambda role: role == last):
         assert not peers.begun.is_set()
         assert order == []
         peers._take(peers._by_role[role], Ready("here"))
