@@ -342,11 +342,6 @@ def run_past_the_deadline(cluster, given_frame, clock, *, slices=0):
     return cluster.collect(0)
 
 
-def run_until_it_fails(cluster):
-    while cluster.collect(1) is None:
-        pass
-
-
 OWN = {"stop": "own"}
 
 
@@ -486,7 +481,8 @@ def test_a_board_that_is_killed_while_it_computes(folder):
         assert cluster._boards[1].open_link.read32(rm.STATUS) & 15 == rm.BoardState.RUNNING
         boards[1].kill()
         with board_fails(errors.LinkClosedError):
-            run_until_it_fails(cluster)
+            while cluster.collect(1) is None:
+                pass
         # the other board was computing: it was stopped, and is ready
         assert cluster.is_open(0)
         program(endpoints[0], part, timeout=PATIENCE)

@@ -166,33 +166,28 @@ def test_units_are_those_of_the_deployment_of_a_frame(chain):
 
 
 async def test_switches_that_do_not_answer_are_bounded_and_hold_up_nothing():
-    asked, poses, sent = [], [], []
+    asked, poses = [], []
+    texts = [json.dumps({"switch": f"/boat/{n}", "on": True}) for n in range(1000)]
+    texts += [json.dumps({"pose": [1, 2]}), "."]
 
     async def switch(name, _on):
         asked.append(name)
         await asyncio.Event().wait()
 
-    class Socket:
-        def __init__(self):
-            self.texts = [json.dumps({"switch": f"/boat/{n}", "on": True}) for n in range(1000)]
-            self.texts += [json.dumps({"pose": [1, 2]}), "."]
+    async def receive_text():
+        await asyncio.sleep(0)
+        if not texts:
+            raise WebSocketDisconnect
+        return texts.pop(0)
 
-        async def receive_text(self):
-            await asyncio.sleep(0)
-            if not self.texts:
-                raise WebSocketDisconnect
-            return self.texts.pop(0)
-
-        async def send_bytes(self, message):
-            sent.append(message)
-
+    socket_ = SimpleNamespace(receive_text=receive_text, send_bytes=AsyncMock())
     robot = SimpleNamespace(switch=switch, set_pose=lambda *pose: poses.append(pose))
     room = asyncio.Semaphore(0)
     with pytest.raises(WebSocketDisconnect):
-        await Dashboard(Feed(), robot)._read(Socket(), room)
+        await Dashboard(Feed(), robot)._read(socket_, room)
     assert (len(asked), poses, room.locked()) == (8, [(1.0, 2.0)], False)
-    assert len(sent) == 992
-    assert b"not answered" in sent[0]
+    assert socket_.send_bytes.await_count == 992
+    assert b"not answered" in socket_.send_bytes.await_args.args[0]
 
 
 async def test_a_topic_with_too_large_messages_does_not_end_the_page():

@@ -19,28 +19,13 @@ from terminal.logs import get_logger
 from tests.patience import PATIENCE, PROCESS_PATIENCE
 
 
-class Events:
-    """A run that only notes what happens."""
-
-    def __init__(self):
-        self.error = self.pending = None
-
-    def ready(self, peer): ...
-
-    def received(self, peer, record): ...
-
-    def lost(self, peer): ...
-
-    def awaited(self, peer):
-        return self.pending
-
-    def fail(self, error):
-        self.error = error
-
-
 @pytest.fixture
 def events():
-    return Events()
+    """A run that only notes what happens."""
+    events = Mock(error=None, pending=None)
+    events.awaited.side_effect = lambda _peer: events.pending
+    events.fail.side_effect = lambda error: setattr(events, "error", error)
+    return events
 
 
 @pytest.fixture

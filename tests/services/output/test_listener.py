@@ -7,6 +7,7 @@ import asyncio
 import json
 import re
 from contextlib import asynccontextmanager
+from types import SimpleNamespace
 
 import pytest
 
@@ -31,12 +32,12 @@ async def say(fake, number, *, published=True):
         await fake.publish("/BMresults", posterior_message(certain(number), 32, 32))
 
 
-class Listening:
-    """A listener's server, its task, and what it has shown."""
-
-    def __init__(self, fake, deployment=None, *, count=None, silence=None, file=None, first=PATIENCE):
-        self.fake, self.shown = fake, []
-        self.task = asyncio.create_task(
+@asynccontextmanager
+async def listening(deployment=None, *, count=None, silence=None, file=None, first=PATIENCE):
+    """A listener: its server, its task, what it has shown, and a wait until it has shown so many frames."""
+    shown = []
+    async with FakeRosbridge() as fake:
+        task = asyncio.create_task(
             show_frames(
                 Settings(first_data_timeout=first),
                 deployment,
@@ -44,25 +45,19 @@ class Listening:
                 topic="/BMresults",
                 count=count,
                 silence=silence,
-                show=lambda *shown: self.shown.append(shown),
+                show=lambda *frame: shown.append(frame),
                 file=file,
             )
         )
 
-    async def have(self, count):
-        """Wait until so many frames were shown."""
-        await until(lambda: self.task.done() or len(self.shown) >= count)
-        assert len(self.shown) == count
+        async def have(number):
+            await until(lambda: task.done() or len(shown) >= number)
+            assert len(shown) == number
 
-
-@asynccontextmanager
-async def listening(*arguments, **options):
-    async with FakeRosbridge() as fake:
-        listener = Listening(fake, *arguments, **options)
         await fake.wait_for_op("subscribe", topic="/BMresults")
-        yield listener
-        listener.task.cancel()
-        await asyncio.wait([listener.task])
+        yield SimpleNamespace(fake=fake, task=task, shown=shown, have=have)
+        task.cancel()
+        await asyncio.wait([task])
 
 
 async def test_frames_are_shown_and_saved_until_there_are_enough_posteriors(tmp_path):
