@@ -46,7 +46,7 @@ class Case:
     options: Sequence[str] = ()
     """Options of the build."""
     pointer: str = ""
-    """The end of the line with the page's address: advice, if there is any."""
+    """Advice, if any, at the end of the line with the page's address."""
     viewer: str
     viewing: Sequence[str] = ()
     """Options of the viewer."""
@@ -175,7 +175,7 @@ def demo(
     if stay and uri is None:
         _check_port("hub", int(PORT), f"use that server with --uri ws://127.0.0.1:{PORT}")
     if dashboard:
-        # the page is started last, when it is late to say that its port is taken
+        # checked now, because the page is started last
         _check_port("page", page_port, "choose another --page-port")
     check_writable(out)
     rate = rate or (2.0 if is_disparity else 10.0)
@@ -296,7 +296,7 @@ async def _run(
             saying.cancel()
             screen.show(f"open {address[0]} in a browser{case.pointer}")
         ends = _ends(case, count, master, viewer)
-        # a failure of one need not wait for the other's timeout; a master without a count ends only so
+        # the first end counts: a failure need not wait for the other's timeout, and a master without a count never ends
         await next(iter((await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED))[0]))
         if case.is_frame:
             await ends[0]

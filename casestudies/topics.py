@@ -228,7 +228,7 @@ class Listener:
         # Set by every truth; cleared by a frame whose truth did not come in time, so that later ones do not wait, too.
         self._truths_come = False
         self._news = asyncio.Event()
-        # From `follow` on; it ends with the error of a message that is not a truth.
+        # The task that reads truths, from `follow` on; a message that is not a truth ends it with an error.
         self._following: asyncio.Task[None] | None = None
 
     @property

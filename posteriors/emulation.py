@@ -121,7 +121,7 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
     Args:
         folder: The folder that `toolchain build` wrote.
         readings: The readings by the names of their variables, as in messages: numbers in their units, or names of
-            states. A variable that is not named, or is None, has no reading, whatever its `on_missing` says of messages.
+            states. A variable that is not named, or is None, has no reading, also with `on_missing = error`.
         bank: Set of seeds; each gives another draw of the same distribution.
 
     Returns:

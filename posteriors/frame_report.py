@@ -30,7 +30,7 @@ class StageTimes:
     reads: FiniteFloat | None = None
     boards_compute: FiniteFloat | None = None
     rosbridge_out: FiniteFloat | None = None
-    """That of the previous frame, because this one has not been sent yet."""
+    """Duration of the previous frame, because this one has not been sent yet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -34,7 +34,7 @@ QUEUE_SIZE: Final = 64
 FIRST_TIMEOUT: Final = 30.0
 """Default timeout for the first posterior, in seconds."""
 _DISORDER_NS: Final = 50_000_000
-"""Maximum time in nanoseconds by which a report may arrive after its posterior, although it was published before."""
+"""Maximum nanoseconds by which a report may arrive after its posterior, although it was published first."""
 _REPORT_TIMEOUT: Final = 1.0
 """Seconds that a posterior waits for its report."""
 
@@ -246,7 +246,7 @@ class Posteriors:
 
 
 posteriors: Final = Posteriors
-"""Subscribe; reads as a verb where a client is at hand: `async for posterior in posteriors(ros)`."""
+"""Another name of `Posteriors`, for loops: `async for posterior in posteriors(ros)`."""
 
 
 def listen(

@@ -56,7 +56,7 @@ class Posterior:
     heard_ns: int
     """Time of arrival, Unix time in nanoseconds."""
     report: FrameReport | None = None
-    """Its `/bm/frame`; None if that was lost."""
+    """The frame's report from `/bm/frame`; None if it was lost."""
     details: Mapping[str, str] = field(default_factory=dict)
     """Statistics of a BM2's samples, by their keys in `/bm/frame`; empty for a BM1."""
     dimensions: "tuple[Dimension, ...]" = ()

@@ -195,7 +195,7 @@ def decision_statuses(
 ) -> list[dict[str, Any]]:
     """Return a status with the most probable value, for each replica.
 
-    `why` is the reason why the decision is not valid, empty if it is; `age_ms` the time since the reading's receipt.
+    `why` is the reason why the decision is not valid, empty if it is; `age_ms` is the time since the reading's receipt.
     """
     replicas = deployment.machine.replicas
     rows = [None] * replicas if posterior is None else posterior.reshape(replicas, -1)

@@ -1,4 +1,4 @@
-"""The start and the end of every command: Ctrl-C during the imports ends it with 130, without a traceback."""
+"""The start and the end of every command: Ctrl-C during the imports exits with code 130, without a traceback."""
 
 # nothing that takes long to import, because Ctrl-C still shows a traceback meanwhile
 import atexit
@@ -8,7 +8,7 @@ import signal
 import sys
 from functools import partial
 
-# each command line, that of a subcommand after a colon, and what it does in the list of `rosbayes --help`
+# the module of each command (a colon precedes a command of a group), and its line in `rosbayes --help`
 COMMANDS = {
     "demo": ("casestudies.demo", "Run a case study, without a robot."),
     "toolchain": ("toolchain.commands.main", "From a model to a deployment."),

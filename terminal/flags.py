@@ -25,7 +25,7 @@ class Flag:
     names: tuple[str, ...] = ()
     metavar: str | None = None
     otherwise: str = ""
-    """Text for the default if neither flag nor variable is given; empty for the default of the field."""
+    """Text that the help shows as the default; empty to show the field's default."""
 
 
 @dataclass(frozen=True, slots=True)

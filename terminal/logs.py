@@ -22,12 +22,12 @@ from typing import Final
 from terminal.one_line import lines_of, one_line
 
 PARENT_VARIABLE: Final = "ROSBAYES_PARENT"
-"""Environment variable that a process sets for its children, so that they exit with it."""
+"""Environment variable that a process sets for its children, so that they exit when it does."""
 FORMAT_VARIABLE: Final = "BM_LOG_FORMAT"
 
 _CLEAR_LINE: Final = "\r\x1b[K"
 _QUOTED: Final = frozenset(" \t=\r\n\"'")
-"""Characters of a value in a text line that would end it, or look like the next field."""
+"""Characters that would end a value in a text line, or look like the next field."""
 
 
 class _Process:
@@ -167,7 +167,7 @@ def _quoted(value: object) -> str:
 
 def get_logger(role: str, level: str = "info") -> Logger:
     """Return the logger of a process; its lines contain the name of the process, and the number of the frame if any."""
-    # our own records cover the warnings of libraries; only their errors are new
+    # our own messages already report what libraries warn of; only their errors are new
     log_libraries(logging.ERROR, "%(name)s: %(message)s")
     return Logger(role, level)
 
@@ -180,7 +180,7 @@ def log_libraries(level: int, form: str) -> None:
 
 
 def escape_last_resort() -> None:
-    """Escape warnings of libraries if logging is not configured, because some quote a server."""
+    """Escape libraries' warnings while logging is not configured, because some quote text from a server."""
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_OneLine())
 

@@ -80,7 +80,7 @@ class LockedRunDirectory:
             OutputError: It cannot be created in an existing folder, or other users can enter it.
         """
         self.path = run_directory(given)
-        """Its path, which is absolute."""
+        """The absolute path of the directory."""
         with contextlib.suppress(OSError):  # whoever may not create it cannot open it either
             self.path.mkdir(mode=0o700)
         # the descriptor of the lock, which children inherit

@@ -81,7 +81,7 @@ def ignore_signals() -> None:
 
 
 async def until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
-    """Run coroutines until one of them ends, cancel the others, and raise its error if it has failed."""
+    """Run coroutines until one of them ends, cancel the others, and raise the error of the one that ended, if any."""
     tasks = [asyncio.ensure_future(each) for each in work]
     try:
         ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

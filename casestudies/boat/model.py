@@ -52,7 +52,7 @@ def model(
         bearing_step: Degrees between distinguishable bearings; a divisor of 360.
         array: Whether readings are six numbers in a std_msgs/Float64MultiArray, in the order of the columns,
             instead of fields named after the sensors; for servers that accept only installed message types.
-        on_missing: Whether the other readings of a frame suffice (`missing`), or each is needed (`error`).
+        on_missing: `missing` computes frames that lack readings; `error` requires all six.
 
     Raises:
         ModelError: A grid without cells, or a step that does not fit.

@@ -54,7 +54,7 @@ def _of_computing(instance: Instance) -> tuple[float | None, float | None]:
 
 
 _Stage: TypeAlias = "tuple[str, StageKind, Callable[[Instance], float | None]]"
-"""A stage's name and part, and its time in microseconds in a frame, None if not known."""
+"""A stage's name, its kind, and a function that returns its microseconds in a frame (None if not known)."""
 
 _STAGES: Final[tuple[_Stage, ...]] = (
     ("rosbridge in", StageKind.ROSBRIDGE, _reported("rosbridge_in")),
@@ -139,7 +139,7 @@ _PART_COLOURS: Final = {
 }
 _TRUTH_COLOUR: Final = "#ff4d4d"
 _EDGE: Final = 0.2
-"""Share of the map's width at each edge; within it, labels are not centred."""
+"""Width of each edge as a share of the map's; labels within it are not centred."""
 
 
 def far_apart(instances: Iterable[Instance]) -> tuple[Instance, ...]:

@@ -65,14 +65,14 @@ SWITCHES: Final = {
     },
     **{f"{name}/plugged": (f"{name} is plugged in", f"{name} is unplugged") for name in SENSOR_NAMES},
 }
-"""The switches, which are services below `/boat/`, and what holds when each is on and off. All are on at first."""
+"""The switches, which are services below `/boat/`, each with the sentences for on and off. All are on at first."""
 _SWITCH_TYPE = "std_srvs/SetBool"
 _SHORE = 2.0  # waypoints are at least this far from the map's edge
-# Minimum number of seconds between a reading and another one that a change causes: a mouse moves 1000 times a second.
+# Minimum number of seconds before a change causes another reading: a mouse moves 1000 times a second.
 _SHORTEST = 0.02
 _POSE_BYTES = 65_536  # a larger message on the topics that move the boat is no such message, and is discarded
 DRIVE_TIMEOUT: Final = 1.0
-"""Seconds after which the boat stops without another velocity, as robots do."""
+"""Seconds after a velocity until the boat stops if no other arrives, as robots do."""
 
 
 class Boat:
@@ -202,7 +202,7 @@ async def simulate(
             _serve_switches(ros, boat),
         ):
             at_the_end.callback(asyncio.create_task(work).cancel)
-        due = time.monotonic()  # when the next step is, which a change does not delay
+        due = time.monotonic()  # time of the next step, which a change of the boat does not delay
         changed = False
         published = 0
         while count is None or published < count:

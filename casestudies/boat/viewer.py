@@ -26,7 +26,7 @@ POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
 PROJECTED_PICTURE: Final = "figure-4.5-projected.png"
 CLOCK_HZ: Final = 100e6
-"""Clock of the boards in the projected figure, that of `toolchain inspect`; the thesis does not state its boards'."""
+"""Clock of the boards in the projected figure, as in `toolchain inspect`; the thesis does not state a clock."""
 Clock: TypeAlias = Annotated[
     float,
     typer.Option(
@@ -37,7 +37,7 @@ HEADING: Final = "frame     true x, y     mean x, y  distance     cycles   time 
 
 
 Numbers = dict[str, Any]
-"""A frame as a JSON object; None is unknown."""
+"""A frame as a JSON object; None means unknown."""
 
 
 def numbers_of(instance: "Instance") -> Numbers:

@@ -18,7 +18,7 @@ _DTYPES: Final = {"mono8": "u1", "8UC1": "u1", "32FC1": "f4"}
 _MOST_PIXELS: Final = 1 << 19
 """Maximum size of an image, because costs and likelihoods take 0.8 kB of memory for each pixel."""
 _WAITING: Final = 16
-"""Images of each camera that wait for the other's."""
+"""Maximum number of images of each camera that wait for the other camera's."""
 
 
 class BadImageError(Exception):
@@ -83,8 +83,8 @@ def disparity_message(
 ) -> dict[str, Any]:
     """Return disparities in pixels, float64[height, width], as a stereo_msgs/DisparityImage.
 
-    Negative disparities are unknown, as for stereo_image_proc. Without a known focal length, the message
-    gives the width of the image for it. The baseline is `T` in ROS 1 and `t` in ROS 2.
+    Negative disparities are unknown, as for stereo_image_proc. If the focal length is unknown, the
+    message has the image's width in its place. The baseline is `T` in ROS 1 and `t` in ROS 2.
     """
     height, width = disparity.shape
     window = {"x_offset": 0, "y_offset": 0, "height": height, "width": width, "do_rectify": False}
@@ -119,7 +119,7 @@ class ImagePairs:
 
     def __init__(self) -> None:
         self.unpaired = [0, 0]
-        # Of each camera, by stamp in the order of arrival; no stamp is in both.
+        # The images of each camera that wait for their pair, by stamp in the order of arrival; no stamp is in both.
         self._waiting: tuple[dict[int, Mapping[str, Any]], ...] = ({}, {})
 
     def add(self, side: int, message: Mapping[str, Any]) -> StereoImages | None:

@@ -138,7 +138,7 @@ class Stack:
 
 
 class Matcher:
-    """The images that arrive, and what the machines make of them.
+    """The received stereo images, and their disparities as the machines compute them.
 
     Attributes:
         matched: The newest pair, for the picture.

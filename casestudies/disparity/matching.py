@@ -27,7 +27,7 @@ def box_sum(values: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
     for axis in (-1, -2):
         size = values.shape[axis]
         zero = np.zeros_like(np.take(values, [0], axis))
-        # float64, because running sums of float32 would lose what windows far from the border hold
+        # float64, because running sums in float32 would lose precision far from the border
         running = np.concatenate([zero, np.cumsum(values, axis, dtype=np.float64)], axis)
         ends = np.minimum(np.arange(size) + reach + 1, size)
         starts = np.maximum(np.arange(size) - reach, 0)

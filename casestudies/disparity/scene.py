@@ -23,7 +23,7 @@ RIGHT_GAIN: Final = 0.95
 _OCTAVES: Final = tuple(1.6 / 2**octave for octave in range(8))
 """Periods of the texture, in metres."""
 _TOLERANCE: Final = 1e-6
-"""Relative difference of distances below which two points of a surface are one."""
+"""Relative difference of distances below which two points count as the same."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +83,7 @@ class Scene:
             for x, size in zip(((-0.8, 0.0), (0.1, 0.8)), random.uniform(0.15, 0.35, 2), strict=True)
         ]
         self._phases = random.uniform(0, 2 * np.pi, 4)
-        # of the texture, for each period; they repeat after 32 of them
+        # random values of the texture for each period; they repeat after 32 points
         self._lattices = random.uniform(-1, 1, (len(_OCTAVES), 32, 32, 32))
 
     def pair(self, number: int, width: int, height: int) -> Pair:

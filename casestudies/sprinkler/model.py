@@ -18,7 +18,7 @@ WET: Final = ((0.0, 0.8), (0.9, 0.99))
 GRASS_TOPIC: Final = "/sprinkler/grass"
 """Topic of G, the reading."""
 TYPE: Final = "std_msgs/UInt8"
-"""Its type, which every ROS server has installed."""
+"""Type of `GRASS_TOPIC`, which every ROS server has installed."""
 
 
 def model() -> Question:

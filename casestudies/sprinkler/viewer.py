@@ -36,7 +36,7 @@ _COLOURS: Final = ("#aa7744", "#4477aa")
 _POINTS: Final = 200
 """Number of points of a curve."""
 _WAITING: Final = 4
-"""Number of messages of samples that wait for their frame; if none of them is the frame's, its own is lost."""
+"""Number of messages of samples that wait for their frame; if none of them fits a frame, its samples are lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,7 +49,7 @@ class FrameSummary:
     share: float
     """P(R = 1) on `/BMresults`."""
     error: float
-    """Its standard error on `/bm/frame`; 0.5, the largest one, if it is not stated."""
+    """Standard error of `share` on `/bm/frame`; 0.5, the largest possible, if it is not stated."""
     effective: float
     """Effective samples on `/bm/frame`; 1 if they are not stated."""
     curve: NDArray[np.int64]

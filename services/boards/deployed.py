@@ -39,11 +39,11 @@ class DeployedBoards:
         self._reprogram = reprogram
         self._endpoints = list(endpoints)
 
-        # None until `open` has succeeded; from then on the same one, whose boards are reopened one by one.
+        # None until `open` has succeeded; from then on the same cluster, whose boards are reopened one by one.
         self._cluster: MiniCluster | None = None
 
-        # Why a board is unusable, by its number: from the failure until `recover` has reopened it. While there is one,
-        # no frame is posted.
+        # Why a board is unusable, by its number: from the failure until `recover` has reopened it. While a board is in
+        # here, no frame is posted.
         self.gone: dict[int, str] = {}
 
         # How often each board was gone, for the status.
@@ -62,7 +62,7 @@ class DeployedBoards:
         return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
 
     def status(self, output: FrameOutput | None) -> list[BoardStatus]:
-        """Return the state of each board, with its part of the last output; may be called from another thread."""
+        """Return the state of each board, with its cycles in the last output; may be called from another thread."""
         # a copy, because the boards' thread changes it meanwhile
         gone = dict(self.gone)
         return [
@@ -115,7 +115,7 @@ class DeployedBoards:
 
     def find_lost_boards(self, error: BoardError) -> None:
         """Find all boards that are gone after a failure, so that boards that die together fail only one frame."""
-        # the error of a board that is already known to be gone
+        # a BoardAwayError is about a board that is already known to be gone
         if self._cluster is None or isinstance(error, BoardAwayError):
             return
         # a board that only refused an access is still open
@@ -139,7 +139,7 @@ class DeployedBoards:
             try:
                 self._cluster.reopen(board, timeout=TICK)
             except BoardError as error:
-                # with another image or key waiting would not help
+                # a board with another image or key needs the user, so waiting would not help
                 if error.exit_code == ExitCode.USAGE:
                     raise
                 self.gone[board] = str(error)

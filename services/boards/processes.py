@@ -32,7 +32,7 @@ _ENDING_TIME: Final = 5.0
 _STOPPING_S: Final = 2.0
 """Seconds after which a board that does not end is killed."""
 _LISTENS: Final = 128
-"""Added to a board's number in the sign that it listens; the number alone is a sign of life."""
+"""Added to a board's number to signal that it listens; the number alone is a sign of life."""
 
 
 def blank_board(index: int, settings: Settings, hardware: SimulatedHardware | None) -> Board:
@@ -84,7 +84,7 @@ def serve_one(
         on_ready()
 
     def is_alive() -> bool:
-        # 0 before it serves: its start has limits of its own
+        # `turned` is 0 before the board serves, and its start has limits of its own
         is_alive = not board.turned or time.monotonic() - board.turned < STUCK_S
         if is_alive:
             on_alive()
@@ -140,7 +140,7 @@ class BoardProcesses:
         # False under a master, which watches its boards itself
         self._reports = PARENT_VARIABLE not in os.environ
 
-        # here, because a service manager accepts messages only from its own child
+        # in the parent, because a service manager accepts messages only from its own child
         self._manager = ServiceManager()
 
         # Boards write their number into this pipe: plus _LISTENS when their sockets listen, and every second while they

@@ -46,7 +46,7 @@ def dashboard(
         str, typer.Option(help="Topic of the true pose (PoseStamped).", metavar="TOPIC")
     ] = TRUTH_TOPIC,
     host: Annotated[str, typer.Option(help="Address to listen on.", metavar="ADDRESS")] = "127.0.0.1",
-    # the second name is that of master and demo, which pass the error on that names it
+    # the second name is the flag of master and demo, which pass on an error that names it
     port: Annotated[
         int, typer.Option("--port", "--page-port", min=0, max=65535, help="Port; 0 selects a free one.")
     ] = 8080,
@@ -116,7 +116,7 @@ async def _serve(
     """Serve the page until cancelled."""
     if sys.platform == "linux":
         # A posterior wakes this process in the middle of the hub's sending. It must not preempt the hub, which has
-        # other subscribers to serve. Where the policy is refused, the page only costs the others more.
+        # other subscribers to serve. If the system refuses the policy, the page only delays the others more.
         with suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     from services.dashboard.feed import Feed

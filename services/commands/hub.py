@@ -146,7 +146,7 @@ async def _serve(
     announce: str | None,
     settings: Settings,
 ) -> int:
-    """Serve rosbridge until cancelled; `port` 0 selects a free port; `announce` is the hub's name on the network."""
+    """Serve rosbridge until cancelled; `port` 0 selects a free port, and `announce` is its name on the network."""
     # a refused client gets no explanation, as from the reference server; the reason is only in the log
     log_libraries(logging.WARNING, "hub: %(message)s")
     # The port, once the hub listens; and its graph, which exists from then on.

@@ -58,7 +58,7 @@ def loader(
         except PcieShimError as error:
             if len(images) == 1:
                 raise
-            # the other boards are programmed nevertheless, so that a second run has only this one left
+            # the other boards are programmed nevertheless, so that only this one is left for a second run
             failed[at] = error
             warn(f"{board} is not programmed: {error}")
     if failed:

@@ -73,16 +73,16 @@ class Doors:
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_our_name(hosts[0]):
             return HTTPStatus.FORBIDDEN
-        # a page of ours, or one that was named; programs send no origin
+        # a page of this server, or an origin that was allowed by name; programs send no origin
         ours = {f"http://{hosts[0]}", f"https://{hosts[0]}", *self._policy.origins}
         if len(origins) > 1 or not set(origins) <= ours:
             return HTTPStatus.FORBIDDEN
-        # another site's picture or frame sends no origin, and each page costs memory; a link may lead here
+        # a picture or frame of another site sends no origin, and each page costs memory; only a link may lead here
         elsewhere = {"cross-site", "same-site"} & set(headers.get_all("Sec-Fetch-Site"))
         if not origins and elsewhere and headers.get_all("Sec-Fetch-Dest") != ["document"]:
             return HTTPStatus.FORBIDDEN
         presented = Headers(headers)
-        # others are no tokens, and no headers
+        # other texts are no tokens, and cannot be put into a header
         if token and token.isascii() and token.isprintable():
             presented.pop("Authorization", None)
             presented["Authorization"] = f"Bearer {token}"

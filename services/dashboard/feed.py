@@ -1,6 +1,6 @@
 """The state behind the page: the last frames, the times of their stages, rate and losses.
 
-    frame outcomes ──▶ Feed ──▶ frames (the last 1000), stage times (a mean a second), rate, losses by reason
+    frame outcomes ──▶ Feed ──▶ frames (the last 1000), stage times (means per second), rate, losses by reason
 
 It has no clock and no connection: the time of each frame comes with it.
 """
@@ -61,7 +61,7 @@ class KeptFrame:
         """Return the standard error of each of a BM2's probabilities; None if unknown, or not sampled."""
         effective = self._statistic("effective_samples")
         error = standard_error(probabilities, effective if 1 <= effective < math.inf else math.nan)
-        # boards that disagree know no error of their own; theirs is that of the worst value
+        # boards that disagree do not know each value's error, so the error of the worst value is used
         if self._statistic("r_hat") > AGREE or np.isnan(error).any():
             worst = self._statistic("standard_error")
             error = np.fmax(error, worst if 0 <= worst <= 1 else math.nan)
@@ -87,7 +87,7 @@ class KeptFrame:
 
 @dataclass(slots=True)
 class _Second:
-    """The frames of one second: their number, and the sum and the number of the times of each stage."""
+    """The frames of one second: their number, and for each stage the sum and the number of its times."""
 
     start: int
     frames: int = 0
@@ -134,7 +134,7 @@ class Feed:
         details = report.details if report else outcome.details
         values = None
         if isinstance(outcome, Posterior):
-            # before they become float32, whose range is smaller; by their maximum first, because a sum may be tiny
+            # scaled before the conversion to float32, whose range is smaller; by the maximum first: a sum may be tiny
             relative = outcome.values / outcome.values.max()
             values = (relative * (outcome.replicas / relative.sum())).astype(np.float32)
         else:

@@ -27,9 +27,9 @@ from terminal.signals import until_one_ends
 
 _STATS_EVERY: Final = 0.5
 _OF_ROBOT: Final = ["state", "connected", "why", "boards", "landmarks", "switches", "can_set_pose", "samples"]
-"""Attributes of the robot that the page gets as they are."""
+"""Attributes of the robot that are sent to the page unchanged."""
 _IN_FLIGHT: Final = 2
-"""Messages on the way to a browser: more would only be older when it gets to them."""
+"""Maximum number of unacknowledged messages to a browser; with more, it would only show older ones."""
 _HERE: Final = Path(__file__).parent
 _MAX_INBOUND: Final = 4096
 _MAX_ASKING: Final = 8
@@ -138,7 +138,7 @@ class Dashboard:
         self._feed.watchers.add(changed.set)
         writing = self._write(socket, self._views.get(view) or View(self._feed), room, changed)
         try:
-            # closed, bytes instead of text, or closed during a message
+            # in this order: the socket is closed, it sent bytes instead of text, or it closed during a message
             with suppress(WebSocketDisconnect, KeyError, RuntimeError):
                 await until_one_ends(writing, self._read(socket, room))
         finally:

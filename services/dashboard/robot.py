@@ -48,7 +48,7 @@ _MAX_LANDMARKS: Final = 100
 _MAX_SWITCHES: Final = 100
 _MAX_NAME: Final = 100
 _MAX_WARNINGS: Final = 20
-"""Maximum number of unreadable messages that are reported, each with another reason: there may be thousands a second."""
+"""Maximum number of warnings about unreadable messages, each with another reason: thousands may come in a second."""
 _QUEUE_SIZE: Final = 64
 
 
@@ -84,7 +84,7 @@ class WatchedRobot:
         self._truth = truth
         # The name of the flag's deployment: frames of others are ignored.
         self._only = deployment.name if deployment else None
-        # Of the flag, or that of the master on this machine, whose status names its folder.
+        # The deployment of the flag, or of the master on this machine, whose status names its folder.
         self._deployment = deployment
         self._folder = ""
         self._axes: tuple[Axis, ...] = tuple(deployment_axes(deployment)) if deployment else ()
@@ -100,7 +100,7 @@ class WatchedRobot:
         # The open connection, and its publication of poses; None while there is none.
         self._ros: Ros | None = None
         self._poses: Publication | None = None
-        # The reasons for which messages were unreadable, as far as they were reported.
+        # The reasons of unreadable messages that were already reported.
         self._warned: set[str] = set()
 
     # Following
@@ -191,7 +191,7 @@ class WatchedRobot:
                     if len(self._warned) < _MAX_WARNINGS and (why := str(error)) not in self._warned:
                         self._warned.add(why)
                         warn(why)
-                # those that were announced and never arrived, and those that came too fast for this process
+                # posteriors that were announced and never arrived, and those that came too fast for this process
                 gone = frames.announced_only + frames.lost
                 for _ in range(gone - counted):
                     self._feed.add_loss("not received by the page")

@@ -10,7 +10,7 @@ from terminal.processes import own_command
 from toolchain.deployment import Deployment
 
 METRICS_PORTS = {"subscriber": 1, "publisher": 2, "pcie-app": 3, "board": 4}
-"""Ports of the processes' metrics, counted from the master's; board N has the N-th after that of board 0."""
+"""Offsets of the processes' metrics ports from the master's port; board N uses the offset of board 0 plus N."""
 
 
 def _metrics(settings: Settings, role: str) -> list[str]:

@@ -18,12 +18,12 @@ from services.sockets.records import AnyRecord, Outcome, Published, Reading, Rea
 class EachMessagePeers(Peers):
     """The three services; each message gets a new subscriber and a new publisher."""
 
-    # Those that have done their work and were told to end, until they have ended. What such a one still sends does not
-    # count: a reading is one that arrived beside the one that was taken, and is missed as if nobody had subscribed.
+    # Peers that have done their work and were told to end, until they have ended. Their records are ignored: another
+    # reading arrived together with the one that was taken, and is missed as if nobody had subscribed.
     _done: set[Peer]
-    # True from the outcome of a result to the end of its publisher.
+    # True from the outcome of a result until its publisher has ended.
     _publishing: bool
-    # Set by everything that may end the wait of a service for its turn, and cleared by each that goes on waiting.
+    # Set whenever a service that waits for its turn may go on; a service that must still wait clears it.
     _changed: asyncio.Event
 
     def prepare(self) -> None:
@@ -38,7 +38,7 @@ class EachMessagePeers(Peers):
 
     @property
     def not_ready(self) -> list[str]:
-        """The roles of peers that are not ready; during the run, only pcie-app counts; the others come and go."""
+        """The roles of peers that are not ready; during the run only pcie-app, because the others come and go."""
         return [role for role in super().not_ready if role == self.app.role or not self.begun.is_set()]
 
     @property
@@ -55,7 +55,7 @@ class EachMessagePeers(Peers):
                 self._end(peer)
             case Published():
                 self._publishing = True
-                # one that was published is only over when it was seen on the wire, or looked for long enough
+                # after publishing, the publisher ends only with `Seen`, when it saw the result or gave up looking
                 if record.outcome is not Outcome.PUBLISHED:
                     self._end(peer)
         self._changed.set()

@@ -87,7 +87,7 @@ class _Computing:
 
 
 class Latencies:
-    """Quantiles over the last published frames, and counts over all of them."""
+    """Latencies of published frames: quantiles over the last frames, and counts over all."""
 
     def __init__(self) -> None:
         # A row for each of the last frames, with a column for each stage, in ns.
@@ -171,11 +171,12 @@ class FrameFlow:
         # For the status: complete readings so far, and the number of the last published frame with its time (ns).
         self._received = 0
         self._last = (0, 0)
-        # The belief of a deployment with [filter]: that of the last frame sent to the boards, predicted when it is sent,
-        # then its posterior. It outlives boards and pcie-app; a lost frame leaves the prediction.
+        # The belief of a deployment with [filter]: the prediction for the last frame sent to the boards, and after its
+        # result the posterior. It outlives boards and pcie-app; a lost frame leaves the prediction.
         self._filter = deployment.new_filter()
-        # Readings since the last one in `_readings` that were lost: steps of the filter without an update. The subscriber
-        # counts messages, of which each topic brings one for a reading; `_messages` is the rest, less than a reading.
+        # Readings that were lost since the last one in `_readings`: steps of the filter without an update. The
+        # subscriber counts messages, and a reading takes one of each topic; `_messages` is the remainder, less than a
+        # reading.
         self._skipped = self._messages = 0
         self.losses: Counter[LossReason] = Counter()
         """Readings and results lost so far, by reason."""
@@ -189,7 +190,7 @@ class FrameFlow:
         self.published = 0
         """Number of results that reached at least one topic."""
         self.seen: bool | None = None
-        """True if the server passed a result of `--loop` back to the publisher; None until the publisher has looked."""
+        """With `--loop`, whether the publisher received one of its results back; None until it knows."""
         self.looked = asyncio.Event()
         """Set when `seen` is known."""
         self.newest: Publish | None = None

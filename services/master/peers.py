@@ -68,15 +68,15 @@ class Peer:
         self.endpoint = endpoint
         self.where = "this process" if endpoint is None else str(endpoint)
         self.child = child
-        # Of the present connection, which `_keep` resets: None and False between two connections. A record counts only
-        # from a peer that has greeted; a frame or a result goes only to one that is ready.
+        # State of the present connection, which `_keep` resets: None and False between two connections. Records count
+        # only from a peer that has greeted; frames and results go only to a peer that is ready.
         self.protocol: RecordProtocol | FusedEnd | None = None
         self.greeted = False
         self.ready = False
         self.away = False
         """True while it has no connection to its rosbridge servers."""
-        # Set at the end of the connection, with its error if it had one: that of a service of another version or
-        # deployment ends the run; after any other, the connection is restored.
+        # Set at the end of the connection, with its error if it had one. The error of a service of another version
+        # or deployment ends the run; after any other error, the connection is restored.
         self.closed = asyncio.Event()
         self.reason: Exception | None = None
         # When its time to greet or to get ready began (monotonic, s).
@@ -132,7 +132,7 @@ class Peers:
         self._deployment = deployment
         self._log = log
         self._once = once
-        # Given to `start`; no record arrives before.
+        # The receiver of events, given to `start`; no record arrives before.
         self._events: PeerEvents
         # Determined by `prepare`, in the order in which a frame meets them: the services by role, the run
         # directory if any of them is started here, the boards' process if the master starts it, and where boards listen.

@@ -63,7 +63,7 @@ class Master:
         self._count = 1 if once else count
         self._json = json
         self._plot = plot
-        # Not beside results, which would run into it even through a pipe, if that ends at the same terminal.
+        # Not together with results: they would overwrite each other on a terminal, even if results go through a pipe.
         self._shows_progress = not (once or json or plot)
         # The last published result, for the progress; and the last drawn one, which is drawn only once.
         self._newest: Published | None = None
@@ -78,7 +78,7 @@ class Master:
         # The page in the browser, which only reads: its failure never ends the run. Made in `run`, if it has a port.
         self._page_port = page_port
         self._page: Child | None = None
-        # Work beside the frames, until the end of the run.
+        # Tasks that run beside the frames until the end of the run.
         self._tasks: list[asyncio.Task[None]] = []
 
     async def run(self) -> int:
@@ -121,7 +121,7 @@ class Master:
                 if self._flow.published and not self._once:
                     with contextlib.suppress(TimeoutError):
                         await asyncio.wait_for(self._flow.looked.wait(), settings.seen_timeout + _REASON_TIME)
-                # the last one, which may be newer than the last picture
+                # the last result, which may be newer than the last picture
                 if show is not None:
                     self._draw(show)
         finally:

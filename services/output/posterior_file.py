@@ -223,7 +223,7 @@ class _Archive(ResultFile):
         # How many of them the archive on disk has, and when it is written again (monotonic, s).
         self._written = 0
         self._next = time.monotonic() + _EVERY
-        # now, instead of after the first seconds of a run that may not come again
+        # checked now, and not at the first write, some seconds into a run that may not be repeatable
         if not os.access(path.parent, os.W_OK):
             raise self._error("it cannot be written: the folder is not writable")
 

@@ -108,7 +108,7 @@ def drawing() -> Iterator[Show]:
         # a picture with wrapped rows could not be recognised
         yield lambda frame, axes: console.print(drawn(frame, axes), soft_wrap=True)
         return
-    # The last frame, drawn at the end even if its turn had not come; and the time of the last picture (monotonic, s).
+    # The last frame, which is drawn at the end in any case; and the time of the last picture (monotonic, s).
     newest: list[tuple[FrameOutcome, list[Axis]]] = []
     shown = -1.0
     with Live(console=console, auto_refresh=False) as live:

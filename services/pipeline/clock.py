@@ -10,9 +10,9 @@ from bridge.stamps import stamp_ns
 CLOCK_TOPIC: Final = "/clock"
 _CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
 _INTERVAL_MS: Final = 10
-"""Minimum time between two messages, of which simulators publish a thousand a second."""
+"""Minimum time between two messages; simulators publish a thousand a second."""
 _MOST_NS: Final = 3600 * 10**9
-"""The most by which a message advances the ticks: jumps to and fro must not make them exceed the 64 bits of a record."""
+"""Maximum advance of the ticks by one message, so that jumps of the time never make them exceed 64 bits."""
 
 
 class Clock:
@@ -27,7 +27,7 @@ class Clock:
         self._time: int | None = None
         self._tick = 0
         self.heard = time.monotonic()
-        """When the last message came, at first when this began (monotonic seconds)."""
+        """When the last message came, at first the creation of this clock (monotonic seconds)."""
 
     def time_ns(self) -> int:
         """Return the time for stamps (ns); 0 before the first message of a simulation."""

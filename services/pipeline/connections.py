@@ -22,7 +22,7 @@ OnState = Callable[[str, State, str], None]
 """Callback with the URI of a server, the new state of its connection, and the reason."""
 
 AFTER: Final = 2.0
-"""Seconds in which a publisher may appear before a mistyped name is suspected."""
+"""Seconds in which a publisher may appear; after them, a mistyped name is suspected."""
 ROSAPI_TIME = 2.0
 """Seconds in which rosapi may answer; many servers lack it, and then nothing is known."""
 SETTLED_TIME = 3.0

@@ -35,12 +35,12 @@ class PcieApp(RunService):
     def __init__(self, settings: Settings, boards: DeployedBoards, link: MakeLink) -> None:
         super().__init__(settings, link)
         self._boards = boards
-        # Number of the frame on the boards, and of the master that sent it: a later master must not get the result.
+        # Numbers of the frame on the boards and of the master that sent it: a later master must not get the result.
         self._posted: tuple[int, int] | None = None
-        # A frame that came while the boards were busy. A master waits for its result before it sends another one,
-        # so the busy frame is that of a former master, or boards are being searched.
+        # A frame that came while the boards were busy. A master waits for each result before it sends another frame,
+        # so the boards still compute a frame of a former master, or are being searched.
         self._next: FrameRequest | None = None
-        # While boards are searched after a failure. It and `DeployedBoards.recover` never run together.
+        # The search for lost boards after a failure, while it runs. It and `DeployedBoards.recover` never run together.
         self._searching: asyncio.Task[None] | None = None
         # The descriptor on whose bytes `_collect` is called: that of the last board that is still running.
         self._watched: int | None = None

@@ -44,7 +44,7 @@ class Publisher(RunService):
         self._draining = True
         # Set by the master's `Begin`: the only result must be seen on the wire, or be an error.
         self._once = False
-        # In a run of many frames: `_looks` from `Begin` to the first published result, which sets the event.
+        # In a run of many frames: `_looks` is True from `Begin` to the first published result, which sets `_first`.
         self._looks = False
         self._first = asyncio.Event()
         self._deployment = deployment

@@ -1,9 +1,9 @@
-"""Topics for robot tools, published behind the results.
+"""Topics for robot tools, published after the results.
 
     publish_now ──▶ offer ──next turn of the loop, or a timer──▶ _send ──▶ /bm/counts, /bm/posterior, /bm/pose, /bm/decision
     status sockets ──once a second──▶ keep_reporting ──────────▶ /diagnostics
 
-A result never waits for them: only the newest frame is kept, and a fault costs a warning.
+A result never waits for them: only the newest frame is kept, and a fault only causes a warning.
 """
 
 import asyncio

@@ -84,7 +84,7 @@ class Subscriber(RunService):
         self._received = self._completed = self._unusable = 0
         self._passed_over = self._passed_over_sent = 0
         self._unpaired_sent = 0
-        # Receipt of the last complete reading (monotonic, ns; 0 before the first one), and the tick of its sending.
+        # Receipt of the last complete reading (monotonic, ns; 0 before the first one), and the tick when it was sent.
         self._last_tick = 0
         self._last_sent: int | None = None
         # What was reported already: a gap between stamps (until the next reading), and topics without which frames

@@ -37,13 +37,13 @@ class Stamped(Generic[Item]):
 class _Topic(Generic[Item]):
     """A topic: its unpaired messages, the oldest first, and its last intervals."""
 
-    # Whether every set needs a message of it.
+    # Whether every set needs a message of this topic.
     needed: bool
     waiting: deque[Stamped[Item]] = field(default_factory=deque)
-    # Stamp and receipt of the last message; None before the first one, and the stamp also after a restart of the clock.
+    # Stamp and receipt of the last message; None before the first one; the stamp also after a restart of the clock.
     newest: int | None = None
     heard: int | None = None
-    # Between the stamps of consecutive messages; a repeated or older stamp adds none.
+    # Nanoseconds between the stamps of consecutive messages; a repeated or older stamp adds none.
     intervals: deque[int] = field(default_factory=lambda: deque(maxlen=_INTERVALS))
 
     @property

@@ -37,9 +37,9 @@ _MULTI_ARRAY: Final = re.compile(r"std_msgs/((?:Float(?:32|64)|U?Int(?:8|16|32|6
 _SHOWN: Final = 40
 _MAX_FIELDS: Final = 10_000
 _LONG: Final = 1 << 16
-"""Length in bytes of a line whose conversion would keep the event loop from answering pings."""
+"""Minimum bytes of a line whose conversion would keep the event loop from answering pings."""
 _AHEAD: Final = 64
-"""Messages that may be on their way, so that none is lost in a queue of the server or of ours."""
+"""Maximum number of messages in flight, so that none is dropped from a queue here or in the server."""
 
 # the largest double that rounds to a float32: its usual text, 3.4028235e+38, is above it
 _FLOAT32_MAX: Final = float.fromhex("0x1.fffffefffffffp127")
@@ -231,12 +231,12 @@ class _Echoes:
         self._watched = watched
         self._limit = limit
 
-        # Number of each line and what it has, in the order of publication. A message comes before those published after
+        # Number and values of each line, in the order of publication. A message comes before those published after
         # it, so the lines before one that is seen are lost.
         self._waiting: deque[tuple[int, list[float]]] = deque()
         self.lost: list[int] = []
 
-        # Set when a message was seen; and whether one ever was, since a server that sends none back must not delay.
+        # Set when a message was seen; and whether any ever was: a server that sends none back must not cause waits.
         self._seen = asyncio.Event()
         self._has_seen = False
 

@@ -39,7 +39,7 @@ _SOCKET: Final = "NOTIFY_SOCKET"
 _WATCHDOG: Final = ("WATCHDOG_USEC", "WATCHDOG_PID")
 
 GetStatus = Callable[[], ProcessStatus]
-"""Function that returns the status of a process, to which identity, rate, CPU time and memory are added here."""
+"""Function that returns the status of a process without identity, rate, CPU time and memory, which are added here."""
 
 
 class ServiceManager:
@@ -59,8 +59,8 @@ class ServiceManager:
         # the watchdog may be meant for another process, such as the one that started this one
         expected = pid in {"", str(os.getpid())} and is_number
         self.watchdog_s: float = int(microseconds) / 1e6 if expected else 0.0
-        """Seconds within which it expects a sign of life; 0 if it expects none."""
-        # What it has accepted: readiness is sent once, a status when it changes, and both again if its queue was full.
+        """Seconds within which the service manager expects a sign of life; 0 if it expects none."""
+        # What the manager has accepted: readiness is sent once, a status when it changes, both again if not accepted.
         self._ready = False
         self._status = ""
 

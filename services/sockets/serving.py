@@ -30,7 +30,7 @@ from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 
 GREETING_TIME = 5.0
-"""Seconds in which a client must send its hello; after them, another may connect."""
+"""Seconds in which a client must send its hello; afterwards, another client may connect."""
 MAX_UNSAID = 4
 """Maximum number of notices that are stored for the next master; the oldest are dropped."""
 _REPORT_ATTEMPTS = 100

@@ -54,7 +54,7 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
     # numbers), and its age.
     last_number: int | None
     last_age_s: float | None
-    # Completed ones per second; `Report` adds it, because a process only counts.
+    # Completed frames per second; `Report` adds it, because a process only counts.
     rate: float = 0.0
     # Of the subscriber: readings without a topic that may be missing and was alive, by topic.
     without: dict[str, int] = msgspec.field(default_factory=dict)
@@ -105,7 +105,7 @@ class PeerStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 BUCKETS_S = tuple(digit * 10.0**exponent for exponent in range(-5, 1) for digit in (1, 2, 5))[:17]
-"""Upper bounds of the buckets of a latency in seconds, from 10 us to 2 s; the last bucket has none."""
+"""Upper bounds of the buckets of a latency in seconds, from 10 us to 2 s; one more bucket has no upper bound."""
 
 
 class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
@@ -115,7 +115,7 @@ class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
     # quantiles over the last 1000 published frames
     p50_ms: float
     p99_ms: float
-    # Over all of them; a bucket has the number of frames up to its bound in `BUCKETS_S`, without those below.
+    # Over all published frames; a bucket counts those up to its bound in `BUCKETS_S` and above the bound before.
     frames: int
     sum_s: float
     buckets: list[int]
@@ -133,13 +133,13 @@ class HubStatus(msgspec.Struct, frozen=True):
 class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     """A process."""
 
-    # Whether it does its work; then its state, otherwise the cause.
+    # Whether it does its work; `why` is its state if it does, otherwise the cause.
     ready: bool
     why: str
     # False if it answers, but makes no progress: a blocking thread hangs, or a child of the master does.
     alive: bool = True
-    # `Report` adds who it is and what it uses. CPU time is user and system time so far, and the percentage that of the
-    # last seconds (100 is one core); the memory is the resident one.
+    # `Report` adds who it is and what it uses. CPU time is user and system time so far, and the percentage is over
+    # the last seconds (100 is one core); the memory is resident memory.
     name: str = ""
     pid: int = 0
     version: str = ""
@@ -147,7 +147,7 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
     cpu_s: float = 0.0
     cpu_percent: float = 0.0
     memory_bytes: int = 0
-    # The hash of its deployment and, of the master, the folder from which it has read it.
+    # The hash of its deployment, and, only for the master, the folder from which it was read.
     deployment: str = ""
     folder: str = ""
     connections: list[ConnectionStatus] = msgspec.field(default_factory=list)
