@@ -96,8 +96,8 @@ async def discover(timeout: float = 2.0) -> list[Robot]:
             if robot is not None:
                 from_name[robot.name] = robot
 
-        # The browser finds names; all are asked for their addresses at the same time, because a robot that has just left
-        # does not answer.
+        # The browser finds names; all are asked for their addresses at the same time, because a robot that has just
+        # left does not answer.
         browser = AsyncServiceBrowser(zeroconf.zeroconf, SERVICE_TYPE, handlers=[on_change])
         asking: set[asyncio.Task[None]] = set()
         try:

@@ -318,7 +318,7 @@ class MachineKind(ABC):
     def posterior(
         self, machines: Sequence[Any], frame: FrameInput, variables: Sequence[str] = ()
     ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
-        """Run the machines of all boards in this process, each to its own stop, and return the posterior and the details.
+        """Run the machines of all boards in this process, each to its own stop; return the posterior and the details.
 
         Raises:
             NoPosteriorError: The readings give no posterior.

@@ -34,9 +34,9 @@ class LinkRate(StrEnum):
 
 
 WIRES: Final[Mapping[str, LinkFigures]] = {
-    # Thesis 2.3: 20,800 Mbps, measured with the vendor's diagnostics. A read of a device takes about 1 us there and back
-    # (Neugebauer et al., "Understanding PCIe performance for end host networking", SIGCOMM 2018). Each board has lanes
-    # of its own.
+    # Thesis 2.3: 20,800 Mbps, measured with the vendor's diagnostics. A read of a device takes about 1 us there and
+    # back (Neugebauer et al., "Understanding PCIe performance for end host networking", SIGCOMM 2018). Each board has
+    # lanes of its own.
     LinkRate.PCIE_GEN2: LinkFigures(20_800, 0.5, shared=False),
     # Thesis 2.3: at most 24 Mbps. A transfer waits for the next micro-frame of high-speed USB, 125 us (USB 2.0
     # specification, 8.4.3). JTAG is a chain: one cable for all boards, and one transfer at a time.

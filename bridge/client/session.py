@@ -154,8 +154,8 @@ class Session:
         self._entered = False
         self._thread: int | None = None
 
-        # The connection. `_websocket` is set just before the state becomes CONNECTED, and cleared just before it changes
-        # again, so handles check it instead of the state.
+        # The connection. `_websocket` is set just before the state becomes CONNECTED, and cleared just before it
+        # changes again, so handles check it instead of the state.
         self._websocket: WebSocket | None = None
         self._connected_at = 0.0
         self._lost_at = 0.0
@@ -167,13 +167,13 @@ class Session:
         self.last_error = ""
 
         # Reconnecting: one task, which runs from a loss until the next connection. `_pause` is its current sleep, which
-        # `reconnect_now` cancels; `_delay` is the length of the next one. It doubles, and a steady connection resets it.
+        # `reconnect_now` cancels; `_delay` is the next wait's length. It doubles; a steady connection resets it.
         self._reconnecting: asyncio.Task[None] | None = None
         self._pause: asyncio.Future[None] | None = None
         self._delay = FIRST_DELAY
 
-        # Silent subscriptions: the timer runs while the connection is open and a topic has had no message. The task asks
-        # rosapi about those with a type; there is at most one.
+        # Silent subscriptions: the timer runs while the connection is open and a topic has had no message. The task
+        # asks rosapi about those with a type; there is at most one.
         self._retry_timer: asyncio.TimerHandle | None = None
         self._renewal_delay = SILENCE
         self._looking: asyncio.Task[None] | None = None
@@ -184,11 +184,11 @@ class Session:
         self._waiting = 0
         # Number of messages since a publisher last yielded; without yielding, a tight loop would starve other tasks.
         self._burst = 0
-        # Size of the largest message sent on this connection: if the server closes it with code 1009, its limit is less.
+        # Size of the largest message sent on this connection: if the server ends it with 1009, its limit is less.
         self._largest_sent = 0
 
-        # The objects behind the numbers, absolute names and ids in the core's events. An entry is made when its operation
-        # is sent, and removed by its handle or by its last event; a lost connection empties goals and calls.
+        # The objects behind the numbers, absolute names and ids in the core's events. An entry is made when its
+        # operation is sent, and removed by its handle or by its last event; a lost connection empties goals and calls.
         self.readers: dict[int, Reader] = {}  # by number of the subscription
         self.servers: dict[str, Server] = {}  # by name of the service
         self.action_servers: dict[str, GoalExecutor] = {}  # by name of the action

@@ -133,8 +133,8 @@ class WebSocket(WebSocketTransport):
         self._on_messages = on_messages
         self._on_lost = on_lost
 
-        # The watchdog runs from `begin` to the end. After a silence it pings once; any data counts as an answer. If there
-        # is none, it sets `_silent_for` and ends the connection.
+        # The watchdog runs from `begin` to the end. After a silence it pings once; any data counts as an answer. If
+        # there is none, it sets `_silent_for` and ends the connection.
         self._watchdog: asyncio.TimerHandle | None = None
         self._pinged_at: float | None = None
         self._silent_for = 0.0

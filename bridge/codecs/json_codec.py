@@ -37,7 +37,7 @@ _EXCERPT: Final = 60
 _COUNTED: Final = 4096
 # Number of occurrences of one character to check before searching for the whole word.
 _HOPS: Final = 64
-# With fewer bytes than this per permitted level, the size and the number of `[` can show that a message is not too deep.
+# With fewer bytes than this per permitted level, size and number of `[` can show that a message is not too deep.
 _SMALL: Final = 6
 # The first byte of `null`; testing for a number is ten times as fast as for a byte string.
 _N: Final = ord("n")

@@ -151,7 +151,7 @@ class MessageDefinitions:
             return None
 
     def serialise(self, type_name: str, message: dict[str, Any], max_size: int) -> bytes:
-        """Serialise a message as ROS 1's transport would, or as CDR with its header, or raise a RefusedOperationError."""
+        """Serialise a message as in ROS 1, or for ROS 2 as CDR with its header, or raise a RefusedOperationError."""
         store, known = self._known(type_name)
         try:
             built = Builder(store, max_size // _BYTES_A_VALUE).message(known, message, "")

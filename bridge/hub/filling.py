@@ -85,7 +85,7 @@ class Filler:
         return None if is_grown else tail
 
     def fill_part(self, message: dict[str, Any], room: int) -> int:
-        """Fill a message inside another one, and return the bytes by which it grew, or raise a RefusedOperationError."""
+        """Fill a message inside another one; return how many bytes it grew by, or raise a RefusedOperationError."""
         grown = _fill_parts(self.parts, message, room)
         if len(message) != self.count:
             absent, tail, _parts = self._known.get(tuple(message)) or self._look_up(message)

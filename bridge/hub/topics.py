@@ -32,8 +32,8 @@ from bridge.names import absolute, same_type, split_type
 _ENVELOPE_KEYS: Final = 3
 # Units of work of one message, besides those for each subscriber.
 _MESSAGE_WORK: Final = 20
-# Bytes copied for a subscriber in one unit of work. Filling a message and writing it as JSON, which happens at most once,
-# takes as long as this many copies.
+# Bytes copied for a subscriber in one unit of work. Filling a message and writing it as JSON, which happens at most
+# once, takes as long as this many copies.
 _COPIED: Final = 4096
 _JSON_COPIES: Final = 8
 TURN_WORK: Final = 10_000
@@ -158,7 +158,7 @@ class Topics:
         payloads: list[bytes] = []
         messages_parsed: list[dict[str, Any]] = []
         for data in messages:
-            # What follows a proven envelope is a message and a brace, or it is parsed in full (and perhaps refused there).
+            # After a proven envelope, a message and a brace follow. All else is parsed in full (and perhaps refused).
             if not data.startswith(envelope) or data[-1] != BRACE:
                 break
             message, payload = data[begin:-1], data
@@ -308,7 +308,7 @@ class Topics:
         self._dispatcher.work += 2 * len(options)
         throttle = min(each.throttle for each in options)
         queue_length = min(each.queue_length for each in options)
-        # With a throttle, 0 means to drop what comes too early; without one, it only means that the client does not care.
+        # With a throttle, 0 drops messages that come too early; without one, it leaves the length to the hub.
         if queue_length == 0 and not throttle:
             queue_length = self._limits.queue_length
         subscription.compression = max({each.compression for each in options}, key=ENCODINGS.index)

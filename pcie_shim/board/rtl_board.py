@@ -42,7 +42,7 @@ class RtlBoard:
         # While there is no simulation, this one answers.
         self._blank = EmulatedBoard(sends_results=False)
 
-        # The simulated hardware and the hash of its image, which are replaced together when the board is programmed again.
+        # The simulated hardware and the hash of its image; programming the board again replaces both.
         self._simulation: Simulation | None = None
         self._image_hash = self._blank.image_hash
 

@@ -81,7 +81,7 @@ class Board(Protocol):
         """Run the machine for one more chunk; then `running` tells whether it must continue."""
 
     def interrupt_words(self) -> bytes:
-        """Return the payload of an interrupt: DONE to COMPUTE_NS, and with CAP_LINK.SENDS_RESULTS the blocks of the answer."""
+        """Return an interrupt's payload: DONE to COMPUTE_NS, with CAP_LINK.SENDS_RESULTS also the answer's blocks."""
 
     def release(self) -> None:
         """Stop a running machine and disable interrupts, because the host has disconnected."""
@@ -127,8 +127,8 @@ def serve_board(
     With `pin`, this thread is pinned to one of its allowed cores, number `index` modulo their number. Boards compute
     for tenths of a millisecond, too short for Linux to distribute the threads woken by one host over the cores:
     without pinning, the boards of a mini-cluster would compute one after the other. The thread also gets the policy
-    SCHED_BATCH, so that it does not preempt others when it wakes. `link` delays the frames of hosts. `on_ready` is called
-    when both sockets are listening.
+    SCHED_BATCH, so that it does not preempt others when it wakes. `link` delays the frames of hosts. `on_ready` is
+    called when both sockets are listening.
 
     Raises:
         EndpointError: The endpoint is invalid or in use.

@@ -74,7 +74,7 @@ class DrivenBoard:
         # True from `ask` until `fetch` has read what was asked for.
         self.asked = False
 
-        # Of the last answer: its words (set by `fetch`), the stop reason of each replica, and with several their cycles.
+        # Of the last answer: its words (set by `fetch`), each replica's stop reason, and with several their cycles.
         self.answer = memoryview(b"")
         self.reasons: tuple[int, ...] = (0,) * self.replicas
         self._replica_cycles: tuple[int, ...] = ()

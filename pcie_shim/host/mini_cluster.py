@@ -105,8 +105,8 @@ class MiniCluster:
         # The posted frame, from `post` until `collect` returns its result or either raises an error.
         self._progress: _Progress | None = None
 
-        # Boards that were still computing or answering when another one failed the frame. Their links were closed, which
-        # stops them, and the next frame opens them again; for the caller they are open.
+        # Boards that were still computing or answering when another one failed the frame. Their links were closed,
+        # which stops them, and the next frame opens them again; for the caller they are open.
         self._interrupted: list[DrivenBoard] = []
 
         # The links of all open boards: registered in the poll when a board is opened, removed when it is closed.

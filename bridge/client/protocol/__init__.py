@@ -14,9 +14,9 @@ A connection, as the core sees it (`->` is what `ClientCore.data_to_send` return
     unsubscribe()        ->  {"op": "unsubscribe", "id": "subscribe:/pose:2", "topic": "/pose"}
     lost()                   drops calls, goals and requests; keeps everything else for restore()
 
-rosbridge has no handshake and no acknowledgements: at most, a server reports a refused operation in a status message. So
-the core stores what the program wants, and sends all of it again on a new connection. Messages may also be encoded as
-CBOR, or in fragments. Goals of actions work like calls, with feedback before the result.
+rosbridge has no handshake and no acknowledgements: at most, a server reports a refused operation in a status message.
+So the core stores what the program wants, and sends all of it again on a new connection. Messages may also be encoded
+as CBOR, or in fragments. Goals of actions work like calls, with feedback before the result.
 
 Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite), and
 the deviations of servers from it (`docs/reference/rosbridge-differences.md`).

@@ -195,8 +195,8 @@ class ServedServices(_Served):
 
     def __init__(self, wire: Wire) -> None:
         super().__init__(wire)
-        # Name and id on the wire by ticket, only of the present connection. Ids are chosen by callers, and may be equal,
-        # so the program gets a ticket instead.
+        # Name and id on the wire by ticket, only of the present connection. Ids are chosen by callers, and may be
+        # equal, so the program gets a ticket instead.
         self._requests: dict[int, tuple[str, Any]] = {}
 
     def __len__(self) -> int:
