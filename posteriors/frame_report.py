@@ -100,9 +100,9 @@ class FrameReport:
         return "ended_early" in self.details
 
     def link_us(self, rate: str) -> float | None:
-        """Return the modelled microseconds of the frame's transfers, one after another, on a link of this --link-rate.
+        """Return the modelled microseconds of the frame's transfers, one after another, on a link of this rate.
 
-        None if the report has no bytes.
+        `rate` is a value of --link-rate. None if the report has no bytes.
         """
         if self.link_bytes is None or self.link_transfers is None:
             return None

@@ -29,7 +29,7 @@ class OtherPeerError(StackError):
 
 
 class NoDataError(StackError):
-    """No reading arrived within the timeout of the first one."""
+    """No first reading arrived in time after the start of the run."""
 
     exit_code = ExitCode.ROSBRIDGE
 

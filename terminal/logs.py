@@ -173,7 +173,7 @@ def get_logger(role: str, level: str = "info") -> Logger:
 
 
 def log_libraries(level: int, form: str) -> None:
-    """Write log records of libraries from a level on to standard error, one line each."""
+    """Write libraries' log records of at least this level to standard error, one line each, in the format `form`."""
     handler = logging.StreamHandler()
     handler.setFormatter(_OneLine(form))
     logging.basicConfig(level=level, handlers=[handler])

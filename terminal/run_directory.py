@@ -77,7 +77,7 @@ class LockedRunDirectory:
 
         Raises:
             OccupiedError: Another run uses it.
-            OutputError: It cannot be created in an existing folder, or other users can enter it.
+            OutputError: It is not a folder and cannot be created, or other users can enter it.
         """
         self.path = run_directory(given)
         """The absolute path of the directory."""

@@ -102,7 +102,7 @@ def disparity_message(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StereoImages:
-    """The two images of one instant, uint8[height, width], with the left one's header."""
+    """The left and right image of one instant, uint8[height, width], and the header of the left one."""
 
     stamp_ns: int
     head: Mapping[str, Any]
@@ -114,7 +114,7 @@ class ImagePairs:
     """The images of two cameras, paired by equal stamps.
 
     Attributes:
-        unpaired: The images of each camera since the last pair, left and right; a silent camera stays at 0.
+        unpaired: Number of images of the left and right camera since the last pair; a silent camera stays at 0.
     """
 
     def __init__(self) -> None:

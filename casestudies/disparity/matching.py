@@ -36,7 +36,10 @@ def box_sum(values: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
 
 
 def filtered(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the outputs of the filters, float32[filters, height, width], of uint8[height, width]; borders are repeated."""
+    """Return the filters' outputs, float32[filters, height, width], for an image, uint8[height, width].
+
+    Beyond the border, the image's edge pixels are repeated.
+    """
     padded = np.pad(image.astype(np.float32), 1, mode="edge")
     across = padded[:, 2:] - padded[:, :-2]
     down = padded[2:] - padded[:-2]

@@ -72,7 +72,7 @@ def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> FrameSummary:
 
 
 def mean_and_error(frames: Sequence[FrameSummary]) -> tuple[float, float]:
-    """Return the mean share of some frames, at least one, and its standard error."""
+    """Return the mean P(R = 1) of at least one frame, and its standard error."""
     mean = math.fsum(frame.share for frame in frames) / len(frames)
     return mean, math.sqrt(math.fsum(frame.error**2 for frame in frames)) / len(frames)
 
@@ -165,7 +165,7 @@ class SamplesViewer:
     async def _samples_of(
         self, posterior: Posterior, samples: Subscription, limit_s: float
     ) -> NDArray[np.int64] | None:
-        """Return the samples whose share of R = 1 is that of a posterior, or None if they are lost."""
+        """Return the samples whose share of R = 1 equals the posterior's P(R = 1), or None if they are lost."""
         share = posterior.marginal("R")[1]
         while True:
             for at, states in enumerate(self._unclaimed):

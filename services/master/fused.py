@@ -69,7 +69,7 @@ def fused_services(
 ) -> dict[str, tuple[FusedEnd, Coroutine[Any, Any, int]]]:
     """Return the three services by role: the master's end of the link, and the coroutine of the service.
 
-    `to_master` returns the function that receives the records of a role. A SettingsError if a board's endpoint is invalid.
+    `to_master` returns the function that receives the records of a role. Raises a SettingsError for a wrong endpoint.
     """
     # filled by the constructors of the services, which make their links
     ends: dict[str, FusedEnd] = {}

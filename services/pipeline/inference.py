@@ -8,7 +8,7 @@ from toolchain.deployment import Deployment
 
 
 def infer(result: FrameResult, deployment: Deployment) -> Inference:
-    """Return the posterior for the results of all boards, computed by the kind of their machines."""
+    """Return the posterior for the results of all boards, computed as their kind of machine requires."""
     machine = deployment.machine
     return machine.kind.infer(decode_boards(result), machine.variables)
 
