@@ -14,8 +14,9 @@ DOCK = "/dock"
 class Docking:
     """A hub with a client that offers /dock, a service or an action, and one that asks for it."""
 
-    def __init__(self, kind, *, ros_version=2, **limits):
+    def __init__(self, kind, type_name=None, *, ros_version=2, **limits):
         self.kind = kind
+        self.type_name = type_name or TYPES[kind]
         self.hub = Harness(ros_version=ros_version, **limits)
         self.server, self.client = self.hub.connect(), self.hub.connect()
         self.offer(self.server)
@@ -29,7 +30,7 @@ class Docking:
         return self.hub.broker._calls.pending if self.kind == "service" else self.hub.broker._actions.goals
 
     def offer(self, peer, name=DOCK):
-        peer.send(op=f"advertise_{self.kind}", type=TYPES[self.kind], **{self.kind: name})
+        peer.send(op=f"advertise_{self.kind}", type=self.type_name, **{self.kind: name})
 
     def withdraw(self, peer):
         peer.send(op=f"unadvertise_{self.kind}", **{self.kind: "dock"})
@@ -376,46 +377,37 @@ def test_feedback_and_result_as_png(action):
     ],
 )
 def test_arguments_and_values_of_a_known_service_are_whole(ros_version, args, received):
-    hub = Harness(ros_version=ros_version)
-    server, client = hub.connect(), hub.connect()
-    server.send(op="advertise_service", service="/add", type="rospy_tutorials/AddTwoInts")
-    client.send(op="call_service", service="/add", args=args)
-    (request,) = server.read()
+    service = Docking("service", "rospy_tutorials/AddTwoInts", ros_version=ros_version)
+    service.ask(args=args)
+    (request,) = service.server.read()
     assert request["args"] == received
-    server.send(op="service_response", id=request["id"], service="/add", values={}, result=True)
-    assert client.read() == [
-        {"op": "service_response", "service": "/add", "values": {"sum": 0}, "result": True}
-    ]
+    service.end(request["id"], values={}, result=True)
+    answer = service.answer()
+    assert (answer["values"], answer["result"]) == ({"sum": 0}, True)
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])
 def test_parts_of_a_known_action_are_whole(ros_version):
-    hub = Harness(ros_version=ros_version)
-    server, client = hub.connect(), hub.connect()
-    server.send(op="advertise_action", action="/look", type="tf2_msgs/LookupTransform")
-    client.send(op="send_action_goal", action="/look", args={"timeout": {"sec": 1, "secs": 1}}, feedback=True)
-    (goal,) = server.read()
+    action = Docking("action", "tf2_msgs/LookupTransform", ros_version=ros_version)
+    action.ask(args={"timeout": {"sec": 1, "secs": 1}}, feedback=True)
+    (goal,) = action.server.read()
     assert goal["args"]["timeout"]["nanosec" if ros_version == 2 else "nsecs"] == 0
     assert goal["args"]["advanced"] is False
-    server.send(op="action_feedback", id=goal["id"], action="/look", values={})
-    assert client.read()[0]["values"] == {}
-    server.send(
-        op="action_result", id=goal["id"], action="/look", values={"error": {"error": 1}}, result=True
-    )
-    values = client.read()[0]["values"]
+    action.server.send(op="action_feedback", id=goal["id"], values={})
+    assert action.client.read()[0]["values"] == {}
+    action.end(goal["id"], values={"error": {"error": 1}}, result=True)
+    values = action.answer()["values"]
     assert values["error"] == {"error": 1, "error_string": ""}
     assert values["transform"]["transform"]["rotation"]["w"] == float(ros_version == 2)
 
 
 def test_values_that_outgrow_the_limit_are_refused():
-    hub = Harness(message_bytes=300)
-    server, client = hub.connect(), hub.connect()
-    server.send(op="advertise_service", service="/map", type="nav_msgs/GetPlan")
-    client.send(op="call_service", service="/map")
-    assert client.read()[0]["result"] is False
-    server.send(op="advertise_service", service="/add", type="rospy_tutorials/AddTwoInts")
-    client.send(op="call_service", service="/add", id=1)
-    assert server.read()[0]["args"] == {"a": 0, "b": 0}
+    large = Docking("service", "nav_msgs/GetPlan", ros_version=1, message_bytes=300)
+    large.ask()
+    assert large.answer()["result"] is False
+    small = Docking("service", "rospy_tutorials/AddTwoInts", ros_version=1, message_bytes=300)
+    small.ask()
+    assert small.server.read()[0]["args"] == {"a": 0, "b": 0}
 
 
 @pytest.mark.parametrize("ros_version", [1, 2])

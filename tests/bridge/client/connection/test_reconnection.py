@@ -251,31 +251,27 @@ async def test_a_subscription_says_how_long_it_was_dark(fake, monkeypatch):
         monkeypatch.setattr(f"bridge.client.{module}.time", clock(now))
     monkeypatch.setattr("bridge.transport.websocket.time", clock(now))
     async with connect(fake.uri) as ros:
-        await _darkness(fake, ros, now)
-
-
-async def _darkness(fake, ros, now):
-    subscription = ros.subscribe("/a", "p/T")
-    await fake.wait_for_op("subscribe")
-    await fake.publish("/a", {})
-    await subscription.next(PATIENCE)
-    assert subscription.blind_seconds == 0
-    for _ in range(2):
-        await fake.vanish()
-        await ros.wait_for_state(State.RECONNECTING, PATIENCE)
-        now[0] += 0.25
-        between = ros.subscribe("/c", "p/T")
-        now[0] += 0.5
-        await fake.come_back()
-        await ros.wait_for_state(State.CONNECTED, PATIENCE)
-    late = ros.subscribe("/b", "p/T")
-    await fake.wait_for_op("subscribe", topic="/b")
-    assert subscription.blind_seconds == 1.5
-    assert between.blind_seconds == 0.5, "of the second time, since it was made"
-    assert late.blind_seconds == 0
-    await subscription.close()
-    await gone_and_back(fake, ros)
-    assert subscription.blind_seconds == 1.5
+        subscription = ros.subscribe("/a", "p/T")
+        await fake.wait_for_op("subscribe")
+        await fake.publish("/a", {})
+        await subscription.next(PATIENCE)
+        assert subscription.blind_seconds == 0
+        for _ in range(2):
+            await fake.vanish()
+            await ros.wait_for_state(State.RECONNECTING, PATIENCE)
+            now[0] += 0.25
+            between = ros.subscribe("/c", "p/T")
+            now[0] += 0.5
+            await fake.come_back()
+            await ros.wait_for_state(State.CONNECTED, PATIENCE)
+        late = ros.subscribe("/b", "p/T")
+        await fake.wait_for_op("subscribe", topic="/b")
+        assert subscription.blind_seconds == 1.5
+        assert between.blind_seconds == 0.5, "of the second time, since it was made"
+        assert late.blind_seconds == 0
+        await subscription.close()
+        await gone_and_back(fake, ros)
+        assert subscription.blind_seconds == 1.5
 
 
 #: Bytes that may be more in use after many rounds than after few: caches, not one object a round.
