@@ -10,7 +10,6 @@ import inspect
 import json
 import os
 import re
-import socket
 import subprocess
 import sys
 import time
@@ -27,7 +26,7 @@ from machines.posterior import joint_posterior
 from pcie_shim.programming_file import read_image
 from tests.command_runner import invoke
 from tests.patience import PROCESS_PATIENCE, PRODUCT_LIMITS
-from tests.pcie_shim.boards import expected
+from tests.pcie_shim.boards import expected, two_ports
 from toolchain.commands import main
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address import to_address
@@ -135,17 +134,7 @@ class Stage:
 
     def place(self):
         """A port that is free, and the next one; nobody else is given them before the test's end."""
-        while True:
-            # bound and never listening
-            pair = socket.socket(), socket.socket()
-            self._places.extend(pair)
-            for each in pair:
-                each.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            pair[0].bind(("127.0.0.1", 0))
-            port = pair[0].getsockname()[1]
-            with contextlib.suppress(OSError, OverflowError):
-                pair[1].bind(("127.0.0.1", port + 1))
-                return port
+        return two_ports(self._places)
 
     async def hub(self, port=0, ros_version="1"):
         """A hub and its address; another one may follow it at its port."""

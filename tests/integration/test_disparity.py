@@ -15,7 +15,7 @@ from matplotlib.image import imread
 from casestudies.disparity.matching import FILTERS
 from machines.posterior import posterior
 from pcie_shim.programming_file import read_image
-from tests.integration.conftest import Robot, until
+from tests.integration.conftest import Robot, stamp_of, until
 from toolchain.deployment import load_deployment
 from toolchain.deployment.address_array import to_addresses
 
@@ -23,10 +23,6 @@ TOPICS = {
     "/disparity/likelihoods": "disparity_msgs/Likelihoods",
     "/stereo/disparity": "stereo_msgs/DisparityImage",
 }
-
-
-def stamp_of(message):
-    return tuple(message["header"]["stamp"].values())
 
 
 @pytest.mark.process

@@ -17,12 +17,16 @@ from machines.bm1 import BM1Machine, Start, StopReason
 from machines.bm1_kind import BM1
 from machines.kind import FrameInput
 from machines.parameters import BM1Parameters, RngKind, SensorMode
-from pcie_shim.board.emulated_board import EmulatedBoard
+from pcie_shim import register_map as rm
+from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
 from pcie_shim.board.server import StopSignal, serve_board
 from pcie_shim.endpoint import Endpoint
 from pcie_shim.errors import BoardError, PcieShimError
+from pcie_shim.host.driven_board import DrivenBoard
 from pcie_shim.host.mini_cluster import MiniCluster
-from pcie_shim.programming_file import Image, Partition
+from pcie_shim.host.socket_link import Done
+from pcie_shim.programming_file import Image, Partition, image_bytes
+from pcie_shim.register_layout import in_field
 from tests.misbehaving_board import serve_misbehaving
 from tests.patience import PATIENCE
 
@@ -86,6 +90,38 @@ def images(seed: int, lines: Sequence[int], **parameters) -> list[Image]:
         )
         for index, own in enumerate(lines)
     ]
+
+
+def loaded(of: Image) -> EmulatedBoard:
+    """A board in no server, programmed with an image."""
+    board = EmulatedBoard()
+    board.load(image_bytes(of))
+    return board
+
+
+def finish(board: EmulatedBoard) -> int:
+    """Step until the machine stops; the number of steps."""
+    steps = 0
+    while board.running:
+        assert board.read(rm.STATUS, 1)[0] & 15 == rm.BoardState.RUNNING
+        board.step()
+        steps += 1
+    return steps
+
+
+def refused(code: rm.ErrorCode) -> contextlib.AbstractContextManager[pytest.ExceptionInfo[RefusedError]]:
+    """An error of this code; its sentence has no full stop, because the host continues it."""
+    return pytest.raises(
+        RefusedError, check=lambda error: error.code is code and not str(error).endswith(".")
+    )
+
+
+def done_by(
+    board: DrivenBoard, reason: int, results: bytes, *, state: rm.BoardState = rm.BoardState.DONE
+) -> Done:
+    """What the interrupt of a board says whose machine has stopped, or is in another state."""
+    status = in_field(rm.STATUS_STATE_MASK, state) | in_field(rm.STATUS_STOP_REASON_MASK, reason)
+    return Done(board.number, status, 9, 100, memoryview(results))
 
 
 class ServedBoard:
@@ -226,16 +262,21 @@ def _inputs(parameters: BM1Parameters, given: object, lines: slice) -> tuple[int
 
 def tcp_endpoint() -> str:
     """Return an endpoint whose port and next port (for programming) stay reserved until `free_places`."""
+    return f"tcp://127.0.0.1:{two_ports(_PLACES)}"
+
+
+def two_ports(places: list[socket.socket]) -> int:
+    """Return a free port, of which and the next one nobody else is given any before these sockets are closed."""
     while True:
         first, second = socket.socket(), socket.socket()
-        _PLACES.extend((first, second))
+        places.extend((first, second))
         for place in (first, second):
             place.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         first.bind(("127.0.0.1", 0))
-        port = first.getsockname()[1]
+        port: int = first.getsockname()[1]
         with contextlib.suppress(OSError, OverflowError):
             second.bind(("127.0.0.1", port + 1))
-            return f"tcp://127.0.0.1:{port}"
+            return port
 
 
 def free_places() -> None:

@@ -4,7 +4,6 @@ frame ──▶ on_host ── blocks ──▶ board 0, board 1 (chains) ──
                         the same start ──▶ the reference in this process ── must be equal, to the bit
 """
 
-import contextlib
 import dataclasses
 
 import msgspec
@@ -18,7 +17,7 @@ from machines.errors import MachineError, NoPosteriorError, ParameterError, Star
 from machines.kind import BoardResult, FrameInput
 from machines.parameters import SampleEvery, Sequencer
 from pcie_shim import register_map as rm
-from pcie_shim.board.emulated_board import EmulatedBoard, RefusedError
+from pcie_shim.board.emulated_board import RefusedError
 from pcie_shim.board.rtl_board import RtlBoard
 from pcie_shim.errors import FrameInputError, ImageError, ImageMismatchError
 from pcie_shim.host.mini_cluster import MiniCluster
@@ -27,7 +26,7 @@ from pcie_shim.register_map import ErrorCode
 from services.boards.hardware import Engine, SimulatedHardware
 from tests.machines.test_bm2 import EXACT
 from tests.machines.test_bm2 import sprinkler as machine_of_the_thesis
-from tests.pcie_shim.boards import board_fails, opened, words
+from tests.pcie_shim.boards import board_fails, finish, loaded, opened, refused, words
 from tests.pcie_shim.boards import image as bm1_image
 from tests.pcie_shim.boards import machine as bm1_machine
 
@@ -239,40 +238,33 @@ def test_a_time_out_of_a_variable_without_a_name_has_its_number():
     assert "variable 1" in BM2.infer(late, ("only",)).outcome
 
 
-@pytest.mark.parametrize("bit", [-2, -1, 3])
-def test_a_time_out_on_a_bit_that_is_not_of_the_state_is_refused(bit):
-    """The result came from a pipe; the state has three bits."""
-    parameters = sprinkler().parameters
-    kept = msgspec.msgpack.encode(Kept(parameters, timed_out_bit=bit))
+def result_with(machine, *samples, reason=BM2StopReason.SAMPLES, **kept):
+    """A result as it may come from a pipe."""
+    parameters = machine.parameters
+    packed = msgspec.msgpack.encode(Kept(parameters, *samples, **kept))
+    return BoardResult(bytes(4 * parameters.result_words), 9, reason, kept=packed)
+
+
+@pytest.mark.parametrize(
+    "result",
+    [
+        *(result_with(sprinkler(), *samples) for samples in ((-5, 0), (2, 3), (2, -1))),
+        *(
+            result_with(sprinkler(), reason=BM2StopReason.OPS_TIMEOUT, timed_out_bit=bit)
+            for bit in (-2, -1, 3)  # the state has three bits
+        ),
+        result_with(wide(stream=6), 1, stream=bytearray(4)),  # half a state
+    ],
+)
+def test_a_result_that_no_machine_gives_is_refused(result):
     with pytest.raises(MachineError, match="does not match"):
-        BM2.infer([BoardResult(bytes(4 * parameters.result_words), 9, BM2StopReason.OPS_TIMEOUT, kept=kept)])
+        BM2.infer([result])
 
 
-@pytest.mark.parametrize(("samples", "unused"), [(-5, 0), (2, 3), (2, -1)])
-def test_counts_of_samples_that_cannot_be_are_refused(samples, unused):
-    parameters = sprinkler().parameters
-    kept = msgspec.msgpack.encode(Kept(parameters, samples, unused))
-    with pytest.raises(MachineError, match="does not match"):
-        BM2.infer([BoardResult(bytes(4 * parameters.result_words), 9, BM2StopReason.SAMPLES, kept=kept)])
-
-
-def test_boards_of_different_models_are_refused():
-    boards = []
-    for machine in (sprinkler(), wide()):
-        kept = msgspec.msgpack.encode(Kept(machine.parameters))
-        empty = bytes(4 * machine.parameters.result_words)
-        boards.append(BoardResult(empty, 9, BM2StopReason.SAMPLES, kept=kept))
+def test_results_of_several_boards_are_of_one_model():
+    BM2.infer([result_with(wide(stream=6), 1, stream=bytearray(8))])
     with pytest.raises(MachineError, match="different models"):
-        BM2.infer(boards)
-
-
-@pytest.mark.parametrize("size", [4, 8])
-def test_a_stream_is_of_whole_states(size):
-    parameters = wide(stream=6).parameters
-    kept = msgspec.msgpack.encode(Kept(parameters, 1, stream=bytearray(size)))
-    board = BoardResult(bytes(4 * parameters.result_words), 9, BM2StopReason.SAMPLES, kept=kept)
-    with pytest.raises(MachineError, match="does not match") if size == 4 else contextlib.nullcontext():
-        BM2.infer([board])
+        BM2.infer([result_with(sprinkler()), result_with(wide())])
 
 
 def test_a_result_that_ended_by_max_cycles_is_marked():
@@ -313,9 +305,7 @@ def test_frames_that_no_chain_can_run_are_refused():
 
 
 def board_with(machine):
-    board = EmulatedBoard()
-    board.load(image_bytes(image(machine)))
-    return board
+    return loaded(image(machine))
 
 
 @pytest.mark.parametrize(
@@ -338,9 +328,8 @@ def test_a_board_refuses_a_start_that_does_not_fit(writes):
     board.write(rm.TARGET_COUNT, words(10, 1 << 20, 0, 0, 0, 0, 0))
     for address, value in writes.items():
         board.write(address, value)
-    with pytest.raises(RefusedError) as refused:
+    with refused(ErrorCode.BAD_VALUE):
         board.write(rm.START, words(1))
-    assert refused.value.code is ErrorCode.BAD_VALUE
     assert not board.running
     assert board.done == 0
 
@@ -354,9 +343,8 @@ def test_a_start_state_that_is_too_hard_is_no_crash(monkeypatch):
         raise StartError("The search takes too long.")
 
     monkeypatch.setattr("machines.bm2_kind.start_state", search)
-    with pytest.raises(RefusedError) as refused:
+    with refused(ErrorCode.BAD_IMAGE):
         board_with(weather())
-    assert refused.value.code is ErrorCode.BAD_IMAGE
     calls.clear()
     host = BM2.on_host([weather()])
     for _ in range(2):
@@ -370,8 +358,7 @@ def test_a_refused_start_leaves_the_limit_of_the_frame_before(monkeypatch):
     board = board_with(weather())
     board.write(rm.TARGET_COUNT, words(10, 1 << 30, 0, 0, 0, 0, 0))
     board.write(rm.START, words(1))
-    while board.running:
-        board.step()
+    finish(board)
     board.write(rm.TARGET_COUNT, words(10, 1, 0, 0, 0, 0, 0))
     board.write(rm.ORDER, words(9))
     with pytest.raises(RefusedError):
@@ -405,8 +392,7 @@ def test_a_board_has_the_registers_of_its_kind():
     (machine,) = np.frombuffer(board.read(rm.CAP_MACHINE, 1), "<u4")
     assert machine & rm.CAP_MACHINE_KIND_MASK == 2
     assert machine & rm.CAP_MACHINE_STREAM_MASK
-    plain = EmulatedBoard()
-    plain.load(image_bytes(bm1_image(bm1_machine())))
+    plain = loaded(bm1_image(bm1_machine()))
     for absent in (rm.START_STATE, rm.KNOWN_MASK, rm.BURN_IN, rm.SAMPLES_DONE, rm.STREAM):
         with pytest.raises(RefusedError):
             plain.read(absent, 1)
@@ -419,23 +405,13 @@ def test_a_resume_needs_more_samples_and_a_run_to_resume():
         board.write(rm.RESUME, words(1))
     board.write(rm.START_STATE, words(0b00100))
     board.write(rm.START, words(1))
-    while board.running:
-        board.step()
-    with pytest.raises(RefusedError) as refused:
+    finish(board)
+    with refused(ErrorCode.BAD_VALUE):
         board.write(rm.RESUME, words(2))
-    assert refused.value.code is ErrorCode.BAD_VALUE
     board.write(rm.TARGET_COUNT, words(12))
     board.write(rm.RESUME, words(2))
-    while board.running:
-        board.step()
+    finish(board)
     assert board.read(rm.SAMPLES_DONE, 1) == words(12)
-
-
-def test_either_image_replaces_the_other_on_an_emulated_board():
-    board = EmulatedBoard()
-    for content in (images()[0], bm1_image(bm1_machine()), images(stream=4)[0]):
-        board.load(image_bytes(content))
-        assert board.image_hash == content.image_hash
 
 
 @pytest.mark.parametrize("is_first", [True, False])
@@ -455,9 +431,9 @@ def test_simulated_hardware_of_the_other_kind_refuses_it(monkeypatch, tmp_path):
     monkeypatch.setattr("toolchain.hardware.check_tools", lambda _: None)
     hardware = SimulatedHardware(Engine.GHDL, tmp_path, {})
     board = RtlBoard(hardware._simulate)
-    with pytest.raises(RefusedError, match="BM2") as refused:
+    with pytest.raises(RefusedError, match="BM2") as caught:
         board.load(image_bytes(images()[0]))
-    assert refused.value.code is ErrorCode.BAD_IMAGE
+    assert caught.value.code is ErrorCode.BAD_IMAGE
 
 
 def test_a_programming_file_names_its_kind(monkeypatch):

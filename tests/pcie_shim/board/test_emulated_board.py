@@ -17,7 +17,7 @@ from pcie_shim.board.emulated_board import CHUNK_S, EmulatedBoard, RefusedError
 from pcie_shim.programming_file import image_bytes
 from pcie_shim.register_layout import field_of, next_doorbell
 from pcie_shim.register_map import BoardState, ErrorCode
-from tests.pcie_shim.boards import image, machine, never_stopping, words
+from tests.pcie_shim.boards import finish, image, loaded, machine, never_stopping, refused, words
 
 MACHINE = machine(1)
 
@@ -29,9 +29,7 @@ def board():
 
 
 def programmed(of):
-    board = EmulatedBoard()
-    board.load(image_bytes(image(of, total=100, offset=3, count=5, index=2)))
-    return board
+    return loaded(image(of, total=100, offset=3, count=5, index=2))
 
 
 def read(board, address):
@@ -55,13 +53,6 @@ def start(board, *addresses, number=0, **settings_):
     board.write(rm.SENSORS, words(*addresses))
     configure(board, **settings_)
     board.write(rm.START, words(number or next_doorbell(board.done)))
-
-
-def refused(code):
-    """An error of this code; its sentence has no full stop, because the host continues it."""
-    return pytest.raises(
-        RefusedError, check=lambda error: error.code is code and not str(error).endswith(".")
-    )
 
 
 # ---- identity and capabilities ----
@@ -158,8 +149,7 @@ def test_no_access_breaks_a_board(address, count, reading, value):
     assert read(board, rm.ID) == rm.ID_VALUE
 
 
-SHARED_BOARD = EmulatedBoard()
-SHARED_BOARD.load(image_bytes(image(MACHINE)))
+SHARED_BOARD = loaded(image(MACHINE))
 
 
 def test_settings_are_kept_over_a_reset(board):
@@ -202,8 +192,7 @@ def test_chunks_and_slices_do_not_change_a_bit(data):
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(emulated_board, "CHUNK_S", 1e-12)  # as short as chunks can be
-        board = EmulatedBoard()
-        board.load(image_bytes(image(of)))
+        board = loaded(image(of))
         kernel = make_kernel(of)
         for _ in range(2):
             compare_a_frame(data, board, kernel)
@@ -241,16 +230,6 @@ def compare_a_frame(data, board, kernel):
     assert status(board)[1] is kernel.reason
     assert np.array_equal(board._machine._kernel.rng_state, kernel.rng_state)
     assert rounds >= kernel.cycles // 64 - len(ends) - 1
-
-
-def finish(board):
-    """Step until the machine stops; the number of steps."""
-    steps = 0
-    while board.running:
-        assert status(board)[0] is BoardState.RUNNING
-        board.step()
-        steps += 1
-    return steps
 
 
 def test_a_long_run_is_cut_into_chunks_that_can_be_reset():

@@ -31,12 +31,12 @@ from pcie_shim.host import mini_cluster
 from pcie_shim.host.driven_board import DrivenBoard
 from pcie_shim.host.loader import program
 from pcie_shim.host.mini_cluster import MiniCluster
-from pcie_shim.host.socket_link import Done, SocketLink
-from pcie_shim.register_layout import in_field
+from pcie_shim.host.socket_link import SocketLink
 from pcie_shim.register_map import BoardState
 from tests.patience import PATIENCE, PROCESS_PATIENCE
 from tests.pcie_shim.boards import (
     board_fails,
+    done_by,
     endpoints_of,
     expected,
     image,
@@ -395,8 +395,7 @@ def interrupted(state=BoardState.DONE, reason=StopReason.OVERFLOW, words=3):
     """A board of three lines after an interrupt of this state, with these words of results."""
     board = DrivenBoard(0, parse_endpoint("unix:/nowhere"), images(1, (3,))[0])
     board.waiting = board.sends_results = True
-    status = in_field(rm.STATUS_STATE_MASK, state) | in_field(rm.STATUS_STOP_REASON_MASK, reason)
-    return board, Done(board.number, status, 9, 100, memoryview(bytes(4 * words)))
+    return board, done_by(board, reason, bytes(4 * words), state=state)
 
 
 @pytest.mark.parametrize("words", [2, 3, 4])
