@@ -148,7 +148,7 @@ def wrapped(text: str) -> str:
 
 
 def aligned(text: str) -> str:
-    """Return declarations of VHDL with their types, values and comments below each other."""
+    """Return declarations of VHDL with their types, values and comments aligned in columns."""
     rows = [re.split(r"( := | : | -- )", line) for line in text.strip("\n").split("\n")]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     cells = ([cell.ljust(width) for cell, width in zip(row, widths, strict=True)] for row in rows)
@@ -156,7 +156,7 @@ def aligned(text: str) -> str:
 
 
 def literal(value: int) -> str:
-    """Return a word in VHDL."""
+    """Return a 32-bit word as a literal of VHDL."""
     return f'x"{value:08X}"'
 
 

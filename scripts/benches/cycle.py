@@ -106,14 +106,14 @@ class Measured:
 
     @classmethod
     async def of_stack(cls, ros: Ros, topic: str = SENSORS_TOPIC, type_: str = SENSORS_TYPE) -> "Measured":
-        """Return the stack that reads a topic, as soon as it does."""
+        """Return the stack that reads a topic, as soon as it has subscribed to the topic."""
         results = ros.subscribe(RESULTS_TOPIC, RESULTS_TYPE)
         publication = await ros.advertise(topic, type_)
         await until_read(ros, topic)
         return cls(publication, results, 0)
 
     async def one_by_one(self, some: list[dict[str, int]], hz: float = 0.0) -> None:
-        """Publish readings, each after the answer to the previous one, and at most so many a second, if given."""
+        """Publish readings, each after the answer to the previous one, and at most `hz` a second unless it is 0."""
         for reading in some:
             started = time.perf_counter_ns()
             await self._publication.publish(message(reading))
@@ -256,7 +256,7 @@ def show(all_: dict[str, Measured], arguments: argparse.Namespace) -> None:
 
 
 def bench_either(arguments: argparse.Namespace) -> Awaitable[int]:
-    """Compare with the echo, or measure by size."""
+    """Compare the stack with the echo, or with `--sizes` measure it for several sizes of the problem."""
     if arguments.sizes:
         from scripts.benches.sizes import bench_sizes  # which needs this module
 

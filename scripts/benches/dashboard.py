@@ -2,7 +2,7 @@
 
 display  this process -- 50 posteriors a second, 64 x 64 --> hub --> dashboard --> Chromium, one window and two
 drag     mouse in Chromium --> dashboard --> hub --> boat-simulator --> ... --> master --> hub --> dashboard --> Chromium
-cycle    two stacks, one of them with a dashboard and a plain WebSocket reader, as Chromium takes a core of its own
+cycle    two stacks, one of them with a dashboard and a plain WebSocket reader, because Chromium takes a core of its own
 """
 
 import argparse
@@ -49,7 +49,7 @@ Rows = list[tuple[str, str, str]]
 
 
 async def publish(ros: Ros, sent: dict[int, float]) -> None:
-    """Publish results as a stack would until cancelled, and keep when each was sent, in Unix ms, by frame number."""
+    """Publish results as a stack would until cancelled, and store the Unix time of each in ms in `sent`, by number."""
     axis, posteriors = np.arange(SIDE), []
     for turn in np.linspace(0, 2 * np.pi, HZ, endpoint=False):
         x, y = SIDE / 2 + SIDE / 3 * np.cos(turn), SIDE / 2 + SIDE / 3 * np.sin(turn)
@@ -160,7 +160,7 @@ async def drags(stand: Stand, chromium: Browser, chance: random.Random) -> Rows:
 
 
 def read(url: str) -> None:
-    """Read what a page would until the server ends."""
+    """Read the WebSocket at `url` as the page would, until the server ends."""
     with connect_plainly(f"{url.replace('http', 'ws', 1)}/live", max_size=None) as socket:
         for _ in socket:
             socket.send(".")  # the page's acknowledgement

@@ -144,7 +144,7 @@ def in_pyagrum(pyagrum: Any, joint: JointDistribution) -> Any:
 def alternatives(
     pyagrum: Any, joint: JointDistribution, known: Known, arguments: argparse.Namespace
 ) -> dict[str, Callable[[], Sampled]]:
-    """Return functions that run each alternative once, and measure the time of the processor."""
+    """Return, for each alternative, a function that runs it once and measures its processor time."""
     model = joint.ask(joint.symbols).network()
     machine = machine_of(model, Sequencer.LINEAR)
     parameters = machine.parameters
@@ -194,7 +194,7 @@ def alternatives(
 
 
 def measure(runs: dict[str, Callable[[], Sampled]]) -> dict[str, Sampled]:
-    """Run all in turns, and return the fastest run of each; the first turn, which compiles, does not count."""
+    """Run the functions in turns, and return the fastest run of each; the first turn compiles and does not count."""
     best: dict[str, Sampled] = {}
     for turn in range(1 + TURNS):
         for name, run in runs.items():
@@ -205,7 +205,7 @@ def measure(runs: dict[str, Callable[[], Sampled]]) -> dict[str, Sampled]:
 
 
 def show(title: str, speeds: dict[str, Sampled]) -> None:
-    """Print a table; the ratios are those of sweeps a second to one chain."""
+    """Print a table, with the sweeps a second of each row divided by those of the first one."""
     rows = []
     single = next(iter(speeds.values()))
     for name, each in speeds.items():

@@ -114,7 +114,7 @@ MOVES: dict[str, Move] = {"write": write, "post": post, "read": read}
 
 
 def times(works: Mapping[LinkRate, Callable[[], float]], repeats: int) -> dict[LinkRate, float]:
-    """Return the time that a tenth of the measurements of each stay below; other processes only slow them down."""
+    """Return the 10th percentile of the times of each function: other processes can only make a measurement longer."""
     found: dict[LinkRate, list[float]] = {link: [] for link in works}
     for turn in range(-SLOWER, repeats):
         for link, work in works.items():
@@ -127,14 +127,14 @@ def times(works: Mapping[LinkRate, Callable[[], float]], repeats: int) -> dict[L
 
 
 def timed(move: Move, links: Sequence[SocketLink], words: int) -> float:
-    """Return how long this took, in microseconds."""
+    """Return how long moving a block of `words` over the links takes, in microseconds."""
     began = time.perf_counter_ns()
     move(links, words)
     return (time.perf_counter_ns() - began) / 1e3
 
 
 def endpoints(folder: Path, link: LinkRate, boards: int) -> list[str]:
-    """Return where the boards of a kind listen."""
+    """Return the endpoints of the boards whose link has this rate."""
     return [f"unix:{folder / link}/board{at}.sock" for at in range(boards)]
 
 
@@ -155,7 +155,7 @@ def measure_transfers(folder: Path, boards: int, words: int, repeats: int) -> Tr
 
 
 def measure_frames(folder: Path, way: str, boards: int, repeats: int) -> Frames:
-    """Measure frames on so many boards."""
+    """Measure frames on this number of boards."""
     parts = [image(RESULTS // boards, index, boards) for index in range(boards)]
     frame = FrameInput(addresses=(0,), target_count=1, max_cycles=1 << 12, bank=0, stop="own")
     with ExitStack() as stack:
@@ -264,7 +264,7 @@ def show(transfers: Transfers, frames: Frames, fitted: Sequence[Fitted]) -> None
 
 
 def draw(path: Path, transfers: Transfers, frames: Frames) -> None:
-    """Draw the time of a read by its size, with the model's own time dotted, and that of a frame by partitions."""
+    """Draw the time of a read by its size, with the model's own time dotted, and the time of a frame by partitions."""
     figure = new_figure(9.6, 4.2)
     by_size, by_boards = figure.subplots(1, 2)
     for link, colour in zip(LinkRate, ("#bbbbbb", "#4477aa", "#ee6677"), strict=True):

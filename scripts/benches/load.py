@@ -114,7 +114,7 @@ async def crowd(uri: str, hub: int, clients: int, seconds: float) -> list[Row]:
 
 
 class Attack(NamedTuple):
-    """Messages that an attacker sends once, those that it repeats, and those of its helpers."""
+    """The messages of an attacker: sent once, repeated after each pause, or sent by twenty other connections."""
 
     once: bytes = b""
     again: bytes = b""

@@ -22,9 +22,9 @@ Known: TypeAlias = Mapping[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """Marginals of the unknown variables, by number (none if only the speed counts), and what they took.
+    """Marginals by number of the unknown variable (none if only the speed counts), and the cost of the run.
 
-    Sweeps and cycles are those of all chains; only a machine has the last three.
+    Sweeps and cycles are summed over all chains; only a BM2 sets `effective`, `cycles` and `stop`.
     """
 
     marginals: dict[int, NDArray[np.float64]]

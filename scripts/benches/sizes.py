@@ -2,8 +2,8 @@
 
 client --reading of some bytes--> hub --> master and its services --> one board of so many lines and columns --> ... --> client
 
-One size varies at a time. The lines of a larger machine repeat those of the smallest, and a sensor hardly tells its two
-readings apart, so that frames of 30 sensors have a posterior too, and the machines differ in nothing but their size.
+One size varies at a time. The lines of a larger machine repeat those of the smallest, and a sensor's two readings
+are nearly equally probable, so that frames of 30 sensors have a posterior too, and the machines differ only in size.
 """
 
 import argparse
@@ -45,7 +45,7 @@ PARTS = {
 
 
 class Point(NamedTuple):
-    """One problem: the medians of its frames, and the times that a tenth of them stay below."""
+    """One problem: the medians and the 10th percentiles of the times of its frames."""
 
     lines: int
     sensors: int
@@ -62,7 +62,7 @@ class Point(NamedTuple):
 
 
 def problems() -> list[tuple[int, int, int]]:
-    """Return lines, sensors and padding of every problem; the base is among them once."""
+    """Return lines, sensors and padding of every problem; the base problem occurs once."""
     lines, sensors, padding = BASE
     first = [(each, sensors, padding) for each in LINES] + [(lines, each, padding) for each in SENSORS]
     return list(dict.fromkeys(first + [(lines, sensors, each) for each in PADDING]))
@@ -132,7 +132,7 @@ async def bench_sizes(arguments: argparse.Namespace) -> int:
 
 
 def varied(points: Sequence[Point]) -> dict[str, list[Point]]:
-    """Return the points along each size, the others being those of the base."""
+    """Return, for each size, the points in which only this size differs from the base."""
     lines, sensors, padding = BASE
     return {
         "lines": [each for each in points if each[1:3] == (sensors, padding)],
@@ -142,7 +142,7 @@ def varied(points: Sequence[Point]) -> dict[str, list[Point]]:
 
 
 def show(points: Sequence[Point], arguments: argparse.Namespace) -> None:
-    """Print the table, and what holds of the thesis's claims."""
+    """Print the table, and which of the thesis's claims hold."""
     rows = []
     for each in points:
         sizes = each.lines, each.sensors, each.size, each.cycles, each.link_bytes

@@ -1,4 +1,4 @@
-"""One message after another as probably in the thesis, with a subscriber and a publisher for each, and with those of a usual run.
+"""The cycle with a subscriber and a publisher started for each message, as probably in the thesis, and started once.
 
 client --reading--> hub --> subscriber -> master -> pcie-app -> 4 boards -> pcie-app -> master -> publisher --> hub --> client
                             `-- started for each message, or once ------------------------------'

@@ -29,7 +29,7 @@ BOARD_TIMEOUT = 2.0 * FACTOR
 
 
 class Topology(StrEnum):
-    """The starter of the processes, which also decides the places of the proxies."""
+    """Which processes the campaign starts itself; this also determines where the proxies are."""
 
     OWN = "processes"
     """The master starts services and boards; a proxy stands between them and rosbridge."""

@@ -79,7 +79,7 @@ class Visit:
         return await found.json_value()
 
     async def text(self, name: str, text: str) -> None:
-        """Wait until the text of an element has another one in it."""
+        """Wait until the content of an element contains this text."""
         await self.until(
             "([name, text]) => document.querySelector(`[data-testid=${name}]`)?.innerText.includes(text)",
             [name, text],
@@ -122,7 +122,7 @@ class Visit:
         return box["x"] + float(data[0]), box["y"] + float(data[1])
 
     async def drag(self, to: Place, steps: int = 5, each: Each | None = None) -> float:
-        """Move the boat with the mouse, and return when it reached its place, in milliseconds of the browser's clock.
+        """Move the boat with the mouse, and return the time of its arrival, in milliseconds of the browser's clock.
 
         Args:
             to: Place as shares of the canvas's width and height.
@@ -143,7 +143,7 @@ class Visit:
         return float(await self.page.evaluate("window.moved"))
 
     async def mean_near(self, to: Place) -> float:
-        """Wait until a posterior was painted after that with its mean near; return when, in the browser's clock."""
+        """Wait until a posterior with its mean near `to` is painted after a drag; return the browser's time."""
         found = await self.until(
             """([x, y, near]) => {
                 const {clientWidth, clientHeight} = document.querySelector('[data-testid=posterior]');

@@ -26,7 +26,7 @@ class ScriptParser(argparse.ArgumentParser):
         super().__init__(prog, description=description.splitlines()[0])
 
     def add_argument(self, *names: str, shown: str = "", **options: Any) -> argparse.Action:
-        """Add a flag or an argument as argparse does; `shown` is a default that the code computes."""
+        """Add a flag or an argument as argparse does; the help shows `shown` as the default if the code computes it."""
         if options.get("action", "append") == "append" and names[0].startswith("-"):
             kind = "|".join(options.get("choices", ())) or _KINDS.get(options.get("type"), "TEXT")
             options.setdefault("metavar", kind)
@@ -38,7 +38,7 @@ class ScriptParser(argparse.ArgumentParser):
         return super().add_argument(*names, **options)
 
     def flag(self, name: str, text: str, default: Any = None, **options: Any) -> None:
-        """Add a flag whose value has the type of its default, a text without one; an integer must be 1 or more."""
+        """Add a flag whose value has the type of its default, or else is a text; an integer must be 1 or more."""
         kind = positive if isinstance(default, int) else str if default is None else type(default)
         self.add_argument(name, **{"help": text, "default": default, "type": kind, **options})
 
@@ -47,11 +47,11 @@ class ScriptParser(argparse.ArgumentParser):
         self.add_argument(name, action="store_true", help=text)
 
     def run(self, work: Callable[[argparse.Namespace], Awaitable[int]], limit: float) -> NoReturn:
-        """Parse the flags, run a coroutine of them with a time limit in seconds, and exit."""
+        """Parse the flags, run the coroutine that `work` makes from them with a time limit in seconds, and exit."""
         arguments = self.parse_args()
         sys.exit(run_script(lambda: work(arguments), limit))
 
     def run_at_once(self, work: Callable[[argparse.Namespace], int]) -> NoReturn:
-        """Parse the flags, run a function of them, and exit."""
+        """Parse the flags, pass them to a function, and exit with what it returns."""
         arguments = self.parse_args()
         sys.exit(reporting_errors(lambda: work(arguments)))

@@ -188,7 +188,7 @@ async def check_schemes(scene: Scene) -> None:
 
 
 async def check_two_browsers(scene: Scene) -> None:
-    """Check that two browsers see the same run, and that a pause is only one's own."""
+    """Check that two browsers see the same run, and that a pause in one does not pause the other."""
     second = await scene.browser.open(scene.stand.url)
     await second.pause()
     stays = await second.frame()
@@ -266,7 +266,7 @@ async def check_dashboard_returns(scene: Scene) -> None:
 
 
 async def check_hostile(scene: Scene) -> None:
-    """Check that names from topics are shown as text, and that the last frame looks old, after the boat's end."""
+    """Check that names from topics are shown as text, and that the last frame looks old after the boat has ended."""
     visit, now = scene.visit, time.time_ns()
     await scene.stand.kill("simulator")
     await visit.page.locator("[data-testid=posterior].bm-old").wait_for()
@@ -360,7 +360,7 @@ async def verify(arguments: argparse.Namespace) -> int:
 
 
 async def run_check(tally: Tally, name: str, check: Callable[[Scene], Awaitable[None]], scene: Scene) -> None:
-    """Run one check and report it; no page may have complained."""
+    """Run one check and report it; it also fails if a page has complaints."""
     started, why = time.monotonic(), None
     try:
         await check(scene)

@@ -114,7 +114,7 @@ def install_node_packages(name: str, folder: Path) -> Path:
 
 
 def install_programs(packages: Mapping[str, str]) -> None:
-    """Install the Debian packages, given for each program or path, of missing ones; a SettingsError if that fails."""
+    """Install the Debian package of each program or path that is missing; raise a SettingsError if that fails."""
 
     def absent_ones() -> list[str]:
         return [each for each in packages if shutil.which(each) is None and not Path("/", each).exists()]

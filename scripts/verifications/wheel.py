@@ -69,7 +69,7 @@ def check_demo(installed: Installed) -> None:
 
 
 def check_sprinkler(installed: Installed) -> None:
-    """Run the sprinkler on two boards, with another folder for what is written."""
+    """Run the sprinkler on two boards, with another output folder."""
     installed.run("rosbayes", "demo", "--sprinkler", "--count", "3", "--out", "rain")
     pictures(installed, "rain", "sprinkler.png")
 
@@ -81,7 +81,7 @@ def check_disparity(installed: Installed) -> None:
 
 
 def check_page(installed: Installed) -> None:
-    """Ask for the page, without its packages: the demo says before its start what to install."""
+    """Check that a demo with the page, whose packages are missing, says before its start what to install."""
     said = installed.run("rosbayes", "demo", "--dashboard", "--out", "page", code=2)
     expect("pip install 'rosbayes[dashboard]'" in said, f"it does not say what to install: {said}")
     expect(not (installed.out / "page").exists(), "it has started")

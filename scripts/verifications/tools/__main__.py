@@ -64,7 +64,7 @@ FEW: Final = 50
 
 
 class Scene(NamedTuple):
-    """The running stack, and what is to be done with it."""
+    """The running stack, its ROS version, and whether to draw pictures."""
 
     stand: Stand
     ros_version: str
