@@ -73,7 +73,7 @@ class Broker:
         )
         # Clients are numbered in the order of connection; a number is not used again.
         self._client_numbers = itertools.count(1)
-        # The clients with incomplete messages, these, and when the first of them expires, or earlier.
+        # The incomplete messages of each client that has some, and when the first expires, or earlier.
         self._reassembling: dict[Client, Reassembler] = {}
         self._fragment_deadline = inf
         # Time and id of the operation that is being performed, for a refusal anywhere below.
