@@ -52,8 +52,8 @@ class Case:
     """Options of the viewer."""
     publishers: Mapping[str, Sequence[str]]
     """The commands on the robot's side with their options, in the order of their start."""
-    is_frame: bool = True
-    """True if the viewer counts the same frames as the master, so that both end after the same number."""
+    counts_frames: bool = True
+    """Whether viewer and master count the same frames, so that `--count` ends both; otherwise it ends only the viewer."""
 
 
 def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:
@@ -97,7 +97,7 @@ def disparity(rates: Sequence[str]) -> Case:
         options=[text for name, value in options.items() for text in (f"--{name}", str(value))],
         viewer="disparity-matcher",
         publishers={"disparity-cameras": rates},
-        is_frame=False,
+        counts_frames=False,
     )
 
 
@@ -221,7 +221,7 @@ async def _load_kernels() -> None:
 def _ends(case: Case, count: int | None, master: Process, viewer: Process) -> list[asyncio.Future[Any]]:
     """Return futures of the ends of master and viewer, and of the viewer's last line if the master does not count."""
     ends: list[asyncio.Future[Any]] = [asyncio.ensure_future(each.succeed()) for each in (master, viewer)]
-    if count is not None and not case.is_frame:
+    if count is not None and not case.counts_frames:
         ends.append(asyncio.ensure_future(viewer.line(rf"^ *{count} ")))
     return ends
 
@@ -282,7 +282,7 @@ async def _run(
         await asyncio.gather(building, viewer.line("listening"), _load_kernels())
         screen.waits_for = "waiting for results"
         await master.start(
-            *("master", "--loop", *(counted if case.is_frame else ())),
+            *("master", "--loop", *(counted if case.counts_frames else ())),
             *("-d", str(deployment), "--uri", uri, *options),
         )
         for name, flags in case.publishers.items():
@@ -298,7 +298,7 @@ async def _run(
         ends = _ends(case, count, master, viewer)
         # the first end counts: a failure need not wait for the other's timeout, and a master without a count never ends
         await next(iter((await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED))[0]))
-        if case.is_frame:
+        if case.counts_frames:
             await ends[0]
         screen.waits_for = "drawing the pictures"
         await ends[1]

@@ -17,7 +17,7 @@ entity bm1_core is
     SENSORS       : natural;          -- sensor columns
     REPLICAS      : positive;         -- machines that share the generators
     MODE          : sensor_mode_t;    -- input of the cells in a sensor column
-    ADDRESS_BITS  : natural_array_t;  -- address width of each sensor column, 1 to SENSORS
+    ADDRESS_BITS  : natural_array_t;  -- address widths of the sensor columns (index 1 to SENSORS)
     PROB_BITS     : positive;         -- width of a code
     PRIOR_BITS    : natural;          -- width of the prior's address
     WRITTEN       : boolean;          -- the host writes the prior

@@ -16,13 +16,13 @@ entity bm1_matrix is
     LINES         : positive;        -- lines of this board
     SENSORS       : natural;         -- sensor columns
     MODE          : sensor_mode_t;   -- input of the cells in a sensor column
-    ADDRESS_BITS  : natural_array_t; -- address width of each sensor column, 1 to SENSORS
+    ADDRESS_BITS  : natural_array_t; -- address widths of the sensor columns (index 1 to SENSORS)
     PROB_BITS     : positive;        -- width of a code
     PRIOR_BITS    : natural;         -- width of the prior's address
     WRITTEN       : boolean;         -- the host writes the prior
     COUNTER_BITS  : positive;        -- width of a counter
     RNG_SHARED    : boolean;         -- one random number per column; otherwise one per cell
-    MEMORY_PREFIX : string           -- path and board of the MIFs
+    MEMORY_PREFIX : string           -- start of the MIFs' file names: folder and board
   );
   port (
     clk_i : in    std_logic; -- clock

@@ -47,7 +47,9 @@ PREPARED_CYCLES: Final = 2**14
 
 
 class FastBM1(BM1Kernel):
-    """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4); it also runs without a cache.
+    """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4).
+
+    It keeps words between frames, at most `kept_bytes`; with 0 it computes them for each frame.
 
     Raises:
         MachineError: The generators of the machine are not LFSRs, or are not shared.

@@ -65,7 +65,7 @@ def seed_set(parameters: RngParameters, bank: int) -> int:
 
 
 def generator_numbers(parameters: RngParameters, bank: int) -> Words:
-    """Return the numbers of a bank's generators, in the parameters' `generator_shape`."""
+    """Return the indices of a bank's generators among those of all banks and chains: uint64[`generator_shape`]."""
     count = math.prod(parameters.generator_shape)
     first = seed_set(parameters, bank) * count
     return np.arange(first, first + count, dtype=np.uint64).reshape(parameters.generator_shape)

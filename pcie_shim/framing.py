@@ -23,7 +23,10 @@ READ: Final = 2
 WRITE: Final = 3
 """Host to board: write the payload from `address` on; acknowledged, unless posted."""
 IRQ: Final = 4
-"""Board to host: the machine has stopped. The payload is DONE to COMPUTE_NS; results follow if the board sends them."""
+"""Board to host: the machine has stopped.
+
+The payload is the registers from DONE to COMPUTE_NS, then the results if CAP_LINK.SENDS_RESULTS is 1.
+"""
 ERROR: Final = 5
 """Board to host: the request of this sequence number was refused (`encode_error`)."""
 PROGRAM: Final = 6

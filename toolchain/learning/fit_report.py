@@ -1,4 +1,4 @@
-"""The path of a fit from recordings to file, and the report on the data behind each table."""
+"""The steps of a fit, from reading the recordings to writing its file, and its report on the data of each table."""
 
 import hashlib
 import math

@@ -99,7 +99,7 @@ def _mass(
 
 
 def middle_bin(bin_in_sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the probability of a bin whose centre is the mean; floors are relative to it."""
+    """Return a normal distribution's probability of the bin of this width around its mean."""
     return 1 - 2 * _upper_tail(bin_in_sigmas / 2)
 
 

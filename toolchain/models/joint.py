@@ -47,7 +47,7 @@ class JointDistribution:
     name: str
     """The name for deployments."""
     factors: tuple[Factor, ...]
-    """The distributions P(A | B, C) and potentials; every given symbol also has a factor."""
+    """The distributions P(A | B, C) and the potentials. Parents such as B and C have a factor of their own."""
     symbols: tuple[Symbol, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
