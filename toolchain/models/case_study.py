@@ -57,7 +57,7 @@ def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
 def installed_models() -> dict[str, Path]:
     """Return the models that are installed with rosbayes, such as `boat`, by name.
 
-    Only the name of their package is known here, because the toolchain imports no case study.
+    They are found by the name of their package, because the toolchain imports no case study.
     """
     package = importlib.util.find_spec("casestudies")
     folders = (package and package.submodule_search_locations) or ()
@@ -109,9 +109,10 @@ def _model_function(path: Path) -> Callable[..., object]:
 
 
 def _guarded(path: Path, what: str, call: Callable[[], _Result]) -> _Result:
-    """Call a function of the user's file; an exception becomes one sentence with its line.
+    """Call a function of the user's file; an exception that it raises becomes one sentence with the file's line.
 
-    An error raised by the file keeps its text; an error of the toolchain also gets the line of the file.
+    A ToolchainError that the file itself raises is unchanged. A ModelError that the toolchain raises, because of a
+    call in the file, gets the line of that call.
     """
     try:
         return call()

@@ -1,7 +1,7 @@
 """Conditional distributions P(K | S): normals over the bins of a reading, wrapped for bearings.
 
-A reading gets the address of its bin, which extends half a step below and above its centre. The bin's probability
-is the integral of the Gaussian over the bin, not the density at the centre, so coarse bins are exact too.
+The address of a reading is the index of its bin, which extends half a step to each side of the bin's centre. A bin's
+probability is the integral of the normal over the bin, not the density at the centre, so coarse bins are exact too.
 """
 
 import math
@@ -93,22 +93,22 @@ def _mass(
     tails_lower: NDArray[np.float64],
     tails_upper: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return Phi(upper) - Phi(lower) from the tails beyond |lower| and |upper|, without cancellation."""
+    """Return Phi(upper) - Phi(lower) without cancellation, from 1 - Phi at |lower| and at |upper|."""
     same_side = np.abs(tails_lower - tails_upper)
     return np.where((lower < 0) & (upper > 0), 1 - tails_lower - tails_upper, same_side)
 
 
 def middle_bin(bin_in_sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a normal distribution's probability of the bin of this width around its mean."""
+    """Return the probability that a normal distribution gives to a bin centred at its mean."""
     return 1 - 2 * _upper_tail(bin_in_sigmas / 2)
 
 
 def _with_outliers(
     table: NDArray[np.float64], shape: Normal, bin_in_sigmas: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Spread the outliers' share over all bins, add the floor, and normalise every line.
+    """Spread the share of outliers over all bins, add the floor of `shape` to each bin, and normalise every line.
 
-    The floor is relative to the mass of a bin with the mean at its centre.
+    The floor is relative to the probability of a bin with the mean at its centre.
     """
     if shape.outliers:
         table = (1 - shape.outliers) * table + shape.outliers / len(table)

@@ -1,7 +1,7 @@
-"""Symbols of a joint distribution, as in ProBT, and its factors: tables, normals, functions and potentials.
+"""Symbols of a joint distribution, as in the library ProBT, and its factors: tables, normals, functions, potentials.
 
-Continuous distributions become tables: the integral of a normal over each value of its symbol, or the value
-of a function.
+Continuous distributions become tables: the integral of a normal over the interval of each value of its symbol, or the
+value of a function.
 """
 
 import math
@@ -158,16 +158,16 @@ Type: TypeAlias = IntegerType | IntervalType | LabelType
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """A variable: its name, its type, and the source of its readings if it is known."""
+    """A variable: its name, its type, and, for a known variable, where its readings come from."""
 
     name: str
     """Its name, which is also the field in the message unless `path` is given."""
     type: Type
     """Its values."""
     path: str = ""
-    """Its path in the message; empty to search the message for the name."""
+    """Path of its field in the message; empty to search the message for the name."""
     bits: int = 0
-    """Address bits of its column; 0 for the minimum."""
+    """Address bits of its column in the machine; 0 for the fewest that suffice."""
     on_range: Literal["error", "clamp", "missing"] = "error"
     """Treatment of a reading out of range: an error, the nearest end, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
@@ -185,7 +185,7 @@ class Symbol:
 
     @property
     def period(self) -> int | None:
-        """The number of values after which they repeat; None if they don't."""
+        """The number of values in a turn, if the symbol's type wraps; otherwise None."""
         return self.type.size if self.type.wraps else None
 
     def values(self) -> NDArray[np.float64]:
@@ -199,7 +199,7 @@ class Symbol:
 
     @property
     def reading(self) -> dict[str, Any]:
-        """The fields of a known variable that come from its symbol."""
+        """The arguments of `Known` or `PriorSelect` that come from the symbol."""
         return {
             "name": self.name,
             "bits": self.bits,
@@ -243,7 +243,7 @@ class Symbol:
 
 
 Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike
-"""A function of the values of given symbols, as float64 arrays of the same shape; or constant numbers."""
+"""A function of the parents' values, which are float64 arrays of the same shape; or constant numbers."""
 
 _SUM_TOLERANCE: Final = 1e-6
 
@@ -255,12 +255,12 @@ class Distribution:
     symbol: Symbol
     """The symbol of the distribution."""
     given: tuple[Symbol, ...]
-    """The symbols on which `symbol` depends."""
+    """The parents: the symbols on which `symbol` depends."""
     table: NDArray[np.float64]
-    """float64[size of the symbol, size of each given], summing to 1 over the first axis."""
+    """float64[size of the symbol, size of each parent], summing to 1 over the first axis."""
     normal: Normal | None = None
-    """The normals behind the table, or None; their arrays are indexed by the values of the given symbols, the
-    last one fastest.
+    """The normals from which the table was computed, or None. Their arrays have an entry for each combination of the
+    parents' values; the last parent varies fastest.
     """
 
     @property
@@ -299,7 +299,7 @@ Factor: TypeAlias = Distribution | Potential
 
 
 def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) -> Distribution:
-    """Return P(symbol | given) from numbers, float64[size of the symbol, size of each given].
+    """Return P(symbol | given) from numbers, float64[size of the symbol, size of each parent in `given`].
 
     Raises:
         ModelError: The shape is wrong, a number is not a probability, or a column does not sum to 1.
@@ -335,15 +335,15 @@ def conditional_normal(
     floor: float = 0.0,
     outliers: float = 0.0,
 ) -> Distribution:
-    """Return P(symbol | given), normal around a function of the given symbols; wrapped if the symbol's type wraps.
+    """Return P(symbol | given), normal around a function of its parents; wrapped if the symbol's type wraps.
 
     Args:
         symbol: An integer or interval symbol; each value gets the integral of the normal over its interval.
-        given: The symbols that it depends on; none for a plain normal.
-        mean: A function of the given symbols' values, or numbers that broadcast to their shape.
+        given: The parents of `symbol`; none for a plain normal.
+        mean: A function of the parents' values, or numbers that broadcast to the parents' sizes.
         sigma: The standard deviation, likewise.
         floor: The minimum probability of a value, relative to the peak.
-        outliers: Share of readings that do not depend on the given symbols.
+        outliers: Share of readings that do not depend on the parents.
 
     Raises:
         ModelError: The symbol has named values, the mean or sigma has another shape, or sigma is not
@@ -368,10 +368,10 @@ def conditional_normal(
 
 
 def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distribution:
-    """Return P(symbol | given) for a function of the given symbols: 1 at its value, 0 elsewhere.
+    """Return P(symbol | given) for a function of the parents in `given`: 1 at the function's value, 0 elsewhere.
 
-    The function gets the given symbols' values as numbers. With `on_range = clamp`, values beyond the ends of the
-    symbol become the ends.
+    The function gets the parents' values as numbers. If the symbol has `on_range = clamp`, results beyond its first
+    or last value become that value.
 
     Raises:
         ModelError: The function returns a value that the symbol does not have.
@@ -432,7 +432,7 @@ def _scope(symbol: Symbol, given: tuple[Symbol, ...]) -> tuple[Symbol, ...]:
 
 
 def _evaluated(title: str, what: str, formula: Formula, given: tuple[Symbol, ...]) -> NDArray[np.float64]:
-    """Return the values of a formula for all values of the given symbols, float64[product of their sizes]."""
+    """Return a formula's value for each combination of the parents' values, float64[product of the parents' sizes]."""
     grids = np.meshgrid(*(each.values() for each in given), indexing="ij") if given else []
     values = formula(*grids) if callable(formula) else formula
     sizes = tuple(each.size for each in given)

@@ -1,9 +1,9 @@
 """Exact inference on a product of factors: tests of independence, and sums over the symbols that a question omits.
 
-Independence is tested on the moral graph without the searched and given symbols. The other symbols are eliminated one
-by one, exactly, in float64. The order is planned before anything is computed, by two rules: the next name is the one
-with the smallest table, or the one whose elimination joins the fewest pairs of names (min-fill). The order with the
-smaller tables is used; if both need a table above the limit, the question is refused.
+Independence is tested on the moral graph without the searched symbols and those with a fixed value. The other symbols
+are eliminated one by one, exactly, in float64. The order is planned before anything is computed, by two rules:
+eliminate next the symbol that needs the smallest table, or the one that joins the fewest pairs of symbols (min-fill).
+The order with the smaller tables is used; if both orders need a table above the limit, the question is refused.
 """
 
 import math
@@ -23,12 +23,12 @@ from toolchain.models.model import MAX_ENTRIES
 
 _NAMED: Final = 6
 _CHEAP: Final = 2**16
-"""If the tables of an order have fewer entries than this, no other order is planned."""
+"""If the tables of the first order of elimination have fewer entries than this, the second is not planned."""
 _MOST_COUNTED: Final = 64
-"""Maximum number of neighbours of a name whose pairs are counted."""
+"""Maximum number of neighbours of a symbol among which `_fill` counts the pairs."""
 
 _Graph: TypeAlias = dict[str, set[str]]
-"""For each name, the other names in its terms."""
+"""For each symbol's name, the names of the symbols with which it shares a term."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,7 +45,7 @@ class Term:
 
 
 def reduced(term: Term, values: Mapping[str, int]) -> Term:
-    """Return the term with some of its names at fixed values."""
+    """Return the term with some of its symbols, by name, at fixed values."""
     if not any(name in values for name in term.scope):
         return term
     at = tuple(values.get(name, slice(None)) for name in term.scope)
@@ -66,10 +66,10 @@ def product(terms: Sequence[Term], scope: Sequence[str], sizes: Mapping[str, int
 
 
 def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, int]) -> list[Term]:
-    """Return terms whose product is the product of the given terms, summed over some names.
+    """Sum the product of terms over the symbols in `names`; return terms whose product is proportional to it.
 
     Tables are scaled by their maxima, so that long products don't underflow: the result is exact up to a
-    factor. If every order needs an intermediate table above the limit, a ModelError is raised.
+    constant factor. If every order needs an intermediate table above the limit, a ModelError is raised.
     """
     left = dict(enumerate(terms))
     names = set(names)
@@ -95,7 +95,7 @@ def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, i
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """An order of elimination; planning stops if `largest`, the size of its largest table, exceeds the limit."""
+    """An order of elimination, complete unless `largest`, the size of its largest table, exceeds the limit."""
 
     order: tuple[str, ...]
     entries: int
@@ -123,7 +123,7 @@ def _order(terms: Iterable[Term], names: set[str], sizes: Mapping[str, int]) -> 
 def _planned(
     graph: _Graph, names: set[str], sizes: Mapping[str, int], cost: Callable[[_Graph, str], int]
 ) -> _Plan:
-    """Return the order in which each next name has the lowest `cost`."""
+    """Return the order that eliminates at each step the symbol with the lowest `cost`."""
     graph = {name: set(neighbours) for name, neighbours in graph.items()}
     costs = {name: cost(graph, name) for name in names}
     # The name breaks ties, so the same question gives the same sums, bit for bit. A changed cost is a new
@@ -163,7 +163,7 @@ def _planned(
 
 
 def _entries(graph: _Graph, name: str, sizes: Mapping[str, int]) -> int:
-    """Return the size of the table over a name and its neighbours, or the limit + 1 if it is larger."""
+    """Return the size of the table over a symbol and its neighbours, or the limit + 1 for a table above the limit."""
     entries = sizes[name]
     for other in graph[name]:
         entries *= sizes[other]
@@ -173,7 +173,7 @@ def _entries(graph: _Graph, name: str, sizes: Mapping[str, int]) -> int:
 
 
 def _fill(graph: _Graph, name: str) -> int:
-    """Return how many pairs of a name's neighbours are not neighbours themselves; an upper bound if there are many."""
+    """Return how many pairs of a symbol's neighbours are not neighbours of each other; an upper bound for many."""
     neighbours = graph[name]
     if len(neighbours) > _MOST_COUNTED:
         return len(neighbours) ** 2
@@ -199,9 +199,9 @@ _SHOWN: Final = 4
 
 
 class Links:
-    """Links between symbols that share a factor; the searched and given symbols, `cut`, are left out.
+    """Links between symbols that share a factor, without the symbols in `cut`: those searched or with a fixed value.
 
-    Symbols in different components are independent given those in `cut` (moral graph criterion).
+    Symbols in different components are independent, given the symbols in `cut` (moral graph criterion).
     """
 
     def __init__(self, factors: Iterable[Factor], cut: set[str]) -> None:
@@ -257,7 +257,7 @@ class Links:
         return before
 
     def drawn(self, path: Sequence[str]) -> str:
-        """Return a path as text with arrows, with common children between their parents; a long one is shortened."""
+        """Return a path as text with arrows, and a common child between two parents; shorten a long path."""
         arrows = [self._arrow(before, after) for before, after in pairwise(path)]
         if len(path) > _LONGEST_DRAWN:
             arrows[_SHOWN:-_SHOWN] = [f" ... {path[-1 - _SHOWN]}"]
@@ -275,7 +275,7 @@ class Links:
 
 
 def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
-    """Remove factors that sum to 1: distributions of unused symbols on which no other symbol depends."""
+    """Remove factors that sum to 1: distributions of symbols not in `asked`, on which no other symbol depends."""
     kept = list(factors)
     uses: dict[str, int] = {}
     own: dict[str, int] = {}
@@ -300,7 +300,7 @@ def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
 
 
 def without_idle(factor: Factor) -> Factor:
-    """Return the factor without symbols on which its values do not depend."""
+    """Return the factor without the symbols on which the factor's values do not depend."""
     scope, table = list(factor.scope), factor.table
     for axis in range(len(scope) - 1, 0, -1):
         first, last = np.take(table, [0], axis=axis), np.take(table, [-1], axis=axis)

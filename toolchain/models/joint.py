@@ -37,7 +37,7 @@ from toolchain.models.network import NetworkModel, network_model
 
 Named: TypeAlias = Symbol | str
 _ROUNDING: Final = 1e-12
-"""Largest difference from 1 that rounding causes in the sum of a distribution."""
+"""A sum of a distribution that differs from 1 by less than this is taken as 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ class JointDistribution:
 
     @cached_property
     def active(self) -> tuple[Factor, ...]:
-        """The factors without symbols on which their values do not depend."""
+        """The factors, each without the symbols on which its values do not depend."""
         return tuple(map(without_idle, self.factors))
 
     def symbol(self, name: Named) -> Symbol:
@@ -281,23 +281,23 @@ class Question:
         return None
 
     def dependent(self) -> list[tuple[str, str]]:
-        """Return the pairs of known symbols that are not independent given the searched ones: no BM1 knows both."""
+        """Return the pairs of known symbols that are dependent given the searched ones; a BM1 can use one of each."""
         factors, pairs = self._pairs()
         return [
             (one, other) for _, one, other in pairs if self._linked(factors, [one, other])[1].path(one, other)
         ]
 
     def _linked(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], Links]:
-        """Return the factors relevant for some observed symbols, and their links without searched and given symbols."""
+        """Return the factors relevant for some observed symbols, and the links between symbols that are not fixed."""
         cut = {*(symbol.name for symbol in self.searched), *self.given}
         factors = relevant(active, cut | set(observed))
         return factors, Links(factors, cut)
 
     def _pairs(self) -> tuple[list[Factor], list[tuple[int, str, str]]]:
-        """Return the factors of all observed symbols, and the pairs of symbols that they join, with lengths of paths.
+        """Return the factors relevant for all observed symbols, and the pairs that they join, with lengths of paths.
 
-        A pair is to be tested with its own factors, which are some of these. So no other pair can be dependent, and a
-        path among its own factors is at least as long.
+        Only these pairs may be dependent. Whether one is must be tested with the factors relevant for that pair alone.
+        They are some of the returned factors, so a path through them is at least as long.
         """
         observed = [symbol.name for symbol in self.observed]
         factors, links = self._linked(self.joint.active, observed)
@@ -334,7 +334,7 @@ class Question:
     def _fusion(
         self, own: Mapping[str, Sequence[Term]], weight: NDArray[np.float64], sizes: Mapping[str, int]
     ) -> Model:
-        """Return the model from the terms of observed symbols, and the weight of the searched ones, float64[lines]."""
+        """Return the model from the terms of each observed symbol and the weight of each line, float64[lines]."""
         searched = [symbol.name for symbol in self.searched]
         tables = {
             name: product(terms, (name, *searched), sizes).reshape(sizes[name], -1)
@@ -368,7 +368,7 @@ class Question:
         )
 
     def _normal(self, symbol: Symbol) -> Normal | None:
-        """Return the normals behind a known symbol's table, if it depends only on searched symbols."""
+        """Return the normals from which a known symbol's table was computed, if all its parents are searched."""
         for factor in self.joint.factors:
             if isinstance(factor, Distribution) and factor.symbol == symbol and factor.normal is not None:
                 break
@@ -397,7 +397,7 @@ def _sums(table: NDArray[np.float64]) -> NDArray[np.float64]:
 def _given_line(
     together: NDArray[np.float64], total: NDArray[np.float64], prior: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return P(K | S) from a table of which each line is a multiple of it, float64[values, lines].
+    """Return P(K | S), float64[values, lines], from a table that is proportional to P(K | S) on each line.
 
     An impossible line gets P(K), which does not change the codes of other lines. If all lines sum to 1, the table is
     returned unchanged.

@@ -47,14 +47,14 @@ _SUM_TOLERANCE: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Normal:
-    """The normals behind a table; `toolchain fit` replaces the parameters that can be learnt."""
+    """The normal distributions from which a table is computed; `toolchain fit` replaces what it can learn."""
 
     mean: NDArray[np.float64]
     """float64[lines], in the reading's unit."""
     sigma: ArrayLike
     """Standard deviation, one for all or float64[lines], in the unit of the reading."""
     floor: float = 0.0
-    """Added to each bin's probability for outliers, relative to the peak of the bin likelihood."""
+    """What is added to each bin's probability for outliers, relative to that of a bin centred at the mean."""
     outliers: float = 0.0
     """Share of readings that do not depend on S."""
 
@@ -68,7 +68,7 @@ class TabulatedVariable:
     table: NDArray[np.float64] = field(repr=False)
     """float64[values, lines]; row k is address k."""
     bits: int = 0
-    """Address bits; 0 for the minimum, including the top address, which means a missing reading."""
+    """Address bits; 0 for the fewest that suffice for the values and the top address, which means a missing reading."""
     offset: float = 0.0
     """The reading with address 0, in the unit of the variable."""
     step: float = 1.0
@@ -87,7 +87,7 @@ class TabulatedVariable:
     """Names of the values, or none; a reading may be a name."""
 
     def _keep_table(self, what: str) -> None:
-        """Store a read-only copy of the table, and choose the address bits if none were given."""
+        """Store a read-only copy of the table, and choose the number of address bits if it is 0."""
         given = np.asarray(self.table)
         if given.ndim != 2 or 0 in given.shape:
             raise ModelError(f"{what} has shape {given.shape}, expected (values, lines)")
@@ -128,7 +128,7 @@ class Known(TabulatedVariable):
     Quantising warns if codes are too coarse for it.
     """
     normal: Normal | None = field(default=None, repr=False)
-    """The normals behind the table, or None."""
+    """The normals from which the table was computed, or None."""
 
     def __post_init__(self) -> None:
         what = f"P({self.name} | S)"
@@ -159,13 +159,14 @@ class Model:
     searched: tuple[Dimension, ...]
     """The searched variable's dimensions, the slowest first; line = y * width + x for (y, x)."""
     known: tuple[Known, ...]
-    """The known variables in the order of the machine's columns 1..N."""
+    """The known variables in the order of the machine's columns, 1 to N."""
     prior: NDArray[np.float64] | None = None
     """P(S), float64[lines] summing to 1; None for a uniform prior, or for the mean of the rows of `prior_select`."""
     prior_select: PriorSelect | None = None
     """The variable that selects the prior; then `prior` is the prior without a selection."""
     transition: Transition | None = None
-    """How the searched variable changes between frames, for a filter; then `prior` predicts the first frame."""
+    """How the searched variable changes between frames, for a filter; then `prior` is the prediction for the first
+    frame."""
 
     def __post_init__(self) -> None:
         name = self.name if isinstance(self.name, str) else ""  # a user's file is not type-checked
@@ -333,12 +334,12 @@ def exact_posterior(
 ) -> NDArray[np.float64]:
     """Return P(S | readings) of the unquantised model, float64[lines].
 
-    There is an address per known variable, in the order of the columns; None for a missing reading. If lines have
-    their own readings (`sensor_mode = cell`), an address is int64[lines]. `prior_address` is the row of the selected
+    `addresses` has one per known variable, in the order of the columns; None for a missing reading. If each line has
+    its own reading (`sensor_mode = cell`), an address is int64[lines]. `prior_address` is the row of the selected
     prior; None for the prior without a selection. `prior` replaces the prior of the model.
 
     Raises:
-        ModelError: The number of addresses is wrong, an address is not supported, or the readings are
+        ModelError: The number of addresses is wrong, an address is not a row of its table, or the readings are
             impossible on every line.
     """
     if len(addresses) != len(model.known):

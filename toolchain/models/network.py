@@ -1,7 +1,7 @@
 """The network that a BM2 samples: the relevant factors of a question and their symbols (thesis 2.1.3).
 
-Known symbols remain variables, because a reading may be missing; given ones are fixed in the tables. Symbols that
-change no answer, because their distributions sum to 1, are left out.
+Known symbols remain variables, because a reading may be missing; the value of a given symbol is fixed in the tables.
+Symbols that change no answer, because their distributions sum to 1, are left out.
 """
 
 import math
@@ -27,7 +27,7 @@ class NetworkModel:
     symbols: tuple[Symbol, ...]
     """The variables of the machine, in the order of the joint distribution."""
     factors: tuple[Term, ...]
-    """The factors, one for each CDE; each scope is in the order of `symbols`."""
+    """The factors, each computed by one CDE of the machine; the names in a scope are in the order of `symbols`."""
     titles: tuple[str, ...]
     """The name of each factor, such as P(A | B)."""
     variables: tuple[Variable, ...]
@@ -55,7 +55,7 @@ class NetworkModel:
 
     @property
     def lines(self) -> int:
-        """The number of probabilities of a posterior."""
+        """The number of probabilities in a posterior, one for each combination of searched values."""
         return math.prod(each.size for each in self.searched)
 
     def exact(self, addresses: Sequence[int | None]) -> NDArray[np.float64]:

@@ -16,9 +16,9 @@ from toolchain.models.model import MAX_ENTRIES
 
 MAX_VARIABLES: Final = 20_000
 MAX_STATES: Final = 65_535
-"""Maximum number of states: as many as a column can have values, 2^16 - 1."""
+"""Maximum number of states of a variable: a column of a machine can have 2^16 - 1 values."""
 MAX_PARENTS: Final = 30
-"""Maximum number of parents: NumPy arrays have at most 64 axes, and no table of 2^24 entries needs as many."""
+"""Maximum number of parents: NumPy arrays have at most 64 axes, and a table of at most 2^24 entries needs fewer."""
 MAX_TOTAL: Final = 2 * MAX_ENTRIES
 """Maximum number of entries of all tables together."""
 MAX_NAME: Final = 200
@@ -47,7 +47,7 @@ class NetworkBuilder:
         self._entries = 0
 
     def name(self, name: str) -> None:
-        """Set the name of the network; the file name replaces `unknown` and similar names."""
+        """Set the name of the network; instead of `unknown` and similar names, the file's name is used."""
         if name.lower() not in {"unknown", "network", "unnamed", "default", ""}:
             self._name = "".join(each for each in name if each.isprintable())[:MAX_NAME]
 

@@ -167,7 +167,7 @@ class Scanner:
         return self._signs.fullmatch(piece) is not None
 
     def _floats(self, words: list[str], wanted: int, what: str, begin: int) -> NDArray[np.float64]:
-        """Return words as numbers, or raise an error for a wrong count; a word too many is only counted."""
+        """Return words as numbers, or raise an error if there are not `wanted`; words beyond that are not converted."""
         values = []
         for word in words[:wanted]:
             try:
@@ -203,8 +203,8 @@ _BIF_COMMENTS: Final = r"//[^\n]*|/\*"
 def read_bif(data: bytes, builder: NetworkBuilder) -> None:
     """Read a BIF file.
 
-    In `table`, the child varies slowest and the last parent fastest; `(a, b) ...` defines one row, `default
-    ...` all others.
+    In `table`, the child varies slowest and the last parent fastest. `(a, b) ...` defines the row for these states of
+    the parents, `default ...` all other rows.
     """
     text = Scanner(data, builder.path, comments=_BIF_COMMENTS)
     while (block := text.next()) or text.quoted:

@@ -34,7 +34,7 @@ class XmlLine:
 
 
 def _entries(text: str, wanted: int, child: str, line: XmlLine) -> list[str]:
-    """Return the words of a table, or raise a NetworkFileError if there are not as many as wanted."""
+    """Return the words of a child's table, or raise a NetworkFileError if there are not `wanted`."""
     words = text.split(maxsplit=wanted)
     if len(words) != wanted:
         count = f"more than {wanted}" if len(words) > wanted else str(len(words))
@@ -52,7 +52,7 @@ def _decimals(words: Sequence[str], child: str, line: XmlLine) -> NDArray[np.flo
 
 @dataclass(slots=True)
 class Element:
-    """An element of an XML file; its text is what follows the last child, or all of it if there are no children."""
+    """An element of an XML file. Its text is what follows its last child, or all that it contains if it has none."""
 
     name: str
     attributes: dict[str, str]
