@@ -1,6 +1,6 @@
 """Analyses of a machine before it is on a board: accuracy, cycles, resources, energy.
 
-This module has their options: dataclasses of flags, without NumPy, so that `--help` is fast.
+The dataclasses here hold the command-line options of these analyses; they need no NumPy, so `--help` is fast.
 """
 
 import itertools
@@ -75,7 +75,10 @@ class InspectOptions(ReadingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """The options of a sweep over all combinations of the comma-separated lists; other options are the same for all."""
+    """The options of a sweep, which measures one machine for each combination of the values in the LIST options.
+
+    The other options are the same for all machines.
+    """
 
     prob_bits: Annotated[str, typer.Option(help="Bits of a code, comma-separated.", metavar="LIST")] = (
         "4,6,8,10"
@@ -113,7 +116,7 @@ class Sweep:
         )
 
     def options(self) -> Iterator[BuildOptions]:
-        """Return the options of every machine in order, or raise a BuildError if there are none or too many."""
+        """Yield the build options of each machine of the sweep; a BuildError if there are none or too many."""
         lists = self._lists()
         count = math.prod(map(len, lists))
         if not 0 < count <= MAX_POINTS:
@@ -137,7 +140,7 @@ class Sweep:
 
 @dataclass(frozen=True, kw_only=True)
 class AdviceOptions:
-    """The options of advice on machines."""
+    """The options of `toolchain advise`, which compares a BM1, a BM2 and exact inference for one model."""
 
     accuracy: Annotated[
         float, typer.Option(help="Mean total variation from exact inference.", min=1e-4, max=0.5)
@@ -167,7 +170,7 @@ def _members(flag: str, text: str, kind: type[_Member]) -> tuple[_Member, ...]:
 
 
 def with_unit(value: float, unit: str) -> str:
-    """Return a value with its unit and the SI prefix that leaves 1 to 999 before the point."""
+    """Return a value as text with a unit, whose SI prefix leaves 1 to 999 before the decimal point."""
     if value <= 0:
         return f"0 {unit}"
     prefixes = ("p", "n", "u", "m", "", "k", "M", "G")

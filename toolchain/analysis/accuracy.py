@@ -1,9 +1,9 @@
-"""Accuracy of a machine's posteriors compared with exact inference, with the quantisation loss apart.
+"""Accuracy of a machine's posteriors compared with exact inference; the quantisation loss is also given separately.
 
-Each frame has three posteriors: of the model (float64), of the codes (float64), and of the machine (counts). The
-codes differ from the model by the quantisation loss, and the machine differs from the codes by the sampling loss. Means
-over frames have confidence intervals. A frame without a posterior is not left out of a mean: its total variation is 1,
-and its most probable line counts as wrong.
+Each frame has three posteriors over the lines (the values of the searched variables): two by exact inference, from the
+model's probabilities and from the machine's codes, and one from the machine's counts. The first two differ by the
+quantisation loss, the last two by the sampling loss. Means over frames have confidence intervals. A frame without a
+posterior is not left out of a mean: its total variation is 1, and its most probable line is taken to be wrong.
 """
 
 import math
@@ -66,11 +66,11 @@ _LOST: Final = (1.0, math.nan, 0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """Distances between posteriors, averaged over frames.
+    """Distances between two posteriors of a frame, ours and theirs, averaged over frames.
 
     Attributes:
         total_variation: Half the sum of absolute differences, 0 to 1; 1 for a frame without a posterior.
-        map_agreement: Share of all frames in which both have a posterior, with the same most probable line.
+        map_agreement: Share of all frames in which both posteriors exist, with the same most probable line.
         kl_bits: KL(ours || theirs) in bits; None if the mean includes frames without a posterior. (KL(theirs || ours)
             would be infinite if a count is 0.)
         alone: The same distances over only the frames with a posterior; None if there are no such frames.
@@ -84,11 +84,12 @@ class Difference:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ZScores:
-    """Counts of runs of a fixed length compared with equation 2.1: (n - c p) / sqrt(c p (1 - p)).
+    """Counts of runs of a fixed length compared with equation 2.1: z = (n - c p) / sqrt(c p (1 - p)).
 
     Attributes:
-        cycles: The length c.
-        draws: Number of independent draws of random numbers for the intervals: banks, or readings with free generators.
+        cycles: The length c; a line with probability p of counting in a cycle has the count n after it.
+        draws: Number of independent sequences of random numbers, over which the intervals are bootstrapped: one per
+            bank of seeds, or one per reading if generators are never reset.
         rms: Root mean square of the z-scores: 1 for independent bits, 1.6 if the variance is 2.6 times as large.
         mean: Their mean: 0 if the counts are unbiased.
         beyond_three: Share of z-scores below -3 or above 3; 0.0027 for a normal distribution.
@@ -133,7 +134,7 @@ class Accuracy:
         machine: The machine against the model; None without a model.
         quantising: Exact inference on the codes against the model; None without a model.
         sampling: The machine against exact inference on its codes.
-        z: Counts compared with equation 2.1; None if no line counts often enough.
+        z: Counts compared with equation 2.1; None if no line's expected count is high enough.
     """
 
     frames: int
@@ -162,11 +163,12 @@ def measure(
 ) -> Accuracy:
     """Run a machine on readings and compare its posteriors with exact inference.
 
-    A replica has the same counts as a single machine with the same bank, so a single machine is run for all
-    replicas. As many successive readings as there are replicas form a frame, which is as long as the longest of these
-    runs. Without a `model`, the machine is compared only with its codes. Readings that are impossible in the model have
-    no posterior. `advance` is called after every reading. With the filter `own`, the readings are a sequence, each is
-    run with one bank, and the machine is compared with the exact filter.
+    A replica has the same counts as a single machine with the same bank of seeds, so a single machine is run for all
+    replicas. As many successive readings as there are replicas form a frame, which takes the cycles of the longest of
+    their runs. Without a `model`, the machine is compared only with exact inference on its codes. Readings that are
+    impossible in the model have no posterior. `advance` is called after every reading. With `own`, the filter of
+    a deployment, the readings are a sequence, each is run with one bank, and the machine is compared with the exact
+    filter.
 
     Raises:
         BuildError: Fewer readings than replicas.
@@ -180,7 +182,7 @@ def measure(
     banks = 1 if own is not None else banks
     banks = max(1, min(banks, parameters.rng_banks if parameters.rng_reset is RngReset.BANK else banks))
     if own is not None or parameters.rng_reset is RngReset.FREE:
-        run = in_this_process  # a frame depends on those before
+        run = in_this_process  # a frame depends on the frames before it
     frames = len(readings) // replicas
     job = _Frames(boards, readings, model, banks, replicas, own)
     found: list[_Reading] = in_order(run, job, range(frames * replicas), advance)
@@ -211,15 +213,15 @@ def measure(
 
 
 class _Reading(NamedTuple):
-    """Results of a reading, which was run with every bank.
+    """Results of a reading, which was run once with each bank of seeds.
 
     Attributes:
-        is_likely: Whether it is possible in the model; true without a model.
-        is_possible: Whether it is possible in the codes.
+        is_likely: Whether the reading is possible in the model; true without a model.
+        is_possible: Whether some line can count, according to the codes.
         lengths: Cycles with each bank.
         without: Number of runs without a posterior.
         overflow: Number of runs that ended with an overflow.
-        prior: uint16[lines], its written prior, if any.
+        prior: uint16[lines], the prior that the filter wrote for it, or None.
         differences: Results of `_differences` for the machine against its codes and, if there is a model, for the
             codes against the model and the machine against the model.
     """
@@ -287,7 +289,10 @@ class _Frames:
 def _differences(
     ours: Sequence[NDArray[np.float64] | None], theirs: NDArray[np.float64] | None
 ) -> NDArray[np.float64]:
-    """Return mean differences over all runs, and over those with a posterior (NaN if none has one): float64[2, 3]."""
+    """Return mean total variation, KL and agreement, float64[2, 3]: over all runs, and over those with a posterior.
+
+    The second row is NaN if no run has a posterior.
+    """
     runs = [_difference(each, theirs) for each in ours if each is not None and theirs is not None]
     every = [*runs, *[_LOST] * (len(ours) - len(runs))]
     return np.array([np.mean(every, axis=0), np.mean(runs or [(math.nan,) * 3], axis=0)])

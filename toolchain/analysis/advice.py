@@ -34,18 +34,18 @@ from toolchain.models.network import NetworkModel
 MOST_CYCLES: Final = 30_000_000
 """Maximum number of cycles of a frame, because their emulation takes time."""
 _NEAR: Final = 0.8
-"""A value is near its limit from this share of it on: an error near the accuracy, cycles near `MOST_CYCLES`."""
+"""A value above this share of its limit is near it: an error near the accuracy asked for, cycles near `MOST_CYCLES`."""
 _ATTEMPTS: Final = 8
 _WIDTHS: Final = (8, 12, 16)
 
 
 _Run: TypeAlias = tuple[int, tuple[int, float, float], int, Estimate]
-"""Bits of a code; setting, total variation and cycles; number of boards; resources of one board."""
+"""Bits of a code; setting, total variation and cycles as in `Candidate`; number of boards; resources of one board."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A machine for a question; without numbers if it is refused.
+    """A machine for a question; if it is refused, the fields after `refused` keep their defaults.
 
     Attributes:
         refused: The reason why it cannot answer the question; empty if it can.
@@ -156,7 +156,7 @@ def advise(
 
 
 def _candidate(machine: str, clock_hz: float, run: Callable[[], _Run]) -> Candidate:
-    """Return the results of `run`, which runs a machine, or why the machine is refused if it raises an error."""
+    """Return the results of `run`, which runs a machine, or why the machine is refused if `run` raises an error."""
     try:
         prob_bits, (setting, variation, cycles), boards, cost = run()
     except ToolchainError as reason:
@@ -221,7 +221,7 @@ def _bm2(
 def _run_until(
     run: Callable[[int], tuple[float, float]], setting: int, accuracy: float
 ) -> tuple[int, float, float]:
-    """Return the lowest setting tried that is accurate enough, or the most accurate, with total variation and cycles.
+    """Return the lowest setting tried that is accurate enough, or else the most accurate; with variation and cycles.
 
     The error is inversely proportional to the square root of the setting, so every run predicts the next setting.
     """

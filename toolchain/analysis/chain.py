@@ -1,9 +1,10 @@
 """The Markov chain of a BM2, exactly: its law (the distribution of its state), cycles and correlations, for few bits.
 
-With ideal random numbers, the CDEs of a pointed bit agree on 1 in one try with the product of their chances of a 1, and
-on 0 with the product of the complements. This gives the matrix of a sweep, from state to state, and with it everything
-that long runs approach. The codes are those of the machine, so the effects of quantising and clipping are included. The
-samples are the states after each sweep, even if a machine takes one after every move.
+In a move, a BM2 points at a bit (or several); every cycle, each CDE whose factor contains the bit draws 0 or 1, until
+all agree. With ideal random numbers, they agree on 1 in a cycle with the product of their chances of a 1, and on 0 with
+the product of the complements. This gives the matrix of a sweep, from state to state, and with it everything that long
+runs approach. The codes are those of the machine, so the effects of quantising and clipping are included. The samples
+are the states after each sweep, even if a machine takes one after every move.
 """
 
 import itertools
@@ -32,7 +33,7 @@ _WORK: Final = 2**27
 def agreement(
     machine: BM2Machine, bit: int, values: Mapping[int, NDArray[np.int64]]
 ) -> list[tuple[int, NDArray[np.float64]]]:
-    """Return each CDE whose factor contains a pointed bit, with its chance of a 1 in each state, float64[states].
+    """Return the CDEs whose factors contain a bit, each with its chance of drawing a 1 in each state, float64[states].
 
     `values` has the value of every other bit of these factors in each state, int64[states], by bit.
     """
@@ -51,7 +52,7 @@ def agreement(
 class ExactChain:
     """The chain over the states of the unknown bits; bit i of a state's index is the i-th unknown bit.
 
-    The evidence is the values of the known variables; at most `MOST_BITS` bits are unknown.
+    `evidence` has the value of each known variable, by index; at most `MOST_BITS` bits may be left unknown.
     """
 
     def __init__(self, machine: BM2Machine, evidence: Mapping[int, int]) -> None:
@@ -69,7 +70,7 @@ class ExactChain:
             for bit in range(p.state_bits)
         }
         self._one = np.ones((len(self._unknown), len(index)))
-        """The chance that one try at a pointed bit agrees on 1: float64[unknown bits, states]."""
+        """The chance that in one cycle all CDEs of a bit agree on 1: float64[unknown bits, states]."""
         self._zero = np.ones_like(self._one)
         for at, bit in enumerate(self._unknown):
             concerned = agreement(machine, bit, self._values)
@@ -79,7 +80,7 @@ class ExactChain:
             self._zero[at] = start * np.prod([1 - chance for _, chance in concerned], axis=0)
 
     def _moved(self, laws: NDArray[np.float64], move: Sequence[int]) -> NDArray[np.float64]:
-        """Return laws, float64[..., states], after a move."""
+        """Return the laws after a move from the laws before it, float64[..., states]."""
         for at in move:
             one, zero = (each.reshape(-1, 2, 1 << at)[:, :1] for each in (self._one[at], self._zero[at]))
             split = laws.reshape(*laws.shape[:-1], -1, 2, 1 << at).sum(axis=-2, keepdims=True)
@@ -92,7 +93,7 @@ class ExactChain:
         total = np.zeros(agree.shape[1])
         for count in range(1, len(move) + 1):
             for chosen in itertools.combinations(range(len(move)), count):
-                # the mean of a maximum, by inclusion and exclusion: until one of the chosen agrees
+                # mean of a maximum, by inclusion and exclusion; a term is the mean until one chosen bit is agreed on
                 total -= (-1) ** count / (1 - np.prod(1 - agree[list(chosen)], axis=0))
         return total
 
@@ -163,7 +164,10 @@ class ExactChain:
         return np.asarray(np.divide(own, total, out=np.ones_like(own), where=own > 0))
 
     def frame(self, state: int, burn_in: int, sweeps: int) -> NDArray[np.float64]:
-        """Return the mean law over a frame's sweeps after its burn-in, from a packed start state: float64[states]."""
+        """Return the mean law over a frame's sweeps after its burn-in, float64[states].
+
+        `state` is the start state of all variables, bit i for bit i of the machine.
+        """
         first = np.linalg.matrix_power(self.sweep, burn_in + 1)[
             sum((state >> bit & 1) << at for at, bit in enumerate(self._unknown))
         ]
@@ -179,7 +183,7 @@ class ChainError:
     """
 
     share: float
-    """The probability of the readings that were examined, the likeliest ones."""
+    """The total probability of the readings that were examined, which are the likeliest ones."""
     quantising: float
     """Mean distance of the stationary law from exact inference."""
     worst: float

@@ -24,7 +24,7 @@ _FRAMES: Final = 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChainInspection:
-    """Results of an inspection; `exact` is the error computed without runs, or None if `chain_error` returns none."""
+    """Results of an inspection; `exact` is the error from `chain_error`, or None if the chain is too large for it."""
 
     deployment: Deployment
     machine: BM2Machine
@@ -150,7 +150,7 @@ def inspect_chain(
 
 
 def check_same(deployment: Deployment, machine: BM2Machine, model: NetworkModel) -> None:
-    """Raise a BuildError if the model does not have the codes of the deployment."""
+    """Raise a BuildError if a build of the model would not give the deployment's machine (its codes may be edited)."""
     p = machine.parameters
     place = {name: at for at, name in enumerate(model.names)}.__getitem__
     scopes = tuple(tuple(map(place, term.scope)) for term in model.factors)

@@ -17,9 +17,10 @@ from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 
 Inputs: TypeAlias = "tuple[int, ...] | NDArray[np.int64]"
-"""Inputs of a frame: an address per column, or int64[sensors, all lines] if lines have their own readings."""
+"""Inputs of a frame: the address of the reading in each column's table, or int64[sensors, all lines] if each line
+has its own readings."""
 WrittenPrior: TypeAlias = "NDArray[np.uint16] | None"
-"""Codes of the prior of a frame, uint16[all lines]; None to use the prior of the machines."""
+"""Codes of a prior that the host writes for a frame, uint16[all lines]; None to use the prior of the machines."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,7 +43,7 @@ class FrameRun:
 
 
 class EmulatedBoards:
-    """Boards that share the lines of one machine; a BuildError if the target does not fit the counters."""
+    """Boards among which the lines of one machine are divided; a BuildError if the target does not fit the counters."""
 
     def __init__(
         self, machines: Sequence[BM1Machine], *, target_count: int, max_cycles: int, stop: Stop
@@ -71,7 +72,7 @@ class EmulatedBoards:
         ]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the machines alone, since each process has its own kernels."""
+        """Pickle the machines without their kernels, since each process makes its own."""
         make = partial(
             EmulatedBoards, target_count=self.target_count, max_cycles=self.max_cycles, stop=self.stop
         )
@@ -83,7 +84,7 @@ class EmulatedBoards:
         return self.machines[0].parameters
 
     def parts(self, inputs: Inputs, prior: WrittenPrior) -> Iterator[tuple[Inputs, WrittenPrior]]:
-        """Return each board's inputs of a frame and its part of a written prior, which is None without one.
+        """Return each board's inputs of a frame, and its part of a written prior (None if no prior is written).
 
         Inputs of lines are split among the boards; addresses of columns go to all boards.
         """
@@ -92,9 +93,10 @@ class EmulatedBoards:
         return zip(of_boards, [None] * count if prior is None else np.split(prior, ends), strict=True)
 
     def run(self, addresses: Inputs, prior_address: int, bank: int, prior: WrittenPrior = None) -> FrameRun:
-        """Run a frame as the host does: in slices of 256 * 2^k cycles until a board overflows, or each to its own end.
+        """Run a frame as the host does, with the stop rule of the boards.
 
-        `prior` is a written prior, uint16[all lines].
+        With `Stop.SLICES`, all boards run to the same cycle, which doubles until a board reaches the target; otherwise
+        each board runs to its own end.
         """
         end = first_slice(self.target_count) if self.stop is Stop.SLICES else 0
         if end >= self.max_cycles:

@@ -33,10 +33,10 @@ from toolchain.outputs.mif import table_length
 FRAMES: Final = 200
 BANKS: Final = 4
 SLOW_FRAMES: Final = 20
-"""Number of frames for slow machines: with one generator per cell, or without LFSRs."""
+"""Number of frames for machines that are slow to emulate: with one generator per cell, or without LFSRs."""
 LEAST_FRAMES: Final = 20
 SLOW_LEAST_FRAMES: Final = 3
-"""Minimum number of frames of slow machines with replicas."""
+"""Minimum number of frames for slow machines, whose frames are fewer the more replicas they have."""
 SLOW_BANKS: Final = 1
 
 

@@ -1,8 +1,8 @@
-"""Logic and memories of a machine in an FPGA, as the sum of the units of its VHDL.
+"""Logic and memories of a machine in an FPGA, as the sum over the units of its VHDL (see `Of`).
 
 A unit's cost is fitted to the synthesis of small machines by GHDL and yosys (`scripts/verify resources
---calibrate`; docs/how-to/design-space.md); registers are counted from the VHDL. Tables go into memory blocks, then
-into memory LABs.
+--calibrate`; docs/how-to/design-space.md); registers are counted from the VHDL. Tables go into memory blocks
+(M20K); those that no longer fit there go into memory LABs, which are made of logic.
 """
 
 import math
@@ -61,34 +61,36 @@ WORD_BITS: Final = 32
 """Width of a word that the host writes or reads."""
 
 _BOARD_REGISTERS: Final = 1032
-"""Registers of bm1_axi, bm_register_block, bm1_registers and bm1_control, without target and replicas."""
+"""Registers of bm1_axi, bm_register_block, bm1_registers and bm1_control, except those for target and replicas."""
 _REPLICA_BITS: Final = 5
 """Registers of bm1_control for each replica: its stop reason, whether it runs and whether it is halted."""
 _FEW_WORDS: Final = 8
-"""A memory of at most this many words is built from memory LABs, which, unlike a block, need registers for output."""
+"""A memory of at most this many words is built from memory LABs, which, unlike a block, need output registers."""
 
 
 class Of(StrEnum):
-    """The kinds of units."""
+    """The kinds of units: what a machine's number of ALMs is counted in, and the VHDL that one unit stands for."""
 
     BOARD = "board"
-    """bm1_axi, bm_register_block, bm1_guard, and bm1_control of a single machine."""
+    """What each board has once: bm1_axi, bm_register_block, bm1_guard, and bm1_control of a single machine."""
     CODE_BIT = "code bit"
-    """bm1_stochastic_bitstream_generator: r < code, all ones, all zeros; with the AND of bm1_tile_element."""
+    """A bit of a cell's code, in bm1_stochastic_bitstream_generator: its part of the comparison of the random number
+    with the code, of the tests for all ones and all zeros, and of the AND of bm1_tile_element."""
     COUNTER_BIT = "counter bit"
-    """bm1_counter, bm1_readout, bm1_matrix: increment, comparison with the target, and selection for the host."""
+    """A bit of a counter, in bm1_counter, bm1_readout and bm1_matrix: its increment, its comparison with the target,
+    and its selection for the host."""
     STATE_BIT = "state bit"
-    """bm1_lfsr: one bit of the state, which loads the seed or takes the steps of a cycle."""
+    """A bit of the state of an LFSR (bm1_lfsr), which loads the seed or takes the steps of a cycle."""
     STEP = "step"
-    """bm1_lfsr: the parity of the taps in one step."""
+    """A step of an LFSR in a cycle (bm1_lfsr): the parity of the taps."""
     PLACE_BIT = "place bit"
-    """bm1_table_player: the next index, wrapping at the end of the table."""
+    """A bit of the index in a table of random numbers (bm1_table_player): the next index, wrapping at the end."""
     WORD = "word"
-    """bm1_words: address and check of a used word."""
+    """A word that the host writes for a frame, in bm1_words: its address and the check of its value."""
     MEMORY = "memory"
-    """bm1_words: initial contents and output of a memory of words."""
+    """A memory of such words, in bm1_words: its initial contents and its output."""
     REPLICA = "replica"
-    """bm1_control and bm1_readout, with several replicas: stop, reason, resume and outcome of each."""
+    """One of several replicas, in bm1_control and bm1_readout: its stop, stop reason, resume and outcome."""
 
 
 WORST_ERROR: Final = 0.06
@@ -167,7 +169,7 @@ def state_bits(p: BM1Parameters | BM2Parameters, table_length: int) -> int:
 def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH, inputs: int = 0) -> Logic:
     """Return the logic of a machine on a board, without memories; a BuildError if its generators are only emulated.
 
-    `inputs` is the number of inputs of the interface, if it has more than the machine needs.
+    `inputs` is the number of input words of the board's registers, if it is more than the machine needs.
     """
     p = parameters
     if p.rng is RngKind.IDEAL:
@@ -178,7 +180,7 @@ def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH, inputs: i
     # codes that the host writes are held for the frame; the others are held by the memories' outputs
     held = lines * ((p.prior_mode is PriorMode.WRITTEN) + (0 if p.has_tables else p.sensors))
     several = p.replicas if p.replicas > 1 else 0
-    # the target, and what bm1_readout has selected: a count, and of several replicas a word of the outcomes
+    # the target, and what bm1_readout has selected: a count and, with several replicas, a word of their outcomes
     control = _BOARD_REGISTERS + 2 * p.counter_bits + (WORD_BITS + several * CYCLE_BITS if several else 0)
     return Logic(
         (
@@ -216,7 +218,7 @@ def _inputs(p: BM1Parameters, inputs: int) -> LogicPart:
     if p.prior_mode is PriorMode.WRITTEN:
         blocks.append((used.result_words, used.result_words * p.prob_bits, used.result_words))
         place_bits = _index_bits(p.lines)  # in the memory of their initial codes
-    # a used word has a flag, whether it is too large; a block has two indices, each with a flag, and an output
+    # a used word has a flag that says that it is too large; a block has two indices, each with a flag, and an output
     registers = sum(
         words + bits + 2 * _index_bits(depth) + 2 + (WORD_BITS if depth <= _FEW_WORDS else 0)
         for words, bits, depth in blocks
@@ -312,7 +314,7 @@ def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
 def place_memories(
     parameters: BM1Parameters, device: Device, table_length: int = LENGTH, inputs: int = 0
 ) -> Memories:
-    """Place tables in the remaining memory blocks, the deepest first, and the rest in memory LABs."""
+    """Place tables, the deepest first, in the blocks that the other memories leave, and the rest in memory LABs."""
     tables = tables_of(parameters)
     room = math.floor(device.usable * device.blocks)
     others = random_memories_of(parameters, table_length) + word_memories_of(parameters, inputs)

@@ -1,7 +1,7 @@
 """Frames that a BM1 gives no posterior, predicted from its codes before it runs, and the options that save them.
 
-A frame is lost if every line has a code 0, or if no line counts in any of its cycles. Frames are drawn from the
-model (a sample). The probability that a frame is lost is (1 - u)^cycles, where u is the probability that some line
+A frame is lost if every line has a code 0, or if no line counts in any cycle of the frame. A sample of frames is drawn
+from the model. The probability that a frame is lost is (1 - u)^cycles, where u is the probability that some line
 counts in a cycle. All lines use the same random number of each column, so u is the volume of a union of boxes: one for
 each line, with the codes of its cells as sides. Karp and Luby's method estimates it: points are drawn in the boxes, and
 each has a weight of one over the number of boxes that contain it.
@@ -25,14 +25,14 @@ from toolchain.errors import BuildError
 TOLERATED: Final = 0.01
 """Share of lost frames above which a build and a check warn."""
 _WORK: Final = 2**26
-"""Comparisons of points with codes for one machine, which take less than a second; only large models need more."""
+"""Number of comparisons of points with codes for one machine, in less than a second; only large models take more."""
 _MOST_FRAMES: Final = 1000
 _LEAST_FRAMES: Final = 10
 _POINTS: Final = 16
 """Number of points that are drawn for a frame."""
 _SEED: Final = 1
 _MOST_CYCLES: Final = 2**26
-"""Cycles from which on advice does not try more: 0.7 s at 100 MHz."""
+"""Maximum number of cycles that are tried for the advice: 0.7 s at 100 MHz."""
 
 
 class LostFrames(NamedTuple):
@@ -119,9 +119,9 @@ def _advice(plan: MachinePlan, drawn: Readings) -> str:
 def _expected(
     plan: MachinePlan, changes: dict[str, Any], drawn: Readings, count: int, *, longer: bool
 ) -> tuple[str, float]:
-    """Return changed options as flags, and the share of frames that they lose with only the first `count` sensors.
+    """Return `changes` as flags, and the share of frames lost with them and with only the first `count` sensors.
 
-    If `longer`, the maximum number of cycles is also raised until few frames are lost.
+    If `longer`, the maximum number of cycles is also raised (as a further flag) until few frames are lost.
     """
     model, options = replace(plan.model, known=plan.model.known[:count]), replace(plan.options, **changes)
     try:

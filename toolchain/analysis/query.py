@@ -1,4 +1,4 @@
-"""Answers about a network: exact posteriors for known states, those of a machine, and the variables to ask about."""
+"""Answers about a network: its variables, and posteriors for known states, by exact inference and by a machine."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -41,9 +41,9 @@ class MachineAnswer:
     stopped: str
     """The reason why the board stopped."""
     posterior: NDArray[np.float64] | None
-    """float64[lines]; None if there is none for these readings."""
+    """float64[lines], one value per combination of searched states; None if all counts are 0."""
     total_variation: float
-    """Distance from the exact posterior; 1 without a posterior."""
+    """Total variation from the exact posterior; 1 if the machine has no posterior."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,7 +120,7 @@ def answer(
 
     Raises:
         ToolchainError: A variable or state does not exist, the states are impossible together, inference needs a table
-            above the limit, or there is no such machine for the question.
+            above the limit, or the kind of machine asked for cannot answer the question.
     """
     question = joint.ask(searched, list(known))
     addresses = tuple(symbol.index(known[symbol.name]) for symbol in question.known)
@@ -138,7 +138,7 @@ def answer(
 def _machine_answer(
     question: Question, addresses: tuple[int, ...], exact: NDArray[np.float64], choice: MachineChoice
 ) -> MachineAnswer:
-    """Run the machine that a build would make, as `inspect` runs it."""
+    """Run the machine that a build would make, in this process, with the known states at these `addresses`."""
     options = BuildOptions(machine=choice)
     model, why = model_for(question, options)
     if isinstance(model, NetworkModel):

@@ -1,4 +1,4 @@
-"""The readings that emulated boards are given: drawn from a model, or recorded."""
+"""The readings with which emulated boards are run: drawn from a model, or recorded."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,8 +34,8 @@ class Readings:
         addresses: int64[frames, sensors], in the order of the columns; `MISSING` for a missing reading. If
             lines have their own readings, int64[frames, sensors, lines].
         prior_addresses: int64[frames], the row of the prior; `MISSING` if none is selected.
-        codes: uint16[frames, sensors, lines], the codes of these readings' likelihoods, for a machine with
-            `sensor_mode = threshold`; None for other machines.
+        codes: uint16[frames, sensors, lines], the codes of these readings' likelihoods, for a machine without tables
+            (`sensor_mode = threshold`); None for other machines.
         lines: int64[frames], the true line of each; None if unknown.
     """
 
@@ -76,7 +76,7 @@ class Readings:
 
 
 def check_frames(frames: int) -> None:
-    """Raise a BuildError for a number of frames that is not from 1 to `MOST_FRAMES`."""
+    """Raise a BuildError if `frames` is not from 1 to `MOST_FRAMES`."""
     if not 1 <= frames <= MOST_FRAMES:
         raise BuildError(f"--frames is {frames}, expected 1 to {MOST_FRAMES}")
 
@@ -86,7 +86,7 @@ def sample_readings(
 ) -> Readings:
     """Draw the line of each frame, then its readings; a `prior_select` gets equally probable values.
 
-    With `in_sequence`, the lines of a model with a transition are drawn one after the other.
+    With `in_sequence`, the line of a frame is drawn from the transition out of the line before, if the model has one.
     """
     check_frames(frames)
     random = np.random.default_rng(seed)
@@ -119,8 +119,8 @@ def readings_of_lines(
     """Convert drawn readings for a machine whose lines have their own readings.
 
     The cell of the true line reads the drawn value. The model does not define the readings of the other
-    lines, so these are drawn from the mean over all lines. With sensor_mode `threshold`, the likelihoods are
-    returned as codes.
+    lines, so these are drawn from the mean distribution over all lines. With sensor_mode `threshold`, the likelihoods
+    are returned as codes.
 
     Raises:
         BuildError: The readings were not drawn, so their true line is unknown.
@@ -148,7 +148,7 @@ def readings_of_lines(
 def model_of_codes(
     name: str, searched: Sequence[Dimension], variables: Sequence[Variable], machine: BM1Machine
 ) -> Model:
-    """Return a model that quantises to the codes of a machine, for drawing readings without the original.
+    """Return a model that quantises to the codes of a machine, for drawing readings without the original model.
 
     Each row of a table was divided by its maximum before quantising. These maxima are estimated so that
     the column of every line sums to 1 as nearly as possible (expectation maximisation).
@@ -169,7 +169,7 @@ def model_of_codes(
 
 
 def _conditional(codes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scale rows so that columns sum to about 1, then normalise them; a column of zeros becomes uniform."""
+    """Scale rows so that columns sum to about 1, then normalise the columns; one of zeros becomes uniform."""
     codes = np.where(codes.sum(axis=0) > 0, codes, 1.0)
     served = codes.sum(axis=1) > 0
     weights = served / max(int(served.sum()), 1)
@@ -182,7 +182,7 @@ def _conditional(codes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _distribution(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ratios with the sum 1; even a distribution of a model has this sum only within 1e-6."""
+    """Return ratios, normalised to the sum 1 (also those of a model, whose sum is 1 only within 1e-6)."""
     total = ratios.sum()
     return ratios / total if total > 0 else np.full(ratios.shape, 1 / ratios.size)
 
@@ -200,8 +200,8 @@ def recorded_readings(
 
     With `in_sequence`, these are the first rows, and one that does not fit is kept with all its readings missing.
 
-    `given` are NAME=COLUMN for variables whose column has another name, with `*` for the same text in both;
-    in a bag, messages of other topics may be `tolerance_s` apart from a row.
+    `given` has NAME=COLUMN for each variable whose column has another name, with `*` for the same text in both;
+    in a bag with several topics, the messages of one row may be up to `tolerance_s` apart.
 
     Raises:
         ModelError: The recording or a column does not exist, or no row fits the machine.
@@ -227,8 +227,8 @@ class Frames:
     Attributes:
         readings: The readings of all rows; all are missing in a row that does not fit.
         fits: bool[rows], whether the machine takes all values of the row; a row that does not fit gets no posterior.
-        stamps: int64[rows], nanoseconds: of the messages of a bag or the column of a CSV file, or else the numbers
-            of the rows, 0, 1, 2, ...
+        stamps: int64[rows], in nanoseconds, from a bag's messages or a CSV file's column of stamps; without stamps,
+            the rows' indices 0, 1, 2, ...
         why: What is wrong with the first row that does not fit; empty if all do.
     """
 

@@ -1,10 +1,10 @@
-"""All frames of a recording through the machines of a deployment, as `master --loop --queue all` would compute them.
+"""The posteriors of all rows of a recording, as `master --loop --queue all` would compute them, written to OUT.
 
     recording ──rows──▶ addresses ──▶ Replay (a job: one piece per frame) ──▶ OUT.frames ──▶ OUT.npz or OUT.mcap
 
 `OUT.frames` begins with a line that identifies everything on which the results depend. After it, each frame has a place
-for its record, so that a killed run can be resumed. `OUT` grows in the order of the rows, and its bytes do not depend
-on where they were computed.
+for its record, so that a killed run can be resumed. `OUT` is written in the order of the rows, so its bytes do not
+depend on which process computed a frame, or when.
 """
 
 import fcntl
@@ -75,7 +75,7 @@ class Replay:
     machines: Sequence[Any]
     frames: Frames
     earlier: Callable[[int], tuple[_Posterior, int] | None] | None = None
-    """For a filter, which goes through all rows: returns what an interrupted run computed for a row, if anything."""
+    """For a sequence, which goes through all rows: returns what an interrupted run computed for a row, if anything."""
 
     @property
     def is_sequence(self) -> bool:
@@ -92,7 +92,7 @@ class Replay:
 
         def compute(row: int) -> bytes:
             nonlocal steps
-            steps += 1  # as a master predicts: also for rows before that do not fit
+            steps += 1  # as a master predicts: also for the rows before that do not fit
             record, posterior, prior = np.zeros((), layout), None, None
             if fits[row]:
                 if own is not None:
@@ -110,7 +110,7 @@ class Replay:
 
 
 def record_layout(deployment: Deployment) -> "np.dtype[np.void]":
-    """Return the layout of a record: a checksum of the rest, the cycles of the slowest board, the posterior or NaN."""
+    """Return the layout of a record: checksum of the rest, cycles of the longest-running board, posterior or NaN."""
     return np.dtype([("crc", "<u8"), ("cycles", "<u8"), ("posterior", "<f8", deployment.machine.results)])
 
 
@@ -132,9 +132,9 @@ class PartFile:
     @classmethod
     @contextmanager
     def opened(cls, path: Path, key: str, layout: "np.dtype[np.void]", frames: int) -> Iterator["PartFile"]:
-        """Open or create the file, locked, and with room for all; remove it if the block ends without an error.
+        """Open or create the file, locked, with room for all records; remove it if the block ends without an error.
 
-        The file begins with `key`. A place that was not written, or only in part, has a wrong checksum.
+        The file begins with `key`. A record that was not written, or only in part, has a wrong checksum.
 
         Raises:
             BuildError: The file cannot be written, is locked by another run, or has another key.
@@ -191,14 +191,14 @@ def replay(
     advance: Callable[[], None] = lambda: None,
     begun: Callable[[int], None] = lambda _: None,
 ) -> tuple[int, int]:
-    """Compute all frames that are not done, and write the output.
+    """Compute all frames that an interrupted run has not computed, and write the output.
 
-    `begun` is called with the number of frames that an earlier run has computed, and `advance` after each further one.
+    `begun` is called with the number of frames that such a run has computed, and `advance` after each further one.
     The frames of a sequence are computed in this process. Return the number of frames computed now, and the number of
     all frames without a posterior.
 
     Raises:
-        BuildError: A file cannot be written, or belongs to other work.
+        BuildError: A file cannot be written, or is that of another recording, deployment or version.
     """
     job = Replay(deployment, [image.machine for image in read_images(deployment)], frames)
     path, layout = output.with_name(output.name + ".frames"), record_layout(deployment)
@@ -236,7 +236,7 @@ def _key(deployment: Deployment, frames: Frames) -> str:
 
 @contextmanager
 def _archive(path: Path, deployment: Deployment, frames: Frames) -> Iterator[_Write]:
-    """Write the arrays of `listen --save FILE.npz`."""
+    """Write an archive with the arrays that `listen --save FILE.npz` writes."""
     dimensions, cycles = deployment.searched, list[NDArray[np.uint64]]()
     shape = (len(frames), *(each.size for each in dimensions))
     with whole_file(path, BuildError) as partial, zipfile.ZipFile(partial, "w") as archive:
@@ -270,7 +270,7 @@ def _archive(path: Path, deployment: Deployment, frames: Frames) -> Iterator[_Wr
 
 @contextmanager
 def _bag(path: Path, deployment: Deployment, frames: Frames) -> Iterator[_Write]:
-    """Write a message of the topic of results for each frame with a posterior, at the stamp of its row."""
+    """Write an MCAP file with a message on /BMresults for each frame with a posterior, at the stamp of its row."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 

@@ -1,8 +1,8 @@
 """Resources and energy of a BM1 on the FPGAs of its boards, and the number of boards that it needs.
 
 Tables are memories, so that their content can be changed without a new compilation. Nothing here was measured on a
-board. Logic is estimated; energy is estimated from toggles of nets, with the same energy for each net, and the
-assumed constants are listed.
+board. Logic is estimated; energy is estimated from toggles of nets, with the same energy for each net;
+`ASSUMPTIONS` lists the constants.
 """
 
 import math
@@ -27,7 +27,7 @@ from toolchain.outputs.mif import LENGTH, table_length
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """Resources of a machine on an FPGA; its PCIe controller is a hard block and needs no logic."""
+    """Resources of a machine on an FPGA, whose PCIe controller is a hard block and needs no logic."""
 
     device: Device
     logic: Logic
@@ -35,7 +35,7 @@ class Estimate:
 
     @property
     def alms(self) -> float:
-        """All ALMs: logic, registers that don't fit into its ALMs, and tables."""
+        """All ALMs: those of the look-up tables, or of the registers if these need more, and those of memory LABs."""
         logic = max(self.logic.alms, self.logic.registers / self.device.registers_per_alm)
         return logic + self.memories.alms
 
@@ -73,8 +73,8 @@ def estimate(
 ) -> Estimate:
     """Return the resources of a machine on a device, or raise a BuildError if it exists only in emulation.
 
-    `inputs` is the number of inputs of the interface, if it has more than the machine needs. Results take no memory,
-    because they are counters.
+    `inputs` is the number of input words of the board's registers, if it is more than the machine needs. Results take
+    no memory, because they are counters.
     """
     return Estimate(
         device=device,
@@ -88,7 +88,7 @@ def _why_not(
 ) -> str:
     """Return what the device or the interface of a board lacks for a machine, as a clause; empty if the machine fits.
 
-    `interface` is the value of `--interface`; without it, the interface may be as large as the register map.
+    `interface` is the value of `--interface` (inputs, results); None allows as many as the register map has room for.
     """
     used = BM1.registers(machine)
     whose = "the map" if interface is None else "the interface"
@@ -110,7 +110,7 @@ def most_replicas(
     table_length: int = LENGTH,
     interface: tuple[int, int] | None = None,
 ) -> tuple[int, str]:
-    """Return how many replicas of a board's machine fit the board (0 if none does), and why no more, as a clause."""
+    """Return how many replicas of a machine fit a board (0 if none does), and why no more fit, as a clause."""
 
     def why_not(replicas: int) -> str:
         return _why_not(replace(board, replicas=replicas), device, table_length, interface)
@@ -128,7 +128,7 @@ def boards_needed(
     table_length: int = LENGTH,
     interface: tuple[int, int] | None = None,
 ) -> tuple[int, str]:
-    """Return the minimum number of boards for a machine, and why, as a sentence; or raise a BuildError."""
+    """Return the minimum number of boards for a machine, and why, as a sentence; a BuildError if none is enough."""
 
     def why_not(lines: int) -> str:
         return _why_not(replace(parameters, lines=lines), device, table_length, interface)

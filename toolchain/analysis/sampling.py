@@ -36,13 +36,13 @@ from toolchain.outputs.memories import seed_width
 from toolchain.outputs.mif import table_length
 
 _INFINITE: Final = 1e9
-_SEQUENCER_BITS: Final = 16  # an LFSR16 of its own, and its seeds
+_SEQUENCER_BITS: Final = 16  # the sequencer has an LFSR16 of its own, and seeds for it
 Addresses = tuple[int, ...]
 """A frame's readings: an address per known variable."""
 
 
 def drawn_readings(model: NetworkModel, frames: int, seed: int) -> list[Addresses]:
-    """Draw readings of all known variables from the model, each given those drawn before it."""
+    """Draw readings of all known variables from the model, each conditioned on the variables drawn before it."""
     check_frames(frames)
     random = np.random.default_rng(seed)
     given_earlier = [
@@ -69,7 +69,7 @@ class Sampled:
         frames: All frames.
         without: Share of frames without a posterior.
         total_variation: Mean distance from exact inference, 1 for a frame without a posterior; None without a model.
-        alone: The same over only the frames with a posterior, as is everything below but `reasons`.
+        alone: The same mean over only the frames with a posterior; so are all fields below, except `reasons`.
         cycles: Cycles of the longest-running board.
         sweep_cycles: Mean cycles of a sweep; 0 if samples are taken after every move.
         effective_samples: Median and minimum of the effective samples of a frame; 0 if unknown.
@@ -100,7 +100,7 @@ class _Frames:
     readings: Sequence[Addresses]
     model: NetworkModel | None
     settings: FrameInput
-    """Samples and limit of every frame."""
+    """Number of samples and maximum number of cycles, the same for every frame."""
 
     def prepare(self) -> Work:
         """Return the function that runs a reading on all boards."""
@@ -160,10 +160,10 @@ def run_chains(
 
 
 def chain_resources(machine: BM2Machine, device: Device) -> Estimate:
-    """Return the resources of a board, estimated from the units of a BM1; there is no VHDL of a BM2 to compare."""
+    """Return the resources of a board, estimated from the units of a BM1, because there is no VHDL of a BM2."""
     p = machine.parameters
     seed, adders = seed_width(machine), len([bits for bits in p.bits if bits]) + 1
-    # each local bit of a CDE moves by one place in the address if the pointer is below it
+    # each bit of a CDE's factor moves by one place in the address if the pointer is below it
     moved, state = sum(len(p.factor_bits(cde)) for cde in range(p.cdes)), p.cdes * seed + _SEQUENCER_BITS
     counts: dict[str, tuple[dict[Of, float], int]] = {
         "CDEs": ({Of.CODE_BIT: p.cdes * p.prob_bits, Of.STATE_BIT: moved}, 0),

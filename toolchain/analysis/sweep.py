@@ -1,4 +1,4 @@
-"""Sweeps over the possible machines of a model: points, stored in a file, with Pareto front, table and picture."""
+"""Sweeps over the possible machines of a model: a stored point for each, their Pareto front, table and picture."""
 
 import fcntl
 import hashlib
@@ -51,13 +51,13 @@ class Point(BaseModel):
         total_variation_high: Upper end of its 95 % interval.
         quantising: The same distance for exact inference on the codes.
         map_agreement: Share of all frames with a posterior and the same most probable line.
-        alone_total_variation: The mean over frames with a posterior; None if no frame had one, as for the next two.
-        alone_map_agreement: The share of these frames.
-        kl_bits: KL(machine || model) in bits, over these frames.
-        z_rms: Root mean square of z-scores; 1 is ideal.
+        alone_total_variation: The mean distance over only the frames with a posterior; None if no frame has one.
+        alone_map_agreement: The share of these frames that have the same most probable line; None likewise.
+        kl_bits: KL(machine || model) in bits, mean over these frames; None likewise.
+        z_rms: Root mean square of z-scores (`ZScores`), ideally 1; None if no line's expected count is high enough.
         without: Share of runs without a posterior.
-        cycles_median: Cycles of a frame.
-        cycles_95: Their 95th percentile.
+        cycles_median: Median cycles of a frame.
+        cycles_95: 95th percentile of the cycles.
         alms: ALMs of the largest board; None for generators that FPGAs do not have.
         blocks: Memory blocks of the largest board.
         fits: Whether the largest board fits the device.
@@ -123,7 +123,7 @@ class Results:
         line = point.model_dump_json().encode() + b"\n"
         with file_errors(self.path, "written", BuildError), self._locked() as file:
             file.seek(self._torn_at)
-            if self._torn and file.read() == self._torn:  # otherwise, another sweep has cut it
+            if self._torn and file.read() == self._torn:  # otherwise, another sweep has removed it
                 file.truncate(self._torn_at)
             self._torn = b""
             written = file.write(line)
@@ -138,7 +138,7 @@ class Results:
         while True:
             with self.path.open("a+b", buffering=0) as file:
                 fcntl.flock(file, fcntl.LOCK_EX)
-                if os.fstat(file.fileno()).st_nlink:  # otherwise, another sweep has sorted it
+                if os.fstat(file.fileno()).st_nlink:  # otherwise, another sweep has replaced it
                     yield file
                     return
 
@@ -215,7 +215,7 @@ COLOURS: Final = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa337
 MARKERS: Final = "osD^v<>P"
 _SUFFIXES: Final = (".png", ".svg", ".pdf")
 _KINDS_INSIDE: Final = 5
-"""Maximum length of a legend inside the picture, because a longer one would cover points."""
+"""Maximum number of entries of a legend inside the axes, because a longer one would cover points."""
 
 
 def check_plot(path: Path) -> None:
@@ -284,7 +284,7 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
 
 
 def _name_points(axes: Any, names: Iterable[tuple[tuple[float, float], str]]) -> None:
-    """Write names beside points, the highest first; one that would cover another goes below it, with a line."""
+    """Write names beside points, the highest first; a name that would cover another goes lower, joined to its point."""
     line = 9.5
     dots = axes.figure.dpi / 72
     axes.get_xlim()  # sets the limits, on which the places depend
@@ -294,7 +294,7 @@ def _name_points(axes: Any, names: Iterable[tuple[tuple[float, float], str]]) ->
         if any(
             name == other and abs(x - left) < line and abs(y - high) < line for left, high, other in taken
         ):
-            continue  # the same, but for the generator
+            continue  # the same machine, except for the generator
         low = y
         while any(abs(x - left) < 5 * line and abs(low - high) < line for left, high, _ in taken):
             low -= 1
@@ -343,7 +343,7 @@ def tasks(model: Model, sweep: Sweep, readings: Readings, device: Device) -> lis
             "device": device.name,
         }
         key = hashlib.sha256(json.dumps(words, sort_keys=True).encode()).hexdigest()
-        # 0 steps and the number that this selects are the same machine
+        # `--steps 0` and the number of steps that it selects give the same machine
         found.setdefault(key, Task(plan, key))
     if not found:
         raise BuildError(f"none of these machines can be built: {refused}")
@@ -359,7 +359,7 @@ def run_task(task: Task, readings: Readings, device: Device, banks: int) -> Poin
         machines, target_count=task.plan.target_count, max_cycles=task.plan.max_cycles, stop=options.stop
     )
     accuracy = measure(boards, readings, model, banks=banks)
-    # there is a model to compare with
+    # not None, because there is a model to compare with
     machine, quantising = cast("Difference", accuracy.machine), cast("Difference", accuracy.quantising)
     alone = machine.alone
     point = Point(
@@ -392,7 +392,7 @@ def run_task(task: Task, readings: Readings, device: Device, banks: int) -> Poin
 
 
 def with_resources(task: Task, point: Point, device: Device) -> Point:
-    """Return a point with resources of its largest board from the current estimate."""
+    """Return a point with the resources of the machine's largest board, as estimated now."""
     parameters, options = task.plan.parameters, task.plan.options
     if options.rng is RngKind.IDEAL:
         return point
@@ -417,9 +417,9 @@ class SweepJob:
 
 
 def run_sweep(job: SweepJob, run: Run, results: Results, advance: Callable[[Point], None]) -> None:
-    """Measure the machines without a stored result, and store every point as soon as it is there.
+    """Measure the machines without a stored result, and store every point as soon as it is measured.
 
-    At the end, its points are in the file in the order of the sweep, wherever they were measured.
+    At the end, the sweep's points are in the file in the order of its tasks, whichever process measured them.
     """
     left = [number for number, task in enumerate(job.tasks) if task.key not in results.points]
     for key in (task.key for task in job.tasks if task.key in results.points):
