@@ -1,4 +1,4 @@
-"""Dimensions of posteriors with units and names of states, and cells in words."""
+"""The dimensions of posteriors, with units and names of states, and texts that name a cell."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -65,7 +65,10 @@ def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
 
 
 def state_in_words(dimensions: "Sequence[Dimension]", codes: Sequence[int]) -> str:
-    """Return a sampled state as text, `rain=yes  grass=wet`; without dimensions, its machine words in hexadecimal."""
+    """Return a sampled state as text, `rain=yes  grass=wet`.
+
+    Without dimensions, `codes` are the 32-bit words of the state, which are shown in hexadecimal.
+    """
     if not dimensions:
         return " ".join(f"{word:08x}" for word in reversed(codes))
     axes = [Axis(each.label, each.size, each) for each in dimensions]

@@ -25,7 +25,7 @@ class EmulatedPosterior(Posterior):
 
     deployment: Deployment = field(compare=False)
     machines: tuple[Any, ...] = field(compare=False)
-    """The machines of its boards, which are kept because the folder may have changed."""
+    """The emulated machines of the boards, kept for `exact`, because the deployment's folder may change later."""
     addresses: tuple[int | None, ...]
     """The reading of each variable of the deployment; None without one."""
 
@@ -36,10 +36,10 @@ class EmulatedPosterior(Posterior):
             model: The model from which the deployment was built: a folder with `model.py`, a network file, or the
                 object that either gives. Without it, the rounded probabilities in the memories of a BM1 are used,
                 which differ from the model by the loss of quantising. A BM2 has no such probabilities.
-            settings: Parameters of `model()`, as `--set` gave them to the build.
+            settings: Parameters of `model()`, with the values that `toolchain build --set` got.
 
         Returns:
-            The posterior; in its `details`, `exact` says from what it was computed: `model` or `codes` (the memories).
+            The posterior. `details["exact"]` says from what it was computed: `model`, or `codes` (the memories).
 
         Raises:
             PosteriorError: There is no model for a BM2, or there are settings without a model.
@@ -121,16 +121,16 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
     Args:
         folder: The folder that `toolchain build` wrote.
         readings: The readings by the names of their variables, as in messages: numbers in their units, or names of
-            states. A variable that is not named, or is None, has no reading, also with `on_missing = error`.
-        bank: Set of seeds; each gives another draw of the same distribution.
+            states. A variable that is left out, or is None, has no reading, even if its `on_missing` is `error`.
+        bank: Number of the set of seeds; each set gives another draw of the same distribution.
 
     Returns:
         The posterior in the shape of the model, with its labels and units; `report` is None.
 
     Raises:
-        LabelError: The deployment has no variable of this name.
-        PosteriorError: The readings have no names, or the machine has replicas or readings for each line; for these,
-            use `machines.posterior`.
+        LabelError: The deployment has no variable with a name in `readings`.
+        PosteriorError: `readings` is not a mapping; or the machine has replicas, or a reading for each line (then
+            use `machines.posterior`).
         ToolchainError: The deployment is damaged, or a reading cannot be used.
         NoPosteriorError: All counts are 0 for these readings.
     """

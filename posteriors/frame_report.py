@@ -30,7 +30,7 @@ class StageTimes:
     reads: FiniteFloat | None = None
     boards_compute: FiniteFloat | None = None
     rosbridge_out: FiniteFloat | None = None
-    """Duration of the previous frame, because this one has not been sent yet."""
+    """The time for sending the previous posterior, because the report is sent before its own posterior."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,11 +57,11 @@ class VariableReading(NamedTuple):
     """The reading of a variable in a frame."""
 
     value: Annotated[float | str, BeforeValidator(_number_or_text)]
-    """As received, to nine digits; the name of a state, or `inf` for a clamped one, is text."""
+    """As received, to nine digits; text for the name of a state, and for `inf`, a number too large for a float."""
     address: int
     """Address in the variable's column."""
     age_ms: FiniteFloat
-    """Milliseconds from the receipt of its message to the sending of the report."""
+    """Milliseconds from the receipt of the variable's message to the sending of the report."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +71,7 @@ class FrameReport:
     stamp_ns: int
     """Time of the reading."""
     heard_ns: int = 0
-    """Arrival of this message here."""
+    """Arrival of the report in this process."""
     outcome: str
     deployment: str = ""
     published: bool = True
@@ -79,7 +79,7 @@ class FrameReport:
     cycles: int | None = None
     counts_total: int | None = None
     link_bytes: int | None = None
-    """Bytes between pcie-app and all boards, in both directions, and the number of transfers that they took."""
+    """Bytes between pcie-app and all boards, in both directions; `link_transfers` is the number of their transfers."""
     link_transfers: int | None = None
     received_ns: int | None = None
     """Receipt of the reading by the subscriber."""
@@ -92,7 +92,7 @@ class FrameReport:
     missing: tuple[str, ...] = ()
     """Names of the variables without a reading."""
     readings: Mapping[str, VariableReading] = field(default_factory=dict)
-    """Readings by the names of their variables, without arrays."""
+    """Readings by the names of their variables; readings that are arrays are left out."""
 
     @property
     def is_biased(self) -> bool:
@@ -145,7 +145,7 @@ def _template(keys: tuple[str, ...]) -> str:
 
 
 def _status(keys: tuple[str, ...], head: tuple[object, ...], values: tuple[object, ...]) -> str:
-    """Return a DiagnosticStatus as JSON; `head` is everything before the values; values of None are left out."""
+    """Return a DiagnosticStatus as JSON; `head` has the fields before the values; a value that is None is left out."""
     if None in values:
         keys = tuple(key for key, value in zip(keys, values, strict=True) if value is not None)
         values = tuple(value for value in values if value is not None)
@@ -194,7 +194,7 @@ def write_frame_report(report: FrameReport, ros_version: Literal[1, 2]) -> dict[
 
 @cache
 def _reading_begin(name: str) -> str:
-    """Return the JSON pair of a reading up to its value; cached, because a deployment has few names."""
+    """Return the beginning of a reading's JSON pair, up to the value; cached, because a deployment has few names."""
     return f',{{"key":{_quoted(_READING + name)},"value":"'
 
 
@@ -231,7 +231,7 @@ _REPORT: Final = TypeAdapter(FrameReport)
 
 
 def read_frame_report(message: dict[str, Any], heard_ns: int) -> FrameReport:
-    """Return the report in a diagnostic_msgs/DiagnosticArray, or raise a BadResultError; keys may be absent."""
+    """Return the report in a diagnostic_msgs/DiagnosticArray, or raise a BadResultError; any key may be absent."""
     array = validated(_ARRAY, message, FRAME_TOPIC, FRAME_TYPE)
     first, *others = array.status
     values = first.by_key()

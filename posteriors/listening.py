@@ -50,8 +50,8 @@ class Posteriors:
 
     Args:
         ros: The open client.
-        topic: Topic of the posteriors (`toolchain build --output`).
-        frame_topic: Topic of their frames' reports.
+        topic: Topic of the posteriors (the one given to `toolchain build --output`).
+        frame_topic: Topic of the frame reports.
         deployment: The model's name, to ignore frames of other stacks on the same server.
         queue_size: Maximum number of posteriors that wait for their reader; then the oldest is dropped and
             counted.

@@ -41,7 +41,7 @@ class Pairing:
         return bool(self._posteriors)
 
     def add_report(self, report: FrameReport) -> list[FrameOutcome]:
-        """Add a `/bm/frame` and return the frames that are now complete."""
+        """Add a report (`/bm/frame`), and return the frames that are now complete."""
         self._reports.append(report)
         if len(self._reports) > WAITING:  # no posteriors arrive on the subscribed topic
             self._reports.popleft()
@@ -49,7 +49,7 @@ class Pairing:
         return self._match()
 
     def add_posterior(self, posterior: Posterior) -> list[FrameOutcome]:
-        """Add a `/BMresults` and return the frames that are now complete."""
+        """Add a posterior (`/BMresults`), and return the frames that are now complete."""
         self._posteriors.append(posterior)
         ready = self._match()
         if len(self._posteriors) > WAITING:
@@ -82,7 +82,7 @@ class Pairing:
         return ready
 
     def _belongs_to_a_later(self, posterior: Posterior) -> bool:
-        """Return whether a posterior is too late for the first report, and not too early for the next."""
+        """Return whether a posterior came too late for the first waiting report, and not too early for the second."""
         first, second = self._reports[0], self._reports[1]
         return (
             first.heard_ns + self._disorder_ns < posterior.heard_ns

@@ -77,7 +77,7 @@ class Posterior:
         return self.sizes[0] if self.labels[0] == REPLICA else 1
 
     def replica(self, at: int) -> "Posterior":
-        """Return the posterior of one replica, without that dimension, or raise a LabelError if it has none."""
+        """Return the posterior of replica `at`, without the label `replica`, or raise a LabelError if it has none."""
         if not 0 <= at < self.replicas:
             raise LabelError(f"there is no replica {at}: expected 0 to {self.replicas - 1}")
         if self.labels[0] != REPLICA:
@@ -132,7 +132,7 @@ class Posterior:
 
     @property
     def cycles(self) -> int | None:
-        """Largest number of cycles of a board; None if unknown."""
+        """Number of cycles of the board that took the most; None if unknown."""
         return self.report.cycles if self.report else None
 
     @property
@@ -208,7 +208,7 @@ class Posterior:
 
     @property
     def entropy(self) -> float:
-        """Entropy in bits: 0 if one cell is certain, log2 of the number of cells if all are alike."""
+        """Entropy in bits: 0 if one cell is certain, log2 of the number of cells if all are equally probable."""
         import numpy as np
 
         likely = self.values[self.values > 0] / self.values.sum()
@@ -224,7 +224,7 @@ class Posterior:
         return float(np.abs(self.values - other.values).sum() / 2)
 
     def marginal(self, *labels: str) -> "NDArray[np.float64]":
-        """Return the marginal posterior of some of the searched variables, without repetition.
+        """Return the marginal posterior of some searched variables; each may be named once.
 
         The float64 array has one dimension for each label, in the order given.
 
@@ -281,7 +281,7 @@ class Posterior:
         return as_html(self.axes, self.values, facts)
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw bars for one dimension, or a map of the two longest, over which the others are summed out.
+        """Draw bars for one dimension; for more, draw a map of the two longest, and sum over the others.
 
         Args:
             axes: matplotlib's Axes to draw in; without them, pyplot makes a figure, which a notebook shows.
@@ -336,9 +336,9 @@ def samples_layout(samples: int, sample_bytes: int) -> dict[str, Any]:
 def read_samples(message: dict[str, Any], sizes: Sequence[int] = (), newest: int = 0) -> "NDArray[np.int64]":
     """Return the sampled states in a message on `/bm/samples` as values of variables, int64[samples, variables].
 
-    `sizes` are the variables' numbers of values, in the order of the machine; a value of at least its size is an unused
-    code. Without sizes, return the states' machine words, int64[samples, words]. If `newest` is not 0, return at most
-    that many samples, the newest.
+    `sizes` has the number of values of each variable, in the order of the machine; a sampled value that is not below it
+    is an unused code. Without sizes, return the states' machine words, int64[samples, words]. If `newest` is not 0,
+    return at most that many samples, the newest.
 
     Raises:
         BadResultError: The message does not hold states of this machine.

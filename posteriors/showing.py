@@ -39,7 +39,7 @@ def _plane(axes: Sequence[Axis], values: NDArray[Any]) -> tuple[list[Axis], NDAr
 
 
 def as_html(axes: Sequence[Axis], values: NDArray[np.float64], facts: Iterable[str]) -> str:
-    """Return HTML with a table of the axes, facts and a picture, without scripts or styles, which viewers remove."""
+    """Return HTML with a table of the axes, a line of facts and a picture; viewers would remove scripts and styles."""
     best = np.unravel_index(values.argmax(), values.shape)
     rows = [
         (

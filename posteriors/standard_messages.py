@@ -53,7 +53,7 @@ class Plane(NamedTuple):
 
     @classmethod
     def of(cls, dimensions: Sequence[Dimension], *, square: bool = False) -> Self:
-        """Return the plane of a result's dimensions, or raise a ValueError: there is none, or none with `square` cells.
+        """Return the plane of a result's dimensions, or raise a ValueError: it has none, or the cells are not `square`.
 
         x and y are the variables of these names; with other names, the last one is x.
         """

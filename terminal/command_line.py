@@ -42,7 +42,7 @@ class CommandLine(typer.Typer):
     def add_later(self, name: str, module: str, *, purpose: str) -> None:
         """Add the command line `app` of a module as a subcommand; it is imported when the subcommand is named.
 
-        `MODULE:NAME` is a command of a group.
+        If that command line is a group, `MODULE:NAME` adds one of its commands.
         """
         module, _, part = module.partition(":")
 

@@ -20,7 +20,7 @@ from pydantic import BaseModel
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """What a field does not say of its flag: `names` other than `--field-name`, a word for the value, the default."""
+    """What a flag has besides its field: `names` other than `--field-name`, a word for the value, a default text."""
 
     names: tuple[str, ...] = ()
     metavar: str | None = None
@@ -37,19 +37,19 @@ class Group:
 
 
 def field_flag(model: type[BaseModel], name: str) -> Flag:
-    """Return the flag of a field."""
+    """Return the `Flag` in the annotation of a model's field, or an empty one."""
     found = [each for each in model.model_fields[name].metadata if isinstance(each, Flag)]
     return found[0] if found else Flag()
 
 
 def default_of(model: type[BaseModel], name: str) -> str:
-    """Return the default of a field in words; empty if there is none."""
+    """Return the default of a model's field as text; empty if there is none."""
     default = model.model_fields[name].default
     return field_flag(model, name).otherwise or ("" if default in (None, False, ()) else str(default))
 
 
 def flags_of(model: type[BaseModel], names: Sequence[str], *, prefix: str) -> list[inspect.Parameter]:
-    """Return the flags of fields. An omitted flag is None: then a variable `PREFIX...` applies, or the default."""
+    """Return the flags of a model's fields. An omitted flag is None: its variable `PREFIX...` or default applies."""
     return [_flag_of(model, name, f"{prefix}{name.upper()}") for name in names]
 
 

@@ -44,7 +44,7 @@ def status_socket(directory: str | os.PathLike[str], name: str) -> str:
 
 
 def read_status(path: str, timeout: float) -> bytes:
-    """Return the answer at a status socket; a NoHealthError if it takes `timeout` seconds, or `ANSWER_LIMIT` bytes."""
+    """Return the answer at a status socket; a NoHealthError after `timeout` seconds or more than `ANSWER_LIMIT` bytes."""
     deadline = time.monotonic() + timeout
     data = bytearray()
     with silence_explained(path, timeout), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
@@ -61,7 +61,7 @@ def read_status(path: str, timeout: float) -> bytes:
 
 @contextlib.contextmanager
 def silence_explained(path: str, timeout: float) -> Iterator[None]:
-    """Within the context, turn an OSError or a TimeoutError of a query into a NoHealthError with its reason."""
+    """Within the context, turn an OSError or a TimeoutError into a NoHealthError that says why no answer came."""
     try:
         yield
     except TimeoutError:

@@ -27,7 +27,7 @@ FORMAT_VARIABLE: Final = "BM_LOG_FORMAT"
 
 _CLEAR_LINE: Final = "\r\x1b[K"
 _QUOTED: Final = frozenset(" \t=\r\n\"'")
-"""Characters that would end a value in a text line, or look like the next field."""
+"""A value with one of these characters is quoted: they would end it in a text line, or begin another field."""
 
 
 class _Process:

@@ -55,7 +55,7 @@ def show_progress(text: str) -> None:
 
 @contextlib.contextmanager
 def say_if_slow(text: str, *, after_s: float = 2.0) -> Iterator[None]:
-    """Print one line for the user if the block takes longer than `after_s`."""
+    """Print one line for the user if the context lasts longer than `after_s`."""
     timer = threading.Timer(after_s, say, (text,))
     timer.daemon = True
     timer.start()

@@ -30,7 +30,7 @@ _PR_SET_NAME: Final = 15
 
 
 def own_command(name: str) -> list[str]:
-    """Return the command line of one of our commands in this environment; a path is used unchanged.
+    """Return the command line of one of our commands in this environment; a `name` that is a path stays as it is.
 
     PATH is not searched, because other software has commands of the same names.
     """
@@ -77,7 +77,7 @@ class Forked:
 
 
 def fork(run: Callable[[], NoReturn]) -> Forked:
-    """Run a function in a forked process. The function starts with the ending signals blocked, and must exit."""
+    """Run a function in a forked process. At its start `ENDING_SIGNALS` are blocked; it must not return, but exit."""
     # until the child has handlers of its own, a signal would reach the event loop of this process instead
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
     pid = os.fork()
@@ -99,7 +99,7 @@ def fork_command(
     """Run one of our commands in a fork of this process, which has most of its modules already.
 
     It runs as if it had been executed: in its own session, without standard input, and with no open descriptors but
-    `output` (None: /dev/null), `errors` and those in `kept`.
+    `output` (/dev/null if None), `errors` and those in `kept`.
     """
     return fork(partial(_run_command, name, arguments, output, errors, kept, variables or {}))
 
@@ -138,7 +138,7 @@ def _run_command(
         _show_command(
             name, [sys.executable, *(word for word in command if word != sys.executable), *arguments]
         )
-        # by its name, as its script does: only the entry point knows all commands
+        # by its name, as its executable does: only the entry point knows all commands
         getattr(import_module("rosbayes.start"), name.replace("-", "_"))()
     except BaseException:
         traceback.print_exc()
@@ -175,7 +175,7 @@ class Process:
         self._news = asyncio.Event()
 
     async def start(self, *command: str) -> None:
-        """Start the process in its own session, so that Ctrl-C reaches only the script."""
+        """Start the process in its own session, so that Ctrl-C reaches only the process that starts it."""
         if self._forks:
             reading, writing = os.pipe()
             self._process = fork_command(command[0], command[1:], output=writing, errors=writing)
@@ -217,7 +217,7 @@ class Process:
         self._news.set()
 
     async def line(self, pattern: str) -> re.Match[str]:
-        """Wait for a line that matches.
+        """Wait for a line that matches `pattern`.
 
         Raises:
             ProcessError: The process ended before it printed such a line.

@@ -41,7 +41,7 @@ def default_run_directory() -> Path:
 
 
 def run_directory(given: Path | None) -> Path:
-    """Return the given directory, or create this user's; raise an OutputError if the latter is not private."""
+    """Return `given`, or without it create this user's directory; raise an OutputError if that is not private."""
     if given is not None:
         return given.absolute()
     path = default_run_directory()

@@ -52,7 +52,7 @@ def _stop(number: int, _frame: object) -> None:
 
 
 def _report_dropped(dropped: sys.UnraisableHookArgs) -> None:
-    """Report an exception that Python drops; `check_signals` raises those of signals again instead."""
+    """Report an exception that Python drops, except for one of a signal, which `check_signals` raises again."""
     if not isinstance(dropped.exc_value, StoppedError):
         sys.__unraisablehook__(dropped)
 
@@ -110,7 +110,7 @@ def run_async(main: Coroutine[Any, Any, int | None]) -> int:
         loop = asyncio.get_running_loop()
         for number in _ENDS:
             loop.add_signal_handler(number, stop, number)
-        # one that came before may have lost its exception, for example during an import
+        # the exception of an earlier signal may have been lost, for example during an import
         check_signals()
         task = asyncio.ensure_future(main)
         try:
