@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from machines.kind import MachineKind
 
 FAST_CODES_MAX: Final = 2**24
-"""Maximum number of codes over all columns (columns * 2**prob_bits) for the fast kernel, which has a table of them."""
+"""Maximum of columns * 2**prob_bits for the fast kernel, which has a table with an entry for each code of a column."""
 
 
 def make_kernel(machine: "BM1Machine", *, boards: int = 1) -> "BM1Kernel":
-    """Return the fastest kernel that can run the machine; `boards` kernels of a process share one bounded cache."""
+    """Return the fastest kernel that can run the machine; if a process has `boards` kernels, each caches less."""
     parameters = machine.parameters
     codes = parameters.columns << parameters.prob_bits
     if parameters.shared and parameters.rng.lfsr_bits is not None and codes <= FAST_CODES_MAX:
@@ -68,7 +68,7 @@ def _bm2() -> "MachineKind":
 
 
 KINDS: Final[dict[str, Callable[[], "MachineKind"]]] = {"BM1": _bm1, "BM2": _bm2}
-"""Functions that import and return a kind of machine, by name; they need NumPy, which the subscriber must not load."""
+"""By name, functions that import and return a kind of machine: kinds need NumPy, which not every process loads."""
 
 
 def kind_of(parameters: object) -> "MachineKind":

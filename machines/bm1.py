@@ -35,7 +35,7 @@ class MachineContents:
         return same_parameters and all(map(np.array_equal, self.arrays, other.arrays))
 
     def __hash__(self) -> int:
-        # equal machines have equal ones
+        # equal machines have equal parameters
         return hash(self.parameters)
 
 
@@ -96,7 +96,7 @@ class BM1Machine(MachineContents):
 
 
 SHORTEST_SLICE: Final = 256
-"""Minimum end of the first slice, in cycles. Each later slice ends at twice the cycle of the previous slice's end."""
+"""Minimum end of the first slice, in cycles. Each later slice ends at twice the cycle at which the one before ended."""
 
 
 def first_slice(target_count: int) -> int:

@@ -50,7 +50,7 @@ class BM1Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM1Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the sections of the prior, of each column (a MIF of the thesis), and of a table of random numbers."""
+        """Yield the prior's section, one for each column (each a MIF of the thesis), and one for any random numbers."""
         yield "prior", "<u2", (parameters.prior_addresses, parameters.lines)
         if parameters.has_tables:
             for column, bits in enumerate(parameters.sensor_bits, start=1):
@@ -64,7 +64,7 @@ class BM1Kind(MachineKind):
         return BM1Machine(parameters, sections["prior"], columns, sections.get("rng"))
 
     def registers(self, parameters: BM1Parameters) -> UsedRegisters:
-        """Return the registers; INPUTS replaces SENSORS for several machines or inputs per cell."""
+        """Return the registers; INPUTS replaces SENSORS for several replicas or inputs per cell."""
         inputs, results = math.prod(parameters.input_shape), math.prod(parameters.count_shape)
         size = f"{parameters.sensors} sensors and {parameters.lines} lines"
         if not _is_plain(parameters):
@@ -107,7 +107,7 @@ class BM1Kind(MachineKind):
         )
 
     def contents(self, machine: BM1Machine) -> Blocks:
-        """Return the widths of the columns, and the prior that a host may overwrite."""
+        """Return the address widths of the sensor columns, and the codes of a prior that a host may overwrite."""
         parameters = machine.parameters
         # a machine with inputs per cell can have more sensors than fit into the registers
         contents = {"CAP_SENSOR_BITS": bytes(parameters.sensor_bits[:_SENSOR_BITS_MAX])}
@@ -128,7 +128,7 @@ class BM1Kind(MachineKind):
         return _OnHost(machines)
 
     def joint_reason(self, reasons: Sequence[int]) -> int:
-        """Return one stop reason for replicas: SLICE if all of them overflowed only on other boards."""
+        """Return one stop reason for replicas: SLICE if all were halted because they overflowed on other boards."""
         joint = joint_reason([StopReason(reason) for reason in reasons], range(len(reasons)))
         return joint if joint is not StopReason.NONE else StopReason.SLICE
 
@@ -176,7 +176,7 @@ BM1: Final = BM1Kind()
 
 
 def _is_plain(parameters: BM1Parameters) -> bool:
-    """Return whether a single machine has one input per column."""
+    """Return whether the board has a single machine, with one input per column."""
     return parameters.replicas == 1 and parameters.sensor_mode is SensorMode.COLUMN
 
 
@@ -309,7 +309,7 @@ class _OnHost(HostMachine):
     """Encoder of frames for each board, which checks them against the whole machine."""
 
     def __init__(self, machines: Sequence[BM1Machine]) -> None:
-        # the boards differ in their lines and priors alone, so one has the parameters of all
+        # the boards differ in their lines and priors alone: what is used of the first one's parameters holds for all
         self._machines = tuple(machines)
         self._parameters = machines[0].parameters
         self._replicas = self._parameters.replicas
@@ -372,7 +372,11 @@ class _OnHost(HostMachine):
         return self._sensor_words.pack(*words)
 
     def _prior_selects(self, frame: FrameInput) -> tuple[int, bytes]:
-        """Return the prior's address (of several, one out of range if there is any), and the words of PRIOR_SELECTS."""
+        """Return the prior's address and the words of PRIOR_SELECTS.
+
+        If replicas have their own addresses, the first result is the largest, or if any is negative, the smallest: the
+        caller checks only this one.
+        """
         given = frame.prior_address
         if isinstance(given, tuple):
             if self._replicas == 1 or len(given) != self._replicas:
@@ -389,7 +393,7 @@ class _OnHost(HostMachine):
         return worst, np.array(given, dtype="<u4").tobytes() if fits else b""
 
     def _input_words(self, inputs: npt.NDArray[np.integer]) -> list[bytes]:
-        """Return the words of INPUTS for each board; with inputs per cell, only the inputs of its lines."""
+        """Return the words of INPUTS for each board; with inputs per cell, a board gets only those of its lines."""
         parameters = self._parameters
         per_cell = parameters.sensor_mode is not SensorMode.COLUMN
         replicas, sensors, lines = self._replicas, parameters.sensors, self._total_lines

@@ -29,10 +29,10 @@ STATE_BITS_MAX: Final = 2048
 """Maximum number of bits of the state: the register map has 64 words for a state."""
 
 FACTOR_BITS_MAX: Final = 20
-"""Maximum number of bits of all variables of a factor: then its table has 20 * 2**19 codes, or 20 MB."""
+"""Maximum number of bits of a factor's variables together; a factor of 20 bits has 20 * 2**19 codes, or 20 MB."""
 
 RESULT_WORDS_MAX: Final = 4096
-"""Maximum number of words of histograms and joint together: the register map's memory for results."""
+"""Maximum number of words of all histograms, with that of the joint: the size of RESULTS in the register map."""
 
 CHAINS_MAX: Final = 65536
 """Maximum number of boards that run chains of one model."""
@@ -47,7 +47,7 @@ FACTOR_VARIABLES_MAX: Final = 32
 """Maximum number of variables of a factor: its array has an axis for each."""
 
 SEARCH_MAX: Final = 150_000
-"""Maximum work, without a unit, of the search for a start state; this much takes about a second."""
+"""Maximum work of the search for a start state, in units of its own; this much takes about a second."""
 
 
 class BM2StopReason(IntEnum):
@@ -64,23 +64,27 @@ class BM2StopReason(IntEnum):
     IMPOSSIBLE = 4
     """The start had 0 samples (no state agrees with the evidence), so the machine did not run."""
     OPS_TIMEOUT = 5
-    """The CDEs of a bit did not agree within `ops_timeout` cycles of a move."""
+    """The CDEs whose factor has a bit did not agree on the bit within the `ops_timeout` cycles of a move."""
     FULL = 6
     """The stream's buffer is full; a resume empties it and continues."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BM2Parameters:
-    """Parameters of a BM2: bit-level Gibbs sampling in a product of factors, each of which has a CDE.
+    """Parameters of a BM2: bit-level Gibbs sampling in a product of factors.
+
+    Each factor has a conditional distribution encoder (CDE). In a move, the sequencer points at one or more bits of the
+    state, which are drawn anew. A sweep has as many moves as it takes to point at every unknown bit once.
 
     Attributes:
         cardinalities: Number of values of each variable, in the model's order.
         factors: Variables of each factor, in rising order; every variable is in a factor.
-        searched: Variables whose joint is counted, in the order of its axes (the first varies slowest).
-        known: Variables to which a frame's addresses belong, in the order of the addresses.
+        searched: Variables whose joint distribution is counted, in the order of its axes (the first varies slowest).
+        known: Variables whose values a frame may set, in the order of the frame's addresses.
         prob_bits: Bits of a code (W), 2 to 16.
-        sequencer: Default order of the sequencer.
-        literal: Whether all CDEs must agree, as the thesis draws it, or only those whose factor has the pointed bit.
+        sequencer: Default order in which the sequencer points at bits.
+        literal: True: a bit is written if all CDEs agree on it, as the thesis draws it. False: if those agree whose
+            factor has the bit.
         sample_every: Moves after which a sample is taken.
         burn_in: Default number of whole sweeps before the first sample.
         ops_timeout: Default maximum number of cycles of a move.
@@ -89,9 +93,9 @@ class BM2Parameters:
         rng_banks: Number of seed sets of each board; a start selects one.
         rng_reset: Whether a start restarts the generators.
         ideal_seed: Seed of the `ideal` generator, 64 bits.
-        chain: Number of this board.
-        chains: Number of boards; each runs a chain of its own.
-        stream: Number of samples that the stream's buffer holds; 0 for no stream.
+        chain: Index of this board, from 0.
+        chains: Total number of boards; each runs a chain of its own.
+        stream: Number of samples that the board can hold for the host to read (the stream); 0 for no stream.
 
     Raises:
         ParameterError: A machine with these parameters cannot be built.
@@ -223,13 +227,13 @@ class BM2Parameters:
 
     @property
     def joint_words(self) -> int:
-        """Number of words of the joint of the searched variables; 0 if there is no room for it after the histograms."""
+        """Number of words of the searched variables' joint histogram; 0 if it does not fit after the others."""
         words = 1 << sum(self.bits[variable] for variable in self.searched) if self.searched else 0
         return words if self.histogram_words + words <= RESULT_WORDS_MAX else 0
 
     @property
     def result_words(self) -> int:
-        """Number of words of histograms and joint."""
+        """Number of words of all histograms, with that of the joint."""
         return self.histogram_words + self.joint_words
 
     @property
@@ -300,8 +304,8 @@ class BM2Machine(MachineContents):
 
     Attributes:
         parameters: Variables, factors, widths and generators.
-        tables: One uint16[n * 2**(n - 1)] per CDE whose factor has n bits: the codes at the addresses
-            j * 2**(n - 1) + others, of the pointed local bit j and the other local bits.
+        tables: For each CDE, whose factor has n bits, a uint16[n * 2**(n - 1)]: the code with which the factor's bit j
+            is drawn is at j * 2**(n - 1) + v, where v consists of the values of its other n - 1 bits, in rising order.
         supports: One bool[cardinalities of the variables] per factor: True where the factor is not 0.
         rng_table: uint32[length], the random numbers for all CDEs if `rng` is `table`; otherwise None.
 
@@ -367,12 +371,12 @@ class BM2Start:
     Attributes:
         state: The packed start state, with the evidence.
         known: Mask of the state bits of the known variables.
-        samples: Number of samples after which the machine stops, 1 to 2**32 - 1; 0 if there is no start state.
+        samples: Number of samples after which the machine stops, 1 to 2**32 - 1; 0 if no state fits the evidence.
         burn_in: Whole sweeps before the first sample.
         ops_timeout: Maximum number of cycles of a move.
         max_cycles: The frame's last cycle.
         bank: Set of seeds from which the generators restart (`rng_reset` = `bank`); free generators ignore it.
-        sequencer: Order of the sequencer.
+        sequencer: Order in which the sequencer points at bits.
     """
 
     state: int
@@ -386,11 +390,12 @@ class BM2Start:
 
 
 def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np.uint16]:
-    """Return the codes of a CDE, which stand for the odds factor(bit = 1) / factor(bit = 0) of each pointed bit.
+    """Return a CDE's table (`BM2Machine.tables`): codes of the odds factor(bit = 1) / factor(bit = 0) of each bit.
 
-    If a cardinality is no power of two, some codes are unused. Between a used and an unused code, the odds favour the
-    used one as far as a code can; if both are unused, or another variable is at an unused code, the odds are 1. The
-    factor is float64[cardinalities of the variables]; the result for n bits is uint16[n * 2**(n - 1)].
+    If a cardinality is no power of two, some codes of the variable stand for no value. Between a used and an unused
+    code, the odds favour the used one as far as a code can; if both are unused, or another variable is at an unused
+    code, the odds are 1. The factor is float64[cardinalities of the variables], for n bits the result is
+    uint16[n * 2**(n - 1)].
     """
     # NaN at unused codes: what is computed with one is NaN, too
     padded = np.full([1 << (cardinality - 1).bit_length() for cardinality in factor.shape], np.nan)
@@ -402,7 +407,7 @@ def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np
         with np.errstate(invalid="ignore"):
             code = np.floor((1 << prob_bits) * (one / (one + zero)) + 0.5)
         code = np.where(np.isnan(code), 1 << (prob_bits - 1), np.clip(code, 1, (1 << prob_bits) - 1))
-        # a code with the bit set is the larger one, so it alone can be the unused one of the two
+        # of two codes, the one with the bit set is larger, so only this one can be unused while the other is used
         tables.append(np.where(np.isnan(one) & ~np.isnan(zero), 1, code))
     return np.concatenate(tables).astype(np.uint16)
 
@@ -433,8 +438,8 @@ def unpack_all(cardinalities: tuple[int, ...], states: npt.NDArray[np.uint32]) -
 def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bool = False) -> int | None:
     """Return the lexicographically smallest (or largest) state of non-zero probability; variable 0 comes first.
 
-    The state agrees with the evidence, the values of the known variables; if no state does, the result is None. Boards
-    with odd numbers start from the largest state.
+    The state agrees with the evidence, the values of the known variables; if no state does, the result is None.
+    `largest` is for every second board: chains that start far apart show whether they mix.
 
     Raises:
         StartError: A value is out of range, or the search takes more than `SEARCH_MAX`.
@@ -444,7 +449,7 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
     for variable, value in evidence.items():
         check_start_value(f"The value of variable {variable}", value, 0, len(domains[variable]) - 1)
         domains[variable] = np.arange(len(domains[variable])) == value
-    # the factors with zeros, and their numbers for each variable
+    # the factors with zeros, and for each variable the indices in this list of those that have the variable
     zeros = [
         (scope, support)
         for scope, support in zip(parameters.factors, machine.supports, strict=True)
@@ -467,7 +472,7 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
 
     def propagate(domains: list[npt.NDArray[np.bool_]], changed: Sequence[int]) -> bool:
         """Remove values that a factor excludes, until nothing changes; return False if a variable has no value left."""
-        due = dict.fromkeys(changed)  # numbers of factors that have a variable whose domain has changed
+        due = dict.fromkeys(changed)  # indices of the factors in `zeros` that are yet to be looked at
         while due:
             at, _ = due.popitem()
             scope, support = zeros[at]
@@ -484,8 +489,8 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
                     due |= dict.fromkeys(other for other in of_variable[variable] if other != at)
         return True
 
-    # Values that are still to try, the next one last: the domains, a variable before which all have one value, and
-    # its value. The first complete state is the answer, since variables and values are tried in order.
+    # Choices that are still to try, the next one last: the domains before the choice, a variable (all before it have a
+    # single value), and the value to try. Choices are tried in order, so the first complete state is the answer.
     left: list[tuple[list[npt.NDArray[np.bool_]], int, int]] = []
     changed: Sequence[int] = range(len(zeros))
     variable = 0

@@ -30,11 +30,11 @@ from machines.vectors import VECTOR, aligned, below, first_one, first_ones, in_l
 
 SLICE: Final = 512  # chains in a vector
 SLICED_MIN: Final = 64  # chains to be sliced; fewer are faster in step
-UNKNOWN_MAX: Final = 5  # unknown bits of sliced chains, of which each state but one has a counter
+UNKNOWN_MAX: Final = 5  # unknown bits of chains to be sliced; each of their joint values but 0 has a counter
 CYCLES: Final = 8  # cycles of sliced chains whose random bits are made together
-LOW_PLANES: Final = 3  # a counter's lowest bits; they overflow at most once in `CYCLES` cycles
+LOW_PLANES: Final = 3  # lowest bits of a counter; together they overflow at most once in `CYCLES` cycles
 LANES: Final = 8  # chains in step that share a vector, a word each
-PARTS: Final = 2  # such vectors; the numbers of more chains would not fit a core's cache
+PARTS: Final = 2  # such vectors; the random numbers of more chains would not fit into a core's cache
 IN_STEP: Final = PARTS * LANES
 
 
@@ -55,12 +55,11 @@ class ChainResult:
 class _Circuit(NamedTuple):
     """The operations of a cycle of sliced chains."""
 
-    unknown: Integers  # the unknown bits; a place is one in this array
-    cdes: Integers  # [pairs of contexts]
+    unknown: Integers  # the unknown bits of the state; a bit's place is its index in this array
+    cdes: Integers  # [pairs of contexts]: the CDE of each
     masks: Words  # [pairs, prob_bits, 2]: the bits of the contexts' codes, each as a word of 64
-    entries: (
-        Integers  # [entries, 3 + n]: a bit's place, a CDE's first context, number and places of context bits
-    )
+    # [entries, 3 + n]: a bit's place, a CDE's first context, and number and places of the context bits
+    entries: Integers
 
 
 # Cycles, states and results of some chains; the results' last row counts the samples with an unused code.
@@ -131,7 +130,7 @@ class Chains:
         parts: list[_Ran] = []
         size = SLICE if circuit else IN_STEP
         for at in range(0, count, size):
-            # the last chain fills the rest of the last part
+            # copies of the last chain fill the rest of the last part
             lanes = [min(at + lane, count - 1) for lane in range(size)]
             given = moves, first, [starts[lane].state for lane in lanes], seeds[lanes]
             part = self._run_slice(circuit, *given) if circuit else self._run_in_step(*given)
@@ -292,8 +291,9 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
 ) -> bool:
     """Run sliced chains to their ends, and set `ends`; return False if a chain may reach a limit before that.
 
-    `counts` has a counter of sweeps, which overflows at the end of the burn-in and of the chain, and counters of
-    samples for each state but 0. `room` is working space: for the contexts' bits or a sample's events, and for carries.
+    Of the vectors, `counts` has a counter of sweeps, which overflows at the end of the burn-in and of the chain, and a
+    counter of samples for each state but 0. `room` is working space: for the contexts' bits or a sample's events, and
+    for carries.
     """
     numbers, values, pointed, counts, room = vectors
     burn_in, samples, max_cycles, window, steps = limits
@@ -430,8 +430,8 @@ def run_in_step(  # noqa: PLR0915 - vectors are not passed to functions
 ) -> bool:
     """Run chains in step until their samples are drawn; return False if a chain may reach a limit before that.
 
-    The rows of `clock` are, for each chain, the place of its next cycle in `numbers`, the place where its block ends,
-    and the number of the block's first cycle.
+    `numbers` are random numbers. Of the vectors, `clock` has three rows with a value for each chain: the place of its
+    next cycle in `numbers`, the place where its block of cycles ends, and the block's first cycle.
     """
     values, addresses, results, clock, room = vectors
     burn_in, samples, max_cycles, ops_timeout = limits

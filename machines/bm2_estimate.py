@@ -25,8 +25,9 @@ class BoardSamples:
 
     Attributes:
         reason: Its last stop reason.
-        counts: uint32[batches, values], the counts of the searched joint after each batch, since the frame's start.
-        values: int[samples], the searched value of each sample, -1 for an unused code; None without a stream.
+        counts: uint32[batches, values], for each joint value of the searched variables the samples that had it, counted
+            from the frame's start to the end of each batch.
+        values: int[samples], the index of each sample's joint value, -1 for an unused code; None without a stream.
     """
 
     reason: BM2StopReason
@@ -39,13 +40,13 @@ class ChainEstimate:
     """The estimate of a frame from the chains of all boards.
 
     Attributes:
-        posterior: float64[values] of the searched joint; None if all boards are left out.
-        error: float64[values], the posterior's standard error; NaN where the effective samples are unknown, unless
-            boards disagree.
+        posterior: float64[values], over the joint values of the searched variables; None if all boards are left out.
+        error: float64[values], the posterior's standard error; NaN where the effective samples are unknown. If boards
+            disagree, it is at least that of the mean of the boards' posteriors.
         effective_samples: Sum over the boards, for the value with the smallest sum; NaN if unknown, for example if
             all samples of a board have the same value.
-        r_hat: The largest R-hat of all values; NaN for a single board, or if it is unknown.
-        left_out: Numbers of the boards that are left out, because they timed out or have no sample.
+        r_hat: The largest R-hat of all values; NaN for a single board, or if a board has too few samples.
+        left_out: Indices of the boards that are left out, because they timed out or have no sample that counts.
     """
 
     posterior: Floats | None
@@ -56,10 +57,10 @@ class ChainEstimate:
 
 
 def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
-    """Return the counts of the searched joint's values, row-major: integers[..., product of the cardinalities].
+    """Return the counts of the searched variables' joint values, row-major: integers[..., product of cardinalities].
 
-    The results are integers[..., result_words]. Without a joint in them, only one variable may be searched: then its
-    histogram has the counts.
+    The results are integers[..., result_words]. If they have no joint histogram, only one variable may be searched: its
+    own histogram has the counts.
     """
     first = parameters.histogram_words
     if not parameters.joint_words:
@@ -73,7 +74,10 @@ def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer])
 
 
 def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
-    """Return the searched value of each state in a stream, uint32[samples, state_words]; -1 for unused codes."""
+    """Return the index of each state's searched joint value; -1 if it has an unused code.
+
+    The stream is uint32[samples, state_words].
+    """
     codes = unpack_all(parameters.cardinalities, stream)
     values = np.zeros(len(stream), dtype=np.int64)
     for variable in parameters.searched:
@@ -108,7 +112,7 @@ def estimate(chains: Sequence[BoardSamples]) -> ChainEstimate:
             r_hat = float(split_r_hat(halves).max())
     error = standard_error(posterior, effective)
     if r_hat > AGREE:
-        # chains that have not mixed know no error of their own
+        # a chain that has not mixed cannot tell its error from its own samples
         means = [chain.counts[-1] / chain.counts[-1].sum() for chain in counted]
         error = np.fmax(error, np.sqrt(np.var(means, axis=0, ddof=1) / len(means)))
     return ChainEstimate(posterior, error, float(effective.min()), r_hat, left_out)

@@ -55,10 +55,10 @@ FULL, ROOM = int(BM2StopReason.FULL), 7
 class Wiring(NamedTuple):
     """A machine's tables and wiring."""
 
-    codes: npt.NDArray[np.uint16]  # of each entry, by all local bits; first twice the code 2**(prob_bits - 1)
+    codes: npt.NDArray[np.uint16]  # of each entry, by the factor's bits; first, twice 2**(prob_bits - 1)
     bits: Words  # [state bits, 4]: its variable, its place in the variable's code, and its entries
-    # [entries, 4]: a CDE that is compared for a bit: its first number, its place in `Chain.addresses` (a CDE that is
-    # not concerned has an unused one), its first code, and the pointed local bit
+    # [entries, 4]: a CDE that is compared for a bit: its first random number, its place in `Chain.addresses` (the
+    # unused one if its factor does not have the bit), its first code, and the place of the bit in the factor
     entries: Words
     exponents: Integers  # of the generators' polynomial
     clock: Words  # [1, bytes, 256]: a clock of the generators
@@ -81,11 +81,11 @@ class Chain(NamedTuple):
 
     control: Integers  # [13]
     values: Words  # [variables]: codes of the state
-    addresses: Words  # [CDEs + 1]: local bits of each factor; the last one is unused
+    addresses: Words  # [CDEs + 1]: values of each factor's bits; the last one is unused
     pending: Words  # [state bits]: bits of the move that are not yet written, in rising order
     numbers: npt.NDArray[
         np.uint16
-    ]  # [CDEs, block + CHUNK]: those of the cycles from ORIGIN on; the last are unused
+    ]  # [CDEs, block + CHUNK]: random numbers of the cycles from ORIGIN on; the last are unused
     results: Integers  # [result words]
     stream: npt.NDArray[np.uint32]  # [room, state words]
 
@@ -125,7 +125,7 @@ class FastBM2(BM2Kernel):
         """A copy of the generators' states: uint64[CDEs]."""
         # `start` sets the public number of cycles to 0 before free generators go on
         cycles = int(self._chain.control[ORIGIN] + self._chain.control[AT])
-        # `_states` are those in cycle 0 of the frame
+        # `_states` are the states in cycle 0 of the frame
         states = np.empty_like(self._states)
         jump(self._jumps, self._states, cycles % LFSR(self._parameters.rng).period, states)
         return states
@@ -178,19 +178,19 @@ class FastBM2(BM2Kernel):
 
 
 def warm_up() -> None:
-    """Compile the kernel, or load it from the cache."""
+    """Compile the kernel, or load it from numba's cache on disk."""
     parameters = BM2Parameters(cardinalities=(2,), factors=((0,),), stream=1)
     kernel = FastBM2(BM2Machine.from_factors(parameters, [[0.5, 0.5]]))
     kernel.start(BM2Start(state=0, known=0, samples=1, burn_in=0, ops_timeout=1000, max_cycles=1000))
 
 
 def row_size(parameters: BM2Parameters) -> int:
-    """Return how many random numbers are stored for each CDE: a block of 32 times the LFSR's bits, and a chunk."""
+    """Return how many random numbers are stored for each CDE: a block (32 for each bit of the LFSR) and a chunk."""
     return (POLYNOMIALS[parameters.rng][0] + 1) * CHUNK
 
 
 def load_state(parameters: BM2Parameters, state: int, values: Words, addresses: Words) -> None:
-    """Write the codes in a packed state to `values`, and the local bits of every factor to `addresses`."""
+    """Write the variables' codes in a packed state to `values`, and the bits of every factor to `addresses`."""
     values[:] = unpack(parameters, state)
     bits = parameters.bits
     for cde, factor in enumerate(parameters.factors):
@@ -280,7 +280,7 @@ _NUMBERS: Final = ir.VectorType(ir.IntType(16), CHUNK)
 
 
 def compared(builder: Any, numbers: Any, place: Any, code: Any) -> Any:
-    """Compare the numbers of a chunk with a code: bit i is 1 if `numbers[place + i]` is less."""
+    """Compare the random numbers of a chunk with a code: bit i is 1 if `numbers[place + i]` is less than the code."""
     chunk = builder.load(builder.bitcast(builder.gep(numbers, [place]), _NUMBERS.as_pointer()))
     chunk.align = 2
     less = builder.icmp_unsigned("<", chunk, repeated(builder, code, _NUMBERS))
@@ -292,7 +292,7 @@ less_in_chunk: Final = in_llvm(types.uint64, None, types.int64, types.uint16)(co
 
 @jit
 def fill(wiring: Wiring, numbers: npt.NDArray[np.uint16], generators: Words, ones: int) -> None:
-    """Compute the first block of a chain's numbers."""
+    """Compute the first block of a chain's random numbers."""
     exponents = wiring.exponents
     for cde in range(generators.shape[0]):
         state = generators[cde]
@@ -308,7 +308,7 @@ def fill(wiring: Wiring, numbers: npt.NDArray[np.uint16], generators: Words, one
 
 @jit
 def refill(exponents: Integers, numbers: npt.NDArray[np.uint16], first: int, rows: int) -> None:
-    """Replace a chain's `rows` rows of numbers by the next block's; the rows begin at vector `first` of `numbers`."""
+    """Replace a chain's random numbers, `rows` rows from vector `first` of `numbers` on, by those of the next block."""
     top, near = exponents[0], exponents[2] == 2  # then the exponents are 32, 22, 2 and 1
     for row in range(first, first + rows * (top + 1), top + 1):
         last, older = load(numbers, row + top - 1), load(numbers, row + top - 2)

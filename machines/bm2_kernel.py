@@ -23,7 +23,7 @@ class BM2Kernel(ABC):
         self.machine = machine
         self._parameters = machine.parameters
         self._random_numbers = random_numbers(machine)
-        # the states of the generators and that of the sequencer's, computed once for each bank
+        # the states of the CDEs' generators and of the sequencer's generator, computed once for each bank
         self._seeds = cache(
             lambda bank: (self._random_numbers.restart(bank), sequencer_seed(self._parameters, bank))
         )
@@ -58,7 +58,7 @@ class BM2Kernel(ABC):
 
     @property
     def results(self) -> npt.NDArray[np.uint32]:
-        """A copy of the result words: uint32[result_words], histograms, then the joint."""
+        """A copy of the result words, uint32[result_words]: each variable's histogram, then that of the joint."""
         return self._results.astype(np.uint32)
 
     @property

@@ -63,7 +63,7 @@ class BM2Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM2Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the sections of each CDE, of each factor's non-zero entries, and of any table of random numbers."""
+        """Yield a section for each CDE, one for each factor's non-zero entries, and one for any random numbers."""
         for at in range(parameters.cdes):
             bits = len(parameters.factor_bits(at))
             yield f"cde {at}", "<u2", (bits << bits >> 1,)
@@ -134,7 +134,7 @@ class BM2Kind(MachineKind):
         return _OnHost(machines)
 
     def infer(self, results: Sequence[BoardResult], variables: Sequence[str] = ()) -> Inference:
-        """Return the posterior of all chains; those that timed out are left out, and named in the details."""
+        """Return the posterior of all chains; the details name those left out: timed out, or without a sample."""
         chains, every = [], [_kept(board) for board in results]
         if len({(kept.parameters.cardinalities, kept.parameters.searched) for kept in every}) > 1:
             raise MachineError("The results of the boards are those of different models.")
@@ -174,7 +174,7 @@ class BM2Kind(MachineKind):
         if left_out:
             details["left_out"] = left_out
         outcome = "posterior"
-        # their samples depend on how long the moves took
+        # the samples of these boards depend on how long the moves took
         early = [at for at, board in enumerate(results) if board.reason == BM2StopReason.MAX_CYCLES]
         if early:
             details["ended_early"] = ", ".join(f"board{number}" for number in early)
@@ -229,7 +229,7 @@ def _start_of(
 
 
 def kernels_of(machines: Sequence[BM2Machine]) -> list[BM2Kernel]:
-    """Return the kernels for `run_batches`. They have no stream, which would not change the samples."""
+    """Return kernels for `run_batches`, without streams, which would not change the samples."""
     return [
         make_bm2_kernel(replace(machine, parameters=replace(machine.parameters, stream=0)))
         for machine in machines
@@ -257,12 +257,12 @@ def run_batches(kernels: Sequence[BM2Kernel], frame: FrameInput) -> list[BoardRe
 
 
 def _batch_ends(samples: int, batches: int = BATCHES) -> list[int]:
-    """Return the number of samples after which each batch ends; few samples have fewer batches."""
+    """Return the number of samples after which each batch ends; with few samples there are fewer batches."""
     return sorted({samples * (at + 1) // batches for at in range(batches)} - {0}) or [0]
 
 
 class _OnBoard(BoardMachine):
-    """A kernel that reads start state, mask and settings from a board's blocks, and writes the blocks of its answer."""
+    """A kernel that reads start state, known bits and settings from a board's blocks, and writes its answer there."""
 
     def reset(self) -> None:
         self._kernel.reset()
@@ -313,7 +313,7 @@ class Kept(msgspec.Struct, array_like=True):
     Attributes:
         samples: Number of samples drawn so far.
         unused: Number of samples that no histogram counts.
-        timed_out_bit: The bit on which the CDEs did not agree; -1 for none.
+        timed_out_bit: The state bit on which the CDEs did not agree in time; -1 for none.
         batches: Without a stream, the result words at the end of each batch; in a `BoardResult`, the last batch's
             are left out.
         stream: The sampled states, `state_words` words each.
@@ -386,7 +386,7 @@ class _Course(FrameCourse):
     def proceed(
         self, reasons: Sequence[Sequence[int]], answers: Sequence[memoryview]
     ) -> tuple[Sequence[int], Blocks]:
-        """Resume the boards whose streams are full, and for the next batch those that have drawn all samples."""
+        """Resume boards whose stream is full, and for the next batch those that have drawn the samples of this one."""
         going = {BM2StopReason.FULL} if not self._targets else {BM2StopReason.FULL, BM2StopReason.SAMPLES}
         for number in self._running:
             self._kept[number].add(answers[number])
@@ -471,7 +471,7 @@ class _OnHost(HostMachine):
         try:
             ends = [start_state(self._machines[0], evidence, largest=largest) for largest in (False, True)]
         except StartError as error:
-            return str(error)  # remembered, too: a long search is not made again
+            return str(error)  # remembered, too, so that a long search is not repeated
         size = 4 * parameters.state_words
         words = [b"" if end is None else end.to_bytes(size, "little") for end in ends]
         common = {**self._blocks, "KNOWN_MASK": known.to_bytes(size, "little")}

@@ -79,7 +79,7 @@ class ReferenceBM2(BM2Kernel):
         return reason
 
     def _stochastic_bits(self, bit: int, random: list[int]) -> set[int]:
-        """Return the set of bits that the compared CDEs make for a pointed bit: one element if they agree."""
+        """Return the set of values (0, 1) that the compared CDEs make for a pointed bit: one value if they agree."""
         concerned = self._concerned[bit]
         bits = {int(random[cde] < self._code(cde, bit)) for cde in concerned}
         if self._parameters.literal:
@@ -88,7 +88,7 @@ class ReferenceBM2(BM2Kernel):
         return bits
 
     def _code(self, cde: int, bit: int) -> int:
-        """Return the code in a CDE's table for the pointed local bit, at the values of the factor's other bits."""
+        """Return the code in a CDE's table for a bit of its factor, given the values of the factor's other bits."""
         local_bits = self._factor_bits[cde]
         others = [self._state >> other & 1 for other in local_bits if other != bit]
         address = local_bits.index(bit) << len(others) | sum(value << at for at, value in enumerate(others))

@@ -37,7 +37,7 @@ from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
 from machines.rng import LFSR, LFSRNumbers, Words, jump_tables
 
 KEPT_BYTES: Final = 64 * 2**20
-"""Maximum size of a machine's cache in bytes; the operating system allocates only the part in use."""
+"""Maximum size in bytes of the cache of a machine's words; the operating system allocates only the part in use."""
 
 KEPT_CYCLES: Final = 2**17
 """Number of a frame's first cycles whose words may be cached."""
@@ -49,7 +49,8 @@ PREPARED_CYCLES: Final = 2**14
 class FastBM1(BM1Kernel):
     """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4).
 
-    It keeps words between frames, at most `kept_bytes`; with 0 it computes them for each frame.
+    Words are kept between frames (at most `kept_bytes`) if frames restart from a bank; otherwise, or if not even a block
+    for every bank fits, each frame computes its own.
 
     Raises:
         MachineError: The generators of the machine are not LFSRs, or are not shared.
@@ -175,7 +176,7 @@ class FastBM1(BM1Kernel):
                 self._reasons[replica] = StopReason.SLICE
 
     def _free_rows(self) -> None:
-        """Free the rows, with their words, that the last frame was assigned; the rows of the cache remain."""
+        """Free the rows of words that were assigned for the last frame only; cached rows remain."""
         if not self._rows:
             return
         assigned = self._store.row_column[: self._rows], self._store.row_code[: self._rows]
@@ -198,8 +199,8 @@ class FastBM1(BM1Kernel):
 
 
 def warm_up() -> None:
-    """Compile the kernel, or load it from the cache: about 5 s the first time, then 0.2 s."""
-    # the generator that builds choose, whose tables are cached, too
+    """Compile the kernel, or load it from numba's cache on disk: about 5 s the first time, then 0.2 s."""
+    # with the generator that a build chooses by default, because its tables are then cached, too
     parameters = BM1Parameters(lines=1, sensor_bits=(), rng=RngKind.LFSR32)
     kernel = FastBM1(BM1Machine(parameters, np.full((1, 1), 128, dtype=np.uint16), ()))
     kernel.start(Start(addresses=(), target_count=2, max_cycles=2, run_until=1))

@@ -126,13 +126,13 @@ class UsedRegisters:
 
     Attributes:
         lines: Lines of the model on the board.
-        part: Number of the board, and number of all boards, if the parameters contain them; otherwise None.
+        part: Index of the board, and number of boards, if the parameters contain them; otherwise None.
         replicas: Machines on the board.
         inputs: Name of the block of inputs.
         input_words: Number of input words of all replicas.
         result_words: Number of words of the block RESULTS, for all replicas.
         written: Number of words of each other block that a host may write, by name.
-        answer: Number of words of each block that a stopped board sends, by name: RESULTS, then others.
+        answer: Number of words of each block that a stopped board sends, by name, in this order; RESULTS is the first.
         capabilities: Values of the capability registers (`CAP_LINES`) or their fields (`CAP_MACHINE.KIND`), by name.
         size: The size of the machine, described for a user.
     """
@@ -206,9 +206,9 @@ class FrameCourse(ABC):
 
     Attributes:
         starts: For each board the blocks to write before the start.
-        settings: The settings of the slice, for all boards.
-        begun: Cycle after which the slice begins.
-        end: Last cycle of the slice; 0 if it ends with the frame.
+        settings: The settings of the present slice, for all boards.
+        begun: Cycle after which this slice begins.
+        end: Last cycle of this slice; 0 if it ends with the frame.
     """
 
     starts: Sequence[Blocks]
@@ -227,7 +227,7 @@ class FrameCourse(ABC):
         """
 
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:
-        """Return the results of the frame, with what the course has stored of its slices in `BoardResult.kept`."""
+        """Return the frame's results, after adding to `BoardResult.kept` what the course has stored of its slices."""
         return results
 
 
@@ -304,7 +304,7 @@ class MachineKind(ABC):
         """Return the host's view of the machines of all boards, which are in the order of the partition."""
 
     def joint_reason(self, reasons: Sequence[int]) -> int:
-        """Return one stop reason for a board's replicas after a frame. Kinds without replicas have only one."""
+        """Return one stop reason for a board's replicas after a frame; without replicas, it is the only one."""
         return reasons[0]
 
     @abstractmethod

@@ -70,7 +70,7 @@ class SensorMode(StrEnum):
 
 
 class Sequencer(StrEnum):
-    """Orders in which the sequencer of a BM2 points at the unknown bits."""
+    """Orders in which a BM2 draws the unknown bits: rising, random, or one bit of each variable of a colour at once."""
 
     LINEAR = "linear"
     RANDOM = "random"
@@ -219,7 +219,7 @@ class BM1Parameters:
 
 
 def set_choices(parameters: object, **kinds: type[StrEnum]) -> None:
-    """Convert parameters, given by name in `kinds`, to members of their enumerations, or raise a ParameterError."""
+    """Convert the parameters that `kinds` names to members of these enumerations, or raise a ParameterError."""
     for name, kind in kinds.items():
         given = getattr(parameters, name)
         try:

@@ -1,9 +1,9 @@
 """The random number generators of a machine: seeds, steps and outputs.
 
-BM1 has one generator for each column, or for each cell if they are not shared; BM2 has one for each CDE. The
-number of a generator is its column or CDE, or line * columns + column for a cell; the numbers of seed set s
-begin at s times the number of generators. The state of a generator is one uint64, and a cell or CDE compares
-its code with the low `prob_bits` bits of the output.
+BM1 has one generator for each column, or for each cell if they are not shared; BM2 has one for each CDE. Each
+generator has a serial number: its column or CDE, or line * columns + column for a cell. In seed set s, s times the
+count of generators is added to it. The state of a generator is one uint64, and a cell or CDE compares its code with
+the low `prob_bits` bits of the output.
 """
 
 import math
@@ -60,12 +60,12 @@ def random_numbers(machine: BM1Machine | BM2Machine) -> RandomNumbers:
 
 
 def seed_set(parameters: RngParameters, bank: int) -> int:
-    """Return the number of a bank's set of seeds on this board; the boards of a BM2 never share a set."""
+    """Return the index of the seed set that a bank is on this board; the boards of a BM2 never share a set."""
     return bank * parameters.chains + parameters.chain
 
 
 def generator_numbers(parameters: RngParameters, bank: int) -> Words:
-    """Return the indices of a bank's generators among those of all banks and chains: uint64[`generator_shape`]."""
+    """Return the serial numbers of a bank's generators: uint64[`generator_shape`]."""
     count = math.prod(parameters.generator_shape)
     first = seed_set(parameters, bank) * count
     return np.arange(first, first + count, dtype=np.uint64).reshape(parameters.generator_shape)
@@ -110,10 +110,10 @@ class LFSR:
         return states
 
     def seeds(self, numbers: Words) -> Words:
-        """Return the initial states of the generators with these numbers.
+        """Return the initial states of the generators with these serial numbers.
 
         Their distances from a base state are scattered, not even: the states of 3, 5 or 17 columns at even
-        distances would XOR to 0, because these numbers divide 2**32 - 1. The AND of such columns is wrong
+        distances would XOR to 0, because 3, 5 and 17 divide 2**32 - 1. The AND of such columns is wrong
         however many cycles are run.
         """
         base = BASE_STATE & self.period or 1
@@ -126,7 +126,7 @@ def sequencer_seed(parameters: BM2Parameters, bank: int) -> int:
     return int(LFSR(RngKind.LFSR16).seeds(np.array([seed_set(parameters, bank)], dtype=np.uint64))[0])
 
 
-@lru_cache(1 << 12)  # 2 ms each, and the same for all boards of a deployment and most machines of a sweep
+@lru_cache(1 << 12)  # 2 ms each, and the same for all boards of a deployment and most of a design space
 def _seeds(kind: RngKind, first: int, count: int) -> Words:
     return LFSR(kind).seeds(np.arange(first, first + count, dtype=np.uint64))
 
@@ -158,7 +158,7 @@ class LFSRNumbers:
 class TableNumbers:
     """Generators that all repeat one table of recorded numbers; a state is an index.
 
-    Generator n of `count` starts at floor(n * length / count) in seed set 0. In seed set s of `sets`, it starts
+    In seed set 0, generator n of `count` starts at index floor(n * length / count). In seed set s of `sets`, it starts
     later by s / sets of the distance to the next generator's start.
     """
 
@@ -184,10 +184,10 @@ class TableNumbers:
 
 @dataclass(frozen=True, slots=True)
 class IdealNumbers:
-    """Nearly ideal generators, for comparison: splitmix64 of the seed and the numbers of generator and step.
+    """Nearly ideal generators, for comparison: splitmix64 of the seed, the generator and the step.
 
-    The state of generator n starts at mix(mix(`ideal_seed`) + (n + 1) * GOLDEN), a step adds GOLDEN, and the
-    output is mix(state), all modulo 2**64.
+    The state of the generator with serial number n starts at mix(mix(`ideal_seed`) + (n + 1) * GOLDEN). A step adds
+    GOLDEN, and the output is mix(state), all modulo 2**64.
     """
 
     parameters: RngParameters

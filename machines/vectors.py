@@ -64,7 +64,7 @@ _define(operator.rshift, "lshr", 2)
 
 
 def in_llvm(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that turns a function that writes LLVM code into a function for compiled code.
+    """Return a decorator for a function that writes LLVM code: it becomes a function that compiled code can call.
 
     `kinds` are the types of its arguments; None for any array, whose data's address is passed to the LLVM code.
     """
