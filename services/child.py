@@ -32,7 +32,7 @@ LONGEST_LINE: Final = 1 << 20
 """Maximum number of bytes of a line from a child; a longer one is passed on in pieces."""
 
 RESTARTS = 3
-"""A process may be restarted three times within the setting `restart_window`; then its master gives up."""
+"""Restarts of a process that are allowed within the setting `restart_window`; at one more, its master gives up."""
 
 
 def describe_exit(code: int | None) -> str:
@@ -128,7 +128,7 @@ class Child:
         self.restarts = 0
 
     async def start(self) -> None:
-        """Start it in its own session, which no Ctrl-C in a terminal reaches; a StackError if it is not installed."""
+        """Start the child in its own session, where no Ctrl-C reaches it; a StackError if it is not installed."""
         self.close()
         self._error = ""
         lines, reports = self._pipes = [_Pipe(lambda line: relay(line, self.name)), _Pipe(self._take_report)]
@@ -216,7 +216,7 @@ class Child:
         return ReportedError(ExitCode.CHILD, f"{self.name} {describe_exit(code)}")
 
     def may_restart(self, window: float) -> bool:
-        """Count a restart; return whether the limit within `window` seconds permits it."""
+        """Count the last exit; return whether the limit of exits within `window` seconds permits another start."""
         now = time.monotonic()
         self.restarts += 1
         self._ends.append(now)

@@ -44,7 +44,7 @@ def status_socket(directory: str | os.PathLike[str], name: str) -> str:
 
 
 def read_status(path: str, timeout: float) -> bytes:
-    """Return the answer at a status socket; a NoHealthError after `timeout` seconds or more than `ANSWER_LIMIT` bytes."""
+    """Return the answer at a status socket; a NoHealthError after `timeout` seconds or `ANSWER_LIMIT` bytes."""
     deadline = time.monotonic() + timeout
     data = bytearray()
     with silence_explained(path, timeout), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:

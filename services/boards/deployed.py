@@ -62,7 +62,7 @@ class DeployedBoards:
         return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
 
     def status(self, output: FrameOutput | None) -> list[BoardStatus]:
-        """Return the state of each board, with its cycles in the last output; may be called from another thread."""
+        """Return the state of each board, with its cycles in the last frame's `output`; any thread may call this."""
         # a copy, because the boards' thread changes it meanwhile
         gone = dict(self.gone)
         return [
@@ -96,7 +96,7 @@ class DeployedBoards:
 
     @property
     def awaited(self) -> int | None:
-        """File descriptor to watch until the next `collect`."""
+        """File descriptor that is readable when `collect` has something to read; None if no board is awaited."""
         return None if self._cluster is None else self._cluster.awaited
 
     @property
@@ -121,7 +121,7 @@ class DeployedBoards:
         # a board that only refused an access is still open
         lost = {} if self._cluster.is_open(error.board) else {error.board: error}
         for board in sorted(set(range(len(self._endpoints))) - {error.board, *self.gone}):
-            # only reopening tells whether it is alive
+            # only reopening a board tells whether it is alive
             try:
                 self._cluster.reopen(board, timeout=TICK)
             except BoardError as other:

@@ -18,7 +18,7 @@ _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(list[BoardResult])
 
 PriorRow = int | tuple[int, ...]
-"""Row of the prior's table; with replicas, a row for each."""
+"""Number of a row in the prior's table; with replicas, one such number for each."""
 
 
 class BoardAwayError(BoardError):
@@ -37,7 +37,7 @@ def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> Fram
             raise FrameInputError(
                 "The frame has several readings of a variable; this machine takes one of each"
             )
-        # too few or too many are the driver's error, which names both numbers
+        # too few or too many addresses are the driver's error, which names both numbers
         if deployment.prior_select is not None and len(addresses) == len(deployment.variables):
             addresses, row = deployment.machine_addresses(addresses)
     else:
@@ -102,7 +102,7 @@ def _row(deployment: Deployment, variable: Variable, given: int | list[int] | No
 
 
 def encode_boards(boards: Sequence[BoardResult]) -> msgspec.Raw:
-    """Encode the boards' part of a `FrameResult`, which the master forwards without decoding it."""
+    """Encode the boards' results for `FrameResult.boards`, which the master forwards without decoding it."""
     return msgspec.Raw(_encoder.encode(boards))
 
 

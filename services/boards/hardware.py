@@ -59,7 +59,7 @@ class SimulatedHardware:
             self._compiled(image)
 
     def board(self, index: int) -> RtlBoard:
-        """Return a blank board, or raise a SimulationError; hardware with a known image is already running."""
+        """Return a blank board, or raise a SimulationError; if its image is known, the simulation already runs."""
         from pcie_shim.board.rtl_board import RtlBoard
 
         board = RtlBoard(self._simulate)

@@ -28,11 +28,11 @@ from terminal.run_directory import remove_stale_sockets
 from terminal.signals import ENDING_SIGNALS, check_signals, run_async, stopped_error
 
 _ENDING_TIME: Final = 5.0
-"""Seconds in which the boards of a killed process exit, even if they are suspended for a moment."""
+"""Seconds to wait at the start for boards of an earlier, killed process, which exit soon after it."""
 _STOPPING_S: Final = 2.0
 """Seconds after which a board that does not end is killed."""
 _LISTENS: Final = 128
-"""Added to a board's number to signal that it listens; the number alone is a sign of life."""
+"""A board's process writes its board's number to its parent as a sign of life, and plus this when the board listens."""
 
 
 def blank_board(index: int, settings: Settings, hardware: SimulatedHardware | None) -> Board:
@@ -54,9 +54,9 @@ def serve_one(
     on_ready: Callable[[], None],
     on_alive: Callable[[], None] = lambda: None,
 ) -> NoReturn:
-    """Serve one board in this process until a signal (a StoppedError), and close it.
+    """Serve one board in this process until a signal, then close the board and raise a StoppedError.
 
-    `directory` is the folder of its status socket, if any; `on_ready` is called when both its sockets are listening,
+    `directory` is the folder of its status socket, if any; `on_ready` is called when the board's two sockets listen,
     and `on_alive` every second while the board is not stuck.
     """
     stop = StopSignal()
@@ -99,7 +99,7 @@ def serve_one(
 def _await_free(endpoint: Endpoint, limit: float) -> None:
     """Wait until no other process listens at an endpoint, or raise a SettingsError after `limit` seconds.
 
-    Later, a socket at this path is taken for our own.
+    From then on, a socket at this path counts as one of our own boards.
     """
     deadline = time.monotonic() + limit
     for each in (endpoint, endpoint.programming):
@@ -123,7 +123,7 @@ class BoardProcesses:
         settings: Settings,
         hardware: SimulatedHardware | None = None,
     ) -> None:
-        """Store the folder of the sockets, and how often boards may be restarted within `restart_window`."""
+        """Store the folder of the sockets, and how many `restarts` may happen within the setting `restart_window`."""
         self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
         self._settings = settings
         self._hardware = hardware

@@ -15,7 +15,7 @@ from toolchain.deployment import Deployment, Source
 
 
 def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Return a decorator that gives a command the flags of the named settings; its parameter `settings` gets all."""
+    """Return a decorator that gives a command the flags of the named settings, and all settings as `settings`."""
 
     def load(**flags: Any) -> Settings:
         end_with_parent()  # first, because the parent may have ended already
@@ -29,7 +29,7 @@ def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., i
 
 
 def refuse_with_deployment(settings: Settings, flags: Mapping[str, str | None]) -> None:
-    """Raise a SettingsError if there are both a deployment, which describes its topics, and flags that describe one."""
+    """Raise a SettingsError for flags that describe a topic if there is a deployment, which describes its own."""
     given = [f"{flag} {value}" for flag, value in flags.items() if value]
     # if it were ignored, the command would use another topic than the user named
     if settings.deployment is not None and given:

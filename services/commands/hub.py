@@ -106,7 +106,7 @@ def access_policy(
     insecure: bool,
     danger: str,
 ) -> AccessPolicy:
-    """Return the access policy of the flags; `files` are certificate, key and tokens, needed beyond loopback."""
+    """Return the access policy of the flags; its `files` (certificate, key, tokens) are needed if others can connect."""
     certificate, key, tokens = files
     if (certificate is None) != (key is None):
         raise SettingsError(
@@ -146,10 +146,10 @@ async def _serve(
     announce: str | None,
     settings: Settings,
 ) -> int:
-    """Serve rosbridge until cancelled; `port` 0 selects a free port, and `announce` is its name on the network."""
+    """Serve rosbridge until cancelled; `port` 0 selects a free port, `announce` is the hub's name on the network."""
     # a refused client gets no explanation, as from the reference server; the reason is only in the log
     log_libraries(logging.WARNING, "hub: %(message)s")
-    # The port, once the hub listens; and its graph, which exists from then on.
+    # The port, once the hub listens; and the hub's graph, which exists from then on.
     listening = asyncio.get_running_loop().create_future()
     graphs: list[Graph] = []
     scheme, address = "wss" if access.tls else "ws", f"[{host}]" if ":" in host else host

@@ -34,7 +34,7 @@ _MAX_REASONS: Final = 20
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeptFrame:
-    """A frame in the feed, equal only to itself; `values` is None if it has no posterior."""
+    """A frame in the feed, compared by identity; `values` is None if the frame has no posterior."""
 
     at: int
     """Place in the sequence of all frames that arrived, from 1."""
@@ -45,7 +45,7 @@ class KeptFrame:
     statistics: Mapping[str, str] = field(default_factory=dict)
     """Statistics of a BM2's samples, by their keys in `/bm/frame`."""
     truth: tuple[float, float] | None = None
-    """The true x and y when the frame arrived."""
+    """The true position (x, y) of the simulated robot when the frame arrived."""
 
     @property
     def searched(self) -> tuple[str, ...]:
@@ -58,7 +58,7 @@ class KeptFrame:
         return self.values is not None and (self.labels, self.values.shape)
 
     def sampling_error(self, probabilities: "NDArray[np.float64]") -> "NDArray[np.float64] | None":
-        """Return the standard error of each of a BM2's probabilities; None if unknown, or not sampled."""
+        """Return the standard error of each probability; None if the frame has no statistics of samples (a BM1)."""
         effective = self._statistic("effective_samples")
         error = standard_error(probabilities, effective if 1 <= effective < math.inf else math.nan)
         # boards that disagree do not know each value's error, so the error of the worst value is used
@@ -100,8 +100,8 @@ class Feed:
 
     Attributes:
         frames: The last frames, at most `KEPT_FRAMES`.
-        truth: The newest true x and y; None if there is none.
-        watchers: Functions called after each change; they must only note it, because a frame is still being added.
+        truth: The newest true position (x, y) of the simulated robot; None if there is none.
+        watchers: Functions called after each change; they may only note that, because a frame is still being added.
         lost: Number of frames without a posterior by reason, at most `_MAX_REASONS` of them.
     """
 
@@ -173,7 +173,7 @@ class Feed:
         return sum(each.frames for each in recent) / max(min(RATE_SECONDS, last - first), 1)
 
     def stage_times(self, now_s: float) -> list[tuple[int, list[float]]]:
-        """Return the mean microseconds of each stage, a row a second with its age in seconds, the oldest first."""
+        """Return the mean microseconds of each stage, a row per second with its age in seconds, the oldest first."""
         rows = []
         for second in self._seconds:
             means = [total / max(count, 1) for total, count in zip(second.sums, second.counts, strict=True)]

@@ -33,7 +33,7 @@ _IN_FLIGHT: Final = 2
 _HERE: Final = Path(__file__).parent
 _MAX_INBOUND: Final = 4096
 _MAX_ASKING: Final = 8
-"""Maximum number of services that are asked at once for a browser."""
+"""Maximum number of unanswered calls of the switches' ROS services for one browser."""
 
 
 class Live(Element, component="live.js"):
@@ -45,7 +45,7 @@ class Live(Element, component="live.js"):
 
 
 class Wish(msgspec.Struct, frozen=True):
-    """A request from a browser: a new place for the boat, or the setting of a switch."""
+    """A request from a browser: a new place for the simulated boat, or the setting of a switch."""
 
     pose: tuple[float, float] | None = None
     switch: str = ""
@@ -120,7 +120,7 @@ class Dashboard:
             """Offer the marginals of the newest posterior; the list is updated only if it differs."""
             frame = self._feed.newest
             labels = frame.searched if frame is not None else ()
-            # what goes across is named first, as in a position
+            # the horizontal variable is named first, as in a position
             options = {each: " by ".join(map(printable, reversed(each))) for each in choices(labels)}
             if labels:  # a frame without a posterior has none
                 marginals.set_visibility(len(labels) > 1)

@@ -36,13 +36,13 @@ LANDMARKS_TYPE: Final = "visualization_msgs/MarkerArray"
 _WORLD: Final = "/boat/"
 _SAIL: Final = "/boat/sail"
 _SWITCHES: Final = frozenset({"sail", "noise", "works", "plugged"})
-"""Last parts of the names of the services that are switches of the world."""
+"""Last parts of the names of the ROS services that are switches of the simulated world."""
 _RETRY: Final = 1.0
 _ASK_EVERY: Final = 2.0
 _STATUS_EVERY: Final = 1.0
 _SAMPLES_EVERY_MS: Final = 500
 _SAMPLES: Final = 8
-"""Number of samples that are shown."""
+"""Number of sampled states that are shown."""
 _MAX_LINE: Final = 1000
 _MAX_LANDMARKS: Final = 100
 _MAX_SWITCHES: Final = 100
@@ -59,12 +59,12 @@ class WatchedRobot:
         state: State of the connection in words.
         connected: Whether there is a connection.
         landmarks: x, y and name of each landmark.
-        switches: The simulated world's switches by service name, with the value last set here; True before.
-        can_set_pose: Whether the topic that moves the boat has a subscriber.
+        switches: The simulated world's switches by service name, with the value last set here, at first True.
+        can_set_pose: Whether the topic that moves the simulated boat has a subscriber.
         lost: Lost frames by reason, as the processes of the stack count them.
         boards: Endpoint, state and image of each board.
         why: Sentences about processes that are not ready.
-        samples: The last states that a BM2 streamed, a line each; empty if it streams none.
+        samples: The last sampled states that a BM2 streamed, a line each; empty if it streams none.
     """
 
     def __init__(
@@ -175,7 +175,7 @@ class WatchedRobot:
         self._feed.changed()
 
     async def _follow_frames(self, ros: Ros) -> None:
-        # all reports are read, because a posterior is known by its report
+        # reports of other deployments are read too: only the report tells from which deployment a posterior is
         async with posteriors(ros, topic=self._topic, queue_size=_QUEUE_SIZE) as frames:
             counted = 0
             while True:
@@ -198,7 +198,7 @@ class WatchedRobot:
                 counted = gone
 
     async def _ask_about_world(self, ros: Ros) -> None:
-        """Ask which services and topics of the world exist, again and again, because a simulator may come later."""
+        """Ask repeatedly which services and topics of the simulated world exist: a simulator may start later."""
         while True:
             if (names := await ros.services()) is not None:
                 found = sorted(each for each in names if _is_switch(each))[:_MAX_SWITCHES]
@@ -234,7 +234,7 @@ class WatchedRobot:
             await asyncio.sleep(_STATUS_EVERY)
 
     async def _learn_axes(self, folder: Path) -> None:
-        """Read the units from the folder of the master on this machine; without it, cells have only numbers."""
+        """Read the units from the deployment folder of this machine's master; without it, cells are only indices."""
         try:
             deployment = await asyncio.to_thread(load_deployment, folder, images=False)
         except (ToolchainError, OSError) as error:
@@ -244,7 +244,7 @@ class WatchedRobot:
         self._feed.changed()
 
     def axes_for(self, frame: KeptFrame) -> tuple[Axis, ...]:
-        """Return the axes of a frame's posterior; none if the frame is of another deployment, with other units."""
+        """Return the axes of a frame's posterior; none for a frame of another deployment, whose units may differ."""
         if self._deployment_of(frame) is None or frame.values is None:
             return ()
         ours = [(axis.label, axis.size) for axis in self._axes]
@@ -275,7 +275,7 @@ class WatchedRobot:
     # Asking
 
     def set_pose(self, x: float, y: float) -> None:
-        """Move the boat to (x, y); do nothing without a connection or a subscriber."""
+        """Move the simulated boat to (x, y); do nothing without a connection or a subscriber."""
         ros, poses = self._ros, self._poses
         if ros is None or poses is None or not self.can_set_pose or not math.isfinite(x + y):
             return
@@ -287,7 +287,7 @@ class WatchedRobot:
             poses.publish_nowait({"header": head, "pose": pose_at(x, y)})
 
     async def switch(self, name: str, on: bool) -> str:
-        """Call a switch of the simulated world; return the reason of a failure, empty on success."""
+        """Set a switch of the simulated world to `on`; return the reason of a failure, empty on success."""
         if self._ros is None or name not in self.switches:
             return "this switch is not there now"
         try:

@@ -20,7 +20,7 @@ def same_shape(frames: Sequence[KeptFrame], shown: KeptFrame | None) -> list[Kep
 
 
 def archive(frames: Sequence[KeptFrame], axes: Sequence[Axis]) -> bytes:
-    """Return an archive for `numpy.load`, with the names that `listen --save` uses; frames must not be empty."""
+    """Return an archive for `numpy.load`, with the same array names as `listen --save`; `frames` must not be empty."""
     file = io.BytesIO()
     write_archive(
         file,
@@ -34,7 +34,7 @@ def archive(frames: Sequence[KeptFrame], axes: Sequence[Axis]) -> bytes:
 
 
 def table(frames: Sequence[KeptFrame]) -> bytes:
-    """Return a CSV table with a row for each frame and its most probable cell; frames must not be empty."""
+    """Return a CSV table, a row per frame: its most probable cell, all probabilities; `frames` must not be empty."""
     labels, first = frames[0].labels, frames[0].values
     cells = cell_names(labels, first.shape) if first is not None else ()
     file = io.StringIO(newline="")

@@ -61,7 +61,7 @@ class View:
         self._feed.changed()
 
     def choose(self, labels: tuple[str, ...]) -> None:
-        """Show another marginal."""
+        """Show the marginal of these labels."""
         self.chosen = labels
         self._feed.changed()
 

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 QUEUE_ALL_DEPTH = 256
 """Maximum number of frames that wait with `queue = all` before the run ends with an error."""
 MOST_AT_PUBLISHER = 8
-"""Maximum number of results that the publisher has not acknowledged; frames wait when it is reached."""
+"""Maximum number of results that the publisher has not acknowledged; at this number, frames wait."""
 
 REMEMBERED = 1000
 """Number of frames over which quantiles are computed."""
@@ -56,7 +56,7 @@ _STAGES = (
     *("rosbridge_in", "waited", "register_writes", "compute", "reads", "rosbridge_out"),
     *("local_hops", "frame"),
 )
-"""The stages in the order of a frame's path, the time between the processes, and the whole frame."""
+"""The stages in the order in which a frame passes them, then the time between processes, and the whole frame."""
 
 _LOSSES = {
     Outcome.NO_POSTERIOR: LossReason.NO_POSTERIOR,
@@ -256,7 +256,7 @@ class FrameFlow:
             self._at_publisher.clear()
 
     def awaited(self, peer: Peer) -> Awaited | None:
-        """Return the frame or the results for which a peer has not sent an answer yet."""
+        """Return the frame or the results that a peer has not answered yet; None if there are none."""
         if peer is self._peers.app and self._computing is not None:
             what, since = f"answer frame {self._computing.number}", self._computing.sent / 1e9
             return Awaited(what, since, self._settings.board_timeout + ANSWER_TIME)
@@ -287,7 +287,7 @@ class FrameFlow:
             self.losses[LossReason.PASSED_OVER] += len(self._readings)
             self._skipped += sum(each.steps for each in self._readings)
             self._readings.clear()
-        # an error instead of a loss, because who keeps all readings wants every result
+        # an error instead of a loss, because a user who chose `queue = all` wants every result
         elif len(self._readings) >= QUEUE_ALL_DEPTH:
             self.fail(
                 OverflowedQueueError(

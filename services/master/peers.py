@@ -3,7 +3,7 @@
     _keep:  _connect ──▶ _watch ──connection lost──▶ _bring_back ──▶ _connect ...
     records of a connection:  Hello ──▶ Ready ──▶ (all ready: Begin) ──▶ readings, frames, results ──▶ FrameFlow
 
-Each peer has such a task, whose error ends the run. With `--fused` there are no connections to keep, and the
+Each peer has a task `_keep`, whose error ends the run. With `--fused` there are no connections to keep, and the
 tasks are the services themselves.
 """
 
@@ -50,7 +50,7 @@ ANSWER_TIME = 60.0
 """Seconds by which a service may exceed its own timeouts before it counts as stuck."""
 
 COMPILING_TIME = 60.0
-"""Additional seconds for the run's own boards to listen, because without a cache they compile their kernels."""
+"""Additional seconds for boards that the master starts: they compile the kernels that numba has not cached yet."""
 
 _CONNECT_EVERY = 0.01
 _WATCH_EVERY = 1.0
@@ -94,7 +94,7 @@ class Peer:
 
 @dataclass(frozen=True, slots=True)
 class Awaited:
-    """A pending task of a peer: description, start (monotonic, s) and time limit in seconds."""
+    """What a peer has to do next: description, start of the wait (monotonic, s) and time limit in seconds."""
 
     what: str
     since: float
@@ -118,7 +118,7 @@ class PeerEvents(Protocol):
         """Handle the loss of a peer, with its frame or results."""
 
     def awaited(self, peer: Peer) -> Awaited | None:
-        """Return the pending task of a peer that is ready."""
+        """Return what a ready peer has to do next; None if nothing."""
 
     def fail(self, error: Exception) -> None:
         """End the run."""
@@ -234,7 +234,7 @@ class Peers:
         if text or self.directory is None:
             return Peer(role, endpoint_from(text, f"--{role}"), None)
         endpoint = endpoint_in(self.directory, role)
-        # only this run can have programmed its own boards
+        # boards that this master starts can hold only images of this run
         reprogram = role == "pcie-app" and self._boards is not None
         arguments = service_arguments(role, endpoint, self._service_settings, reprogram=reprogram)
         return Peer(role, endpoint, ForkedCommand(role, role, arguments, directory=self._run))
@@ -249,7 +249,7 @@ class Peers:
 
     @property
     def _compiling_time(self) -> float:
-        """Additional seconds to wait for the run's own boards, which may compile; their exit is detected at once."""
+        """Additional seconds to wait for boards that the master starts, which may compile their kernels."""
         return 0.0 if self._boards is None else COMPILING_TIME
 
     async def start(self, events: PeerEvents) -> None:

@@ -227,7 +227,7 @@ class Master:
     async def _show_progress(self) -> None:
         from services.output.master_output import sentence
 
-        # as of the last line: its time, and the results published until then
+        # of the last line of progress: its time, and the number of results published until then
         before, count = time.monotonic(), 0
         while True:
             await asyncio.sleep(_PROGRESS_EVERY)

@@ -49,7 +49,7 @@ def sentence(record: Published, deployment: Deployment) -> str:
 
 
 def _cell(axes: Sequence[Axis], line: int) -> dict[str, int]:
-    """Convert a line of the result to an index for each dimension; the last dimension changes fastest."""
+    """Convert the number of a cell (a line of the machine) to indices by label; the last dimension changes fastest."""
     indices: dict[str, int] = {}
     for axis in reversed(axes):
         line, indices[axis.label] = divmod(line, axis.size)

@@ -36,7 +36,7 @@ class ResultFile(ABC):
 
     @abstractmethod
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
-        """Save one frame, or raise a SettingsError for an unwritable file or one with another shape."""
+        """Save one frame, or raise a SettingsError: the file is unwritable, or has posteriors of another shape."""
 
     @abstractmethod
     def close(self) -> None:
@@ -106,7 +106,7 @@ def cell_names(labels: Sequence[str], sizes: Sequence[int]) -> list[str]:
 def write_archive(
     file: IO[bytes], frames: Sequence[FrameReport | Posterior | None], axes: Sequence[Axis], **arrays: Any
 ) -> None:
-    """Write an archive for `numpy.load`: the arrays, number, stamp and cycles of each frame, and the values of axes."""
+    """Write an archive for `numpy.load`: `arrays`; number, stamp and cycles of each frame; the values of the axes."""
     import numpy as np
 
     for name in ("frame", "stamp_ns", "cycles"):
@@ -160,7 +160,7 @@ class _Lines(ResultFile):
 
 class _JsonLines(_Lines):
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
-        """Append one object."""
+        """Append one frame as a JSON object."""
         self._write(orjson.dumps(record(frame, axes)) + b"\n")
 
 

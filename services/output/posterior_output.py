@@ -41,7 +41,7 @@ Show = Callable[[FrameOutcome, list[Axis]], None]
 
 
 def line(frame: FrameOutcome, axes: list[Axis]) -> str:
-    """Return the line of one frame."""
+    """Return the line of text for one frame."""
     number = "-" if frame.number is None else str(frame.number)
     if not isinstance(frame, Posterior):
         return f"frame {number}: {one_line(frame.outcome)}"
@@ -92,7 +92,7 @@ def print_json(frame: FrameOutcome, axes: list[Axis]) -> None:
 
 @contextlib.contextmanager
 def drawing() -> Iterator[Show]:
-    """Draw one picture that is updated on a terminal, and separate pictures elsewhere."""
+    """Yield a function that draws frames: on a terminal in one picture that is updated, elsewhere one below another."""
     # labels come from the robot's side, so neither brackets nor numbers in them are formatted
     console = Console(highlight=False, markup=False)
     colour = console.color_system is not None and not console.no_color  # NO_COLOR disables it
@@ -133,7 +133,7 @@ def drawing() -> Iterator[Show]:
 
 
 def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool, rows: int = ROWS) -> Text:
-    """Draw a posterior in colour or with characters " " to "@", `width` characters wide, in `rows` lines with text.
+    """Draw a posterior in colour, or with characters from " " to "@", `width` columns wide, in `rows` lines plus text.
 
     Of three or more dimensions, the two longest are drawn, and the others are summed out.
     """

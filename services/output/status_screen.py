@@ -175,7 +175,7 @@ def _duration(seconds: float) -> str:
 
 
 def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
-    """Return the columns received, completed, per second, last frame and lost."""
+    """Return the texts of the columns received, completed, per second, last frame and lost."""
     if frames is None:
         return "", "", "", "", ""
     # a subscriber knows no numbers, only the age
@@ -196,7 +196,7 @@ async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) 
     """Print the status of a run, once or (with `watch`) every second; return 0 if everything is ready, otherwise 6.
 
     Raises:
-        SettingsError: No process answers, or a master is needed and does not answer, and `watch` is false.
+        SettingsError: Without `watch`, no process answers, or with `needs_master` the master does not.
     """
     # in a file or a pipe, lines are not wrapped to the width of a terminal, and nothing is overwritten
     terminal = sys.stdout.isatty()
