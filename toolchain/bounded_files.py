@@ -108,7 +108,7 @@ class TomlFile:
     error: type[ToolchainError]
     """The type of its errors."""
     text: str
-    """Its text, to find the lines of mistakes."""
+    """Its text, in which the lines of mistakes are looked up."""
     tables: dict[str, Any]
     """Its tables, not yet validated."""
 
@@ -150,7 +150,7 @@ class TomlFile:
         return self.error(sentence, path=self.path, line=self._line_of(place), place=place)
 
     def _line_of(self, place: Sequence[str | int]) -> int | None:
-        """Return the line (from 1) of the key at a place like `("variable", 2, "bits")`, or of its table."""
+        """Return the line (from 1) of the key at a place such as `("variable", 2, "bits")`, or of the key's table."""
         table, index, key = _split(place)
         number = -1
         here = not table
@@ -248,7 +248,7 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 def _followed(
     model: type[BaseModel], place: Sequence[str | int]
 ) -> tuple[list[str | int], list[type[BaseModel]]]:
-    """Follow a place through the fields of models; return it without types of sections, and the models at its end."""
+    """Follow a place through the fields of models; return the place without types of sections, and the models there."""
     followed: list[str | int] = []
     models = [model]
     for step in place:

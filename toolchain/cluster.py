@@ -6,7 +6,8 @@
     keep(number, result) ◀────────────────────┴────────────── as batches are done, in any order
 
 A piece is only a number, so the tables are sent once, with the job. A result depends on job and number alone, not on
-where or in which order it is computed. A caller that keeps results on disk can resume with the missing numbers.
+where or in which order the pieces are done. A caller that keeps results on disk can resume with the numbers that have
+none.
 """
 
 import asyncio
@@ -43,11 +44,11 @@ _SMALLEST_S: Final = BATCH_S / 20
 _AHEAD: Final = 3
 """Number of batches under way for each worker: one being computed, one that waits there, one at the scheduler."""
 _PATIENCE_S: Final = 60.0
-"""Seconds in which a scheduler must come back, or get a worker again."""
+"""Seconds within which a lost scheduler must come back, or one without workers must get a worker again."""
 _CONNECT_S: Final = 10.0
 _POLL_S: Final = 1.0
 _LEAN: Final = {"distributed.worker.profile.enabled": False, "distributed.admin.tick.interval": "1s"}
-"""Settings of our own scheduler and workers; with dask's, each spends 3 to 5 % of a core on watching itself."""
+"""Settings of the processes of `local`: with dask's defaults, each spends 3 to 5 % of a core on monitoring itself."""
 _ADDRESS: Final = re.compile(r"(tcp|tls)://(\[[\da-fA-F:.]+]|[^][:/]+):\d{1,5}")
 _LOOPBACK: Final = re.compile(r"127(\.\d+){3}|\[::1]|localhost")
 
@@ -87,12 +88,12 @@ def in_order(run: Run, job: Job, numbers: Sequence[int], advance: Callable[[], N
 
 
 class ClusterError(ToolchainError):
-    """A scheduler that cannot be used, or workers that cannot do the work."""
+    """A scheduler cannot be used, or its workers cannot do the work."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SchedulerOptions:
-    """The place where independent pieces of work are done: this process or a cluster."""
+    """The flags that say where independent pieces of work are done: in this process or on a cluster."""
 
     scheduler: Annotated[
         str | None,
@@ -146,7 +147,7 @@ def _check_certificates(files: dict[str, Path | None]) -> None:
 
 @contextmanager
 def runner(options: SchedulerOptions) -> Iterator[Run]:
-    """Yield the function that does the pieces where the options say, or raise a ClusterError."""
+    """Yield the function that does pieces of work where the options say, or raise a ClusterError."""
     address = options.scheduler
     if address is None:
         yield in_this_process
@@ -230,10 +231,10 @@ def _prepared(pickled: bytes, _thread: int) -> Work:
 
 
 def do_batch(pickled: bytes, numbers: Sequence[int], most_s: float, theirs: str) -> tuple[bytes, float]:
-    """Do pieces on a worker for `most_s` seconds, but at least one; return their results and the seconds.
+    """Do pieces on a worker until `most_s` seconds are over, but at least one; return results and seconds taken.
 
-    The results are pickled and compressed, because a posterior is mostly zeros, and dask would not compress it on the
-    way through the scheduler. `theirs` is the client's `software()`.
+    The results are pickled and compressed, because a posterior is mostly zeros, and dask would send it through the
+    scheduler uncompressed. `theirs` is the client's `software()`.
 
     Raises:
         ClusterError: This worker has another version of our software than the client.
@@ -266,10 +267,10 @@ def _noticing_loss() -> Iterator[None]:
 def _on_scheduler(
     address: str, connect: Callable[[], Any], job: Job, numbers: Sequence[int], keep: Keep
 ) -> None:
-    """Do the pieces on the workers of a scheduler; if it is lost, go on when one answers there again.
+    """Do the pieces on the workers of a scheduler; if it is lost, go on as soon as one answers at its address again.
 
     Raises:
-        ClusterError: The workers cannot do them, or stay away for a minute.
+        ClusterError: The workers cannot do the pieces, or there is no scheduler or worker for a minute.
     """
     left = dict.fromkeys(numbers)  # the numbers without a result, in order
     until = 0.0  # monotonic time until which to wait after a loss; 0 before the first
@@ -313,7 +314,7 @@ def _client(address: str, connect: Callable[[], Any], until: float) -> Any:
 
 
 def _do(address: str, client: Any, pickled: bytes, left: dict[int, None], keep: Keep) -> None:
-    """Do the pieces of a job on the workers of one scheduler; a `_LostError` if that cannot go on here."""
+    """Do the pieces of a job on the workers of one scheduler; a `_LostError` if it or all its workers are lost."""
     from distributed import wait
 
     # Numbers that are not under way yet, in order; the numbers of each batch under way; the seconds of a piece in the

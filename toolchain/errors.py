@@ -59,7 +59,7 @@ class DeploymentVersionError(DeploymentError):
 
 
 class DamagedDeploymentError(DeploymentError):
-    """A file of the deployment has changed since the build: its hash differs."""
+    """A file of the deployment has changed since the build: its hash is not the recorded one."""
 
 
 class ReadingError(ToolchainError):
@@ -69,11 +69,11 @@ class ReadingError(ToolchainError):
 
 
 class NotANumberError(ReadingError):
-    """A reading is not a number: a string, an object, a non-empty array."""
+    """A reading is a string, an object or a non-empty array instead of a number."""
 
 
 class ValueOutOfRangeError(ReadingError):
-    """The address of a number is not supported by the column (`on_range = error`)."""
+    """A reading is a number outside the range of its variable, with `on_range = error`."""
 
 
 class ReadingMissingError(ReadingError):

@@ -85,7 +85,7 @@ PARAMETERS: Final = "bm1_parameters.vhd"
 
 
 def in_order(sources: Sequence[Path | str], parameters: Path | str = PARAMETERS) -> list[str]:
-    """Return the files in the order of analysis, with the package of parameters in its place."""
+    """Return VHDL files in the order of analysis, with the package of parameters after the first."""
     return [str(sources[0]), str(parameters), *map(str, sources[1:])]
 
 
@@ -134,7 +134,7 @@ def board_memories(image: Image) -> list[Memory]:
 
 
 def _deployment(image: Image) -> Deployment:
-    """Return a deployment for an image; its variables are called by number, because an image has no names."""
+    """Return a deployment for an image; its variables have numbers as names, because an image has no names."""
     parameters = image.machine.parameters
     widths = [*parameters.sensor_bits, *([parameters.prior_bits] if parameters.prior_bits else [])]
     total = image.partition.total_lines
@@ -212,7 +212,7 @@ def check_tools(simulator: Simulator) -> None:
 
 
 def compiled(image: Image, simulator: Simulator, folder: Path, on_compile: Callable[[str], None]) -> Compiled:
-    """Return the simulation of an image's hardware, compiled unless it is in the folder already.
+    """Return the simulation of an image's hardware; compile it, unless it is in the folder already.
 
     The folder is created; nobody else may be able to change it. `on_compile` is called with a sentence before a
     compilation.
@@ -296,7 +296,7 @@ def _compile_verilator(image: Image, folder: Path) -> None:
 
 
 def _key(image: Image, simulator: Simulator) -> str:
-    """Return a folder name that differs if image, sources or tools differ."""
+    """Return a folder name for a simulation, which differs if image, sources or tools differ."""
     parts = [f"{simulator} {image.image_hash} {image.partition}"]
     parts += [run_tool([tool, "--version"], Path("/")) for tool in simulator.tools]
     names = [*SOURCES, _TABLE_VHDL, _BENCH_VHDL, _TABLE_VERILOG, _BENCH_CPP]

@@ -12,7 +12,7 @@ _SHOWN = 60
 
 
 def to_address(variable: Variable, value: object) -> int | None:
-    """Return the address of one reading, 0 to `variable.values - 1`, in its column; None for a missing reading.
+    """Return the address of a reading in its column, from 0 to `variable.values - 1`; None for a missing reading.
 
     `None` (null or an absent field), NaN and an empty array are missing readings. Booleans are 0 and 1. Strings
     are never numbers, but may be names of states.
@@ -20,8 +20,8 @@ def to_address(variable: Variable, value: object) -> int | None:
     Raises:
         ReadingMissingError: The reading is missing and `on_missing` is `error`.
         NotANumberError: The reading is a string, an object or a non-empty array.
-        ValueOutOfRangeError: The address is not supported and `on_range` is `error`, or the reading is
-            infinite and the variable periodic.
+        ValueOutOfRangeError: The reading is out of range and `on_range` is `error`; or it is infinite, the variable
+            is periodic, and `on_range` is `clamp`.
     """
     if value is None:
         return _missing(variable, "is absent or null (NaN is null in JSON)")
@@ -58,7 +58,10 @@ def _missing(variable: Variable, what: str) -> int | None:
 
 
 def _unserved(variable: Variable, value: float, beyond_top: bool | None) -> int | None:
-    """Return the address that `on_range` gives a value out of range; `beyond_top` is None for a periodic variable."""
+    """Return the address that `on_range` gives a value out of range, None for missing, or raise an error.
+
+    `beyond_top` is whether the value is beyond the last one; None if neither end is nearer.
+    """
     if variable.on_range == "missing":
         return _missing(variable, f"is {_shown(value)}, out of range")
     if variable.on_range == "clamp" and beyond_top is not None:

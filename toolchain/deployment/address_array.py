@@ -1,8 +1,8 @@
 """Conversion of arrays of readings to addresses or codes: one per line, one per replica, or both (thesis 4.4).
 
-Each number is converted as in `toolchain.deployment.address`. Numbers are in order (replica after replica, line
-after line). A reading of a sensor is missing either on all lines of a machine or on none. Likelihoods
-(`sensor_mode = threshold`) and written priors become codes.
+Each number is converted as in `toolchain.deployment.address`. The numbers of an array are in the order replica after
+replica, and line after line in each. A reading of a sensor is missing either on all lines of a machine or on none.
+Likelihoods (`sensor_mode = threshold`) and written priors become codes.
 """
 
 import base64
@@ -23,8 +23,8 @@ from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError
 def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Scale) -> NDArray[np.uint16]:
     """Return the codes of one sensor's likelihoods in a frame, one per line (`sensor_mode = threshold`).
 
-    The likelihoods are float64[..., lines]: P(its reading | S = line); the codes have the same shape. With the
-    scale `column`, each row is divided by its maximum, because only ratios matter; with `none`, values up to 1
+    The likelihoods are float64[..., lines]: P(the sensor's reading | S = line); the codes have the same shape. With
+    the scale `column`, each row is divided by its maximum, because only ratios matter; with `none`, values up to 1
     are encoded unchanged.
 
     Raises:
@@ -77,16 +77,16 @@ def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int
 
 
 MISSING: Final = -1
-"""The address of a missing reading, in all lines of its machine."""
+"""The address that stands for a missing reading, on all lines of a machine."""
 
 
 def to_addresses(deployment: Deployment, variable: Variable, value: object) -> list[int] | None:
     """Return the addresses (`threshold`: codes) of one variable's readings in a frame; None if all are missing.
 
     The value of the field is a flat array, or one with the shape `deployment.reading_shape(variable)`; an
-    array `uint8[]` may be bytes or base64 text. With `None` or an empty array, all readings are missing; null and NaN
-    are single missing readings. There is one address per element of the shape, row by row; `MISSING` in all lines of a
-    missing reading.
+    array `uint8[]` may be bytes or base64 text. If it is `None` or an empty array, all readings are missing; a null
+    or NaN in it is one missing reading. There is one address per element of the array, row by row; a missing reading
+    has `MISSING` on all lines.
 
     Raises:
         ReadingError: The array has another length, or contains an unusable reading, which the sentence names.
@@ -154,7 +154,7 @@ def _length(shape: tuple[int, ...]) -> str:
 
 
 def _holds_text(values: list[Any]) -> bool:
-    """Return whether there are strings, which NumPy would read as numbers."""
+    """Return whether nested arrays have strings in them, which NumPy would read as numbers."""
     return any(
         isinstance(each, str) or (isinstance(each, list) and any(isinstance(inner, str) for inner in each))
         for each in values

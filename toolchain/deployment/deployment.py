@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 FORMAT: Final = 1
 FILE_NAME: Final = "deployment.toml"
 FORMER_KEYS: Final = frozenset({"integrity", "integrity_frames"})
-"""Keys of a check that no longer exists; removing them kept the format, because they were not part of the hash."""
+"""Keys of a check that no longer exists, which files of earlier builds may have; they were never part of the hash."""
 MOST_TRANSITIONS: Final = 2**24
 """Maximum number of transitions of a filter, lines x lines (128 MiB as float64)."""
 REPLICA: Final = "replica"
@@ -148,7 +148,7 @@ class Deployment(DeploymentFile):
         return next((variable for variable in self.variables if variable.kind == "prior_select"), None)
 
     def machine_addresses(self, addresses: Iterable[int | None]) -> tuple[tuple[int | None, ...], int]:
-        """Return the addresses of the sensors by column, and the row of the prior; each is None if missing."""
+        """Split the addresses of all variables into those of the columns, None if missing, and the row of the prior."""
         sensors: list[int | None] = []
         row = 0
         for variable, address in zip(self.variables, addresses, strict=True):
@@ -160,7 +160,7 @@ class Deployment(DeploymentFile):
 
     @property
     def state_dimensions(self) -> tuple[Dimension, ...]:
-        """The variables of a sampled state, in the order of their bits; none if the deployment lacks one of them."""
+        """The variables of a BM2's sampled state, in the order of their bits; none if one is not described here."""
         keys = {"offset", "step", "unit", "states"}
         known = (Dimension(label=v.name, size=v.values, **v.model_dump(include=keys)) for v in self.variables)
         described = {each.label: each for each in (*known, *self.searched, *self.hidden)}
@@ -242,9 +242,9 @@ def load_deployment(
 ) -> Deployment:
     """Read and check the deployment in a folder written by `toolchain build`.
 
-    Without `images`, the images are not read or compared with their hashes, and NumPy is not imported. With `edited`, a
-    `deployment.toml` whose hash does not match its content is accepted. With `interrupted`, images and a filter may
-    differ from their hashes, because an interrupted call has written them but not yet `deployment.toml`.
+    Without `images`, the images are not read or compared with their hashes, and NumPy is not imported. With `edited`,
+    a `deployment.toml` whose hash does not match its content is accepted. With `interrupted`, images and the filter's
+    file may differ from their hashes: an interrupted command has written them, but not yet `deployment.toml`.
 
     Raises:
         DeploymentError: The deployment is absent, not TOML, or has a wrong key or value.
@@ -290,7 +290,7 @@ def load_deployment(
 
 
 def other_image(path: Path, found: str, named: str) -> DamagedDeploymentError:
-    """Return the error for an image whose hash is not the one in `deployment.toml`; it contains both hashes."""
+    """Return the error for an image whose hash is `found`, while `deployment.toml` has `named`."""
     return DamagedDeploymentError(
         f"{path} is another board's or another build's image: its hash is {found[:16]}, {FILE_NAME} names {named[:16]}; "
         "if 'toolchain regenerate' was interrupted, run it again, otherwise build again with 'toolchain build'"

@@ -34,7 +34,7 @@ class Transition:
     start: NDArray[np.float64]
     """P(S) before the first frame, float64[lines]."""
     table: NDArray[np.float64]
-    """P(S | its value one frame before), float64[lines, lines]; a row for each earlier value."""
+    """P(S | S one frame earlier), float64[lines, lines]; a row for each value of the earlier S."""
 
     def __post_init__(self) -> None:
         lines = np.shape(self.start)
@@ -52,7 +52,7 @@ class Transition:
             object.__setattr__(self, name, own)
 
     def after(self, belief: NDArray[np.float64], steps: int = 1) -> NDArray[np.float64]:
-        """Return the distribution some frames later, float64[lines], without readings."""
+        """Return the distribution `steps` frames after the belief, if there is no reading meanwhile: float64[lines]."""
         for _ in range(steps):
             belief = belief @ self.table
         later: NDArray[np.float64] = belief / belief.sum()
@@ -92,7 +92,7 @@ class Transition:
 
 
 def _header(shape: tuple[int, int]) -> bytes:
-    """Return the header that the file must have; NumPy's reader of headers fails in many ways on hostile ones."""
+    """Return the header that the file must have, because NumPy's parser fails in many ways on a hostile header."""
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
     return file.getvalue()
@@ -101,8 +101,8 @@ def _header(shape: tuple[int, int]) -> bytes:
 def prediction_codes(prediction: NDArray[np.float64], prob_bits: int) -> NDArray[np.uint16]:
     """Return the codes of a predicted prior, uint16[lines], relative to its maximum.
 
-    A code is at least 1 where the prediction is above 0. With a code of 0, no reading could bring back a value that an
-    earlier frame excluded, if the searched variable rarely changes to it.
+    A code is at least 1 where the prediction is above 0, however little: with a code of 0, no reading could bring
+    back a value to which the searched variable rarely changes.
     """
     codes = encode_probability(prediction / prediction.max(), prob_bits)
     codes[(codes == 0) & (prediction > 0)] = 1

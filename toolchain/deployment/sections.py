@@ -110,15 +110,15 @@ MessageType = Annotated[
 _A_PATH = "a path in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
 MessagePath = Annotated[str, _matching(MESSAGE_PATH, _A_PATH)]
 PathOrName = Annotated[str, _matching(re.compile(f"(?:{MESSAGE_PATH.pattern})?"), _A_PATH)]
-"""A path, or an empty text to search the message for the name of the variable."""
+"""A path of a field in a message, or an empty text to search the message for the name of the variable."""
 Name = Annotated[str, Field(min_length=1, max_length=NAME_MAX), AfterValidator(_printable)]
-"""One printable line, because names also come from network files."""
+"""A name: one printable line, which is checked because names also come from network files."""
 Sha256 = Annotated[str, _matching(_SHA256, "a SHA-256 hash; expected 64 hexadecimal digits")]
 OwnPath = Annotated[str, AfterValidator(_inside)]
-"""A path in the folder of the deployment."""
+"""A file path inside the folder of the deployment."""
 Step = Annotated[float, AfterValidator(_not_zero)]
 TOPIC_BYTES_MIN, TOPIC_BYTES_MAX = 1 << 10, 1 << 28
-"""Smallest and largest limit of the size of a topic's messages, in bytes."""
+"""The smallest and the largest value of `topic_bytes`, the limit on a message's size, in bytes."""
 TopicBytes = Annotated[int, Field(ge=TOPIC_BYTES_MIN, le=TOPIC_BYTES_MAX)]
 
 Item = TypeVar("Item")
@@ -134,7 +134,7 @@ States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda state
 
 
 def states_fit(name: str, states: tuple[str, ...], size: int) -> None:
-    """Raise a ValueError if there are state names, but not as many as values."""
+    """Raise a ValueError if a variable has names of states, but not `size` of them."""
     if states and len(states) != size:
         raise ValueError(f"{name} has {size} values, but {len(states)} states are named")
 
@@ -162,7 +162,7 @@ class Stop(StrEnum):
 
 
 class Queue(StrEnum):
-    """The readings that wait if they arrive faster than frames are computed."""
+    """Which readings wait if they arrive faster than frames are computed."""
 
     LATEST = "latest"
     """Only the newest waits; the readings that it replaces are counted."""
@@ -171,10 +171,10 @@ class Queue(StrEnum):
 
 
 class Scale(StrEnum):
-    """The part of a table that is divided by its maximum before quantising."""
+    """Which parts of a table are each divided by their maximum before quantising."""
 
     ADDRESS = "address"
-    """Every address of a column separately, which needs the fewest cycles."""
+    """The row of each address, which needs the fewest cycles of the machine."""
     COLUMN = "column"
     """The whole table of a column."""
     NONE = "none"
@@ -194,7 +194,7 @@ class Section(BaseModel):
 
 
 class ModelSection(Section):
-    """`[model]`: the flags with which the build read the model, so that later commands with `--model` need none."""
+    """`[model]`: the flags with which the build read the model; later commands with `--model` use them again."""
 
     settings: Sequence[str] = ()
     bits: Sequence[str] = ()
@@ -283,7 +283,7 @@ class CommonSection(Section):
 
     @property
     def kind(self) -> "MachineKind":
-        """The kind of the machine, which defines its frames and results."""
+        """The kind of the machine, BM1 or BM2, which defines what a frame and a result are."""
         return KINDS[self.type]()
 
     @property
@@ -319,11 +319,11 @@ class BM1Section(CommonSection):
     )
     replicas: int = Field(default=1, ge=1, le=REPLICAS_MAX, exclude_if=lambda replicas: replicas == 1)
     is_divided: ClassVar[bool] = True
-    """True if each board has a part of the lines, False if each has the whole machine."""
+    """True for a BM1, of which each board has a part of the lines; False if each board has the whole machine."""
     stream: ClassVar = 0
-    """Number of states that a board buffers for the topic of samples; always 0, because a BM1 has no such topic."""
+    """Number of sampled states that a board buffers for publication; always 0, because a BM1 does not sample states."""
     variables: ClassVar[tuple[str, ...]] = ()
-    """Names of the machine's variables, if its results need them."""
+    """Names of the variables in a sampled state; none, because a BM1 does not sample states."""
 
     @model_validator(mode="after")
     def _target_fits(self) -> Self:
@@ -344,12 +344,12 @@ class BM1Section(CommonSection):
 
     @property
     def is_plain(self) -> bool:
-        """True for one machine with one reading per column, and so one posterior per result."""
+        """True for a machine without replicas, with one reading per column: a result is then one posterior."""
         return self.replicas == 1 and not self.reads_lines
 
     @property
     def results(self) -> int:
-        """The number of probabilities of a frame: one per line and replica."""
+        """The number of probabilities in the result of a frame: one per line and replica."""
         return self.replicas * self.lines
 
 
@@ -372,7 +372,7 @@ class BM2Section(CommonSection):
     stream: int = Field(default=0, ge=0, le=_WORD_MAX)
     variables: Sequence[Name] = ()
 
-    # what a BM2 never has, with the values that a BM1 without them has, so that no caller needs to ask for the kind
+    # settings that only a BM1 has, as in a BM1 that does not use them, so that no caller needs to ask for the kind
     scale: ClassVar = Scale.NONE
     prior_bits: ClassVar = 0
     prior_mode: ClassVar = PriorMode.TABLE
@@ -386,7 +386,7 @@ class BM2Section(CommonSection):
 
     @property
     def results(self) -> int:
-        """The number of probabilities of a frame."""
+        """The number of probabilities in the result of a frame."""
         return self.lines
 
 
@@ -401,7 +401,7 @@ MachineSection: TypeAlias = Annotated[
 
 
 class WrittenPrior(Section):
-    """`[prior]`: the source of a written prior, with one number per line; only their ratios matter.
+    """`[prior]`: the topic of a written prior, with one number per line; only the ratios of the numbers matter.
 
     Without this section, a machine with `prior_mode = written` uses the prior of its images until a host
     writes another.
@@ -420,7 +420,7 @@ class FilterSection(Section):
 
 
 class BoardSection(Section):
-    """`[[board]]`: one board of the mini-cluster, its image and its lines of the machine."""
+    """`[[board]]`: one board of the mini-cluster, its image and the lines of the machine that it computes."""
 
     image: OwnPath
     image_hash: Sha256
@@ -450,7 +450,7 @@ class TopicsSection(Section):
 
 
 def parse_interface(text: str) -> tuple[int, int]:
-    """Return the inputs and results of an interface such as `20x1200` (thesis 3.2), or raise a ValueError."""
+    """Return the numbers of inputs and results in an interface such as `20x1200` (thesis 3.2), or raise a ValueError."""
     match = _INTERFACE.fullmatch(text)
     if not match:
         raise ValueError(f"{text!r} is not {_AN_INTERFACE}")

@@ -13,16 +13,16 @@ class FitMethod(StrEnum):
     """A method of learning."""
 
     NORMALS = "normals"
-    """Sigma, share of outliers and bias of variables that are normal around a known mean."""
+    """Bias, standard deviation and share of outliers of known variables that are normal around a known mean."""
     COUNTS = "counts"
-    """Whole tables, by counting."""
+    """Whole tables, by counting how often each value was read at each true position."""
 
 
 class FitPrior(StrEnum):
-    """The table that counting starts from."""
+    """The table with which counting starts; it decides where there are few readings."""
 
     MODEL = "model"
-    """The table of the model."""
+    """The model's own table."""
     UNIFORM = "uniform"
     """All values equally probable."""
 

@@ -1,10 +1,10 @@
 """Learning of tables from recordings with ground truth: normals with a share of outliers, or counts.
 
 **Normals.** A reading is `mean(S) + bias + noise` with noise N(0, sigma^2), or, for a share of the readings,
-uniform over the range of the variable. Bias, sigma and share are estimated by expectation maximisation from
-the residuals at the true position; within a cell, the mean is assumed linear. A pool of variables may share
-sigma and bias. Every variable has its own share of outliers, estimated as if it had one more outlier and one more
-good reading (the mode with a Beta(2, 2) prior).
+uniform over the range of the variable. Bias, sigma and share are estimated by expectation maximisation from the
+residuals (reading minus mean) at the true position; the mean is assumed linear within a cell. A pool of variables may
+share sigma and bias. Every variable has its own share of outliers, estimated as if it had one more outlier and one
+more good reading (the mode with a Beta(2, 2) prior).
 
 **Counts.** P(k | s) = (n(k, s) + a q(k | s)) / (n(s) + a): a Dirichlet prior with the weight of `a` readings
 in every cell; q is the table of the model or a uniform one. Likewise P(s) = (n(s) + a M q(s)) / (n + a M)
@@ -36,7 +36,7 @@ from toolchain.learning.fitted import (
 from toolchain.models.model import Known, Model
 
 LEAST_READINGS: Final = 10
-"""Minimum number of readings of a pool; with fewer, it keeps the values set by hand."""
+"""Minimum number of readings of a pool of variables; a pool with fewer keeps the values set by hand."""
 
 _ROUNDS: Final = 1000
 _SETTLED: Final = 1e-10
@@ -51,13 +51,13 @@ class TrueCells:
     """The true position in each usable row."""
 
     rows: NDArray[np.int64]
-    """int64[n], the rows with a true value of every searched dimension inside the grid."""
+    """int64[n], the usable rows: every searched dimension has a true value, and it is inside the grid."""
     lines: NDArray[np.int64]
-    """int64[n], the line of each."""
+    """int64[n], the line of the model's grid in which the true position of each of these rows is."""
     within: NDArray[np.float64]
-    """float64[dimensions, n], the offset from the centre of the cell, in cells: -0.5 to 0.5."""
+    """float64[dimensions, n], the offset of the true position from the centre of its cell, in cells: -0.5 to 0.5."""
     outside: int
-    """The number of other rows."""
+    """The number of rows that are not usable."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,17 +67,17 @@ class Support:
     name: str
     """The variable."""
     readings: int
-    """Number of its readings in rows with a true position."""
+    """Number of the variable's readings in rows with a true position."""
     cells: int
     """Number of lines with at least one of these readings."""
     median: float
-    """The median number of readings in such a line."""
+    """The median number of these readings in a line that has any."""
     refused: int
     """Number of readings that are not values of the variable."""
 
 
 def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> TrueCells:
-    """Return the true position in each of `rows` rows; `columns` are the true values by label."""
+    """Return the true position in each of `rows` rows; `columns` has the true values of each dimension, by its label."""
     places = np.array(
         [[_position(dimension, value) for value in columns[dimension.label]] for dimension in model.searched]
     ).reshape(len(model.searched), rows)
@@ -176,8 +176,8 @@ def mixture(
 ) -> tuple[float, float, list[float]]:
     """Fit one normal to all variables, and to each its share of outliers; return mean, standard deviation and shares.
 
-    `residuals` are readings minus expectations. Outliers are uniform over the range of their variable, whose
-    width is in `widths`. Without `bias`, the mean is 0.
+    `residuals` are the readings of each variable minus their means. Outliers of a variable are uniform over its
+    range, whose width is in `widths`. Without `bias`, the mean of the residuals is 0.
     """
     everything = np.concatenate(residuals)
     mean = float(np.median(everything)) if bias else 0.0
@@ -208,7 +208,7 @@ def mixture(
 def _residuals(
     model: Model, known: Known, truth: TrueCells, values: Sequence[object]
 ) -> tuple[NDArray[np.float64], Support]:
-    """Return reading minus expectation at the true position, for every row with a reading."""
+    """Return reading minus mean at the true position, for every row with a reading, and the amount of data."""
     slopes = mean_slopes(model, known)
     expected = normal_of(known).mean[truth.lines] + (slopes[:, truth.lines] * truth.within).sum(axis=0)
     given = [values[row] for row in truth.rows]

@@ -25,7 +25,7 @@ from toolchain.models.model import Model, cell_centres, exact_posterior
 
 _CHUNK: Final = 1 << 20
 _MOST_BITS: Final = 60
-"""Maximum surprise in bits, for a cell with probability 0."""
+"""Maximum surprise in bits, -log2 of the probability of the true cell; it counts for the probability 0."""
 _MOST_STATES: Final = 12
 """Maximum number of states for which a confusion matrix is shown."""
 
@@ -38,7 +38,7 @@ def run_fit(
     options: FitOptions,
     checks: Sequence[Path] = (),
 ) -> str:
-    """Learn the tables of a model, write them, and return a report; `checks` are not used for learning."""
+    """Learn the tables of a model, write them, and return a report; `checks` are recordings that only test the fit."""
     _check(options, output)
     for path in checks:
         if any(path.resolve() == other.resolve() for other in recordings):
@@ -151,7 +151,7 @@ def _posteriors(
 
 
 def _scores(model: Model, truth: TrueCells, found: Sequence[NDArray[np.float64] | None]) -> Iterator[str]:
-    """Yield accuracy, distance and surprise; distances only between numbers, not between names of states."""
+    """Yield accuracy, distance and surprise; the distance is only over dimensions without names of states."""
     lines = truth.lines.tolist()
     right = sum(
         each is not None and int(each.argmax()) == line for each, line in zip(found, lines, strict=True)

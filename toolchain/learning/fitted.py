@@ -29,11 +29,11 @@ _HEADER: Final = "# Written by `toolchain fit`; read by toolchain.learning.fitte
 _META: Final = "fit.json"
 _PRIOR: Final = "prior.npy"
 _BAD: Final = (zipfile.BadZipFile, zlib.error, KeyError, ValueError, AttributeError, EOFError, RuntimeError)
-"""Errors of NumPy, zipfile and pydantic for a damaged file."""
+"""Errors that NumPy, zipfile and pydantic raise for a damaged file."""
 
 
 class FittedRecording(Section):
-    """A `[[recording]]` used for learning."""
+    """`[[recording]]` of a fit file: a recording used for learning."""
 
     file: str
     sha256: str
@@ -41,7 +41,7 @@ class FittedRecording(Section):
 
 
 class FittedVariable(Section):
-    """A `[[variable]]`, a known variable; with counts, only its name and rows, because its table is an array apart."""
+    """`[[variable]]` of a fit file; after `counts`, it has only name and rows, because its table is an array apart."""
 
     name: str
     rows: int = Field(ge=0)
@@ -137,7 +137,7 @@ def normal_of(known: Known) -> Normal:
 
 
 def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
-    """Return the slopes of a variable's mean: float64[dimensions, lines], per cell."""
+    """Return the change of a variable's mean per cell along each dimension: float64[dimensions, lines]."""
     sizes = tuple(dimension.size for dimension in model.searched)
     mean = normal_of(known).mean.reshape(sizes)
     turn = None if known.period is None else known.period * abs(known.step)
@@ -156,7 +156,7 @@ def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
 
 
 def wrapped(away: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
-    """Return the shorter differences on a circle."""
+    """Return differences around a circle of length `turn`, each the shorter way: -turn / 2 to turn / 2."""
     shorter: NDArray[np.float64] = (away + turn / 2) % turn - turn / 2
     return shorter
 

@@ -25,7 +25,7 @@ MAX_ROWS: Final = 2_000_000
 _LONGEST_LINE: Final = 1 << 20
 
 _STAMP_UNITS: Final = {"stamp_ns": 1, "time_s": 10**9}
-"""The columns of our own CSV files that have the time of a row, and their unit in nanoseconds."""
+"""The columns for the time of a row in CSV files that this project writes, and the nanoseconds in their unit."""
 _STEP: Final = re.compile(r"(\w+)((?:\[\d{1,9}\])*)")
 
 
@@ -38,9 +38,9 @@ class Recording:
     rows: int
     """The number of rows."""
     columns: dict[str, list[object]]
-    """Values by name, one per row: a number, a text, or None if missing."""
+    """The values in each column, by its name, one per row: a number, a text, or None if missing."""
     stamps: tuple[int, ...] = ()
-    """Nanoseconds of each row of a bag, or of a CSV file with stamps if they were asked for; otherwise empty."""
+    """The time of each row in nanoseconds: of a bag, or of a CSV file read with `stamped`; otherwise empty."""
 
 
 def read_recording(
@@ -48,7 +48,7 @@ def read_recording(
 ) -> Recording:
     """Return the named columns of a recording: a CSV file (`.csv`), an MCAP file, a ROS 1 bag or a ROS 2 bag's folder.
 
-    In a bag, the topic of the first column defines the rows; messages of other topics may be `tolerance_s` apart.
+    In a bag, each message on the topic of the first column is a row; those of other topics may be `tolerance_s` away.
     With `stamped`, the stamps of a CSV file are those of its column `stamp_ns` or `time_s`.
 
     Raises:
@@ -64,7 +64,11 @@ def read_recording(
 
 
 def reading_columns(names: Sequence[str], given: Sequence[str]) -> dict[str, str]:
-    """Return the column of each variable, by default its name; a BuildError for a pattern without a match."""
+    """Return the column of each variable: its name, or that of a `PATTERN=COLUMN` in `given`.
+
+    Raises:
+        BuildError: No variable matches a pattern.
+    """
     if not given:
         return {name: name for name in names}
     columns: dict[str, str] = {}

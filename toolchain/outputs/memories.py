@@ -1,9 +1,9 @@
 """The memories of a machine on each board, with a MIF for each: priors, tiles, CDEs, random numbers (thesis 3.2).
 
-All tiles of a column have the same reading, so a column is one memory: its address is that of the reading,
-and a word contains the codes of all lines of the board, with line 0 in the lowest bits. The prior elements
-are also one memory. If each line has its own reading, each tile is a separate memory, with its bits of these words.
-A BM2 has a memory for each CDE, the same on all boards (thesis 2.1.3).
+All tiles of a column have the same reading, so a column is one memory. Its address is that of the reading, and a word
+contains the codes of all lines of the board, with line 0 in the lowest bits. The prior elements are also one memory.
+If each line has its own reading, each tile is a separate memory with the tile's bits of every word. A BM2 has a
+memory for each CDE (conditional distribution encoder), the same on all boards (thesis 2.1.3).
 """
 
 import math
@@ -43,9 +43,9 @@ class Memory:
     comments: tuple[str, ...]
     """Comment lines for the beginning of the file."""
     board: int | None = None
-    """The board that has it, or None if all have the same."""
+    """The board that has this memory, or None if all boards have the same."""
     section: str = ""
-    """The section of the programming file with its codes; none for seeds, which follow from the parameters."""
+    """The section of the programming file with the memory's codes; empty for seeds, which follow from the parameters."""
 
     def lines(self) -> Iterator[str]:
         """Yield the MIF, in canonical form."""
@@ -78,7 +78,7 @@ def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, .
 
 
 def column_name(board: int, column: int, sensors: int) -> str:
-    """Return the file name of a board's column, 1 to `sensors`; all have the same length, for sorting."""
+    """Return the file name of a board's column, counted from 1; names with the same `sensors` have the same length."""
     return f"board{board}_column{column:0{len(str(sensors))}d}.mif"
 
 
@@ -93,7 +93,7 @@ def seed_words(machine: BM1Machine | BM2Machine) -> NDArray[np.uint64]:
 
 
 def seed_width(machine: BM1Machine | BM2Machine) -> int:
-    """Return the bits of a seed: of an LFSR's state, or of an index into the table of random numbers."""
+    """Return the number of bits in a seed, which is an LFSR's state, or an index into the table of random numbers."""
     if machine.rng_table is not None:
         return max(1, (machine.rng_table.size - 1).bit_length())
     return machine.parameters.rng.lfsr_bits or 64
@@ -117,7 +117,7 @@ def packed_words(codes: NDArray[np.uint16], prob_bits: int) -> Iterator[int]:
 
 
 def unpacked_codes(words: Sequence[int], prob_bits: int, count: int) -> NDArray[np.uint32]:
-    """Return the codes of words, uint32[words, count], the inverse of `packed_words`."""
+    """Return `count` codes from each word, uint32[words, count]; the inverse of `packed_words`."""
     size = -(-count * prob_bits // 8)
     data = np.frombuffer(b"".join(word.to_bytes(size, "little") for word in words), np.uint8)
     found = np.empty((len(words), count), np.uint32)

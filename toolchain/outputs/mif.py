@@ -24,7 +24,7 @@ MOST_BYTES: Final = 1 << 30
 """Maximum size of a file in bytes."""
 
 MOST_WORDS: Final = 1 << 24
-"""Maximum depth of a memory, because a few bytes of a file could declare any depth."""
+"""Maximum number of words in a memory, because a few bytes in a file could declare any number."""
 
 MOST_WIDTH: Final = 1 << 20
 """Maximum width of a word in bits: 4096 lines with the widest codes have 65,536."""
@@ -72,7 +72,7 @@ def printable(text: str) -> str:
 def read_mif(path: Path, due: tuple[int, int] | None = None) -> Mif:
     """Read the contents of a memory from any form of MIF; a MifError contains the line.
 
-    `due` is the expected width and depth; if given, a memory of another size, or with a missing address, is refused.
+    With `due`, the expected width and depth, a memory of another size, or with a missing address, is refused.
     """
     data = read_bounded(path, MOST_BYTES, MifError)
     return parse_mif(data.decode("latin-1"), str(path), due)
@@ -84,7 +84,7 @@ def parse_mif(text: str, name: str = "the MIF", due: tuple[int, int] | None = No
 
 
 class _Reader:
-    """A token reader; `_kind` and `_word` are the current token, `_line` is its line."""
+    """A reader of a MIF's tokens; `_kind` and `_word` are the current token, and `_line` is its line."""
 
     def __init__(self, text: str, name: str, due: tuple[int, int] | None) -> None:
         self._name = name
@@ -238,7 +238,7 @@ def _short(word: str) -> str:
 
 
 LENGTH: Final = 1 << 16
-"""Length of a generated table: a multiple of every number of codes."""
+"""Length of a generated table of random numbers: a multiple of the number of codes at every width of codes."""
 
 
 def table_length(machine: BM1Machine | BM2Machine) -> int:

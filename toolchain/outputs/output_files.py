@@ -22,7 +22,7 @@ from toolchain.outputs.vhdl_parameters import PARAMETERS_FILE, parameters_vhd
 
 FAMILY: Final = "Stratix V"
 DEVICE: Final = "5SGSMD8K2F40C2"
-"""A Stratix V GS D8, as on the thesis's Proce V boards; compare package and speed grade with the board."""
+"""A Stratix V GS D8, as on the thesis's Proce V boards; check its package and speed grade against your board."""
 
 PROJECT: Final = "bm1"
 
@@ -85,7 +85,7 @@ foreach revision {{{" ".join(revisions)}}} {{
 
 
 class Change(StrEnum):
-    """Effect of writing on a file."""
+    """What writing the files of a part does to one file."""
 
     UNCHANGED = "unchanged"
     CHANGED = "changed"
@@ -95,7 +95,7 @@ class Change(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class OutputFiles:
-    """A part of a deployment: its files, and a pattern for files of earlier builds."""
+    """A part of a deployment, such as its MIFs: the files, and a pattern for those of earlier builds."""
 
     contents: dict[str, Iterable[bytes]]
     """For each path in the deployment's folder, the pieces of the file's content, which can be consumed once."""
@@ -128,7 +128,7 @@ def _encoded(memory: Memory) -> Iterator[bytes]:
 
 
 def only_emulated(deployment: Deployment) -> str:
-    """Return why the machine exists only in emulation, as a clause; empty if there is hardware of it."""
+    """Return why the machine exists only in emulation, as a clause; empty if it also exists as hardware."""
     if not deployment.machine.kind.has_hardware:
         return f"the VHDL of a {deployment.machine.type} does not exist yet"
     return "rng = ideal exists only in emulation" if deployment.machine.rng is RngKind.IDEAL else ""
@@ -178,7 +178,7 @@ def text_file(name: str, text: str) -> OutputFiles:
 
 
 def write_files(directory: Path, *parts: OutputFiles) -> list[tuple[str, Change]]:
-    """Write the files of parts, one after the other, each atomically; return every path, sorted, and its change."""
+    """Write the parts' files one after the other, each atomically; return every path, sorted, and the file's change."""
     changes: dict[str, Change] = {}
     for part in parts:
         changes |= {name: _write(directory / name, pieces) for name, pieces in part.contents.items()}
@@ -202,7 +202,7 @@ def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change
 
 
 def _stale(directory: Path, files: OutputFiles) -> list[str]:
-    """Return the paths that an earlier build wrote for this part, and that are not in its `contents` now."""
+    """Return the paths that an earlier build wrote for this part, and that the part no longer has."""
     folders = ("", "boards", PARAMETERS_FILE.partition("/")[0], MEMORIES_FOLDER)
     paths = [path for folder in folders for path in (directory / folder).glob("*")]
     names = [path.relative_to(directory).as_posix() for path in paths]

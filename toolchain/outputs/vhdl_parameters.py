@@ -211,7 +211,7 @@ def _memory_files(images: Sequence[Image]) -> str:
 _TOKEN: Final = re.compile(r'\n|--[^\n]*|\w*"[^"\n]*"|[\w.]+|:=|=>|[^\s]')
 _MOST_BYTES: Final = 4 << 20
 _FLAGS: Final = {"RNG_KIND": " --rng", "RNG_SHARED": " --per-cell", "RNG_BANKS": " --rng-banks"}
-"""The flags of a build to name in the error if somebody edits these constants of the generators."""
+"""For each constant of the generators, the flag of the build that changes it, for the error after an edit by hand."""
 _IMAGE_HASH: Final = re.compile(r'(image_hash\s*=>\s*)x"[0-9a-f]{64}"')
 
 
@@ -219,7 +219,7 @@ _IMAGE_HASH: Final = re.compile(r'(image_hash\s*=>\s*)x"[0-9a-f]{64}"')
 class PackageTokens:
     """The package as tokens without comments, in lower case like VHDL's names, and the line of each.
 
-    Hashes of images are left out, because they follow from the rest.
+    Hashes of images are left out, because they follow from the other tokens.
     """
 
     name: str
