@@ -34,13 +34,13 @@ class ImageMismatchError(ImageError):
 
 
 class FrameInputError(PcieShimError):
-    """A frame that does not fit the machine: addresses, target, prior or bank."""
+    """A frame whose addresses, target, prior or bank do not fit the machine."""
 
     exit_code = 2
 
 
 class SimulationError(PcieShimError):
-    """A simulation of a board's hardware that cannot be started, ended, hangs, or answers garbage."""
+    """A simulation of a board's hardware that cannot be started, has ended, hangs, or answers garbage."""
 
 
 class LinkError(PcieShimError):

@@ -2,7 +2,7 @@
 
 All numbers are little-endian. The CRC covers the other 16 bytes of the header and the words. Read requests and
 replies to writes have a count, but no words. The framing corresponds to the data link layer of thesis 2.3, which adds
-sequence numbers and CRCs to read and write requests. `FrameDecoder` uses one buffer as long as the link is open.
+sequence numbers and CRCs to read and write requests.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def encode(
 
 
 class FrameDecoder:
-    """Decoder of a stream of bytes into frames.
+    """Decoder of a stream of bytes into frames, which receives into the same buffer as long as the link is open.
 
     Receive into `room`, pass the number of bytes to `received`, then call `next_frame` until it returns None.
     After an error the decoder is unusable.
@@ -157,7 +157,7 @@ class Greeting(NamedTuple):
     Attributes:
         protocol_version: Version of the wire format.
         bar_size: Size of the register map, in bytes.
-        board: Number of the board, given at its start.
+        board: Index of the board, which its server got when it was started.
         map_hash: SHA-256 (hex) of the register map's definition.
         image_hash: SHA-256 (hex) of the loaded image; all zeros on a blank board.
         token: Token that proves to the programming port that its sender holds this link.

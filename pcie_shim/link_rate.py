@@ -34,8 +34,8 @@ class LinkModel:
         self._wire = wire
         self._wait = wait
 
-        # Monotonic time at which the last transfer leaves the wire; a shared one has it in memory that forks share,
-        # under a lock, which the kernel takes from a process that is killed.
+        # Monotonic time at which the last transfer leaves the wire. For a shared wire it is in memory that forks share,
+        # under a lock, which the kernel releases if its owner is killed.
         self._free_ns = memoryview(mmap.mmap(-1, 8) if wire.shared else bytearray(8)).cast("q")
         self._lock = os.memfd_create("wire") if wire.shared else None
 

@@ -1,8 +1,8 @@
 """Programming files, which the toolchain builds from a model and the loader sends to a board (thesis 3.4).
 
 A file is a fixed header, a manifest (readable JSON: `head -c 4000 board0.bm`) and the tables of the machine,
-one section each. The header contains the SHA-256 of the manifest, and the manifest that of every section, so
-that an error names the damaged part. The same image and build date always give the same bytes.
+one section each. The header contains the SHA-256 of the manifest, and the manifest the SHA-256 of every section,
+so that an error names the damaged part. The same image and build date always give the same bytes.
 
 `image_hash` identifies the computation: parameters, tables, partition, interface, model and register map, but
 not the date or the version of the tools.
@@ -37,12 +37,12 @@ MAX_IMAGE_BYTES: Final = 1 << 30
 
 _HEADER: Final = struct.Struct("<8sII32s")  # magic, length of the manifest, zero, SHA-256 of the manifest
 
-_Word: TypeAlias = Annotated[int, Field(ge=0, lt=2**32)]  # a number in a file is checked, a given one is not
+_Word: TypeAlias = Annotated[int, Field(ge=0, lt=2**32)]  # pydantic checks it when a file is read
 
 
 @dataclass(frozen=True)
 class Partition:
-    """The lines of a model of `total_lines` lines that are on board `index` of `count`: those from `line_offset` on."""
+    """The part on board `index` of `count` of a model with `total_lines` lines: the lines from `line_offset` on."""
 
     index: _Word
     count: _Word
@@ -298,7 +298,7 @@ def _read_sections(
     due = kind.due_sections(manifest.identity.parameters)
     for section in manifest.identity.sections:
         name_due, dtype, shape = next(due, ("no further section", "", ()))
-        # -1: the only length that the parameters do not define
+        # -1 stands for a length that the parameters do not define
         fits = len(shape) == len(section.shape) and all(
             size in {-1, given} for size, given in zip(shape, section.shape, strict=True)
         )

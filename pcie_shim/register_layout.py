@@ -14,10 +14,10 @@ WORD: Final = struct.Struct("<I")
 """A register of 32 bits."""
 
 SETTINGS: Final = struct.Struct("<IQII")
-"""TARGET_COUNT, MAX_CYCLES, BANK and PRIOR_SELECT, followed by RUN_UNTIL and the doorbells."""
+"""The registers TARGET_COUNT, MAX_CYCLES, BANK and PRIOR_SELECT; RUN_UNTIL and the doorbells come next in the map."""
 
 DONE_BLOCK: Final = struct.Struct("<IIQQ")
-"""DONE, STATUS, CYCLES and COMPUTE_NS."""
+"""The registers DONE, STATUS, CYCLES and COMPUTE_NS."""
 
 
 def next_doorbell(number: int) -> int:
@@ -36,7 +36,7 @@ def field_of(mask: int, word: int) -> int:
 
 
 def register_values(fields: Mapping[str, int]) -> dict[int, int]:
-    """Return register values by address, given values by register (`CAP_LINES`) or by field (`CAP_MACHINE.RNG`)."""
+    """Return register values by address from values by register (`CAP_LINES`) or by field (`CAP_MACHINE.RNG`)."""
     values: dict[int, int] = {}
     for name, value in fields.items():
         register, _, field = name.partition(".")
@@ -47,5 +47,5 @@ def register_values(fields: Mapping[str, int]) -> dict[int, int]:
 
 
 def interface_room(registers: UsedRegisters) -> tuple[int, int]:
-    """Return how many input words and result words the map has room for, with the block `registers.inputs`."""
+    """Return how many words the map has for inputs (in the block `registers.inputs`), and how many for results."""
     return rm.BLOCKS[registers.inputs].words, rm.RESULTS.words

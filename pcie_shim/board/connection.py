@@ -47,13 +47,12 @@ class Connection:
         self.socket = connection
         self.decoder = framing.FrameDecoder()
 
-        # The model of a slower link, and the monotonic time at which it gets the frames of the last receive: when the
-        # first one is decoded, so that its time comes on top of the socket's; 0 before that.
+        # The model of a slower link, and the monotonic time from which it delays the frames of the last receive: when
+        # the first of them is decoded, so that the delay comes on top of the socket's; 0 before that.
         self._link = link
         self._sent_ns = 0
 
-        # Frames that are sent when all requests received so far have been handled, as they arrived together; empty
-        # outside of `answer`.
+        # True while `answer` handles the requests that arrived together, and the frames that it will send at its end.
         self._answering = False
         self._unsent = bytearray()
 

@@ -90,7 +90,7 @@ class EmulatedBoard:
         # Cycles of the next chunk, which adapts to the measured speed, and of the first one of each frame.
         self._chunk = self._first_chunk = _SHORTEST_CHUNK
 
-        # Those of the last start or resume: its limits, its time so far, and its number.
+        # Of the last start or resume: its limits, its computing time so far, and its doorbell number.
         self._max_cycles = 0
         self._run_until = 0
         self._compute_ns = 0

@@ -39,7 +39,7 @@ class RtlBoard:
         """Create a blank board; `simulate` compiles and starts an image's hardware, or raises a SimulationError."""
         self._simulate = simulate
 
-        # While there is no simulation, this one answers.
+        # While there is no simulation, this board answers.
         self._blank = EmulatedBoard(sends_results=False)
 
         # The simulated hardware and the hash of its image; programming the board again replaces both.
@@ -52,7 +52,7 @@ class RtlBoard:
         # Clocks of the next chunk, which adapts to the measured speed.
         self._chunk = _SHORTEST_CHUNK
 
-        # Those of `Board`: `done` and `running` are what the hardware's registers said last.
+        # Attributes that `Board` requires; `done` and `running` are the last values read from the hardware's registers.
         self.turned = 0.0
         self.programmed = 0
         self.done = 0
@@ -159,7 +159,7 @@ class RtlBoard:
         places = range(address, address + 4 * count, 4)
         writes = list(zip(places, struct.unpack(f"<{count}I", words), strict=True))
         if count > 1:
-            # in a burst, doorbells take effect after all other words, and 0 is none
+            # in a burst, doorbells take effect after all other words; a 0 written to a doorbell has no effect
             rings = [write for write in writes if write[0] in _DOORBELLS and write[1]]
             writes = [write for write in writes if write[0] not in _DOORBELLS] + rings
         # one by one, up to the first that is refused

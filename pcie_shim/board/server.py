@@ -1,4 +1,4 @@
-"""The server of a board: one thread that serves the registers to one host at a time, and a loader.
+"""The server of a board: one thread that serves the registers to one host at a time, and programs the board.
 
     host ────▶ register port ────┐
                                  ├─ one epoll loop ─── board (registers, machine)
@@ -124,11 +124,11 @@ def serve_board(
 ) -> None:
     """Serve board number `index`, emulated by default and initially blank, until `stop`; then remove the socket files.
 
-    With `pin`, this thread is pinned to one of its allowed cores, number `index` modulo their number. Boards compute
+    With `pin`, this thread is pinned to one of its allowed cores, chosen by `index` modulo their count. Boards compute
     for tenths of a millisecond, too short for Linux to distribute the threads woken by one host over the cores:
-    without pinning, the boards of a mini-cluster would compute one after the other. The thread also gets the policy
-    SCHED_BATCH, so that it does not preempt others when it wakes. `link` delays the frames of hosts. `on_ready` is
-    called when both sockets are listening.
+    without pinning, the boards of a mini-cluster would compute one after the other. The pinned thread also gets the
+    policy SCHED_BATCH, so that it does not preempt other threads when it wakes. `link` delays the frames of hosts.
+    `on_ready` is called when both sockets are listening.
 
     Raises:
         EndpointError: The endpoint is invalid or in use.
@@ -176,7 +176,7 @@ class BoardServer:
         self._loader: LoaderConnection | None = None
         self._silent_loaders: dict[int, LoaderConnection] = {}
 
-        # Everything above that has a descriptor is registered here, from its creation until it is closed.
+        # All of the sockets above, and the stop signal, are registered here until they are closed.
         self._epoll = select.epoll()
         for descriptor in (stop.fileno(), self._registers.fileno(), self._programming.fileno()):
             self._epoll.register(descriptor, _READABLE)

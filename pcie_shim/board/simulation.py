@@ -44,7 +44,7 @@ class SimulatorAnswer(NamedTuple):
 
 
 class Simulation:
-    """A running simulation; `speed` is in clocks per second while the machine runs, and 0 until it is measured."""
+    """A running simulation; `speed` is its clocks per second while the machine runs, 0 until that was measured."""
 
     def __init__(self, command: Sequence[str], folder: Path) -> None:
         """Start the child, or raise a SimulationError; its first answer may take START_S."""
@@ -63,7 +63,7 @@ class Simulation:
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
                 bufsize=0,
-                start_new_session=True,  # a Ctrl-C is for the board, which ends the child
+                start_new_session=True,  # so that a Ctrl-C reaches only the board, which ends the child
             )
         except OSError as error:
             self._errors.close()

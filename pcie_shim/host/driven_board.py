@@ -44,7 +44,7 @@ class DrivenBoard:
         self.image = image
         self._reprogram = reprogram
 
-        # What follows from the image: the blocks of an answer, which begins with the results, and its reasons.
+        # What follows from the image: the stop reasons, and the blocks of an answer, which begins with the results.
         self._kind = image.kind
         self._reasons = frozenset(image.kind.reasons) - {0}
         self.replicas = image.registers.replicas
@@ -66,7 +66,7 @@ class DrivenBoard:
         self.settings: FrameSettings | None = None
         self._blocks: dict[str, bytes] = {}
 
-        # Number of the last doorbell, and whether its answer is still missing: then `done` is None.
+        # Number of the last doorbell, and whether the board's answer to it is still missing; `done` is then None.
         self.number = 0
         self.waiting = False
         self.done: Done | None = None
@@ -74,7 +74,7 @@ class DrivenBoard:
         # True from `ask` until `fetch` has read what was asked for.
         self.asked = False
 
-        # Of the last answer: its words (set by `fetch`), each replica's stop reason, and with several their cycles.
+        # The last answer's words (set by `fetch`), the replicas' stop reasons, and if there are several, their cycles.
         self.answer = memoryview(b"")
         self.reasons: tuple[int, ...] = (0,) * self.replicas
         self._replica_cycles: tuple[int, ...] = ()
@@ -131,7 +131,7 @@ class DrivenBoard:
             )
         # a machine that another host left running would refuse every other write
         link.write32(rm.CONTROL, rm.CONTROL_RESET_MASK)
-        # memory that is no board reads what was written
+        # plain memory would return what was written, a board returns its complement
         pattern = time.monotonic_ns() & ALL_ONES
         link.write32(rm.LIVENESS, pattern)
         if link.read32(rm.LIVENESS) != pattern ^ ALL_ONES:
@@ -155,7 +155,7 @@ class DrivenBoard:
         theirs = dict(zip(_CAPABILITIES, (word for (word,) in words), strict=True))
         self.sends_results = bool(theirs[rm.CAP_LINK] & rm.CAP_LINK_SENDS_RESULTS_MASK)
         registers = self.image.registers
-        # these decide how long a result is, and where its parts are
+        # the capabilities decide how long a result is, and where its parts are
         for address, value in register_values(registers.capabilities).items():
             if theirs[address] != value:
                 name = next(name for name, block in rm.BLOCKS.items() if block == address)

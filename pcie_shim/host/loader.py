@@ -20,8 +20,8 @@ def program(
     """Program the board with the given register endpoint, and return the image hash that the board then reports.
 
     The file and the board's register map are checked before the board is changed. Connecting, transferring the file
-    and loading the machine may each take `timeout` seconds. `token` comes from
-    the greeting of this host's link to the board, if it has one.
+    and loading the machine may each take `timeout` seconds. If this host has a link to the board, `token` is that of
+    the link's greeting.
 
     Raises:
         ImageError: The file is missing, damaged, or for another register map.

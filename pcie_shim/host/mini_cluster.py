@@ -77,7 +77,7 @@ class _Progress:
         self.running = boards
         self.left = 0
 
-        # The cycles of the slice, the seconds that they may take, and the monotonic time when these are over.
+        # The cycles of the slice, the seconds that they may take, and the monotonic time when these seconds are over.
         self.cycles = 0
         self.limit = 0.0
         self.deadline = 0.0
@@ -279,7 +279,7 @@ class MiniCluster:
 
     def _next_slice(self, progress: _Progress) -> FrameOutput | None:
         """Return the frame's result after its last slice; otherwise start the next slice and return None."""
-        # the boards' own times are of this slice, so those of the slowest are added up
+        # a board reports its computing time in this slice: the longest one of each slice is added up
         now = time.perf_counter_ns()
         progress.waits_ns += now - progress.clock_ns
         progress.clock_ns = now
@@ -372,7 +372,7 @@ class MiniCluster:
             self._register(board)
 
     def _open(self, board: DrivenBoard, connect_timeout: float) -> None:
-        # its link may be open still, if only another board has failed
+        # this board's link may still be open, if only another board has failed
         self._close(board, "it is being opened")
         self._connect(board, connect_timeout)
         self._register(board)

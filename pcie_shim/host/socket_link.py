@@ -109,7 +109,7 @@ class SocketLink:
         # Bytes of all frames in both directions, and transfers: frames that were sent together count once.
         self.bytes_moved = self.transfers = 0
 
-        # Reads whose answers `answers` returns: their sequence numbers, addresses and words, in order.
+        # Read requests whose answers `answers` will return: sequence number, address and number of words, in order.
         self._asked: list[tuple[int, int, int]] = []
 
         # An interrupt that came while a request waited for its answer, with a copy of its results, until it is taken.
@@ -130,7 +130,7 @@ class SocketLink:
             if frame.operation == framing.ERROR:
                 self._refused(frame)
             self.greeting = framing.decode_greeting(frame)
-            # proves to the programming port that its owner holds this link
+            # the token proves to the programming port that its owner holds this link
             self.token = self.greeting.token
         except LinkError as error:
             self._give_up(error)
@@ -175,7 +175,7 @@ class SocketLink:
             GreetingMismatchError: The board has another protocol version, register map or BAR size.
             LinkError: The peer does not greet, or is not a board.
         """
-        # the greeting is the board's word; `DrivenBoard` compares the registers too
+        # the greeting is only what the board says; `DrivenBoard` compares the registers, too
         link = cls._opened(endpoint, timeout, timeout if connect_timeout is None else connect_timeout)
         greeting = link.greeting
         for what, theirs, ours in (
@@ -198,7 +198,7 @@ class SocketLink:
             try:
                 return cls(endpoint, timeout=timeout, connect_timeout=connect_timeout)
             except HeldError:
-                # perhaps by this host's own link, whose end is still on its way
+                # the board may be held by this host's previous link, whose end it has not noticed yet
                 if time.monotonic() >= deadline:
                     raise
                 time.sleep(_RETRY_S)
@@ -454,7 +454,7 @@ class SocketLink:
     def _give_up(self, error: LinkError) -> NoReturn:
         """Close the link, and raise the error."""
         if not self._closed and type(error) in {FramingError, CrcError, SequenceError}:
-            # the decoder does not know the endpoint
+            # the error of the decoder does not name the endpoint
             error = type(error)(f"The link to the board at {self.endpoint} is broken and closed: {error}")
         self.close(str(error))
         raise error
