@@ -141,17 +141,15 @@ def _prior(deployment: Deployment, board: int, image: Image) -> Memory:
             depth=parameters.lines,
             words=lambda: (int(code) for code in image.machine.prior[0]),
             comments=(
-                "prior elements, P(S), until the host writes another",
-                f"address = the line of the board, from line {part.line_offset} of the model on",
+                "prior elements, P(S), until the host writes another prior",
+                f"address = the line of the board; line 0 of the board is line {part.line_offset} of the model",
             ),
             board=board,
             section="prior",
         )
     what = "P(S)"
     if select is not None:
-        what = (
-            f"P(S | {select.name}): address = the value of {select.name}; the top one is the prior without it"
-        )
+        what = f"P(S | {select.name}): address = the reading of {select.name}; the top address is a missing reading"
     return _codes(name, f"prior elements, {what}", image, image.machine.prior, "prior")
 
 
@@ -160,13 +158,13 @@ def _columns(deployment: Deployment, board: int, image: Image) -> Iterator[Memor
     parameters = image.machine.parameters
     if not parameters.has_tables:
         return
-    whose = "the line's own " if parameters.sensor_mode is SensorMode.CELL else "the "
+    whose = "each line's own " if parameters.sensor_mode is SensorMode.CELL else "the "
     for column, (variable, table) in enumerate(
         zip(deployment.sensors, image.machine.tables, strict=True), start=1
     ):
         what = (
-            f"column {column}, tiles, P({variable.name} | S): address = {whose}value of {variable.name}, {variable.values} "
-            "are served; the top one is a missing reading"
+            f"column {column}, tiles, P({variable.name} | S): address = {whose}reading of {variable.name}, one of "
+            f"{variable.values} values; the top address is a missing reading"
         )
         yield _codes(column_name(board, column, sensors), what, image, table, f"column {column}")
 
@@ -182,8 +180,8 @@ def _codes(name: str, what: str, image: Image, codes: NDArray[np.uint16], sectio
         comments=(
             what,
             (
-                f"a word is the codes, {bits} bits each, of lines {part.line_offset} to {part.line_offset + lines - 1}, "
-                "the first in the lowest bits"
+                f"a word has the codes, {bits} bits each, of lines {part.line_offset} to {part.line_offset + lines - 1}, "
+                f"line {part.line_offset} in the lowest bits"
             ),
         ),
         board=part.index,
@@ -201,7 +199,10 @@ def _seeds(machine: BM1Machine | BM2Machine, prefix: str, address: str) -> list[
             width=seed_width(machine),
             depth=parameters.rng_banks * generators(parameters),
             words=lambda: (int(word) for word in seed_words(machine).ravel()),
-            comments=(f"where the generators ({parameters.rng}) start", f"address = {address}"),
+            comments=(
+                f"start states of the random number generators ({parameters.rng})",
+                f"address = {address}",
+            ),
         )
     ]
 
@@ -223,8 +224,8 @@ def _cdes(machine: BM2Machine) -> Iterator[Memory]:
             depth=table.size,
             words=partial(map, int, table),
             comments=(
-                f"CDE {at}, of the variables {_listed(factor)}, which are the bits {_listed(bits)} of the state",
-                f"address = j * {1 << len(bits) - 1} + the other bits, for the pointed bit number j of these",
+                f"CDE {at}, for the factor of variables {_listed(factor)}, which are the bits {_listed(bits)} of the state",
+                f"address = j * {1 << len(bits) - 1} + the other bits, if the sequencer points to bit number j of these",
             ),
             section=f"cde {at}",
         )
@@ -245,7 +246,7 @@ def _chain_seeds(machine: BM2Machine, prefix: str) -> Iterator[Memory]:
         width=16,
         depth=parameters.rng_banks,
         words=lambda: map(int, LFSR(RngKind.LFSR16).seeds(sets)),
-        comments=("where the generator (lfsr16) of the random sequencer starts", "address = bank"),
+        comments=("start states of the random sequencer's generator (lfsr16)", "address = bank"),
     )
 
 
@@ -256,6 +257,8 @@ def _rng_table(table: NDArray[np.uint32], prob_bits: int) -> Memory:
         width=prob_bits,
         depth=table.size,
         words=lambda: (int(number) & mask for number in table),
-        comments=("the random numbers that all generators play in a ring",),
+        comments=(
+            "random numbers; every generator reads them in this order, and starts again after the last",
+        ),
         section="rng",
     )

@@ -28,8 +28,8 @@ PROJECT: Final = "bm1"
 
 _UNVERIFIED: Final = """\
 # NOT VERIFIED BY QUARTUS: this file was written from Quartus's documentation and has never been opened by it.
-# The device is a Stratix V GS D8; its package and speed grade, the pins and the PCIe controller are the board's:
-# compare them with what came with it.
+# The device is a Stratix V GS D8. Its package and speed grade, the pins and the PCIe controller depend on the board:
+# compare them with the board's documentation.
 """
 
 
@@ -45,7 +45,7 @@ set_global_assignment -name PROJECT_OUTPUT_DIRECTORY output_files/board{board}
 set_global_assignment -name VHDL_INPUT_VERSION VHDL_2008
 set_global_assignment -name NUM_PARALLEL_PROCESSORS ALL
 
-# Which of PARTITIONS in bm1_parameters.vhd this revision is.
+# The index of this board in PARTITIONS of bm1_parameters.vhd.
 set_parameter -name BOARD {board}
 
 set_global_assignment -name VHDL_FILE "{PARAMETERS_FILE}"
@@ -56,8 +56,8 @@ def _script(revisions: Sequence[str]) -> str:
     return f"""#
 # Compiles a programming file for every board, in the project's folder:
 #     quartus_sh -t {PROJECT}.tcl FOLDER
-# FOLDER holds the machine's VHDL, as the project's hdl/: the entity {PROJECT} with the generic BOARD, what it is made of,
-# and in synthesis/ the memories that are filled from the MIFs.
+# FOLDER has the machine's VHDL, as hdl/ of rosbayes: the entity {PROJECT} with the generic BOARD, the entities in it, and,
+# in synthesis/, the memories that are filled from the MIFs.
 
 package require ::quartus::project
 package require ::quartus::flow

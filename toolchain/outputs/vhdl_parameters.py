@@ -44,38 +44,45 @@ def parameters_vhd(deployment: Deployment, images: Sequence[Image]) -> str:
     return "".join(
         [
             f"-- Parameters of the Bayesian machine of the model {printable(deployment.name)}, VHDL-2008.\n",
-            f"-- It searches {printable(searched)}; the first is the slowest in the lines' order.\n",
-            "-- Written by 'toolchain build'; after an edit, 'toolchain regenerate images' makes images of it.\n\n",
+            f"-- It searches {printable(searched)}; the first varies slowest from line to line.\n",
+            "-- Written by 'toolchain build'; after an edit, 'toolchain regenerate images' updates the images.\n\n",
             "library ieee;\nuse ieee.std_logic_1164.all;\n\npackage bm1_parameters is\n\n",
             _TYPES,
             _section("The matrix: column 0 is the prior, columns 1 to SENSORS the known variables"),
             _constant("LINES", "positive", deployment.machine.lines, "of the whole model"),
             _constant("SENSORS", "natural", parameters.sensors),
             _constant("COLUMNS", "positive", parameters.columns),
-            _constant("REPLICAS", "positive", parameters.replicas, "machines around the same generators"),
+            _constant("REPLICAS", "positive", parameters.replicas, "machines that share the generators"),
             _constant(
                 "SENSOR_MODE",
                 "sensor_mode_t",
                 f"SENSOR_{parameters.sensor_mode.upper()}",
-                "what a column's cells are given",
+                "what the cells of a column get in a frame",
             ),
             _sensor_widths(deployment, parameters),
             _section("Resolutions, in bits"),
             _constant("PROB_BITS", "positive", parameters.prob_bits, "of a code in the probability tables"),
-            _constant("PRIOR_BITS", "natural", parameters.prior_bits, "of the prior's address; 0: one row"),
+            _constant(
+                "PRIOR_BITS",
+                "natural",
+                parameters.prior_bits,
+                "of the prior's address; 0 for a prior of one row",
+            ),
             _constant("COUNTER_BITS", "positive", parameters.counter_bits),
             _section("The prior"),
             _flag("PRIOR_WRITTEN", parameters.prior_mode is PriorMode.WRITTEN, "the host writes it"),
             _generator_constants(image),
             _seed_constants(image),
-            _section("When a machine stops: the registers hold 0 until the host writes these"),
+            _section(
+                "When a machine stops: the host writes these values into registers, which hold 0 before"
+            ),
             _constant("TARGET_COUNT", _vector(32), _hexadecimal(deployment.machine.target_count, 32)),
             _constant("MAX_CYCLES", _vector(64), _hexadecimal(deployment.machine.max_cycles, 64)),
             _section("The PCIe interface"),
             _constant("INTERFACE_SENSORS", "positive", image.interface_sensors, "inputs"),
             _constant("INTERFACE_RESULTS", "positive", image.interface_results, "outputs"),
             _constant("MAP_HASH", _vector(256), _hexadecimal(int(image.map_hash, 16), 256)),
-            _section("The boards, and which lines each one holds"),
+            _section("The boards, and the lines of the model that each board has"),
             _constant("BOARDS", "positive", len(images)),
             _constant("MODEL_HASH", _vector(256), _hexadecimal(int(image.model_hash, 16), 256)),
             _partitions(images),
@@ -131,9 +138,9 @@ def _sensor_widths(deployment: Deployment, parameters: BM1Parameters) -> str:
         )
     ]
     title = (
-        "\n  -- Address bits of every column; its top address is a missing reading.\n"
+        "\n  -- Address bits of every column; the top address of a column is a missing reading.\n"
         if parameters.has_tables
-        else "\n  -- Bits of the codes that a column's cells are given; all ones is a missing reading.\n"
+        else "\n  -- Bits of the codes that the cells of a column get; all ones is a missing reading.\n"
     )
     return title + _array("SENSOR_BITS", "natural_array_t", rows, f"1 to {parameters.sensors}")
 
@@ -145,7 +152,7 @@ def _generator_constants(image: Image) -> str:
         "RNG_KIND", "rng_kind_t", f"RNG_{parameters.rng.upper()}"
     )
     width, taps = seed_width(image.machine), 0
-    state, polynomial = "of a generator's state: a place in the table", "no LFSR"
+    state, polynomial = "of a generator's state: an index of the table", "no LFSR"
     if exponents is not None:
         taps = sum(1 << (exponent - 1) for exponent in exponents)
         state = "of a generator's state"
@@ -156,7 +163,9 @@ def _generator_constants(image: Image) -> str:
     return (
         text
         + _constant("RNG_TABLE_LENGTH", "positive", length, what)
-        + _flag("RNG_SHARED", parameters.shared, "one a column, shared by its lines; else one a cell")
+        + _flag(
+            "RNG_SHARED", parameters.shared, "one per column, shared by its lines; otherwise one per cell"
+        )
         + _constant("STEPS_PER_CLOCK", "positive", parameters.steps_per_clock)
         + _flag("RNG_RESET_BANK", parameters.rng_reset is RngReset.BANK, "a frame restarts the generators")
         + _constant("RNG_BANKS", "positive", parameters.rng_banks, "sets of seeds")
@@ -166,11 +175,11 @@ def _generator_constants(image: Image) -> str:
 def _seed_constants(image: Image) -> str:
     parameters = image.machine.parameters
     if parameters.rng is RngKind.IDEAL:
-        return "\n  -- RNG_IDEAL exists emulated only: there are no seeds.\n"
+        return "\n  -- RNG_IDEAL exists only in emulation, and has no seeds.\n"
     width = seed_width(image.machine)
     text = "\n" + _constant("SEED_BITS", "positive", width)
     if not parameters.shared or parameters.rng_banks * generators(parameters) > _MOST_SEEDS:
-        return text + "  -- The seeds are in Memory_MIFs alone, since they are many.\n"
+        return text + "  -- The seeds are only in Memory_MIFs, because there are too many for this package.\n"
     kind = f"  type seed_array_t is array (natural range <>, natural range <>) of {_vector(width)};\n"
     rows = [
         f"    {bank} => ({', '.join(f'{column} => {_hexadecimal(int(seed), width)}' for column, seed in enumerate(row))})"
@@ -178,7 +187,7 @@ def _seed_constants(image: Image) -> str:
     ]
     bounds = f"0 to {parameters.rng_banks - 1}, 0 to {parameters.columns - 1}"
     return (
-        f"{text}  -- By bank and column, as in Memory_MIFs/rng_seeds.mif.\n{kind}"
+        f"{text}  -- The seed of each bank and column, as in Memory_MIFs/rng_seeds.mif.\n{kind}"
         f"  constant RNG_SEEDS         : seed_array_t({bounds}) := (\n" + ",\n".join(rows) + "\n  );\n"
     )
 
