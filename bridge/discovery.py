@@ -5,7 +5,7 @@ Its properties are `path` of the URL, `tls`, `token` and `ros` (1 or 2). All are
 configuration of Avahi is sufficient to announce a rosbridge server.
 
 `zeroconf` is an extra (`pip install zeroconf`), imported when one of these functions is called.
-Data from the network is not trusted: it is bounded and printable.
+Data from the network is not trusted: its amount is limited, and announcements with unprintable names are ignored.
 
 Source: RFC 6762 and 6763.
 """

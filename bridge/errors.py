@@ -1,11 +1,11 @@
 """Errors of rosbridge connections, each with one sentence for the user.
 
 `str(error)` states what happened, where, what was expected and, if it helps, what to do. `exit_code` is the
-exit code of a command that ends with the error.
+exit code of a command that ends with the error; classes below these inherit it.
 
-* `BridgeError` (3: the server, or what it sent)
-    * `UsageError` (2: usage, configuration or credentials)
-    * `FieldMissingError`, `FieldAmbiguousError` (4: a variable was not found in a message)
+* `BridgeError`: 3, caused by the server, or by what it sent
+    * `UsageError`: 2, caused by usage, configuration or credentials
+    * `FieldMissingError`, `FieldAmbiguousError`: 4, a variable was not found in a message
 """
 
 from typing import ClassVar
@@ -32,11 +32,11 @@ class NameFormError(UsageError):
 
 
 class TypeConflictError(UsageError):
-    """Raised when one topic is advertised or subscribed twice by one client with different types."""
+    """Raised when one client uses a topic twice with different types or options, or serves the same name twice."""
 
 
 class OptionError(UsageError):
-    """Raised when an option is out of range (a rate, a queue size, a time)."""
+    """Raised when an option is invalid: a number out of range, an unusable file, or two that exclude each other."""
 
 
 class ConcurrentReadError(UsageError):
@@ -64,7 +64,7 @@ class MessageTypeError(EncodeError):
 
 
 class TopicLeftOutError(BridgeError):
-    """Raised when a topic is left out, because its messages are too large for the connection."""
+    """Raised when a client no longer subscribes to a topic, because its messages exceed the client's limit."""
 
 
 class DecodeError(BridgeError):
@@ -96,7 +96,7 @@ class NoMessageError(BridgeError):
 
 
 class NoAnswerError(BridgeError):
-    """Raised when a service did not answer in time."""
+    """Raised when a service did not answer, or a goal did not end, in time."""
 
 
 class SlowPeerError(BridgeError):

@@ -21,7 +21,7 @@ Place = tuple[str | int, ...]
 MAX_LISTED: Final = 24
 """Maximum number of fields listed in an error."""
 MAX_SHOWN: Final = 80
-"""Maximum number of characters of each field."""
+"""Maximum number of characters of each field's path in an error."""
 
 _STEP = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)|\[([0-9]{1,9})\]")
 

@@ -67,7 +67,7 @@ def ros_version_of_type(name: str) -> RosVersion | None:
 
 
 def check_name(name: str) -> str:
-    """Return the name of a topic or a service if it is valid in ROS; the server resolves relative names."""
+    """Return the name of a topic or a service, or raise a NameFormError; relative names are valid."""
     if len(name) > MAX_NAME:
         raise NameFormError(
             f"name {name[:40]!r}... has {len(name)} characters, at most {MAX_NAME} are allowed"

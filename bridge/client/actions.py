@@ -1,6 +1,8 @@
-"""Actions of ROS 2: goals of this client, and actions that it serves.
+"""Actions of ROS 2: goals that this client sends, and actions whose goals it executes.
 
-    Ros.send_goal        ->  send_action_goal     ->  Goal, which receives feedback and the end
+Method of the client, operation that it sends, and object that the program gets:
+
+    Ros.send_goal        ->  send_action_goal     ->  Goal, which receives feedback and the result
     Ros.advertise_action ->  advertise_action     ->  ActionServer, which runs a handler with each GoalRequest
 
 Actions of ROS 1 (actionlib) are topics, and are not supported (see `Ros.send_goal`).
@@ -24,7 +26,7 @@ from bridge.names import absolute
 _log = logging.getLogger("bridge")
 
 FEEDBACK_QUEUE_SIZE: Final = 64
-"""Maximum number of queued feedback messages; then the oldest is dropped."""
+"""Maximum number of feedback messages queued for one goal; a further one replaces the oldest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,10 +43,10 @@ class GoalResult:
 
 
 class Goal:
-    """One active goal: `async for feedback in goal`, then `await goal.result(timeout)`.
+    """A goal that this client has sent: `async for feedback in goal`, then `await goal.result(timeout)`.
 
     The iteration ends with the goal. If the connection is lost, iteration and result fail, because the server then
-    never reports the end of the goal. They also fail if `async with` is left before the goal ends, which cancels it.
+    never reports the end of the goal. Leaving `async with` before the goal ends cancels it; then both fail too.
 
     Attributes:
         action: Name of the action.
@@ -108,7 +110,7 @@ class Goal:
         self._session.flush()
 
     async def result(self, timeout: float) -> GoalResult:
-        """Wait for the end of the goal; return its status even if canceled or aborted. May be repeated.
+        """Wait until the goal has ended, also if canceled or aborted, and return its result. May be called again.
 
         Raises:
             GoalError: The action refused the goal, or does not exist.
@@ -171,7 +173,7 @@ End = Callable[[GoalStatus, Mapping[str, Any] | str], None]
 
 
 class GoalRequest:
-    """A goal that this client executes, for its handler.
+    """A goal that this client executes, as the handler of the action gets it.
 
     The first of `succeed`, `abort` and `cancel` ends it; the handler may continue, to clean up.
 
@@ -229,7 +231,7 @@ GoalHandler = Callable[[GoalRequest], Awaitable[Mapping[str, Any] | None]]
 
 
 async def execute(goal: GoalRequest, handler: GoalHandler, action: str) -> None:
-    """Run a goal's handler, and end the goal with its result; if the handler fails, abort the goal."""
+    """Run a goal's handler, and end the goal with the values that it returns; if it fails, abort the goal."""
     # The handler may have ended the goal already; then the end here has no effect.
     try:
         values = await handler(goal)
@@ -250,8 +252,8 @@ class ActionServer(Handle):
 
     Attributes:
         name: Name of the action.
-        result_check: The check of results, if their type is known.
-        feedback_check: The check of feedback, if its type is known.
+        result_check: Checks results before they are sent, if their type is known.
+        feedback_check: Checks feedback before it is sent, if its type is known.
     """
 
     def __init__(self, session: Session, name: str, type_name: str, handler: GoalHandler) -> None:

@@ -1,7 +1,7 @@
-"""Handles for a program: subscriptions, publications and services.
+"""Handles: the subscriptions, publications and services that a program has opened.
 
-A handle registers its operation with the session when it is created, and withdraws it when it is closed. A lost
-connection does not end it.
+A handle registers its operation (such as `subscribe`) with the session when it is created, and withdraws it when it is
+closed. Handles stay open when the connection is lost.
 """
 
 import asyncio
@@ -56,7 +56,7 @@ class Handle:
         self._closed = False
 
     def _register(self) -> None:
-        """Register the handle with its client, which closes it at its own end, and send its operation."""
+        """Send the handle's operation; from now on, closing the client also ends the handle."""
         self._session.on_closed.add(self.end)
         self._session.flush()
 
@@ -69,7 +69,7 @@ class Handle:
         raise NotImplementedError
 
     async def close(self) -> None:
-        """Withdraw this from the server. Further calls have no effect."""
+        """Close the handle, and withdraw its operation from the server. Further calls have no effect."""
         self._session.check_thread()
         if not self._closed:
             self.end()
@@ -100,8 +100,9 @@ class Subscription(Handle):
     Attributes:
         topic: Name of the topic.
         lost: Number of messages dropped because the queue was full.
-        discarded: Number of messages above the topic's limit (`max_bytes`).
-        blind_seconds: Total time without a connection, from the last data to the next subscription.
+        discarded: Number of messages discarded because they were larger than `max_bytes`.
+        blind_seconds: Total time in which messages may have been missed: each time, from the last data of a lost
+            connection until the topic is subscribed to again.
     """
 
     def __init__(
@@ -150,7 +151,7 @@ class Subscription(Handle):
             self._wake()
 
     def discard(self) -> None:
-        """Count a message above the topic's limit."""
+        """Count a message that was discarded because it is larger than `max_bytes`."""
         self.discarded += 1
 
     def leave_out(self, reason: str) -> None:
@@ -160,7 +161,7 @@ class Subscription(Handle):
         self._wake()
 
     def add_blind_seconds(self, seconds: float) -> None:
-        """After a reconnection, add the time without a connection."""
+        """Add the time without a connection to `blind_seconds`, after a reconnection."""
         self.blind_seconds += min(seconds, time.monotonic() - self._begun)
 
     def __aiter__(self) -> Self:
@@ -328,10 +329,10 @@ class Publication(Handle):
         Raises:
             DisconnectedError: There is no connection now, or the publication or the client is closed.
             SlowPeerError: The server did not accept it in time, or `queue_size` messages are already waiting.
-            MessageTooLargeError: It is larger than `max_size`, or than the known limit of the server: the hub
+            MessageTooLargeError: It is larger than `max_size`, or than the known limit of the server: `bridge.hub`
                 announces its limit, and other servers reveal theirs by closing the connection once.
             MessageTypeError: It has a field that its type does not have, or an array of another shape.
-            EncodeError: It cannot be sent as JSON; for a NaN or infinity, the sentence gives its path.
+            EncodeError: It cannot be sent as JSON; for a NaN or infinity, the error names the field.
         """
         session = self._session
         # The usual case has no `await` at all: a task switch would take longer than sending.
@@ -384,7 +385,7 @@ class Service(Handle):
 
     Attributes:
         name: Name of the service.
-        check: The check of its answers, if their type is known.
+        check: Checks answers before they are sent, if their type is known.
     """
 
     def __init__(

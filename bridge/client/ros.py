@@ -281,7 +281,7 @@ class Ros:
 
         Args:
             action: Name of the action.
-            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle.
+            type: Its type, such as `example_interfaces/action/Fibonacci` or `example_interfaces/Fibonacci`.
             goal: Fields of the goal.
             feedback: Whether to receive feedback.
             timeout: Maximum time in seconds until the server has accepted the message.
@@ -318,7 +318,7 @@ class Ros:
 
         Args:
             action: Name of the action.
-            type: Its type: `example_interfaces/action/Fibonacci`, or without the middle.
+            type: Its type, such as `example_interfaces/action/Fibonacci` or `example_interfaces/Fibonacci`.
             handler: Coroutine function that is called with each goal, and executes it. It may send feedback,
                 and should check whether the goal has been cancelled. The fields that it returns become the
                 result: the goal succeeds, or counts as cancelled if the sender asked for that, unless the
@@ -383,7 +383,7 @@ class Ros:
         return await self._ask_names(timeout, "publishers", topic=topic)
 
     async def message_details(self, type: str, timeout: float = 1.0) -> Definitions:
-        """Return the fields of a message type and of its parts, by type in the form of ROS 1; empty if unknown."""
+        """Return the fields of a message type and of the types nested in it, by ROS 1 type name; empty if unknown."""
         args = {"type": self._session.core.wire.type_name(type)}
         return definitions_from_rosapi(await self._session.ask_rosapi("message_details", args, timeout))
 
@@ -400,7 +400,7 @@ class Ros:
         return found if isinstance(found, str) else None
 
     async def _ask_names(self, limit: float, question: str, **args: str) -> list[str] | None:
-        """Ask rosapi a question, and return the names in the answer's field of that name; None without an answer."""
+        """Call the rosapi service `question`, and return the names in its answer; None without an answer."""
         names = (await self._session.ask_rosapi(question, args, limit)).get(question)
         return [name for name in names if isinstance(name, str)] if isinstance(names, list) else None
 
@@ -440,10 +440,10 @@ def connect(
         ca_file: Certificate authorities (PEM) for the server, instead of those of the system.
         tls: An SSL context instead of `ca_file`, for example with a client certificate.
         max_size: Maximum size of a message in bytes, in both directions. A larger inbound message ends the
-            connection, and its topic is left out of the next one (`TopicLeftOutError`).
+            connection, and its topic is not subscribed to again (`TopicLeftOutError`).
         ping_interval: Seconds of silence after which the server is pinged.
         ping_timeout: Seconds to wait for data after a ping before the connection counts as lost.
-        check_types: Refuse messages, requests and goals with a misspelt field or an array of another shape
+        check_types: Whether to refuse messages, requests and goals with a misspelt field or an array of another shape
             before they are sent, if their type is known.
         on_state: Callback for each new state and its reason.
 

@@ -101,7 +101,7 @@ def _tls(uri: WebSocketURI, ca_file: Path | None, tls: ssl.SSLContext | None) ->
 
 
 async def connect_along(route: Route, uri: WebSocketURI, factory: Callable[[], _ConnectionT]) -> _ConnectionT:
-    """Open the transport of a WebSocket to the first address of a host that accepts, or raise the last OSError."""
+    """Connect to the first of a host's addresses that accepts; if none does, raise the OSError of the last."""
     loop = asyncio.get_running_loop()
     # not by `create_connection`, in which uvloop reports a look-up that fails after the attempt has timed out
     found: list[Any] = await loop.getaddrinfo(uri.host, uri.port, type=SOCK_STREAM)
@@ -128,7 +128,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def reason_of(error: Exception) -> str:
-    """Return the text of an error, without the operating system's number."""
+    """Return the text of an error, without the `[Errno ...]` before it."""
     match error:
         case ConnectionRefusedError():
             return "connection refused"

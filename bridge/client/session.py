@@ -48,11 +48,11 @@ MAX_DELAY: Final = 2.0
 ATTEMPT_TIMEOUT: Final = 5.0
 """Timeout in seconds of one attempt to reconnect."""
 STEADY: Final = 5.0
-"""Minimum duration in seconds of a connection that resets the back-off."""
+"""A connection that lasts this many seconds resets the delay of the next reconnection to `FIRST_DELAY`."""
 SILENCE: Final = 2.0
 """Seconds without a message after which a subscription is checked."""
 LONGEST_SILENCE: Final = 30.0
-"""Maximum delay in seconds between two checks; it doubles up to this one."""
+"""Maximum delay in seconds between two checks of silent subscriptions; the delay doubles until it is reached."""
 _ROSAPI_TIMEOUT: Final = 1.0
 KEPT_STATUSES: Final = 16
 """Number of status messages of the server that are stored."""
@@ -85,13 +85,13 @@ class Reader(Protocol):
         """Queue messages."""
 
     def discard(self) -> None:
-        """Count a message above the topic's limit."""
+        """Count a message that was discarded because it is larger than `max_bytes`."""
 
     def leave_out(self, reason: str) -> None:
-        """End, because a message of the topic was too large for the connection."""
+        """Make reading raise an error, because the topic is left out: its messages are too large."""
 
     def add_blind_seconds(self, seconds: float) -> None:
-        """After a reconnection, add the time without a connection."""
+        """Add the time without a connection to `blind_seconds`, after a reconnection."""
 
 
 class GoalReceiver(Protocol):
@@ -520,7 +520,7 @@ class Session:
             self.flush()
 
     async def ask_rosapi(self, name: str, args: Mapping[str, Any], limit: float) -> dict[str, Any]:
-        """Call a rosapi service; return nothing if it fails, since many servers lack rosapi."""
+        """Call a rosapi service; return an empty answer if it fails, since many servers lack rosapi."""
         try:
             answer = await self.call(f"/rosapi/{name}", args, limit)
         except BridgeError:

@@ -89,7 +89,7 @@ class TypeChecks:
             _apply(check, goal, f"a goal of {action}")
 
     async def part(self, part: _Part, type_name: str, limit: float = _ROSAPI_TIMEOUT) -> MessageCheck | None:
-        """Return the check of a part of a service or of an action; None if the server does not know the type."""
+        """Return the check of a request, answer, goal, result or feedback; None for a type unknown to the server."""
         async with self._asking:
             key = part, type_name
             if key not in self._parts and self._may_ask():

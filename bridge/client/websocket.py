@@ -152,7 +152,7 @@ class WebSocket(WebSocketTransport):
 
     @property
     def handshake_error(self) -> Exception | None:
-        """The error of the handshake."""
+        """The error that ended the handshake, or None."""
         return self._client_protocol.handshake_exc
 
     def begin(self) -> None:
@@ -273,7 +273,7 @@ async def open_websocket(
     on_messages: Callable[[list[bytes]], None],
     on_lost: Callable[[WebSocket, str], None],
 ) -> WebSocket:
-    """Connect, without permessage-deflate: on a local network it costs more than it saves.
+    """Connect without compression (permessage-deflate), which on a local network costs more than it saves.
 
     `shown_uri` is the URI without secrets, for errors. `on_messages` is called with messages that arrived
     together, and `on_lost` once, with the reason, when the connection ends.

@@ -158,7 +158,7 @@ def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
 
 
 def encode_json(message: dict[str, Any]) -> bytes:
-    """Write a message that was read from JSON, whose type is unknown.
+    """Write as CBOR a message that was read from JSON and whose type is unknown.
 
     Lists of numbers with at least one float become typed arrays of float64, with NaN for None. Lists of only integers
     remain lists, because their width is unknown.
@@ -178,7 +178,7 @@ def _packed(value: Any) -> Any:
 
 
 def typed_array(numbers: Sequence[Any], elements: str) -> cbor2.CBORTag:
-    """Return a typed array for use in a message, or raise an EncodeError; `elements` is one of `u1` to `f8`."""
+    """Return a typed array for a message, or raise an EncodeError; `elements` is a NumPy type such as `u1` or `f8`."""
     tag = _TAGS[elements]
     try:
         packed = struct.pack(f"<{len(numbers)}{TYPED_ARRAYS[tag][1]}", *numbers)

@@ -28,7 +28,7 @@ MAX_FRAGMENTS: Final = 1 << 16
 MAX_AGE: Final = 10.0
 """Seconds without another fragment after which a message is discarded."""
 OVERHEAD: Final = 128
-"""Minimum overhead in bytes of a stored fragment, so that empty fragments count too."""
+"""Bytes that each stored fragment counts in addition to its data, so that empty fragments count too."""
 _LONGEST_ID: Final = 1024
 # Value and mask of UTF-8 bytes inside a character.
 _CONTINUATION: Final = 0x80, 0xC0
@@ -52,7 +52,7 @@ class _Set:
 
     @property
     def charged(self) -> int:
-        """Number of bytes that the fragments occupy."""
+        """Number of bytes that the fragments occupy, with `OVERHEAD` for each."""
         return self.size + OVERHEAD * len(self.parts)
 
 
@@ -66,7 +66,7 @@ class Reassembler:
         occupy four times as much, including overhead.
         """
         self.waiting_bytes = 0
-        """Number of bytes that incomplete messages occupy."""
+        """Number of bytes that all incomplete messages occupy, with `OVERHEAD` for each fragment."""
         self._max_size = max_size
         self._sets: dict[FragmentId, _Set] = {}  # in the order of their first fragments
 
@@ -171,7 +171,7 @@ def split(message: bytes, fragment_size: int, fragment_id: FragmentId) -> Iterat
 
 
 def _ends(message: bytes, fragment_size: int) -> Iterator[int]:
-    """Yield the ends of the fragments, which do not divide characters."""
+    """Yield the index in `message` at which each fragment ends, never inside a character."""
     inside, mask = _CONTINUATION
     begin = 0
     while begin < len(message):

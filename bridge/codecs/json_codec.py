@@ -8,9 +8,9 @@ Inbound:
   For this, messages that are not strict JSON are parsed a second time.
 * Integers beyond 64 bits become floats.
 
-Outbound: NaN and infinities are refused with their path, because JSON has none, and servers silently drop `null` in a
-float field. NumPy arrays and scalars are written without
-intermediate lists; NumPy is never imported here. Bytes are written as base64, like `uint8[]` by servers.
+Outbound: NaN and infinities are refused by an error that names the field, because JSON has neither, and servers
+silently drop `null` in a float field. NumPy arrays and scalars are written without intermediate lists; NumPy is never
+imported here. Bytes are written as base64, like `uint8[]` by servers.
 """
 
 import base64
@@ -169,7 +169,7 @@ def encode(message: Mapping[str, Any], *, max_size: int = MAX_SIZE, max_depth: i
 
     Raises:
         EncodeError: The message is too deep, or contains a type that JSON does not have, an integer beyond 64
-            bits, a key that is not a string, or a NaN or infinity (the sentence gives its path).
+            bits, a key that is not a string, or a NaN or infinity (the error names the field).
         MessageTooLargeError: The JSON is too large.
     """
     try:
@@ -235,7 +235,7 @@ def _in_native_byte_order(value: Any) -> Any:
 
 
 def find_nonfinite(message: Any) -> str | None:
-    """Return the path of the first NaN or infinity (`scan.ranges[3]`), or None."""
+    """Return where in a message the first NaN or infinity is (`scan.ranges[3]`), or None."""
     inner: list[tuple[str, Any]] = [("", message)]
     while inner:
         place, value = inner.pop()

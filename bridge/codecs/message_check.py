@@ -68,7 +68,7 @@ def definitions_from_rosapi(answer: Any) -> Definitions:
 
 
 def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
-    """Return the definitions of a standard type and its parts from rosbags; empty for others or without rosbags."""
+    """Return the definitions of a type and the types nested in it from rosbags; empty if unknown or without rosbags."""
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
@@ -87,7 +87,7 @@ def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
 
 
 def element_of(kind: Any, content: Any) -> tuple[str, int]:
-    """Return the element type of a field in rosbags, and its length: `SCALAR`, 0 for any length, or a fixed one."""
+    """Return the element type of a field from rosbags, and its length: `SCALAR`, 0 for any length, or a fixed one."""
     match kind.name:
         case "BASE":
             return str(content[0]), SCALAR
@@ -167,7 +167,7 @@ class MessageCheck:
 
 
 def check_from_rosapi(answer: Any) -> MessageCheck | None:
-    """Return the check of the first type in rosapi's answer (the others are its parts); None if it cannot be read."""
+    """Return the check of the first type in rosapi's answer (the others are nested in it); None if it is unreadable."""
     definitions = definitions_from_rosapi(answer)
     match answer:
         case {"typedefs": [{"type": str(name)}, *_]} if (key := _key(name)) in definitions:

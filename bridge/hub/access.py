@@ -21,7 +21,7 @@ from websockets.typing import Origin, Subprotocol
 from bridge.hub.limits import HubError
 
 SUBPROTOCOL: Final = Subprotocol("rosbridge")
-"""The hub's subprotocol, for clients that request one; a client that requests only others disconnects."""
+"""The hub's subprotocol, for clients that request one; one that requests only other subprotocols disconnects."""
 _BEARER: Final = "bearer."
 # Tokens of characters that both a header and a subprotocol accept.
 _TOKEN: Final = re.compile(r"[A-Za-z0-9._~-]{16,1024}")
@@ -62,7 +62,7 @@ class AccessPolicy:
         return [None, LOCAL_ORIGIN, *map(Origin, self.origins)]
 
     def refusal(self, request: Request, *, loopback: bool) -> HTTPStatus | None:
-        """Return the status that refuses a request, or None to admit it.
+        """Return the HTTP status with which to refuse a request, or None to admit it.
 
         On a loopback address, the request's host must be this machine or the host of an allowed page. A web
         page that reaches the hub under another name has made that name resolve to this machine (DNS

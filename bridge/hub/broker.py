@@ -4,11 +4,11 @@ The owner of sockets and clocks calls `Broker.connect`, `Broker.receive_turn`, `
 `Broker.disconnect`, then drains the outboxes of the clients that `Broker.take_ready` returns. The broker
 never waits, never reads the monotonic clock, and never raises because of data from a client.
 
-Invalid operations are refused as on the reference server: with a line in the log and on `/rosout`, but
-without an answer unless the client requested status messages (`set_level`). Only calls and goals are
-answered, with `result: false` and a sentence in `values`. The client stays connected.
+Invalid operations are refused as on the reference server (rosbridge_suite): with a line in the log and on
+`/rosout`, but without an answer unless the client requested status messages (`set_level`). Only calls and goals
+are answered, with `result: false` and a sentence in `values`. The client stays connected.
 
-Messages are not checked against their types, but all output is strict JSON, with `null` for every NaN and
+Messages are not checked against their types, but all JSON sent is strict, with `null` for every NaN and
 infinity received.
 """
 
@@ -101,7 +101,7 @@ class Broker:
 
     @property
     def full(self) -> bool:
-        """Return whether the maximum number of clients is connected."""
+        """Return whether as many clients are connected as the limits allow."""
         return len(self.graph.clients) >= self.limits.clients
 
     @property
@@ -146,7 +146,7 @@ class Broker:
             self._refuse(client, str(error), self._operation_id, with_status=client.wants_status)
 
     def receive_turn(self, client: Client, messages: list[bytes], now: float) -> int:
-        """Perform a client's messages in order, as many as one turn allows; each has at most `limits.message_bytes`.
+        """Perform a client's messages in order, up to `TURN_WORK`; each has at most `limits.message_bytes`.
 
         Returns the number of messages performed. Call it again with the others; if the client's outbox is
         congested, not before the client has read its answers.

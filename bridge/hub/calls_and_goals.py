@@ -13,8 +13,9 @@
     caller ─ cancel_action_goal ─▶ hub ─ cancel_action_goal ─▶ server     a request: the server still ends the goal
     caller ◀─── action_result ──── hub ◀─── action_result ──── server
 
-The hub replaces the caller's id by a key of its own, because ids of different clients may be equal. It ends a call or
-a goal itself, with `result: false`, when the server leaves, and a call also when its deadline passes.
+The server here is the client that offers the service or action. The hub replaces the caller's id by a key of its own,
+because ids of different clients may be equal. It ends a call or a goal itself, with `result: false`, when the server
+leaves, and a call also when its deadline passes.
 """
 
 import heapq
@@ -415,7 +416,7 @@ class Actions(_Exchange):
         return {"return_code": 0, "goals_canceling": []}
 
     def feed_back(self, client: Client, operation: Operation, now: float) -> None:
-        """Perform `action_feedback`; the oldest feedback for a slow client is dropped."""
+        """Perform `action_feedback`; for a caller that reads slowly, the oldest feedback is dropped."""
         goal = self._goal_of(client, operation)
         values = operation.get("values", {})
         if not isinstance(values, dict):

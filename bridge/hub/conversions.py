@@ -1,4 +1,4 @@
-"""Conversion of messages from JSON to the types of their fields: CBOR with typed arrays, and objects for serialising.
+"""Conversion of JSON messages by the types of their fields: to CBOR with typed arrays, and to objects for serialising.
 
 Every conversion checks the type, range and number of values before it allocates memory for them.
 """
@@ -209,7 +209,7 @@ def _each(encode: Encode) -> Encode:
 
 
 def _unless_default(default: Any) -> Encode:
-    """Return the encoder of a field that most messages lack, in which the default is encoded only once."""
+    """Return an encoder for a field that most messages lack: it encodes the default of the field only once."""
     encoded = cbor2.dumps(default)
     return lambda value: encoded if value is default else cbor2.dumps(value)
 

@@ -163,7 +163,7 @@ class MessageDefinitions:
             ) from None
 
     def full_text(self, type_name: str) -> str:
-        """Return the definitions of a type and of its parts, as in bag files, or raise a RefusedOperationError."""
+        """Return the definitions of a type and its nested types, as in bag files, or raise a RefusedOperationError."""
         text = self._texts.get(type_name)
         if text is None:
             store, known = self._known(type_name)
@@ -172,7 +172,7 @@ class MessageDefinitions:
         return text
 
     def details(self, type_name: str) -> list[dict[str, Any]]:
-        """Return the fields of a type and of its parts, as `rosapi_msgs/TypeDef`, or raise a RefusedOperationError."""
+        """Return the fields of a type and nested types as `rosapi_msgs/TypeDef`, or raise a RefusedOperationError."""
         store, known = self._known(type_name)
         found: dict[str, dict[str, Any]] = {}
         waiting = [known]
@@ -232,7 +232,7 @@ def _store(name: "Stores") -> "Typestore":
 
 
 def _define(store: "Typestore", name: str, ros_version: RosVersion) -> bool:
-    """Return whether a type is known; if rosbags lacks it, first add the definitions of the type and its parts."""
+    """Return whether a type is known; if rosbags lacks it, first add the definition in `message_texts`, if any."""
     if name in store.fielddefs:
         return True
     text = message_texts(ros_version).get(name)

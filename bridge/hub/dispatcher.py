@@ -1,4 +1,4 @@
-"""Dispatch of messages to clients' outboxes, with lists of the clients that have output or pending throttles."""
+"""Dispatch of messages to clients' outboxes, and the clients that have output, or messages held by a throttle."""
 
 from math import inf
 from typing import Final
@@ -25,11 +25,11 @@ class Dispatcher:
         # The clients with output, each once (`Client.is_ready`), until the owner of the sockets takes them.
         self._ready: list[Client] = []
         self.throttled: set[Client] = set()
-        """The clients whose outboxes hold messages for their throttles."""
+        """The clients whose outboxes hold messages that a throttle does not admit yet."""
         self.deadline = inf
         """Time at which the broker must be woken (monotonic seconds): for a throttle, a call or a fragment."""
         self.work = 0
-        """Units of work in the current turn (see `bridge.hub.broker.TURN_WORK`)."""
+        """Units of work in the current turn (see `bridge.hub.topics.TURN_WORK`)."""
 
     def mark_ready(self, client: Client) -> None:
         """Add a client to those with output."""
@@ -61,7 +61,7 @@ class Dispatcher:
         self.mark_ready(client)
 
     def as_png(self, payload: bytes) -> bytes:
-        """Return an operation as a picture, or unchanged if the picture is too large, since no answer may be lost."""
+        """Return an operation as a PNG picture, or unchanged if that is too large, since no answer may be lost."""
         wrapped = as_png(payload)
         return wrapped if len(wrapped) <= self._limits.message_bytes else payload
 

@@ -22,7 +22,7 @@ from bridge.hub.limits import RefusedOperationError
 
 
 class Encoding(StrEnum):
-    """Encodings, in ascending priority if a client's subscriptions differ, as on the reference server."""
+    """Encodings. If a client requests several for one topic, the last in this order applies, as in rosbridge_suite."""
 
     NONE = "none"
     PNG = "png"
@@ -72,7 +72,7 @@ def json_prefix(name: str) -> bytes:
 
 
 AROUND: Final = len(json_prefix("")) + 1
-"""Bytes around a topic's name and a message's JSON."""
+"""Number of bytes in a publish operation besides the name of the topic and the JSON of the message."""
 
 
 @dataclass(eq=False, slots=True)
@@ -80,7 +80,7 @@ class OutgoingMessage:
     """One published message, encoded on demand."""
 
     json: bytes
-    """Bytes that contain the message as JSON, from `_begin` on, and a brace. Few encodings need a copy of it."""
+    """Bytes that end with the message as JSON (from index `_begin` on) and a brace, so that it need not be copied."""
     _begin: int
     _parsed: dict[str, Any] | None
     """The parsed message, or None if it was not parsed yet."""

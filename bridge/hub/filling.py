@@ -68,14 +68,14 @@ class Filler:
 
         Args:
             message: The message.
-            room: Bytes by which its parts may grow.
+            room: Number of bytes by which the messages inside it may grow.
 
         Returns:
             What to put in place of the last two braces of an operation that ends with the message, both as JSON. It
             is empty if nothing was absent, and None if the message must be written again.
 
         Raises:
-            RefusedOperationError: The parts would grow by more than `room`.
+            RefusedOperationError: The messages inside it would grow by more than `room`.
         """
         if len(message) == self.count:
             return None if self.parts and _fill_parts(self.parts, message, room) else b""

@@ -17,7 +17,7 @@ from bridge.hub.outbox import Lane, Outbox
 
 @dataclass(eq=False, slots=True)
 class Client:
-    """One connection."""
+    """One connected client. The keys below are the ids that the hub gives to calls and goals."""
 
     number: int
     """1, 2, ... in the order of connection."""
@@ -25,13 +25,13 @@ class Client:
     """Network address, for the log and `service_host`."""
     outbox: Outbox
     advertisements: dict[str, "Advertisement"] = field(default_factory=dict)
-    """By the topic's absolute name."""
+    """The client's advertisements, by the topic's absolute name."""
     subscriptions: dict[str, "TopicSubscription"] = field(default_factory=dict)
-    """By the topic's absolute name."""
+    """The client's subscriptions, by the topic's absolute name."""
     open_advertisements: int = 0
-    """Open advertise operations, over all topics."""
+    """Number of advertise operations in force, over all topics."""
     open_subscriptions: int = 0
-    """Open subscribe operations, over all topics."""
+    """Number of subscribe operations in force, over all topics."""
     services: set[str] = field(default_factory=set)
     """Absolute names of the services that the client offers."""
     calls: set[str] = field(default_factory=set)
@@ -53,7 +53,7 @@ class Client:
     wants_status: bool = False
     """True if the client requested status messages about refusals."""
     status_lane: Lane | None = None
-    """The queue of the client's status messages, once there has been a message."""
+    """The queue of the client's status messages, once one was sent."""
     last_published: "Advertisement | None" = None
     """The advertisement of the client's last message with a known envelope."""
     envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)
@@ -111,7 +111,7 @@ class TopicSubscription:
     typed: bool = False
     """True if the client named a type, which becomes the type of the topic."""
     options: dict[OperationId, SubscribeOptions] = field(default_factory=dict)
-    """Options of each subscribe operation; the smallest value of each option applies, as on the reference server."""
+    """Options of each subscribe operation; the smallest of their numbers apply, as in rosbridge_suite."""
 
 
 @dataclass(eq=False, slots=True)

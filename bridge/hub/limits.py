@@ -119,7 +119,7 @@ class HubLimits:
 
 
 def checked_name(name: str) -> str:
-    """Return the name of a topic, a service or an action."""
+    """Return the name of a topic, a service or an action, if it is valid."""
     if len(name) > MAX_NAME or _NAME.fullmatch(name) is None:
         raise RefusedOperationError(f"{name[:80]!r} cannot be a name: expected letters, digits, _ and /")
     return name
@@ -149,7 +149,7 @@ def flag(operation: Operation, field: str) -> bool:
 def number(operation: Operation, field: str) -> float:
     """Return a number that is not negative; 0 if it is left out.
 
-    The reference server accepts only integers, and ignores a whole operation with `0.0`; no client relies on
+    The reference server accepts only integers, and ignores an operation that contains `0.0`; no client relies on
     that.
     """
     value = operation.get(field)
@@ -188,5 +188,5 @@ def quality(operation: Operation) -> Operation:
 
 
 def is_logged(count: int) -> bool:
-    """Return whether to log the occurrence with this number: the 1st, 10th, 100th and so on."""
+    """Return whether to log occurrence number `count` of an event: only the 1st, 10th, 100th and so on are logged."""
     return str(count).strip("0") == "1"

@@ -104,8 +104,7 @@ class Outbox:
         self.undroppable = 0
         """Bytes of answers and requests in the queue."""
         self.overflowed = False
-        """True if output that cannot be dropped exceeds the bound: the client does not read its answers.
-        """
+        """True if output that cannot be dropped exceeds the bound: the client does not read its answers."""
         self.deadline = inf
         """Time at which to call `release` next (monotonic seconds), infinity for never."""
 
@@ -199,7 +198,7 @@ class Outbox:
         self.deadline = min((lane.next_time for lane in self._holding), default=inf)
 
     def adjust(self, lane: Lane, throttle: float, queue_length: int) -> None:
-        """Change a lane's throttle and length, and queue or drop messages that are no longer held."""
+        """Change a lane's throttle and length, and queue or drop the messages that these no longer hold."""
         # The next message was due one old interval after the last one; now it is one new interval.
         lane.next_time += throttle - lane.throttle
         lane.throttle, lane.queue_length = throttle, queue_length

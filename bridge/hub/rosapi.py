@@ -199,7 +199,7 @@ class Rosapi:
         }
 
     def _server(self, name: str) -> tuple[str, str]:
-        """Return the node that serves a service and its host, or empty strings."""
+        """Return the node that serves a service, and the host of that node, or two empty strings."""
         service = self._graph.services.get(absolute(name))
         if service:
             return service.client.node, service.client.address

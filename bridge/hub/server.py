@@ -50,8 +50,9 @@ _TURN_MESSAGES: Final = 32
 # Bytes of a block that the hub frees once, so that glibc retains up to twice as many bytes of freed memory. Otherwise
 # it returns them after each burst and gets them again page by page: a quarter of the hub's time with messages of 17 kB.
 _RETAINED: Final = 4 * 1024 * 1024
-# Seconds for which the hub polls its sockets after a prompt response; in which a response comes that waited for the end
-# of that; and for which the hub does not poll then, at first and at most (see `_Hub.stay_awake`).
+# In seconds, for `_Hub.stay_awake`: how long the hub polls its sockets after a prompt response; how soon after polling
+# in vain a response shows that its client had to wait for that; and how long the hub then does not poll, at first and
+# at most.
 _AWAKE: Final = 200e-6
 _AT_ONCE: Final = 60e-6
 _PAUSES: Final = (1e-3, 0.1)
@@ -87,7 +88,7 @@ async def serve_hub(
     Args:
         host: the address to listen on. Without tokens and TLS give a loopback address, unless everybody who
             can reach the address may publish to your robot.
-        port: 0 for any free one.
+        port: the port to listen on; 0 for any free one.
         limits: bounds on clients and messages.
         access: access control and TLS; by default every program may connect, and web pages of this machine.
         ros_version: the ROS version that the hub emulates.
@@ -244,10 +245,10 @@ class _Hub:
             self._set_timer(deadline)
 
     def stay_awake(self, now: float) -> None:
-        """Poll the sockets for a moment after a response at `now`, if responses are prompt.
+        """Poll the sockets for a moment after a client's response at `now`, if responses are prompt.
 
         Without polling, client and hub sleep in turn while a message is on its way, and waking up takes longer than all
-        the rest. The hub does not poll for a publisher that waits for no response, which may need the processor core.
+        the rest. The hub does not poll for a client that only publishes, because that may need the processor core.
         """
         is_prompt, self._prompt_until = now < self._prompt_until, now + _AWAKE
         if self._is_polling:
@@ -314,7 +315,7 @@ class _Connection(WebSocketTransport):
 
     @property
     def is_blocked(self) -> bool:
-        """Return whether the client must first read its answers."""
+        """Return whether to stop reading from the client, because it must first read its answers."""
         client = self._client
         return client is not None and (client.outbox.congested or self._pongs_unread)
 

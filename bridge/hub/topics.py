@@ -1,4 +1,4 @@
-"""Topics: advertising, publishing, subscribing, latching; a message is encoded once for all subscribers."""
+"""Topics: advertising, publishing, subscribing, latching; subscribers with one encoding share an encoded message."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -114,10 +114,10 @@ class Topics:
             self.distribute(topic, parsed, now)
 
     def publish_known(self, client: Client, messages: Sequence[bytes], first: int, now: float) -> int:
-        """Perform `publish` operations with known envelopes: only their messages are parsed, and forwarded as received.
+        """Perform `publish` operations whose envelopes (the bytes before the message) are known, parsing only the rest.
 
-        `messages` are any data, performed from index `first` on. Returns the index at which it stopped: at the end, at
-        data that must be parsed in full, or when the turn was over.
+        `messages` may contain any operations. Returns the index, from `first` on, of the first one that was not
+        performed, because it must be parsed in full or the turn was over; `len(messages)` if there is none.
         """
         advertisement = client.last_published
         while advertisement is not None and first < len(messages) and self._dispatcher.work <= TURN_WORK:

@@ -38,13 +38,13 @@ _KEYS: Final = 1024
 UNKNOWN: Final = 0
 """Result of `frame_end` for a frame whose header is incomplete."""
 UNSOUND: Final = -1
-"""Result of `frame_end` for an invalid or too large frame, which the library must refuse."""
+"""Result of `frame_end` for an invalid or too large frame, which `websockets` must refuse."""
 
 
 def whole_messages(
     data: bytes, at: int, *, masked: bool, largest: int, count: int = sys.maxsize
 ) -> tuple[list[bytes], int]:
-    """Read consecutive single-frame messages, up to the first other or incomplete frame.
+    """Read consecutive single-frame messages, up to the first frame that is incomplete or of another kind.
 
     Args:
         data: bytes from the socket.
@@ -112,7 +112,7 @@ def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
 
     Returns:
         The end, which is beyond `data` while the frame is incomplete; `UNKNOWN` while its header is
-        incomplete; `UNSOUND` if it is invalid or has more than `largest` bytes, so that the library must
+        incomplete; `UNSOUND` if it is invalid or has more than `largest` bytes, so that `websockets` must
         handle it at once.
     """
     size = len(data)
@@ -133,7 +133,7 @@ def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
 
 
 def unmasked(payloads: Sequence[bytes]) -> bytes:
-    """Return a server's frames, unmasked, for whole messages: text frames for JSON objects, binary frames for CBOR."""
+    """Return a server's frames (not masked) for whole messages: text frames for JSON objects, binary ones for CBOR."""
     parts: list[bytes] = []
     for payload in payloads:
         headers = _TEXT_HEADERS if payload[0] == _BRACE else _BINARY_HEADERS

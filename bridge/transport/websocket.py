@@ -225,7 +225,7 @@ class WebSocketTransport(asyncio.Protocol):
         self._transport.set_write_buffer_limits(high=self._write_limit)
 
     def data_received(self, data: bytes) -> None:
-        """Handle bytes from the socket, and write all answers to them."""
+        """Handle bytes from the socket: whole messages here, all other frames by the library."""
         self.last_heard = time.monotonic()
         at = 0
         if self._rest:
@@ -386,7 +386,7 @@ class WebSocketTransport(asyncio.Protocol):
             self.close_expected()
 
     def _assembled(self, frame: Frame) -> bytes | None:
-        """Return a whole message, or None before its last frame; the library limits its size."""
+        """Return the whole message that `frame` completes, or None if more follow; the library limits its size."""
         data = bytes(frame.data)
         if self._fragments is None:
             if frame.fin:

@@ -30,13 +30,13 @@ from bridge.errors import SlowPeerError, TypeConflictError
 from bridge.names import absolute, check_name, ros2_type, split_type
 
 MAX_CALLS: Final = 1000
-"""Maximum number of pending calls."""
+"""Maximum number of calls of this client that wait for an answer."""
 MAX_GOALS: Final = 100
-"""Maximum number of active goals."""
+"""Maximum number of goals that this client has sent and that have not ended."""
 MAX_REQUESTS: Final = 64
-"""Maximum number of pending requests; more are refused."""
+"""Maximum number of requests to services of this client that wait for its answer; further ones are refused."""
 MAX_SERVED_GOALS: Final = 64
-"""Maximum number of goals that this client executes; more are aborted."""
+"""Maximum number of goals that this client executes at the same time; further ones are aborted."""
 
 
 # What this client asks for
@@ -94,7 +94,7 @@ class PendingGoals(_Pending):
     """Goals of this client that have not ended."""
 
     def send(self, action: str, type_name: str, goal: Mapping[str, Any], *, feedback: bool) -> str:
-        """Send a goal (see `bridge.client.Ros.send_goal`), and return its id in events."""
+        """Send a goal (see `bridge.client.Ros.send_goal`), and return the id by which events name it."""
         check_name(action)
         if len(self._names) >= MAX_GOALS:
             raise SlowPeerError(f"{MAX_GOALS} goals are active, so none was sent to {action}")
@@ -111,7 +111,7 @@ class PendingGoals(_Pending):
         return identity
 
     def cancel(self, goal: str) -> None:
-        """Ask the server to cancel a goal; its end shows whether it did. No effect after the end of the goal."""
+        """Ask the server to cancel a goal, unless it has ended. The status of its `GoalEnded` shows the outcome."""
         action = self._names.get(goal)
         if action is not None:
             self._wire.write(op="cancel_action_goal", id=goal, action=action)
@@ -189,7 +189,7 @@ class _Served:
 
 
 class ServedServices(_Served):
-    """The services, and their pending requests by ticket; tickets are never reused."""
+    """The services, and their unanswered requests. Each request has a ticket, a number that is never reused."""
 
     kind = "service"
 
@@ -214,7 +214,7 @@ class ServedServices(_Served):
 
         The reference server drops an answer whose `values` are not an object, and the caller waits for ever
         (rosbridge_library/capabilities/service_response.py, `service_response_msg_fields`), so the text is sent in an
-        additional field, which that server ignores and the hub passes on.
+        additional field, which that server ignores and `bridge.hub` passes on.
 
         Raises:
             EncodeError: The values cannot be encoded as JSON; the request is still pending.
@@ -252,7 +252,7 @@ class ServedServices(_Served):
 
 
 class ServedActions(_Served):
-    """The actions, and the executed goals by their ids on the wire."""
+    """The actions, and the goals that are being executed, by their ids on the wire."""
 
     kind = "action"
 

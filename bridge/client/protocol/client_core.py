@@ -21,7 +21,8 @@ from bridge.names import RosVersion
 class ClientCore:
     """State of a rosbridge client.
 
-    Numbers of advertisements, subscriptions and tickets are never reused, so a late event cannot reach a newer object.
+    Each advertisement, subscription and request has a number that is never reused, so a late event cannot reach a newer
+    object.
     """
 
     def __init__(

@@ -39,7 +39,7 @@ class Message(NamedTuple):
 
 
 class MessageReceived(NamedTuple):
-    """A message, and the numbers of the client's subscriptions that get it."""
+    """A message, and the subscriptions that get it, by the numbers from `Subscriptions.subscribe`."""
 
     topic: str
     msg: dict[str, Any]
@@ -106,7 +106,7 @@ class GoalStatus(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class GoalFeedback:
-    """Feedback of an action on a goal of this client."""
+    """Feedback of an action on a goal that this client sent."""
 
     goal: str
     values: Any
@@ -114,7 +114,7 @@ class GoalFeedback:
 
 @dataclass(frozen=True, slots=True)
 class GoalEnded:
-    """The end of a goal of this client: its status and result, or the text of the failure."""
+    """The end of a goal that this client sent: its status and result, or the text of the failure."""
 
     goal: str
     ok: bool

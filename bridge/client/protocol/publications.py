@@ -1,4 +1,4 @@
-"""Advertised topics of a client; all advertisements of a topic share one on the wire."""
+"""Advertised topics of a client; all advertisements of a topic share one `advertise` operation on the wire."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -105,7 +105,7 @@ class Publications:
         return ros1_type(type_name) in self._definitions
 
     def define(self, type_name: str, definitions: Definitions) -> None:
-        """Store a type's definitions; if the type is among them, each publication of it checks its next message."""
+        """Store a type's definitions; if they include it, the next message of each of its advertisements is checked."""
         self._definitions[ros1_type(type_name)] = definitions
         for advertised in self._advertised.values():
             if same_type(advertised.type, type_name):
@@ -119,7 +119,7 @@ class Publications:
             advertised.unchecked = set(advertised.holders)
 
     def publish(self, advertisement: int, msg: Mapping[str, Any]) -> bytes:
-        """Return the encoded message of an advertised topic, which bypasses the outbox."""
+        """Encode a message of an advertised topic, and return it for the caller to send, bypassing the outbox."""
         advertised = self._advertisements[advertisement]
         prefix = advertised.prefix
         try:

@@ -1,4 +1,4 @@
-"""Subscriptions of a client; all subscriptions to a topic share one on the wire.
+"""Subscriptions of a client; all subscriptions to a topic share one `subscribe` operation on the wire.
 
 Some servers deliver a first message twice, or not at all, to a client that subscribes twice.
 """
@@ -25,20 +25,20 @@ from bridge.stamps import ros_version_of_message
 Compression = Literal["none", "cbor", "cbor-raw"]
 
 _OF_ENVELOPE: Final = 3
-"""Keys of an operation with a recognisable envelope: op, topic and msg."""
+"""Number of keys (op, topic, msg) of an operation whose envelope, the bytes before its message, can be recognised."""
 _ENVELOPES: Final = 8
 """Maximum number of envelopes tried for one topic, because some servers never repeat one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Delivery:
-    """Delivery of messages, shared by all subscriptions of a client to one topic.
+    """How the messages of a topic are delivered: the same for all subscriptions of a client to it.
 
     Attributes:
         throttle_rate: Minimum number of milliseconds between two messages.
         queue_length: Number of throttled messages that the server queues.
-        compression: `cbor` for long arrays, `cbor-raw` for the serialised bytes alone. Many servers ignore an unknown
-            value and send JSON.
+        compression: `none` for JSON, `cbor` for long arrays, `cbor-raw` for the serialised bytes alone. Many
+            servers ignore an unknown value and send JSON.
         arrays: Python type of arrays of numbers, regardless of the encoding.
         fragment_size: Maximum number of characters in a fragment; None for whole messages. Servers apply the
             last value that a client requested to everything they send to it.
@@ -196,7 +196,7 @@ class Subscriptions:
         """Do not subscribe to a topic again, because each of its messages would end the connection.
 
         Returns:
-            Numbers of its subscriptions; none if the topic is not subscribed to.
+            The numbers of its subscriptions (as from `subscribe`); empty if there are none.
         """
         subscribed = None if topic is None else self._subscribed.get(absolute(topic))
         if subscribed is None:
@@ -263,7 +263,7 @@ class Subscriptions:
         return bool(waiting)
 
     def silent(self) -> list[str]:
-        """Return the topics with a type that have had no message on this connection."""
+        """Return the topics subscribed to with a type that have had no message on this connection."""
         return [
             s.topic
             for s in self._subscribed.values()

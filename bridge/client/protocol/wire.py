@@ -8,7 +8,7 @@ from bridge.codecs.json_codec import encode
 from bridge.names import Kind, RosVersion, ros1_type, ros2_type
 
 SMALLEST_LIMIT: Final = 2048
-"""Smaller limits of a server are raised to this one, so that subscriptions and advertisements can always be sent."""
+"""Smaller size limits (bytes) of servers are raised to this one, so that subscriptions can always be sent."""
 
 
 class Wire:
@@ -36,7 +36,7 @@ class Wire:
         return ros2_type(name, kind) if self.ros_version == 2 else ros1_type(name)
 
     def write(self, **operation: Any) -> None:
-        """Write an operation."""
+        """Add an operation to the outbox, as JSON."""
         self.write_bytes(encode(operation, max_size=self.sendable, max_depth=self.max_depth))
 
     def limit(self, size: int) -> None:
@@ -44,7 +44,7 @@ class Wire:
         self.sendable = min(self.sendable, max(size, SMALLEST_LIMIT))
 
     def write_bytes(self, data: bytes) -> None:
-        """Write an encoded message."""
+        """Add an encoded message to the outbox."""
         # Dropped without a connection, because `restore` writes everything that is wanted by then.
         if self.connected:
             self._outbox.append(data)
