@@ -1,4 +1,4 @@
-"""Settings of all services: a flag applies before a `BM_*` variable, then the deployment, then the default."""
+"""Settings of all services, from the first source that has them: flag, `BM_*` variable, deployment, default."""
 
 import difflib
 import os
@@ -24,7 +24,7 @@ _DEPLOYMENTS = "the deployment's"
 
 
 class Settings(BaseModel):
-    """Settings of a user. None or "" means the value of the deployment, or the default behaviour."""
+    """Settings of a user. None or "" stands for the value of the deployment, or for the default behaviour."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
@@ -207,7 +207,7 @@ def load_settings(**flags: Any) -> Settings:
     # later children inherit the variable
     if "log_format" in given:
         use_log_format(settings.log_format)
-    # looked up only where the server is used: a board would wait for a robot that it never contacts
+    # a `robot:NAME` is looked up only by users of the server: a board would wait for a robot that it never contacts
     if "uri" in flags and settings.uri is not None:
         return settings.model_copy(update={"uri": find_uri(settings.uri, settings.connect_timeout)})
     return settings

@@ -106,7 +106,7 @@ def access_policy(
     insecure: bool,
     danger: str,
 ) -> AccessPolicy:
-    """Return the access policy of the flags; its `files` (certificate, key, tokens) are needed if others can connect."""
+    """Return the access policy of the flags; `files` (certificate, key, tokens) are needed if others can connect."""
     certificate, key, tokens = files
     if (certificate is None) != (key is None):
         raise SettingsError(

@@ -22,9 +22,9 @@ OnState = Callable[[str, State, str], None]
 """Callback with the URI of a server, the new state of its connection, and the reason."""
 
 AFTER: Final = 2.0
-"""Seconds in which a publisher may appear; after them, a mistyped name is suspected."""
+"""Seconds in which the publisher of a topic may appear; after them, the topic's name may be mistyped."""
 ROSAPI_TIME = 2.0
-"""Seconds in which rosapi may answer; many servers lack it, and then nothing is known."""
+"""Seconds in which rosapi may answer. Many servers lack it; then nothing is known about their topics."""
 SETTLED_TIME = 3.0
 """If a server does not list an advertised topic after this many seconds, it has refused it."""
 CHECK_INTERVAL = 10.0
@@ -45,7 +45,7 @@ async def connect_all(
     the status names also a server that is not reached yet; `options` are those of `connect`.
 
     Raises:
-        BridgeError: A server is unreachable, is not a rosbridge server, or is not announced.
+        BridgeError: A server is unreachable, is not a rosbridge server, or is a `robot:NAME` that nobody announces.
     """
     by_uri = {} if by_uri is None else by_uri
     for uri in uris:
@@ -76,7 +76,7 @@ def reconnect_now(rosbridges: Mapping[str, Ros]) -> None:
 
 
 async def report_unpublished(ros: Ros, topic: str, report: Callable[[str], None]) -> None:
-    """Report a topic, with the nearest names, if according to rosapi it has no publisher after `AFTER` seconds."""
+    """Report a topic, with similar names, if according to rosapi it has no publisher after `AFTER` seconds."""
     # a publisher that starts at the same time is not missing
     await asyncio.sleep(AFTER)
     if await ros.publishers(topic) != []:
@@ -100,7 +100,7 @@ async def check_types(topics: Iterable[tuple[Ros, str, str]]) -> None:
     asked = list(topics)
     types = await asyncio.gather(*(ros.topic_type(topic, ROSAPI_TIME) for ros, topic, _ in asked))
     for known, (ros, topic, own) in zip(types, asked, strict=True):
-        # without a publisher it may still get our type
+        # a topic without a publisher may still get our type
         if known and not same_type(known, own) and await ros.publishers(topic) != []:
             raise NotReceivableError(f"{topic} is {shown(known[:80])} at {ros.uri}, not {own}; use that type")
 
@@ -121,7 +121,7 @@ class AdvertisedTopic:
     name: str
     type: str
     key: str = ""
-    """Its key in `[topics]`, which switches it off; empty for a topic that is always on."""
+    """Key in the section `[topics]` of the deployment that switches the topic off; empty if it is always on."""
 
 
 def reported_refusals(topics: Iterable[AdvertisedTopic]) -> dict[str, str]:

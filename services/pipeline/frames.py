@@ -71,7 +71,7 @@ class _SourceReader:
         return to_addresses(self._deployment, variable, value), None
 
     def _require_all(self, message: dict[str, Any]) -> None:
-        """Raise one error that names all missing readings of a message; do nothing if only a single one is null."""
+        """Raise one error that names all missing readings of a message; do nothing if the only missing one is null."""
         # often several are missing, such as all of one sensor
         needed = [field for variable, field in self._fields if variable.on_missing == "error"]
         if self._prior is not None and not self._prior_optional:
@@ -141,7 +141,7 @@ class FrameAssembler:
     """Assembly of complete readings from the messages of a deployment's topics.
 
     With one topic, every message is a frame. With several, messages are paired by stamp (see `Synchroniser`),
-    and unpaired ones are counted in `unpaired`. The clock of a simulation replaces the times of receipt.
+    and unpaired messages are counted in `unpaired`. The clock of a simulation replaces the times of receipt.
     """
 
     def __init__(self, deployment: Deployment, clock: Clock | None = None) -> None:
@@ -167,7 +167,7 @@ class FrameAssembler:
 
     @property
     def deadline(self) -> int | None:
-        """Tick (ns) at which `due` must be called, unless messages complete the reading earlier; None if none waits."""
+        """Tick (ns) at which `due` must be called if no message completes the reading earlier; None if none waits."""
         return self._synchroniser.deadline
 
     def take(

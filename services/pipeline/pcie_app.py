@@ -109,7 +109,7 @@ class PcieApp(RunService):
             self._watch()
 
     def _watch(self) -> None:
-        """Collect when the awaited board has sent bytes."""
+        """Have `_collect` called when the awaited board has sent bytes."""
         awaited = self._boards.awaited
         if awaited != self._watched:
             self._unwatch()
@@ -145,7 +145,7 @@ class PcieApp(RunService):
         self._post_next()
 
     def _fail(self, error: BoardError) -> None:
-        """Search for other lost boards, so that boards that die together fail only one frame, then report it."""
+        """Search for other lost boards, so that boards that die together fail only one frame; then report the error."""
         if self._posted is None:
             return
         (number, master), self._posted = self._posted, None
@@ -163,7 +163,7 @@ class PcieApp(RunService):
         self._searching = asyncio.ensure_future(search())
 
     def _answer(self, master: int, record: Record) -> None:
-        """Send the result of a frame, unless its master is gone: frames of the next master have the same numbers."""
+        """Send the result of a frame, unless its master is gone: the next master numbers its frames from 1 too."""
         if master == self._link.masters:
             self._link.send(record)
 

@@ -53,7 +53,7 @@ class Publisher(RunService):
         # For the status: outcomes so far, and the last published frame's number and time (monotonic, ns).
         self._outcomes: Counter[Outcome] = Counter()
         self._last = (0, 0)
-        # By topic, why the server does not pass it on, as of the last check.
+        # By topic, why the server does not pass the topic on, as of the last check.
         self._refused: dict[str, str] = {}
 
     def status(self) -> ProcessStatus:
@@ -120,10 +120,10 @@ class Publisher(RunService):
         return msgspec.structs.replace(published, missed=max(published.missed, refused))
 
     async def _check_delivery(self, *, settled: bool) -> None:
-        """Report once each topic that a server refuses; with `--once`, raise a NotReceivableError if it refuses all."""
+        """Report each refused topic once; with `--once`, raise a NotReceivableError if all outputs are refused."""
         topics = self._topics.advertised
         asked = [*topics, *([self._topics.reports] if self._topics.reports else [])]
-        # each question takes a server time, which the first result would have to wait for
+        # a server needs time for each question, and the first result would have to wait for it
         standard = self._topics.standard
         if settled:
             asked += standard.advertised
@@ -142,7 +142,7 @@ class Publisher(RunService):
             await asyncio.sleep(CHECK_INTERVAL)
 
     async def _keep_looking(self) -> NoReturn:
-        """In each run with `--loop`, check whether the server passes results on, since some discard them silently."""
+        """In each run with `--loop`, check whether the server passes results on, since some servers do not."""
         while True:
             await self._first.wait()
             self._first.clear()

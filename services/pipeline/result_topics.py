@@ -94,7 +94,7 @@ class ResultTopics:
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
     def served_by(self, uri: str) -> tuple[str, str]:
-        """Return texts for messages: a server's topics, and the server's name (`rosbridge` if it is the only one)."""
+        """Return two texts for the user: the topics at a server, and its name (only `rosbridge` if it is alone)."""
         if len(self.rosbridges) == 1:
             return "", "rosbridge"
         topics = [publication.topic for ros, publication in self._outputs if ros is self.rosbridges.get(uri)]
@@ -145,7 +145,7 @@ class ResultTopics:
         With `look`, wait until the result is seen on the wire, or until the timeout of the settings.
         """
         inference = infer(publish.result, self._deployment)
-        # a server that does not accept the result in time is left out of it, with a warning
+        # a server that does not accept the result in time does not get it, and the user is warned
         ready = [publication.ready() for publication in self._connected()]
         for error in await asyncio.gather(*ready, return_exceptions=True):
             if isinstance(error, BridgeError):
@@ -213,7 +213,7 @@ class ResultTopics:
         )
 
     async def publish_array(self, values: Any) -> None:
-        """Publish probabilities (float64, one per line) on every output."""
+        """Publish probabilities (float64, one per cell) on every output topic."""
         for _, publication in self._outputs:
             await publication.publish({"layout": self._layout, "data": values})
 

@@ -47,7 +47,7 @@ _TYPES: Final = {
     "decision": ("/bm/decision", FRAME_TYPE),
     "diagnostics": ("/diagnostics", FRAME_TYPE),
 }
-"""Topics and types by their keys in `[topics]`."""
+"""Names and types of the topics, by their keys in the section `[topics]` of a deployment."""
 
 _Make = Callable[[], dict[str, Any] | None]
 """Function that makes a message, or nothing."""
@@ -58,7 +58,7 @@ class StandardTopics:
 
     Attributes:
         advertised: The topics that are published, once `open` has advertised them.
-        refused: Names of topics that the server did not pass on when it was asked, which get no more messages.
+        refused: Names of topics that the server refuses according to the last check; nothing is published on them.
     """
 
     def __init__(self, settings: Settings, deployment: Deployment, role: str) -> None:
@@ -114,7 +114,7 @@ class StandardTopics:
             yield key
 
     def offer(self, publish: Publish, inference: Inference) -> None:
-        """Send the topics of a frame later, unless a newer frame replaces it before."""
+        """Send the messages of a frame later, unless a newer frame replaces it before."""
         self._last, self._waiting = (publish, inference, self._clock.tick()), True
         if self._timer is None and self._publications:
             loop = asyncio.get_running_loop()
@@ -198,7 +198,7 @@ class StandardTopics:
         while True:
             if self._ros is not None and self._ros.state is State.CONNECTED:
                 self._publish("diagnostics", self._health)
-            # a silent process takes a second, by which the next message must not be late
+            # asking a silent process takes a second, which must not delay the next message
             await asyncio.gather(asyncio.sleep(_HEALTH_INTERVAL), self._ask_stack())
 
     async def _ask_stack(self) -> None:
@@ -212,7 +212,7 @@ class StandardTopics:
         return diagnostics([*boards, *self._services()], self._clock.time_ns(), "", self._ros_version)
 
     def _changed_health(self) -> dict[str, Any] | None:
-        """Return the health if a board's level has changed since the last message; None otherwise."""
+        """Return the message on `/diagnostics` if a board's level has changed since the last one; None otherwise."""
         return None if [each["level"] for each in self._boards()] == self._levels else self._health()
 
     def _boards(self) -> Iterator[dict[str, Any]]:

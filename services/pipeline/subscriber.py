@@ -58,7 +58,7 @@ async def newest_message(subscription: Subscription, message: Message) -> tuple[
 
 
 class Subscriber(RunService):
-    """Service that sends readings of a deployment's topics to a master, as addresses of columns."""
+    """Service that sends readings of a deployment's topics to a master, as addresses in the variables' columns."""
 
     role = ROLE
 

@@ -52,7 +52,7 @@ class _Topic(Generic[Item]):
         return int(statistics.median(self.intervals)) if self.intervals else None
 
     def is_alive(self, tick: int, begun: int) -> bool:
-        """Return whether another message is expected; silence counts from the last one, at first from `begun`."""
+        """Return whether another message is expected; silence counts from the last message, at first from `begun`."""
         silence = tick - (begun if self.heard is None else self.heard)
         return silence <= ALIVE_PERIODS * (self.period or _UNKNOWN_PERIOD_NS)
 

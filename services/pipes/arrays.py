@@ -67,7 +67,7 @@ class ArrayField:
         return format_place(self.place)
 
     def numbers(self, line: bytes, number: int) -> list[float]:
-        """Return the numbers of a line of standard input, or raise an InputLineError; integers for an array of integers."""
+        """Return the values in line `number` of standard input, int for integer arrays, or raise an InputLineError."""
         where = f"line {number} of standard input"
         text = line.strip()
         found: list[float]
@@ -127,7 +127,7 @@ def array_field(definitions: Definitions, message_type: str, path: str | None) -
     """Return the array of numbers at a path in a message type, or the type's only one.
 
     Raises:
-        SettingsError: There is no array of numbers at the path, or without a path there are none or several.
+        SettingsError: There is no array of numbers at the path; or without a path, the type has none or several.
     """
     arrays: dict[str, ArrayField] = {}
     waiting: list[tuple[Place, str]] = [((), ros1_type(message_type))]
@@ -168,12 +168,12 @@ async def _definitions(ros: Ros, message_type: str) -> Definitions:
 
 
 async def publish_arrays(settings: Settings, source: Source, path: str | None) -> int:
-    """Publish each line of standard input as one message of a topic, and wait until each is seen.
+    """Publish each line of standard input as one message of a topic, and wait until each message comes back.
 
     Raises:
         InputLineError: A line cannot be a message of the type, or there is no line.
         SettingsError: The type does not have this field.
-        BridgeError: The topic has another type, the server is unreachable, or a message was not seen.
+        BridgeError: The topic has another type, the server is unreachable, or a message did not come back.
     """
     async with contextlib.AsyncExitStack() as stack:
         uris, report = [source.uri], report_waits()
@@ -252,13 +252,13 @@ class _Echoes:
                     break
 
     async def add(self, number: int, numbers: list[float], *, most: int) -> bool:
-        """Add a published line; then act as `at_most`, waiting only for the first line or if any message was seen."""
+        """Add a published line, then act as `at_most`; wait only for the first line, or if a message has come back."""
         first = not self._waiting and not self.lost
         self._waiting.append((number, numbers))
         return await self.at_most(most) if first or self._has_seen else not self._give_up(most)
 
     async def at_most(self, most: int) -> bool:
-        """Wait until at most `most` lines wait and return True; at the limit, give up the others and return False."""
+        """Wait until at most `most` lines wait and return True; after the time limit, give up older lines: False."""
         while len(self._waiting) > most:
             self._seen.clear()
             try:
@@ -269,7 +269,7 @@ class _Echoes:
         return True
 
     def _give_up(self, most: int) -> bool:
-        """Count all but the last `most` waiting lines as lost; return whether there were any."""
+        """Count all but the last `most` waiting lines as lost; return whether any was lost."""
         lost = [self._waiting.popleft()[0] for _ in range(len(self._waiting) - most)]
         self.lost += lost
         return bool(lost)

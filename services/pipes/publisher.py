@@ -21,13 +21,13 @@ _Line = LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # JSON has no i
 
 
 def result_from_line(line: bytes, number: int, machine: MachineSection) -> Publish | list[float]:
-    """Return the value of a line: a result of `pcie-app` with its reading, or probabilities; otherwise an InputLineError."""
+    """Return the result of `pcie-app` with its reading, or the probabilities, in a line, or raise an InputLineError."""
     where = f"line {number} of standard input"
     count, replicas, reasons = machine.results, machine.replicas, machine.kind.reasons
     expected = f"a result of pcie-app or an array of {count} probabilities"
     value = decoded(line, number, _Line, expected)
     found = len(value) if isinstance(value, list) else sum(len(board.counts) for board in value.boards)
-    # results of another model with as many lines cannot be detected, because they do not name their deployment
+    # results of another model with as many cells cannot be detected, because they do not name their deployment
     kept = not isinstance(value, list) and any(board.kept for board in value.boards)
     if found != count and not kept:
         raise InputLineError(f"{where} has {found} values; expected {expected}")

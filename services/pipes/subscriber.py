@@ -41,7 +41,7 @@ async def print_variables(settings: Settings, source: Source, names: list[str], 
             while count is None or printed < count:
                 message = await subscription.next(timeout=settings.first_data_timeout)
                 hint.cancel()
-                # all missing ones in one sentence, instead of one at each attempt
+                # all missing variables in one sentence, instead of one at each attempt
                 found = [(field, *field.value(message.msg)) for field in fields]
                 # one error for all of them
                 if missing := [field for field, present, _ in found if not present]:

@@ -15,8 +15,9 @@
 Any service may send `Notice` at any time, and `Trouble` before it ends. `Unusable` replaces a reading, and
 `FrameFailed` a result.
 
-Every record is a MessagePack array whose first element is its tag. Fields `*_ns` are Unix times; fields
-`*_tick` are times of the machine's monotonic clock, comparable between its processes.
+Every record is a MessagePack array whose first element is its tag. `stamp_ns` and `received_ns` are
+Unix times; other fields `*_ns` are durations; fields `*_tick` and `ticks` are times of this computer's monotonic
+clock, comparable between its processes.
 """
 
 from enum import StrEnum
@@ -39,7 +40,7 @@ class LossReason(StrEnum):
     UNPAIRED = "unpaired"
     """No message arrived on another topic within the tolerance."""
     TOO_LARGE = "too large"
-    """Above the limit of its topic (`topic_bytes`)."""
+    """A message exceeded the limit of its topic (`topic_bytes`)."""
     UNUSABLE = "with an unusable variable"
     FAILED = "failed on a board"
     WITH_APP = "lost with pcie-app"
@@ -47,7 +48,7 @@ class LossReason(StrEnum):
     NO_POSTERIOR = "no posterior"
     ROSBRIDGE_AWAY = "rosbridge away"
     REFUSED = "refused by rosbridge"
-    """The server does not pass the topic on: it has another type, or is not allowed."""
+    """The server does not pass the topic on: the topic has another type there, or is not allowed."""
     SOME_TOPICS = "on some topics only"
     """Published, but not on the topics of a disconnected server."""
 
@@ -124,12 +125,12 @@ class Trouble(Record, tag="trouble", frozen=True):
     sentence: str
 
 
-# --- a frame, in the order of its path -------------------------------------------------------------
+# --- a frame, in the order of sending --------------------------------------------------------------
 
 Addresses = list[int | list[int] | None]
 """Addresses of a frame's readings, in the order of the variables; None for a missing reading.
 
-If replicas or lines have their own readings, each is a flat list (row by row, -1 for a missing one).
+If replicas or cells have readings of their own, each variable has a flat list (row by row, -1 for a missing reading).
 """
 
 Values = list[float | str | None]
@@ -141,7 +142,7 @@ reading, and for an array.
 class Reading(Record, tag="reading", frozen=True):
     """Subscriber to master: one complete set of addresses, with the newest stamp of its messages (or time of receipt).
 
-    `prior_codes` is a written prior, two bytes per line (and replica); empty for the prior of the machine.
+    `prior_codes` is a prior to write, two bytes per cell (and replica); empty for the prior in the machine.
     `passed_over` is the number of readings that the subscriber dropped since the last one it sent; `unpaired` is the
     number of unpaired messages.
     """
@@ -223,10 +224,10 @@ class Publish(Record, tag="publish", frozen=True):
 class Published(Record, tag="published", frozen=True):
     """Publisher to master: the outcome of a result.
 
-    `seen` is whether it was seen on the wire (None if that was not checked). `best_line` is the most
-    probable line. `total_ns` is the time from the reading's receipt to the result's sending. If there are several
-    outputs, `missed` counts those whose servers were not connected. `out_ns` is the duration of publishing. `why` is
-    the report's sentence if there is no posterior or a biased one; `cause` lists the stop reasons of the boards.
+    `seen` is whether the result came back from the server (None if that was not checked). `best_line` is the number of
+    the most probable cell. `total_ns` is the time from the reading's receipt to the result's sending. If there are
+    several outputs, `missed` counts those whose servers were not connected. `out_ns` is the duration of publishing.
+    `why` is the report's sentence if there is no posterior or a biased one; `cause` lists the boards' stop reasons.
     """
 
     number: int
@@ -245,7 +246,7 @@ class Published(Record, tag="published", frozen=True):
 class Seen(Record, tag="seen", frozen=True):
     """Publisher to master, with `--loop`: whether the publisher received one of its own results back in time.
 
-    If not, it is sent again as soon as a later result comes back.
+    If not, a second `Seen` follows as soon as a later result comes back.
     """
 
     seen: bool

@@ -65,7 +65,7 @@ class ServiceManager:
         self._status = ""
 
     def report(self, status: str, *, ready: bool, alive: bool) -> None:
-        """Send the state of this process, and a sign of life only if it is `alive`."""
+        """Send the state of this process, and a sign of life only if the process is `alive`."""
         sent = []
         if ready and not self._ready:
             sent.append("READY=1")
@@ -218,6 +218,6 @@ async def _keep_sampling(report: Report, manager: ServiceManager) -> None:
 def serve_status_in_thread(
     directory: Path | None, name: str, get_status: GetStatus, **more: Any
 ) -> Iterator[None]:
-    """Report from a thread within the context, for a process with one blocking thread."""
+    """Do the same from a thread of its own within the context, for a process whose main thread blocks."""
     with in_thread(lambda: serve_status(directory, name, get_status, **more)):
         yield

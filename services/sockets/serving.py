@@ -78,7 +78,7 @@ MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
 class MasterLink(Link):
     """Link over a local socket that listens for a master and passes its records on.
 
-    A second master is refused until the first has disconnected. If the folder of the service has changed
+    A second master is refused until the first has disconnected. If the deployment folder of the service has changed
     since its start and a master requires the new deployment, the service ends with an error.
     """
 
@@ -263,7 +263,7 @@ class RunService(ABC):
 
 
 async def report_failure(link: Link, error: BaseException) -> None:
-    """Send the error that ends a service to its master; a bug is not sent, because the service prints it."""
+    """Send to the master the error that ends its service; a bug is not sent, because the service prints it."""
     code = exit_code_of(error)
     if code == ExitCode.BUG or not isinstance(error, Exception):
         return
@@ -274,7 +274,7 @@ async def report_failure(link: Link, error: BaseException) -> None:
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
-    """Return the error if a restart would load the deployment that a master required in `refused`; otherwise None."""
+    """Return the error if a restart would load the deployment of a master whose hello was `refused`; otherwise None."""
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None
     try:
@@ -290,7 +290,7 @@ def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None
 
 
 def endpoint_from(text: str, flag: str) -> Endpoint:
-    """Return the endpoint given by a user, or raise a SettingsError."""
+    """Return the endpoint that a user gave to `flag`, or raise a SettingsError."""
     try:
         return parse_endpoint(text)
     except PcieShimError as error:

@@ -23,7 +23,7 @@ Reason = TypeVar("Reason", bound=str)
 ANSWER_TIME = 1.0
 """Seconds in which all processes of a run must answer."""
 _AT_ONCE = 256
-"""Maximum number of processes asked at the same time."""
+"""Maximum number of processes asked for their status at the same time."""
 _ORDER = ("hub", "master", "subscriber", "publisher", "pcie-app")
 
 
@@ -94,7 +94,7 @@ class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PeerStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A peer of the master."""
+    """A service as its master sees it."""
 
     name: str
     endpoint: str
@@ -105,7 +105,7 @@ class PeerStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 BUCKETS_S = tuple(digit * 10.0**exponent for exponent in range(-5, 1) for digit in (1, 2, 5))[:17]
-"""Upper bounds of the buckets of a latency in seconds, from 10 us to 2 s; one more bucket has no upper bound."""
+"""Upper bounds in seconds of the buckets that count latencies, from 10 us to 2 s; one more bucket has no bound."""
 
 
 class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
@@ -131,7 +131,7 @@ class HubStatus(msgspec.Struct, frozen=True):
 
 
 class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A process."""
+    """The status of a process."""
 
     # Whether it does its work; `why` is its state if it does, otherwise the cause.
     ready: bool
@@ -166,7 +166,7 @@ class SilentProcess(msgspec.Struct, frozen=True):
 
 
 class StackStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """All processes of a run."""
+    """The status of all processes of a run."""
 
     directory: str
     ready: bool
