@@ -1,1 +1,1 @@
-"""The stages from a model to a deployment: parameters, codes, partitions, images and files (thesis 3.2, 3.4)."""
+"""The stages from a model to a deployment: parameters, codes, each board's lines, images, files (thesis 3.2, 3.4)."""

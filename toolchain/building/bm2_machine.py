@@ -1,4 +1,4 @@
-"""The BM2 for a model: its plan, the sizes of tables and results, and the chain of each board (thesis 2.1.3)."""
+"""The BM2 for a network: its plan, limits on its tables and results, and each board's chain (thesis 2.1.3)."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
@@ -26,10 +26,10 @@ from toolchain.models.network import NetworkModel
 from toolchain.outputs.mif import random_table
 
 _MOST_CODES: Final = 1 << 27
-"""Maximum number of codes of all CDEs, 2 bytes each."""
+"""Maximum number of codes in the tables of all CDEs, 2 bytes each."""
 
 BM2_KEYS: Final = tuple(key for key in BM2Section.model_fields if key in BM2Parameters.__dataclass_fields__)
-"""The names of parameters that have the same names in `[machine]`."""
+"""The names of the parameters that `[machine]` of `deployment.toml` has too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,7 +42,7 @@ class BM2Plan:
     model: NetworkModel
     options: BuildOptions
     parameters: BM2Parameters
-    """The parameters of the first board; those of other boards differ only in `chain`, the number of the board."""
+    """The parameters of the first board; those of other boards differ only in `chain`, the board's index."""
     target_count: int
     """The number of samples of each board."""
     max_cycles: int
@@ -82,7 +82,7 @@ def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was aske
 
 
 def _check_sizes(model: NetworkModel) -> None:
-    """Raise a BuildError, which names the largest part, for a model that does not fit tables or registers."""
+    """Raise a BuildError if a factor's table or the results are too large; it names the largest factor or variable."""
     bits = {each.name: (each.size - 1).bit_length() for each in model.symbols}
     widths = [sum(bits[name] for name in term.scope) for term in model.factors]
     codes = [width << width >> 1 for width in widths]
@@ -116,7 +116,7 @@ def _check_sizes(model: NetworkModel) -> None:
 
 
 def chain_machines(plan: BM2Plan) -> tuple[BM2Machine, ...]:
-    """Return each board's machine: common tables, but its own seeds; a BuildError if no state is possible."""
+    """Return each board's machine: the same tables, but other seeds; a BuildError if no state is possible."""
     parameters, table = plan.parameters, plan.options.rng_table
     if table is None and parameters.rng is RngKind.TABLE:
         table = random_table(parameters.prob_bits)
@@ -135,7 +135,8 @@ def chain_machines(plan: BM2Plan) -> tuple[BM2Machine, ...]:
 def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]:
     """Return how many odds of a factor are clipped, how many of these because of zeros, and the number of all odds.
 
-    Odds compare two values of one variable whose codes differ in one bit, with all other variables unchanged.
+    Odds compare two values of one variable whose codes differ in one bit, with all other variables unchanged. They are
+    clipped if they are beyond what a code can express.
     """
     clips = zeros = count = 0
     for axis, size in enumerate(factor.shape):

@@ -1,4 +1,4 @@
-"""The path from a model to a deployment (thesis 3.4).
+"""The steps from a model to a deployment (thesis 3.4).
 
 BM1: model, options ──▶ plan_machine ──▶ quantise ──▶ whole_machine ──▶ split ──▶ images ──▶ describe ──▶ files
                         └─▶ board_layout (lines and interface of each board, before tables are computed)
@@ -64,7 +64,7 @@ from toolchain.outputs.output_files import (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Built:
-    """A deployment, the images of its boards, and a report about both."""
+    """A deployment, the images (programming files) of its boards, and the report of the build."""
 
     deployment: Deployment
     """The content of `deployment.toml`."""
@@ -75,7 +75,7 @@ class Built:
     report: str
     """The content of `report.txt`."""
     transition: Transition | None = None
-    """The content of the file of `[filter]`, if there is one."""
+    """The transition of a filter, which `[filter]` of the deployment refers to; None without a filter."""
 
 
 REPORT_NAME: Final = "report.txt"
@@ -86,8 +86,8 @@ def build_deployment(
 ) -> Built:
     """Write a deployment: `deployment.toml`, an image per board, a report, and the hardware project.
 
-    The same plan gives the same bytes. A deployment in the folder is replaced; `remarks` end the report. A
-    BuildError if the options contradict the register map, or the folder cannot be written.
+    The same plan gives the same bytes. A deployment in the folder is replaced. `remarks` returns sentences to
+    add to the report. A BuildError if the options contradict the register map, or the folder cannot be written.
     """
     built = assemble(plan)
     for remark in remarks(built):
@@ -112,7 +112,7 @@ def assemble(
     plan: MachinePlan | BM2Plan,
     place: Callable[[Deployment, Sequence[Image]], Deployment] = lambda deployment, _: deployment,
 ) -> Built:
-    """Return a deployment without writing anything, or raise a BuildError; `place` may change its topics and paths."""
+    """Return a deployment without writing anything, or raise a BuildError; `place` may change its topics."""
     model, options, quantised = plan.model, plan.options, None
     known_variables(plan)  # refuses --order and --path before the tables are computed
     machines: Sequence[BM1Machine | BM2Machine]
@@ -165,10 +165,10 @@ def build_date(model_file: Path) -> str:
 
 
 def _model_hash(plan: MachinePlan | BM2Plan, codes: Sequence[NDArray[Any]]) -> str:
-    """Return the SHA-256 (hexadecimal) of the whole machine and its names.
+    """Return the SHA-256 (hexadecimal) of a machine over all boards, with the model's and the variables' names.
 
-    It covers codes and, for a BM2, which values are possible; it does not cover probabilities, because their last bits
-    depend on the mathematics library.
+    It covers `codes` and, for a BM2, which values are possible; it does not cover probabilities, because their last
+    bits depend on the mathematics library.
     """
     model, parameters = plan.model, plan.parameters
     words: dict[str, Any] = {
@@ -189,7 +189,7 @@ def _model_hash(plan: MachinePlan | BM2Plan, codes: Sequence[NDArray[Any]]) -> s
 
 
 def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[Image]) -> Deployment:
-    """Return the deployment of these images, with its hash; a BuildError if an option does not fit the machine."""
+    """Return the deployment that lists these images, with its hash; a BuildError if an option does not fit."""
     model, options = plan.model, plan.options
     own: dict[str, Any]
     hidden: tuple[Dimension, ...] = ()
@@ -198,7 +198,7 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
     if isinstance(plan, BM2Plan):
         section, keys, own = BM2Section, BM2_KEYS, {"variables": plan.model.names}
         asked = {*plan.model.known, *(each.label for each in model.searched)}
-        symbols = plan.model.symbols if plan.parameters.stream else ()  # only a stream shows hidden ones
+        symbols = plan.model.symbols if plan.parameters.stream else ()  # only a stream shows hidden variables
         hidden = tuple(each.dimension() for each in symbols if each.name not in asked)
     else:
         section, keys, own = BM1Section, MACHINE_KEYS, {"scale": options.scaling, "stop": options.stop}
@@ -242,7 +242,9 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
 
 
 def known_variables(plan: MachinePlan | BM2Plan) -> tuple[Variable, ...]:
-    """Return the known variables; with `threshold`, the values of a sensor are the codes.
+    """Return the known variables as a deployment has them, with their sources and paths in messages.
+
+    With `--sensor-mode threshold`, the values of a sensor are codes.
 
     A BuildError if `--order`, `--path` or a sources file names what the model does not have.
     """
@@ -269,14 +271,14 @@ def known_variables(plan: MachinePlan | BM2Plan) -> tuple[Variable, ...]:
 
 
 def read_images(deployment: Deployment) -> list[Image]:
-    """Return the images of the boards."""
+    """Read the image of each board, and return them in the order of the boards."""
     return [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
 
 
 def check_agreement(
     deployment: Deployment, images: Sequence[Image], *, edited: Container[str] = frozenset()
 ) -> None:
-    """Raise a DeploymentError if `deployment.toml` contradicts its images, except in the keys in `edited`."""
+    """Raise a DeploymentError if `deployment.toml` contradicts its images, except in the keys that `edited` names."""
     machine = deployment.machine
     total = machine.lines if machine.is_divided else len(images)
     for index, (board, image) in enumerate(zip(deployment.boards, images, strict=True)):
@@ -300,7 +302,7 @@ def check_agreement(
 def _parameter_pairs(
     deployment: Deployment, parameters: BM1Parameters | BM2Parameters
 ) -> dict[str, tuple[object, object]]:
-    """Return each parameter by name, as a pair: its value in the deployment, and its value in the machine."""
+    """Return a pair for each parameter, by name: its value in the deployment, and its value in the image."""
     machine, sensors = deployment.machine, deployment.sensors
     pairs: dict[str, tuple[object, object]]
     if isinstance(parameters, BM1Parameters):
@@ -316,7 +318,7 @@ def _parameter_pairs(
         names = getattr(machine, "variables", ())
         pairs["number of names in 'variables'"] = len(names), len(sizes)
         if len(names) == len(sizes):
-            # the known ones as a set, since 'regenerate deployment --order' changes which column is which
+            # known variables are compared in any order, since 'regenerate deployment --order' changes it
             labels, asked = (
                 [each.label for each in deployment.searched],
                 [names[at] for at in parameters.searched],

@@ -15,8 +15,8 @@ def model_for(
 ) -> tuple[Model | NetworkModel, str]:
     """Return the model for the machine that the options ask for, and the reason for its kind, as a clause.
 
-    `bits` (address bits of columns, as `NAME=BITS`) and the FPGA `device` are for a BM1. A ToolchainError if
-    the machine cannot be built, or a flag is for the other machine.
+    `bits` (address bits of columns, as `NAME=BITS`) and the FPGA `device` are for a BM1 only. A ToolchainError
+    if the machine cannot be built, or a flag is for the kind that was not chosen.
     """
     refusal = source.refusal() if isinstance(source, Question) else None
     choice = options.machine
@@ -48,7 +48,7 @@ def network_for(source: Model | Question) -> NetworkModel:
 def _refuse(
     flags: list[str], wanted: str, chosen: str, choice: MachineChoice, why: str, *, is_possible: bool = True
 ) -> None:
-    """Raise a BuildError for flags of the machine that was not chosen."""
+    """Raise a BuildError if `flags`, which are those given for the kind `wanted`, is not empty."""
     if flags:
         this = f"{chosen}, since {why}" if choice is MachineChoice.AUTO else f"{chosen} (--machine {choice})"
         other = f", or use --machine {wanted.lower()}" if is_possible else ""

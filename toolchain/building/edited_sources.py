@@ -1,7 +1,7 @@
-"""Programming files from edited sources: the MIFs and `bm1_parameters.vhd` of a deployment (thesis 3.2, 3.4).
+"""Images (programming files) from edited sources, the MIFs and `bm1_parameters.vhd` of a deployment (thesis 3.2, 3.4).
 
-An edit is accepted if the sources, written again from the new images, are the same as the edited ones. So sources that
-contradict each other are refused.
+An edit is accepted if the sources that the new images give are the same as the edited ones. So sources that contradict
+each other are refused.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,12 +46,13 @@ _PARAMETERS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
     "TARGET_COUNT": ("target_count", _number),
     "MAX_CYCLES": ("max_cycles", _number),
 }
-"""The constants that may be edited, each with its key in `[machine]` and the function that parses its value.
+"""The constants of `bm1_parameters.vhd` that may be edited, each with its key in `[machine]` and the function that
+parses its value.
 
-The other constants are the sizes of memories and boards, and the generators, which determine the seeds.
+The other constants are sizes of memories and boards, and the kind of generators, on which the seeds depend.
 """
 _SHOWN: Final = 3
-"""Maximum number of changed codes of a memory that are listed."""
+"""Maximum number of changed codes that are listed for a memory."""
 
 
 def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Change]]]:
@@ -95,7 +96,7 @@ def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Chang
 def _with_parameters(
     directory: Path, deployment: Deployment, images: Sequence[Image]
 ) -> tuple[Deployment, list[Image], list[str]]:
-    """Return deployment and images with the parameters of the VHDL package, and the edits in it."""
+    """Return deployment and images with the VHDL package's parameters, and the edits of the package, as sentences."""
     found = PackageTokens.read(directory / PARAMETERS_FILE)
     built = PackageTokens.of(parameters_vhd(deployment, images))
     values: dict[str, Any] = {}
@@ -104,7 +105,7 @@ def _with_parameters(
         (old, _), (new, line) = built.value(constant), found.value(constant)
         if new != old:
             edits.append(f"{PARAMETERS_FILE}, line {line}: {constant} {old} -> {new}")
-        try:  # also of the old value, which another board may not have yet
+        try:  # also if the value was not edited: after an interruption, another board may still have an earlier one
             values[key] = value(new)
         except (ValueError, KeyError):
             what = f"{constant} is {new}, expected a value such as {old}"
@@ -134,7 +135,7 @@ def _with_parameters(
 
 
 def _with_memory(path: Path, memory: Memory, images: Sequence[Image]) -> tuple[list[Image], list[str]]:
-    """Return the images with the codes of a memory's file, and the edits in it."""
+    """Return the images with the codes in a memory's file, and the edits of that file, as sentences."""
     words = read_mif(path, (memory.width, memory.depth)).words
     if not memory.section:
         for address, (seed, due) in enumerate(zip(words, memory.words(), strict=True)):
@@ -152,14 +153,14 @@ def _with_memory(path: Path, memory: Memory, images: Sequence[Image]) -> tuple[l
         if memory.board not in {None, board}:
             continue
         before = dict(image.kind.sections(image.machine))[memory.section]
-        if before.size != found.size:  # of another build, with another table of random numbers
+        if before.size != found.size:  # of a build whose table of random numbers is longer or shorter
             raise BuildError(
                 f"the image of board {board} has {before.size} of these, not {found.size}", path=path
             )
         old = before.reshape(found.shape) & (1 << bits) - 1
         if (found == old).all():
             continue
-        # where a code has not changed, the image keeps the bits above it, which a random number may have
+        # where a code has not changed, the image keeps the bits above it: random numbers may have more than the MIF
         codes = np.where(found == old, before.reshape(found.shape), found).astype(before.dtype)
         new[board] = _with_section(path, image, memory.section, codes.reshape(before.shape))
         edits.append(_sentence(path, old, found, image.partition.line_offset))

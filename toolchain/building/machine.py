@@ -1,4 +1,4 @@
-"""The machine for a model: its plan, its lines on the boards, and the codes of all boards (thesis 3.4, 4.2)."""
+"""The BM1 for a model: its plan, which board has which lines, and the boards' registers (thesis 3.4, 4.2)."""
 
 import math
 import re
@@ -24,22 +24,22 @@ from toolchain.models.model import Model
 from toolchain.outputs.mif import random_table
 
 _MOST_CODES: Final = 1 << 30
-"""Maximum number of codes of all columns, which take 2 bytes each while they are computed."""
+"""Maximum number of codes in the tables of all columns, 2 bytes each while they are computed."""
 
 MACHINE_KEYS: Final = tuple(
     key for key in BM1Section.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
 )
-"""The names of parameters that have the same names in `[machine]`, except `lines`, which counts all boards there."""
+"""The parameters that `[machine]` of `deployment.toml` has too, except `lines`, which counts all boards there."""
 
 
 def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) -> dict[str, Any]:
-    """Return those parameters of a machine that have the same names in the build options and in `[machine]`."""
+    """Return the values of `keys` in `source`, without those that no build option sets and those that are None."""
     options = [key for key in keys if key in BuildOptions.__dataclass_fields__]
     return {key: value for key in options if (value := getattr(source, key)) is not None}
 
 
 def option(key: str, options: BuildOptions, section: type[BM1Section | BM2Section]) -> int:
-    """Return the value of an option; if it is None, the default in `[machine]`."""
+    """Return the value of an option; if it is None, the default that `section` (`[machine]`) has for it."""
     asked = getattr(options, key)
     return int(section.model_fields[key].default if asked is None else asked)
 
@@ -53,13 +53,13 @@ class MachinePlan:
     """The reason for a BM1, as a clause."""
     model: Model
     options: BuildOptions
-    """The options; the numbers of boards and replicas may still be changed, to fit the boards' device."""
+    """The options of the build; `fit_to_device` may still change the numbers of boards and replicas."""
     parameters: BM1Parameters
     """The parameters of the whole machine, with the lines of all boards."""
     target_count: int
-    """The count that stops a machine."""
+    """The count of a line that stops the machine."""
     max_cycles: int
-    """The maximum number of cycles."""
+    """The maximum number of cycles of a frame."""
 
     def quantised(self) -> Quantised:
         """Return the codes of the model."""
@@ -127,9 +127,10 @@ def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
 
 
 def _filter_options(options: BuildOptions) -> BuildOptions:
-    """Return the options for the machine of a filter, or raise a BuildError.
+    """Return the options for the machine of a filter, which needs a written prior, or raise a BuildError.
 
-    With codes of 8 bits, the least code weighs too much: on 400 lines, it triples the error of the posteriors.
+    The default is codes of 16 bits: with 8 bits, the least code that a prediction can have is too large, and on 400
+    lines triples the error of the posteriors.
     """
     if options.written_prior is not None:
         flag = "--prior-path" if options.sources is None else f"the prior in {options.sources.toml.path}"
@@ -166,7 +167,7 @@ class LineBlock:
 
     @property
     def end(self) -> int:
-        """The line after the last one."""
+        """The index after the last line of the block."""
         return self.offset + self.lines
 
 
@@ -183,7 +184,7 @@ def partition_lines(lines: int, count: int) -> tuple[LineBlock, ...]:
 
 
 def split(machine: BM1Machine, count: int) -> tuple[BM1Machine, ...]:
-    """Return the machine of each board of a whole machine; errors are those of `partition_lines`."""
+    """Divide a machine among `count` boards, and return each board's machine; errors are those of `partition_lines`."""
     return tuple(
         BM1Machine(
             replace(machine.parameters, lines=block.lines),
@@ -201,14 +202,14 @@ _MOST_SEEDS: Final = 1 << 23
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardLayout:
-    """The lines of each board, and the common interface."""
+    """The lines of each board, and the size of the register interface, which all boards share."""
 
     blocks: tuple[LineBlock, ...]
     """Blocks of lines by board; the first one is one of the largest."""
     interface: tuple[int, int]
-    """Inputs and results of the boards' registers."""
+    """Numbers of input and result words of a board's registers."""
     reason: str
-    """The reason for the interface, as a clause."""
+    """The reason for this size, as a clause."""
 
 
 def board_layout(
@@ -216,8 +217,8 @@ def board_layout(
 ) -> BoardLayout:
     """Return the layout of a machine's boards, before any table is computed.
 
-    Without an `interface`, the registers have the inputs and results that the largest board needs, because every word
-    takes resources (thesis 3.2); 20 x 1200 is the thesis's example.
+    Without an `interface`, the registers have as many inputs and results as the largest board needs, because every
+    word takes resources (thesis 3.2, whose example is 20 x 1200).
 
     Raises:
         BuildError: There are more boards than lines, the machine is larger than the interface, the interface is
@@ -240,7 +241,10 @@ def fitted_layout(
     what: str,
     advice: str = "",
 ) -> BoardLayout:
-    """Return the layout of boards, or raise a BuildError if the registers that they use don't fit the interface."""
+    """Return the layout of boards, or raise a BuildError if the registers that a board uses don't fit the interface.
+
+    `asked` is the interface asked for; None fits it to `used`. `what` describes a board, and `advice` ends the error.
+    """
     needed, room = (used.input_words, used.result_words), interface_room(used)
     sentence = f"a board needs {counted(needed[0], 'input')} and {counted(needed[1], 'result')} ({what})"
     if not _is_within(needed, room):
@@ -285,7 +289,7 @@ def _advice(parameters: BM1Parameters, used: UsedRegisters) -> str:
 
 
 def check_seeds(board: BM1Parameters | BM2Parameters, advice: str = "") -> None:
-    """Raise a BuildError if a board has too many seeds."""
+    """Raise a BuildError, which ends with `advice`, if a board has too many seeds."""
     generators = math.prod(board.generator_shape)
     seeds = board.rng_banks * generators
     if seeds > _MOST_SEEDS and board.rng is not RngKind.IDEAL:

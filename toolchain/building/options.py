@@ -1,4 +1,4 @@
-"""The options of a build, which are everything except the model (thesis 3.2, 3.4)."""
+"""The options of a build: everything that determines a deployment except the model (thesis 3.2, 3.4)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ TARGET_COUNT: Final = typer.Option(
 
 @dataclass(frozen=True, kw_only=True)
 class TargetOptions:
-    """The flags of a build about topics."""
+    """The flags of a build that say where readings come from and posteriors go to."""
 
     uri: Annotated[str, URI] = ""
     topic: Annotated[str, TOPIC] = ""
@@ -65,7 +65,7 @@ class TargetOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class DeploymentEdits:
-    """Changes of `deployment.toml`, the flags of `toolchain regenerate deployment`; None leaves a key unchanged."""
+    """Changes of `deployment.toml`, as flags of `toolchain regenerate deployment`; None leaves a key unchanged."""
 
     uri: Annotated[str | None, URI] = None
     topic: Annotated[str | None, TOPIC] = None
@@ -91,11 +91,11 @@ THESIS: Final = {
     # `toolchain explore` has a list of steps
     "steps": "1",
 }
-"""The defaults of `--thesis`: the machine of the thesis, as a value for each flag that a command may have."""
+"""The values that `--thesis` gives to other flags, for the machine of the thesis; a command may lack some of them."""
 
 
 def _use_thesis(context: typer.Context, value: bool) -> bool:
-    """Replace the defaults of the other flags, which are read later; a flag of the command line still wins."""
+    """Replace the defaults of the other flags by `THESIS`; a flag that the command line also has overrides this."""
     if value:
         context.default_map = {**THESIS, **(context.default_map or {})}
     return value
@@ -114,7 +114,7 @@ Thesis: TypeAlias = Annotated[
 
 
 class MachineChoice(StrEnum):
-    """The machine for a model."""
+    """The values of `--machine`, the kind of machine to build for a model."""
 
     AUTO = "auto"
     """A BM1 if the question is a naive fusion, otherwise a BM2."""
@@ -124,7 +124,7 @@ class MachineChoice(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """The flags of a build that both kinds of machines have; None stands for the default of the kind."""
+    """The flags of a build about either kind of machine; None stands for the default of the kind that is built."""
 
     machine: Annotated[
         MachineChoice,
@@ -159,11 +159,11 @@ class CommonOptions:
 
 
 FILL: Final = 0
-"""`--replicas fill`: the number of machines follows from the device of the boards."""
+"""The value of `--replicas fill`: as many replicas on a board as its FPGA has room for."""
 
 
 def replica_count(text: str) -> int:
-    """Return the number of `--replicas`, or FILL; when click passes the default, `text` is a number."""
+    """Parse the value of `--replicas`: a number, or FILL; click passes the default as a number, not as text."""
     if text == "fill":
         return FILL
     if re.fullmatch(r"\d{1,3}", str(text), re.ASCII) and 1 <= int(text) <= REPLICAS_MAX:
@@ -234,7 +234,7 @@ class BM2Options:
 
 
 def given_flags(options: CommonOptions, group: type[BM1Options | BM2Options]) -> list[str]:
-    """Return the flags of a group that have neither their default nor the value that `--thesis` gives them."""
+    """Return the flags of a group that a user must have given: neither at their default nor set by `--thesis`."""
     preset = THESIS if options.thesis else {}
     return [
         _flag(each.name)
@@ -252,18 +252,18 @@ class MachineOptions(BM2Options, BM1Options, CommonOptions):
 class BuildOptions(MachineOptions, TargetOptions):
     """The options of a build: the values of its flags, and the contents of files that flags name."""
 
-    # for a machine without a robot
+    # defaults for a machine that no robot uses, such as one that is only checked or analysed
     uri: str = "ws://127.0.0.1:9090"
     topic: str = "/readings"
     type: str = "std_msgs/Float64MultiArray"
     interface: tuple[int, int] | None = None
-    """Numbers of inputs and results of the boards' registers; None for as many as the largest board needs."""
+    """Numbers of input and result words of a board's registers; None for as many as the largest board needs."""
     rng_table: NDArray[np.uint32] | None = None
     """uint32[length], the random numbers for `rng = table`; None to generate them."""
     sources: SourcesFile | None = None
-    """Several topics and their variables, in place of `uri`, `topic` and `type`; or None."""
+    """The file of `--sources`: topics and their variables, in place of `uri`, `topic` and `type`; or None."""
     model_flags: ModelSection = field(default_factory=ModelSection)
-    """The flags with which the model was read."""
+    """The flags with which the model was read, for `[model]` of the deployment."""
     build_date: str = ""
     """The date of the build, ISO 8601: part of the images' manifests, but not of their hashes."""
 
@@ -276,7 +276,7 @@ class BuildOptions(MachineOptions, TargetOptions):
 
     @property
     def scaling(self) -> Scale:
-        """The part of a table that is divided by its maximum: `scale`, or its default."""
+        """The part of a table that is divided by its own maximum: `scale`, or its default if that is None."""
         if self.scale is not None:
             return self.scale
         return Scale.ADDRESS if self.sensor_mode is SensorMode.COLUMN else Scale.COLUMN
@@ -290,14 +290,14 @@ class BuildOptions(MachineOptions, TargetOptions):
 
     @property
     def written_prior(self) -> WrittenPrior | None:
-        """The source of a written prior, or None."""
+        """Where a prior that the host writes is found in messages, or None."""
         if self.sources is not None:
             return self.sources.prior
         return None if self.prior_path is None else WrittenPrior(path=self.prior_path)
 
 
 def refused_parameter(reason: ParameterError) -> BuildError:
-    """Return the error for parameters that no machine can have, with flags instead of keys."""
+    """Return an error for parameters that no machine can have, with the flags in place of the parameters' names."""
     keys = "|".join(each.name for each in fields(MachineOptions))
     named = re.sub(rf"\b({keys})(?= is | = )", lambda found: _flag(found[1]), str(reason).rstrip("."))
     return BuildError(named.replace(" = true", "").replace(" = ", " "))

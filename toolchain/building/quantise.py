@@ -1,7 +1,9 @@
-"""Quantising: conversion of probabilities to codes of W bits, after normalising, and its loss.
+"""Quantising: conversion of probabilities to codes of W bits, after scaling, and what is lost by it.
 
-A factor that is the same for all lines does not change the posterior, so every address (a row of a column's
-table) is divided by its maximum over all lines of all boards. Otherwise a machine would rarely count.
+A factor that is the same for all lines does not change the posterior, so by default every row of a column's table (an
+address, which is a value of the variable) is divided by its maximum over all lines of all boards. Otherwise a machine
+would rarely count. An outlier floor is a small probability that a model gives to every value, so that no single outlier
+excludes the true line; if its code becomes 0, an outlier does.
 """
 
 import math
@@ -19,7 +21,7 @@ from toolchain.models.conditional import middle_bin
 from toolchain.models.model import Known, Model
 
 _HALVINGS: Final = 12
-"""Number of bisection steps over the logarithmic range of a floor, enough for the two reported digits."""
+"""Number of bisection steps between the logarithms of a floor and of 1, enough for the two reported digits."""
 
 _ROUNDING: Final = 1e-12
 """Divergences in bits below this are only rounding errors of float64."""
@@ -32,14 +34,14 @@ class ColumnLoss:
     name: str
     """The known variable's name, or `prior`."""
     bits: int
-    """Address bits."""
+    """Number of address bits."""
     values: int
-    """Number of supported addresses."""
+    """Number of addresses that are values of the variable."""
     mass: float
-    """Share of P(S, K) in cells whose code became 0: the probability that a reading selects one on the true line."""
+    """Share of P(S, K) in cells with code 0: the probability that a reading selects code 0 on the true line."""
     kl_bits: float
-    """Divergence of the column's own posterior from the exact one, KL(Q(S | k) || P(S | k)) in bits, averaged
-    over k; all lines read the same k. (KL(P || Q) would be infinite if a tail became 0.)
+    """KL(Q(S | k) || P(S | k)) in bits, averaged over k: both are posteriors from this column alone, Q with its codes,
+    P exactly; all lines read the same k. (KL(P || Q) would be infinite if a tail became 0.)
     """
     dead_values: int
     """Number of possible addresses that have code 0 on every line."""
@@ -47,7 +49,7 @@ class ColumnLoss:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VanishedFloor:
-    """An outlier floor for which some code is 0."""
+    """An outlier floor that is too low for the codes; `what` and `advice` are clauses for the user."""
 
     name: str
     what: str
@@ -59,17 +61,17 @@ class Quantised:
     """The codes of a model for all lines, before they are divided among boards."""
 
     prior: NDArray[np.uint16]
-    """uint16[rows, lines]: one row, or one per address that selects a prior. In the latter case, the top row is
-    the prior without a selection, and rows of unsupported addresses contain 0.
+    """uint16[rows, lines]: one row or, if a variable selects the prior, one per address of it. Then the last row is
+    the prior without a selection, and rows of addresses that are no value contain 0.
     """
     tables: tuple[NDArray[np.uint16], ...]
-    """uint16[2**bits, lines] per known variable; unsupported addresses contain 0, and the top address, for
-    missing readings, contains all-ones codes. No tables with `threshold`.
+    """uint16[2**bits, lines] per known variable; addresses that are no value contain 0, and the top address, for
+    missing readings, contains all-ones codes. No tables with `SensorMode.THRESHOLD`.
     """
     losses: tuple[ColumnLoss, ...]
     """The loss of the prior, and one per known variable."""
     floors: tuple[VanishedFloor, ...]
-    """Outlier floors that are too low for the codes."""
+    """The outlier floors that are too low for the codes."""
     warnings: tuple[str, ...]
     """Warnings for the user, one sentence each."""
 
@@ -83,8 +85,8 @@ def quantise(
 ) -> Quantised:
     """Return the codes of a model with `prob_bits` bits (1 to 16), and the quantisation loss.
 
-    `scale` is the part of a table that is first divided by its maximum. If cells have their own readings, it cannot
-    be `address`.
+    `scale` is the part of a table (a row, or all of it) that is first divided by its maximum. It cannot be `address` if
+    cells have their own readings.
     """
     prior = model.prior_distribution
     prior_codes, prior_loss = _quantised_prior(model, prob_bits, scale)
@@ -145,7 +147,7 @@ def _quantised_prior(model: Model, prob_bits: int, scale: Scale) -> tuple[NDArra
 
 
 def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
-    """Return a table divided by its maxima, float64[values, lines] in 0..1; rows of zeros do not change."""
+    """Return a table, float64[values, lines], with each row or the whole divided by its maximum; zeros stay."""
     if scale is Scale.NONE:
         return table
     largest = table.max(axis=1, keepdims=True) if scale is Scale.ADDRESS else np.asarray(table.max())
@@ -154,13 +156,13 @@ def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
 
 
 def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[np.float64]) -> ColumnLoss:
-    """Compare P(S, K) with its quantised form, float64[values, lines], in which each row may have any scale."""
+    """Compare P(S, K) with its form from codes, both float64[values, lines]; the scale of each row does not matter."""
     weight = exact.sum(axis=1)
     remaining = quantised.sum(axis=1)
     alive = (remaining > 0) & (weight > 0)
     p = exact[alive] / weight[alive, np.newaxis]
     q = quantised[alive] / remaining[alive, np.newaxis]
-    # q is 0 wherever p is; there and in the vanished cells q log q/p is 0.
+    # q is 0 wherever p is; there, and where a code became 0, q log q/p is 0.
     ratio = np.divide(q, p, out=np.ones_like(q), where=q > 0)
     divergence = (q * np.log2(ratio)).sum(axis=1)
     return ColumnLoss(
@@ -176,7 +178,7 @@ def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[n
 def _vanished_floor(
     known: Known, ratios: NDArray[np.float64], vanished: NDArray[np.bool_], prob_bits: int, scale: Scale
 ) -> VanishedFloor:
-    """Describe a floor that is too low for the codes, with a sufficient floor or code width."""
+    """Describe a floor that is too low for the codes, and advise a floor or a code width that is enough."""
     least = float(ratios[vanished].min())
     needed = math.ceil(-math.log2(least) - 1)
     ways = [f"a floor of about {enough:.2g}"] if (enough := _enough_floor(known, prob_bits, scale)) else []
@@ -193,9 +195,9 @@ def _vanished_floor(
 
 
 def _enough_floor(known: Known, prob_bits: int, scale: Scale) -> float:
-    """Return the lowest sufficient floor, rounded up to two digits; 0 if even the peak is not sufficient.
+    """Return the lowest floor for which no code is 0, rounded up to two digits; 0 if even a floor of 1 is too low.
 
-    A higher floor also increases the largest probabilities, so the two are not proportional.
+    It is searched, because a higher floor also raises the maxima by which probabilities are divided.
     """
     peak = known.table.max(axis=0)
     if known.normal is not None:

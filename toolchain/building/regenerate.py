@@ -39,7 +39,7 @@ from toolchain.outputs.output_files import (
 
 
 def edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
-    """Return the deployment with the edits and its new hash, or raise a BuildError for a wrong edit."""
+    """Return the deployment with the edits and a new hash, or raise a BuildError for a wrong edit."""
     target = _defined(uri=edits.uri, topic=edits.topic, type=edits.type)
     if target and len(deployment.sources) > 1:
         raise BuildError(
@@ -78,11 +78,11 @@ def regenerate_memories(
     flags: ModelSection | None = None,
     build_date: str = "",
 ) -> Changes:
-    """Write the memories, and a BM1's `bm1_parameters.vhd`, again, from the images, or with new tables from a model.
+    """Write the memory files and a BM1's `bm1_parameters.vhd` again, from the images or, with new tables, from a model.
 
     With a model, which was read with `flags`, the images (dated `build_date`), the report and the hashes of
-    `deployment.toml` are written too, and the columns get the order of the model. Sizes, widths and everything about
-    topics do not change.
+    `deployment.toml` are written too, and the columns get the order of the model. Sizes, widths, topics and the paths
+    in their messages do not change.
 
     Raises:
         BuildError: The model now needs another machine, so a new build is necessary.
@@ -99,7 +99,7 @@ def regenerate_memories(
     plan = _plan(model, options, deployment, images[0])
 
     def place(new: Deployment, of: Sequence[Image]) -> Deployment:
-        # an image of the same model that is not the built one has edited parameters, which may be undone later
+        # an image of the same model that differs from the built one has edited parameters, which may be undone later
         same_model = of[0].model_hash == images[0].model_hash
         return _with_places(new, deployment, keeps_built=same_model)
 
@@ -122,7 +122,7 @@ def regenerate_project(directory: Path) -> Changes:
 
 
 def regenerate_deployment(directory: Path, edits: DeploymentEdits) -> Changes:
-    """Write `deployment.toml` again, with these edits and manual ones; images do not change.
+    """Write `deployment.toml` again, with `edits` and with what was edited in it by hand; images do not change.
 
     Raises:
         BuildError: An edit has a wrong value, or does not fit the deployment.
@@ -202,7 +202,7 @@ def _with_widths(model: Model, deployment: Deployment) -> Model:
         raise BuildError("another variable now selects the prior: build it again with 'toolchain build'")
     bits = {name: variable.bits for name, variable in built.items()}
     if deployment.machine.sensor_mode is SensorMode.THRESHOLD:
-        # there is no memory whose width must not change
+        # there are no tables, so no memory whose width must stay
         bits |= {known.name: known.bits for known in model.known}
     try:
         return model.with_bits(bits)
@@ -219,7 +219,7 @@ def _listed(values: Sequence[object]) -> str:
 
 
 def _with_places(new: Deployment, old: Deployment, *, keeps_built: bool) -> Deployment:
-    """Return the new deployment with the servers, topics, order, paths and endpoints of the old one.
+    """Return the new deployment with the old one's servers, topics, paths, variables' names and boards' endpoints.
 
     With `keeps_built`, the entry of an edited image keeps the hash of the image that was built.
     """

@@ -20,7 +20,7 @@ SHARED_BITS: Final = {
     "BM1": "means are correct, but the variance of counts is up to 2.6 times as large",
     "BM2": "this biases all samples",
 }
-"""The effect on a machine if successive random numbers share bits, as a clause."""
+"""What it does to each kind of machine's results if successive random numbers share bits, as a clause."""
 
 
 def build_report(model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str) -> str:
@@ -124,7 +124,7 @@ def _boards(deployment: Deployment, what: str, places: Sequence[str]) -> str:
 
 
 def loss_heading(sensor_mode: SensorMode) -> str:
-    """Return the heading of the table of losses."""
+    """Return the heading of the table of quantisation losses."""
     posterior = "the column's own posterior"
     if sensor_mode is SensorMode.CELL:
         posterior += " where all lines read the same"
@@ -132,7 +132,7 @@ def loss_heading(sensor_mode: SensorMode) -> str:
 
 
 def many_sentence(machine: MachineSection) -> str:
-    """Describe a frame's readings and results; empty if they are one number per variable and one posterior."""
+    """Describe a frame's readings and results; empty in the usual case, one number per variable and one posterior."""
     sentence = {
         SensorMode.COLUMN: "",
         SensorMode.CELL: f" Each of the {machine.lines} lines has a reading of its own (sensor_mode = cell).",
@@ -150,7 +150,7 @@ def many_sentence(machine: MachineSection) -> str:
 
 
 def edited_sentence(deployment: Deployment) -> str:
-    """Say that the codes are not only the model's, and what a comparison with the model then means."""
+    """Say which boards' images were edited, and what this means for a comparison with the model."""
     boards = ", ".join(map(str, deployment.edited_boards))
     return (
         f"Edited since the build: the image of board {boards}. Its codes may not be the model's, so a difference from the "

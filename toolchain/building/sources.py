@@ -1,4 +1,4 @@
-"""The sources of a build's readings: the file of `--sources`, and the flags `--order` and `--path`."""
+"""Where a build's readings come from (topics, paths in messages): the file of `--sources`, `--order` and `--path`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,42 +16,42 @@ MOST_SOURCES: Final = 256
 
 
 class SourceTable(Source):
-    """A `[[source]]` of a sources file with its variables; without a `uri`, that of `--uri` is used."""
+    """A `[[source]]` of a sources file, a topic with its variables; without a `uri`, that of `--uri` is used."""
 
     variables: dict[Name, MessagePath] | None = None
-    """Paths in the message by variable; None for all variables that no other source has."""
+    """The path of each variable in the message, by name; None for all variables that no other source has."""
     prior: MessagePath | None = None
-    """The path of a written prior in the message, or None."""
+    """The path in the message of a prior that the host writes; None if this topic has none."""
 
 
 class SourcesTables(Section):
-    """A sources file."""
+    """The tables of a sources file, for validation."""
 
     sources: Sequence[SourceTable] = Field(validation_alias="source", min_length=1, max_length=MOST_SOURCES)
 
 
 @dataclass(frozen=True, slots=True)
 class SourcesFile:
-    """The content of a sources file."""
+    """A sources file: its valid tables, and its TOML text, which locates mistakes."""
 
     toml: TomlFile
     tables: tuple[SourceTable, ...]
 
     @property
     def sources(self) -> tuple[Source, ...]:
-        """The sources, as in a deployment."""
+        """The topics without their variables, as a deployment lists them."""
         return tuple(
             Source(**{key: getattr(table, key) for key in Source.model_fields}) for table in self.tables
         )
 
     @property
     def prior(self) -> WrittenPrior | None:
-        """The source of a written prior, or None."""
+        """Which source has the written prior, and at which path; or None."""
         paths = [(at, table.prior) for at, table in enumerate(self.tables) if table.prior is not None]
         return WrittenPrior(source=paths[0][0], path=paths[0][1]) if paths else None
 
     def place(self, variables: tuple[Variable, ...]) -> tuple[Variable, ...]:
-        """Return the variables of a model with sources and paths, or raise a BuildError if they don't match."""
+        """Return a model's variables with the file's sources and paths, or raise a BuildError if these don't match."""
         places: dict[str, tuple[int, str]] = {}
         names = [variable.name for variable in variables]
         for at, table in enumerate(self.tables):
@@ -116,9 +116,10 @@ def read_sources(path: Path, uri: str | None) -> SourcesFile:
 def placed(
     variables: tuple[Variable, ...], order: str | None, path: list[str] | None
 ) -> tuple[Variable, ...]:
-    """Return variables with `--order` and `--path`, or raise a BuildError.
+    """Return variables as changed by `--order` and `--path`, or raise a BuildError.
 
-    With an order, a column keeps its table and its conversion to addresses; its name, source and path change.
+    `order` says which sensor each column reads: a column keeps its table and its conversion to addresses, but gets the
+    name, source and path of that sensor.
     """
     columns = {variable.name: variable for variable in variables if variable.kind == "sensor"}
     names = names_in("--order", order or "") or list(columns)

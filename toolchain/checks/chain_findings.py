@@ -1,7 +1,8 @@
-"""Findings about a BM2: clipped factors and their error, states that are not connected, wide factors, random numbers.
+"""Findings about a BM2: clipped factors and their error, unconnected states, wide factors, and random numbers.
 
-Zeros of a factor are clipped to the smallest chance that a code can express, so the chain crosses them, but rarely.
-The error that results is computed exactly if there are few states; otherwise a finding says that it was not computed.
+Zeros of a factor are clipped to the smallest chance that a code can express, so the chain does enter impossible states,
+but rarely. The error that results is computed exactly if there are few states; otherwise a finding says
+that it was not.
 """
 
 import math
@@ -26,22 +27,22 @@ from toolchain.deployment import Deployment
 from toolchain.models.network import NetworkModel
 
 _LARGE_ERROR: Final = 0.01
-"""Total variation from which an error is a warning."""
+"""Total variation above which an error is a warning, not a note."""
 _STATE_BITS: Final = 20
-"""Maximum number of bits of a state for which it is checked whether all states are connected."""
+"""Maximum number of bits of a state with which the check runs whether all states are connected."""
 _PATTERN_BITS: Final = 24
-"""The same maximum for these bits plus one for each known variable whose reading may be missing."""
+"""Maximum for the same check of these bits plus the number of known variables whose readings may be missing."""
 _BLANKET_BITS: Final = 16
-"""Maximum number of bits sharing a factor with a pointed bit; the search for clips tries all their values."""
+"""Maximum number of bits that share a factor with the bit of a move; the search for clips tries all their values."""
 _RELATED_BITS: Final = 2048
-"""Maximum number of a board's random bits among which relations are searched, because all pairs are kept."""
+"""Maximum number of random bits per cycle of a board that are searched for relations, because all pairs are kept."""
 _TIMEOUT_RISK: Final = 1e-6
 _MOVE_CYCLES: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedChain:
-    """A BM2 to check, as it is on its first board; without a model, the states of hidden variables have no names."""
+    """A BM2 to check, on its first board; without a model, the states of hidden variables are shown as numbers."""
 
     deployment: Deployment
     machine: BM2Machine
@@ -73,13 +74,13 @@ class CheckedChain:
 
     @property
     def always_known(self) -> set[int]:
-        """The variables of the machine that have a reading in every frame."""
+        """The indices of the variables that have a reading in every frame."""
         pairs = zip(self.machine.parameters.known, self.deployment.variables, strict=True)
         return {at for at, variable in pairs if variable.on_missing != "missing"}
 
 
 def chain_findings(chain: CheckedChain) -> Iterator[Finding]:
-    """Find everything about a BM2 that can make its results wrong or slow, or does not fit a board."""
+    """Find everything about a BM2 that can make its results wrong or slow, or that does not fit a board."""
     yield from _clips(chain)
     yield from _opposite_clips(chain)
     yield from _connections(chain)
@@ -137,7 +138,7 @@ def _error(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
 
 
 def _opposite_clips(chain: CheckedChain) -> Iterator[Finding]:
-    """Find bits at which factors clip in opposite directions, so that the move takes long."""
+    """Find bits that one factor clips towards 0 and another towards 1, so that their CDEs take long to agree."""
     p, wide = chain.machine.parameters, []
     for variable in sorted(set(range(len(p.cardinalities))) - chain.always_known):
         own = range(p.offsets[variable], p.offsets[variable] + p.bits[variable])
@@ -161,9 +162,9 @@ def _opposite_clips(chain: CheckedChain) -> Iterator[Finding]:
 
 
 def _slowest(machine: BM2Machine, bit: int, blanket: Sequence[int]) -> tuple[float, int, int]:
-    """Return the longest mean cycles of a move at a bit that two CDEs clip in opposite directions, and these CDEs.
+    """Return the largest mean cycles of a move at a bit that two CDEs clip in opposite directions, and these CDEs.
 
-    All used codes of the bits that share a factor with it (`blanket`) are tried; the time is 0 if no such clips exist.
+    All used values of `blanket`, the bits that share a factor with it, are tried; the cycles are 0 without such clips.
     """
     p, index = machine.parameters, np.arange(1 << len(blanket))
     values = {other: index >> at & 1 for at, other in enumerate(blanket)}
@@ -185,7 +186,7 @@ def _slowest(machine: BM2Machine, bit: int, blanket: Sequence[int]) -> tuple[flo
 
 
 def _connections(chain: CheckedChain) -> Iterator[Finding]:
-    """Find possible states that single-bit moves do not connect, for any choice of missing readings."""
+    """Find two possible states that moves of single bits do not connect; every set of missing readings is tried."""
     p = chain.machine.parameters
     optional = [at for at in p.known if at not in chain.always_known]
     if p.state_bits > _STATE_BITS or p.state_bits + len(optional) > _PATTERN_BITS:
@@ -209,7 +210,7 @@ def _connections(chain: CheckedChain) -> Iterator[Finding]:
 
 
 def legal_states(machine: BM2Machine) -> NDArray[np.bool_]:
-    """Return which states are possible, bool[2**state_bits]."""
+    """Return which states are possible: bool[2**state_bits], by the bits of the state as an index."""
     p, index = machine.parameters, np.arange(1 << machine.parameters.state_bits)
     codes = [index >> offset & (1 << bits) - 1 for offset, bits in zip(p.offsets, p.bits, strict=True)]
     used = [code < cardinality for code, cardinality in zip(codes, p.cardinalities, strict=True)]
@@ -223,10 +224,10 @@ def legal_states(machine: BM2Machine) -> NDArray[np.bool_]:
 def unconnected(
     machine: BM2Machine, legal: NDArray[np.bool_], known: Sequence[int]
 ) -> tuple[int, int] | None:
-    """Return two legal states with the same values of the known variables and no path between them, or None."""
+    """Return two legal states with the same known values between which no moves lead through legal states, or None."""
     p, index = machine.parameters, np.arange(len(legal))
     mask = sum(p.masks[variable] for variable in known)
-    # the label of a state is the smallest one that it is connected to; illegal states never pass on theirs
+    # the label of a state is the smallest state found to be connected to it; illegal states pass no labels on
     labels = np.where(legal, index, len(legal))
     before = labels + 1
     while not np.array_equal(labels, before):
@@ -235,7 +236,7 @@ def unconnected(
             halves, own = labels.reshape(-1, 2, 1 << bit), legal.reshape(-1, 2, 1 << bit)
             least = np.minimum(halves[:, :1], halves[:, 1:])
             halves[:] = np.where(own[:, :1] & own[:, 1:], least, halves)
-        # a label's own label is at most as large
+        # follow a label to its own label, which is at most as large
         labels = np.where(legal, np.append(labels, len(legal))[labels], labels)
     places = np.flatnonzero(legal)
     evidence = index[places] & mask
@@ -263,11 +264,11 @@ def _memories(chain: CheckedChain) -> Iterator[Finding]:
 
 
 def _limits(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
-    """Find limits that stop a frame before its last sample."""
+    """Find limits on cycles (max_cycles, ops_timeout) that probably stop a frame before its last sample."""
     p, limits = chain.machine.parameters, chain.deployment.machine
     own = max(1, len(p.moves(sum(p.masks[at] for at in p.known), p.sequencer)))
     moves = p.burn_in * own + limits.target_count * (own if p.sample_every is SampleEvery.SWEEP else 1)
-    # without the model, as many as a move takes if no zeros are clipped
+    # mean cycles of a move; without the model, those if no zeros are clipped
     mean = _MOVE_CYCLES if found is None else found.cycles / own
     if limits.max_cycles < moves * mean:
         finding = error if limits.max_cycles < moves else warning
@@ -282,7 +283,7 @@ def _limits(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
 
 
 def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
-    """Find random numbers that are shared between boards, banks or CDEs, related, repeated, or not fresh."""
+    """Find random numbers that boards, banks or CDEs share, that are related, or that repeat in a frame or in each."""
     p, about = chain.machine.parameters, f"rng = {chain.machine.parameters.rng}"
     width, boards, sets = p.rng.lfsr_bits, p.chains, p.rng_banks * p.chains
     wider = "" if p.rng is RngKind.LFSR32 else "--rng lfsr32, or "

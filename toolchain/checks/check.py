@@ -1,7 +1,8 @@
-"""Checks of a model or a deployment before anything runs, with the names in the model (thesis 3.4).
+"""Checks of a model or a deployment before anything runs; findings use the model's names (thesis 3.4).
 
 A model is checked with its build options, a deployment with the codes of its images. Findings about codes are
-exact: a frame with an impossible reading ends as `impossible` on the machine, and a dead line never counts.
+no estimates: a frame with a reading found impossible does end as `impossible` on the machine, and a line found dead
+never counts.
 """
 
 import math
@@ -44,9 +45,12 @@ def check_model(
     options: BuildOptions,
     fit: Callable[[MachinePlan], MachinePlan] = lambda plan: plan,
 ) -> list[Finding]:
-    """Return the findings about a model and its machine, the worst first; `fit` may give a BM1 more boards."""
+    """Return the findings about a model and its machine, the worst first.
+
+    `fit` changes the plan of a BM1 to the number of boards that it needs.
+    """
     refused: list[Finding] = []
-    try:  # besides, so that both mistakes are found at once
+    try:  # apart from the plan, so that mistakes in both are found at once
         if isinstance(model, Model):
             partition_lines(model.lines, options.partitions)
     except ToolchainError as reason:
@@ -86,7 +90,7 @@ def check_deployment(directory: Path) -> list[Finding]:
 
 
 def refusal(reason: Exception, about: str) -> Finding:
-    """Return the finding for an exception: a model cannot be built, or a deployment cannot be read."""
+    """Return an exception as a finding: `about`, such as a model, cannot be built, or a deployment cannot be read."""
     return error(Check.CANNOT_BE_BUILT, about, str(reason).rstrip("."))
 
 
@@ -111,7 +115,7 @@ def _check(
 
 
 def _files(directory: Path, deployment: Deployment, images: Sequence[Image]) -> Iterator[Finding]:
-    """Find files of the hardware project that differ from the images."""
+    """Find files of the hardware project that differ from what the images and `deployment.toml` give."""
     words = {
         Change.NEW: "is not there",
         Change.CHANGED: "differs from the images and deployment.toml",
@@ -137,7 +141,7 @@ def _sorted(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def _same_readings(deployment: Deployment) -> Iterator[Finding]:
-    """Find variables with the same path."""
+    """Find variables that read the same path in messages of the same topic."""
     readers: dict[tuple[int, str], list[str]] = {}
     for variable in deployment.variables:
         # A bare name as a path is searched for like the name itself.
@@ -149,7 +153,7 @@ def _same_readings(deployment: Deployment) -> Iterator[Finding]:
 
 
 def _ranges(deployment: Deployment) -> Iterator[Finding]:
-    """Find ranges of readings that don't fit the addresses."""
+    """Find variables whose addresses, wrapping or `on_range` do not suit their values."""
     for variable in deployment.variables:
         needed = variable.values.bit_length()
         if needed < variable.bits:
@@ -173,7 +177,7 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
 
 
 def state_findings(variable: Variable) -> Iterator[Finding]:
-    """Find readings, numbers or bools, that select another state than their sender probably means."""
+    """Find numbers and bools which, as readings, select another state than their sender probably means."""
     states, shown = variable.states, ", ".join(variable.states[:_MOST_NAMES])
     for at, name in enumerate(states):
         number = variable.offset + at * variable.step
@@ -203,13 +207,13 @@ _WITHOUT_HEADER: Final = frozenset(
         "Twist", "TwistWithCovariance", "Vector3", "Wrench",
     )
 )  # fmt: skip
-"""Types without a header, in packages in which most types have one; no type of std_msgs has one."""
+"""Message types without a header in a package whose other types have one; no type of std_msgs has one."""
 _LEAST_TOLERANCE_S: Final = 0.005
 """Minimum tolerance in seconds for messages sent together to be paired by their times of receipt."""
 
 
 def source_findings(deployment: Deployment) -> Iterator[Finding]:
-    """Find topics that are paired by time of receipt, because their messages have no header."""
+    """Find topics whose messages are paired with other topics' by time of receipt, because they have no header."""
     if len(deployment.sources) < 2:
         return
     bare = [source.topic for source in deployment.sources if not _may_have_header(source.type)]

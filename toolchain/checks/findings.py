@@ -1,4 +1,4 @@
-"""Findings about a machine, and the checks of its codes: lines that never count, readings without a posterior."""
+"""Findings of checks, and the checks of a BM1's codes: lines that never count, readings without a posterior."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class Severity(StrEnum):
     WARNING = "warning"
     """Some readings get no posterior or a wrong one, or resources are wasted."""
     NOTE = "note"
-    """This may be intended."""
+    """Nothing is wrong if this is intended."""
 
 
 class Check(StrEnum):
@@ -63,7 +63,7 @@ class Check(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A finding of a check; `advice` suggests a change, and is empty if none is needed."""
+    """A finding of a check about a part of a model or machine; `advice` says what to change, if anything."""
 
     severity: Severity
     check: Check
@@ -84,14 +84,14 @@ note: Final = partial(Finding, Severity.NOTE)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedMachine:
-    """A whole machine to check, regardless of its partition.
+    """A BM1 to check: all its lines, whichever board has them.
 
     Attributes:
-        deployment: Its variables, lines and limits.
+        deployment: Its deployment, with variables, lines and limits.
         board: The machine of the first board: parameters and random numbers are the same on all boards.
-        prior: uint16[rows, lines], over all boards.
-        tables: One uint16[2**bits, lines] per column, over all boards.
-        model: The probabilities, if known.
+        prior: uint16[rows, lines], the prior's codes with the lines of all boards.
+        tables: One uint16[2**bits, lines] per column, likewise.
+        model: The model with the probabilities, or None if only the codes are known.
     """
 
     deployment: Deployment
@@ -111,11 +111,11 @@ class CheckedMachine:
         return ["the prior", *(variable.name for variable in self.deployment.sensors)]
 
     def addressable_rows(self, column: int) -> NDArray[np.uint16]:
-        """Return the rows of a column (from 0) that readings can address, including permitted missing ones."""
+        """Return the rows of a sensor's table that readings can select; the last is for a missing one, if it may be missing."""
         return _addressable(self.deployment.sensors[column], self.tables[column])
 
     def prior_rows(self) -> NDArray[np.uint16]:
-        """Return the rows of the prior that can be selected."""
+        """Return the rows of the prior that a reading can select; without a selecting variable, all rows."""
         select = self.deployment.prior_select
         return self.prior if select is None else _addressable(select, self.prior)
 
@@ -138,7 +138,7 @@ def code_findings(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def loss_findings(quantised: Quantised, options: BuildOptions) -> Iterator[Finding]:
-    """Find floors whose codes are 0, and frames in which the true line has code 0."""
+    """Find outlier floors that become code 0, and frames in which the true line has code 0, if these are many."""
     for floor in quantised.floors:
         yield warning(Check.VANISHED_FLOOR, floor.name, floor.what, floor.advice)
     mass = sum(loss.mass for loss in quantised.losses)
@@ -152,7 +152,7 @@ def loss_findings(quantised: Quantised, options: BuildOptions) -> Iterator[Findi
 
 
 def line_name(searched: Sequence[Dimension], line: int) -> str:
-    """Return a line by the values of the searched variables: `y = 1.5, x = 3`."""
+    """Return a line as text, by its values of the searched variables: `y = 1.5, x = 3`."""
     places = np.unravel_index(line, [dimension.size for dimension in searched])
     return ", ".join(
         f"{dimension.label} = {dimension.states[at] if dimension.states else f'{dimension.value(float(at)):g}'}"
@@ -172,7 +172,7 @@ def reading(variable: Variable, address: int) -> str:
 def _alive(machine: CheckedMachine) -> NDArray[np.bool_]:
     """Return which lines can count for at least some readings: bool[lines]."""
     alive = np.ones(machine.prior.shape[1], dtype=np.bool_)
-    if machine.parameters.prior_mode is PriorMode.TABLE:  # the written prior is unknown here
+    if machine.parameters.prior_mode is PriorMode.TABLE:  # a written prior is not known before a frame
         alive &= machine.prior_rows().any(axis=0)
     for column in range(len(machine.tables)):
         alive &= machine.addressable_rows(column).any(axis=0)
@@ -245,7 +245,7 @@ def _readings(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def _columns(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find columns whose readings have no effect."""
+    """Find columns whose readings have no effect on the posterior."""
     if machine.parameters.sensor_mode is not SensorMode.COLUMN:
         return
     more = ", or use more --prob-bits" if machine.parameters.prob_bits < PROB_BITS_MAX else ""
@@ -278,7 +278,7 @@ def _some_lines(deployment: Deployment, lines: NDArray[np.int64]) -> str:
 
 
 def _values(variable: Variable, addresses: NDArray[np.int64]) -> str:
-    """Return addresses as values, with adjacent ones as ranges."""
+    """Return addresses as text: the values that they stand for, with adjacent ones as ranges."""
     ranges: list[list[int]] = []
     for address in addresses.tolist():
         if ranges and address == ranges[-1][1] + 1:

@@ -1,8 +1,8 @@
-"""Findings about random numbers: their period, their steps, and relations between columns.
+"""Findings about random numbers: their period, generator steps per cycle, and relations between columns.
 
-A bit of an LFSR's state is a linear function of its initial state. Columns use the same sequence with
-different phases, so bits of the numbers of two to four columns may XOR to 0 in every cycle. Then the columns
-are not independent, their AND is wrong permanently, and no number of cycles averages this out.
+A bit of an LFSR's state is a linear function of the initial state. Columns use the same sequence with
+different phases, so bits of the random numbers of two to four columns may XOR to 0 in every cycle. Then the
+columns are not independent, their AND is wrong permanently, and no number of cycles averages this out.
 """
 
 import math
@@ -41,16 +41,16 @@ def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def fresh_numbers(p: BM1Parameters | BM2Parameters, effect: str) -> Iterator[Finding]:
-    """Find random numbers that every frame uses again, or that share bits with the numbers of the next cycle.
+    """Find random numbers that every frame uses again, or that share bits with the random numbers of the next cycle.
 
-    `effect` is what shared bits do to the results, as a clause.
+    `effect` says what shared bits do to the results, as a clause.
     """
     if p.rng_banks == 1 and p.rng_reset is RngReset.BANK:
         what = (
             "every frame uses the same random numbers, so averaging over frames does not remove their error"
         )
         yield warning(Check.RNG_BANKS, "rng_banks = 1", what, "use --rng-banks 16, or --rng-reset free")
-    # both together are the generators of `--thesis`, which are meant; the report of the build says what they do
+    # both together are the generators of `--thesis`, which are intended; the report of the build says what they do
     thesis = p.rng_reset is RngReset.FREE and p.steps_per_clock == 1
     if p.rng.lfsr_bits is not None and p.steps_per_clock < p.prob_bits and not thesis:
         what = f"numbers of {p.prob_bits} bits share {p.prob_bits - p.steps_per_clock} bits with those of the next cycle: {effect}"
@@ -76,7 +76,7 @@ def _period(machine: CheckedMachine, length: int) -> Iterator[Finding]:
 
 
 def _relations(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find columns whose bits are related by XOR in a bank or, with one generator per cell, in a line."""
+    """Find columns whose random bits are related by XOR: in one bank of seeds or, with a generator per cell, in one line."""
     parameters, names, about = machine.parameters, machine.names, f"rng = {machine.parameters.rng}"
     seeds = seed_words(machine.board).reshape(-1, parameters.columns)
     found, groups = relations(parameters.rng, seeds, parameters.prob_bits)
@@ -106,10 +106,10 @@ def _relations(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def _table_numbers(machine: CheckedMachine, numbers: NDArray[np.uint32]) -> Iterator[Finding]:
-    """Find codes and pairs of columns that a table of random numbers distorts."""
+    """Find codes whose frequency a table of random numbers distorts, and columns that read it from the same index."""
     parameters, names = machine.parameters, machine.names
     codes = 1 << parameters.prob_bits
-    # codes 0 and all-ones don't depend on the numbers
+    # codes 0 and all-ones don't depend on the random numbers
     below = np.cumsum(np.bincount(numbers, minlength=codes))[: codes - 2] / len(numbers)
     errors = np.abs(below - np.arange(1, codes - 1) / codes)
     worst = int(errors.argmax()) if errors.size else 0
@@ -133,7 +133,7 @@ def _table_numbers(machine: CheckedMachine, numbers: NDArray[np.uint32]) -> Iter
 def _table_correlation(
     machine: CheckedMachine, numbers: NDArray[np.uint32], starts: NDArray[np.uint64]
 ) -> Iterator[Finding]:
-    """Find columns whose numbers correlate; they read the table at fixed distances."""
+    """Find columns whose random numbers correlate, because they read one table at a fixed distance from each other."""
     length = len(numbers)
     centred = numbers - numbers.mean()
     if not centred.any():
@@ -153,14 +153,14 @@ def _table_correlation(
 
 
 Bit = tuple[int, int]
-"""A column (0 is the prior) and a bit of its numbers."""
+"""A column (0 is the prior), and a bit of its random numbers (0 is the lowest)."""
 
 _MOST_PAIRS: Final = 20_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """Bits that XOR to 0 in every cycle, in one group: a bank, or the cells of one line in a bank."""
+    """Bits that XOR to 0 in every cycle, in one group of columns: those of a bank, or of one line in a bank."""
 
     group: int
     bits: tuple[Bit, ...]
@@ -170,8 +170,8 @@ def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> tuple
     """Search for relations of 2, 3 or 4 bits between columns, in as many groups as a few seconds permit.
 
     Returns at most one relation of the fewest bits for each group, and the number of groups that were searched.
-    `seeds` are uint64[groups, columns]; the columns of a group are those whose bits are ANDed. The low
-    `prob_bits` bits of a state are compared with a code.
+    `seeds` are uint64[groups, columns]; the bits of a group's columns are ANDed. The low `prob_bits` bits of a
+    state are the random number that is compared with a code.
     """
     groups, columns = seeds.shape
     bits = columns * prob_bits
@@ -187,9 +187,9 @@ def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> tuple
 
 
 def _bit_words(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> NDArray[np.uint64]:
-    """Return each bit's values in its first steps, as many as the state has bits, as one word: uint64[groups, bits].
+    """Return one word per bit of the random numbers, uint64[groups, bits]: its values in the generators' first steps.
 
-    Two bits with the same word are always the same, because so many steps determine a linear sequence.
+    There are as many steps as a state has bits, which determine a linear sequence: bits with equal words always agree.
     """
     lfsr = LFSR(kind)
     shifts = np.arange(prob_bits, dtype=np.uint64)

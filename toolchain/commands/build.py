@@ -110,7 +110,7 @@ def check(
     For example `toolchain check casestudies/boat --partitions 4`, or `toolchain check build/boat`. It takes all options
     of `toolchain build`, and needs none of them. The exit code is 2 if there is an error among the findings, otherwise 0.
     """
-    del directory  # taken so that a command to build is checked by its first word alone
+    del directory  # accepted, so that a `build` command becomes a check by changing only its first word
     from toolchain.checks.check import check_deployment
     from toolchain.checks.findings import Severity
     from toolchain.deployment import FILE_NAME

@@ -16,14 +16,14 @@ from toolchain.errors import BuildError, NotFusionError, counted
 from toolchain.flags import Bits
 
 RESULTS = Path("build/explore.jsonl")
-"""The default file of results, in the folder of most deployments, which version control ignores."""
+"""The default file of results; version control ignores its folder, which most deployments are in too."""
 
 
 @contextmanager
 def progress(total: int | None) -> Iterator[Callable[[str], None]]:
-    """Show a bar on a terminal, nothing elsewhere; yield a function to call with a text after each step.
+    """Show a progress bar on a terminal, nothing elsewhere; yield a function to call with a text after each step.
 
-    Without a total, the bar only moves.
+    Without a `total` number of steps, the bar shows movement, but no share.
     """
     if not sys.stderr.isatty():
         yield lambda _: None
@@ -136,7 +136,7 @@ def explore(
         drawn = sample_readings(read, frames, seed=readings.seed)
     else:
         drawn = recorded_readings(readings.readings, read.variables, readings.reading or (), frames=frames)
-    # another folder that does not exist may be a typing error
+    # only the default folder is created: another one that does not exist may be a typing error
     if results == RESULTS:
         with file_errors(results, "written", BuildError, "; name another file with -o"):
             results.parent.mkdir(exist_ok=True)

@@ -1,4 +1,4 @@
-"""The command `infer`: the posteriors of a whole recording."""
+"""The command `toolchain infer`: the posteriors of a whole recording."""
 
 import sys
 import time

@@ -1,6 +1,6 @@
 """The `toolchain` command (thesis 3.4), and its smaller subcommands: `regenerate`, `fit` and `new`.
 
-NumPy and modules that need it are imported inside the functions of these modules, so that `--help` is fast.
+Modules of commands import NumPy, and what needs it, inside their functions, so that `--help` is fast.
 """
 
 import difflib
@@ -137,7 +137,7 @@ def deployment(directory: Directory, edits: DeploymentEdits, verbose: Verbose = 
 
 
 def _lines(directory: Path) -> list[str]:
-    """Return the lines of `deployment.toml`; none if it is missing, which a later call reports."""
+    """Return the lines of `deployment.toml`; none if the file is missing, which loading the deployment reports."""
     file = directory / FILE_NAME
     return file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
 

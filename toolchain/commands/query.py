@@ -41,7 +41,7 @@ def query(
     """
     from toolchain.analysis.query import answer
 
-    # a comma is also between two of them, but not inside of a state
+    # a comma also separates two NAME=STATE, but one inside of a state does not
     settings = [each for text in known or () for each in re.split(r",(?=[^,=]+=)", text)]
     states = key_values(settings, "--known", "smoke=yes")
     names, joint = names_in("--searched", searched), read_network(network)

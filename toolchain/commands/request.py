@@ -1,4 +1,4 @@
-"""The model and the build options of a command line: their flags, and how they are read."""
+"""The model and the build options that a command line asks for: their flags, and how these are read."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
@@ -57,7 +57,7 @@ class ModelFlags:
     )
 
     def over(self, built: ModelSection) -> "ModelFlags":
-        """Return these flags, with the values of a build for flags that are not given."""
+        """Return these flags, with the values in `built`, a deployment's `[model]`, for flags that are not given."""
         found = {
             each.name: getattr(self if getattr(self, each.name) != each.default else built, each.name)
             for each in fields(ModelFlags)
@@ -67,14 +67,14 @@ class ModelFlags:
         return ModelFlags(**found)
 
     def section(self, bits: Iterable[str] = ()) -> ModelSection:
-        """Return the flags as a deployment keeps them."""
+        """Return the flags as `[model]` of a deployment keeps them, with the flags `bits`."""
         flags = {each.name: getattr(self, each.name) for each in fields(ModelFlags)}
         lists = {"settings": self.settings or (), "given": self.given or (), "bits": bits}
         return ModelSection(**flags | {key: tuple(values) for key, values in lists.items()})
 
     @property
     def question(self) -> list[str]:
-        """The given flags that are only for networks."""
+        """The names of the given flags that are only for network files."""
         values = {
             "--searched": self.searched,
             "--known": self.known,
@@ -115,7 +115,7 @@ class BuildFlags(MachineOptions, ModelFlags):
 
 
 def model_file(path: Path) -> Path:
-    """Return the file of a model, the network file or the `model.py` of a folder, or raise a ToolchainError."""
+    """Return the file of a model, which is a network file or a folder's `model.py`, or raise a ToolchainError."""
     if is_network(path):
         open_regular(path, NetworkFileError).close()
         return path
@@ -125,7 +125,7 @@ def model_file(path: Path) -> Path:
 
 
 def read_source(path: Path, flags: ModelFlags) -> "Model | Question":
-    """Return the model or question of a folder, or the question about a network file."""
+    """Return the model or question that a folder's `model.py` defines, or the question of the flags about a network."""
     settings = key_values(flags.settings or ())
     return (_network_question if is_network(path) else _case_source)(path, flags, settings)
 
@@ -172,7 +172,7 @@ def build_options(
 ) -> BuildOptions:
     """Return the options of a build; `sources` is a file that assigns variables to topics, instead of one topic.
 
-    With `is_checked`, the flags that name a robot's topic may be missing.
+    With `is_checked`, the flags that name the topic of the readings may be missing.
     """
     from toolchain.outputs.mif import read_table
 
@@ -210,7 +210,7 @@ def build_options(
 
 
 def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
-    """Return the plan with enough boards of a device and, for `--replicas fill`, as many replicas as fit; and why."""
+    """Return the plan with enough boards of device `name` (and, for `--replicas fill`, as many replicas as fit), and why."""
     if name is None:
         return plan, ""
     from toolchain.analysis.logic import device_named
