@@ -61,7 +61,7 @@ class Handle:
         self._session.flush()
 
     def end(self) -> None:
-        """End without sending anything, because the client was closed."""
+        """End the handle without sending anything; called by `close`, and by the client when it is closed."""
         self._closed = True
 
     def _withdraw(self) -> None:
@@ -118,7 +118,7 @@ class Subscription(Handle):
         self.lost = 0
         self.discarded = 0
 
-        # `_begun` limits it: a new subscription has not missed what was lost before it existed.
+        # Counted from `_begun` on: a new subscription has not missed what was lost before it existed.
         self.blind_seconds = 0.0
         self._begun = time.monotonic()
 

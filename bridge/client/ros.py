@@ -144,8 +144,8 @@ class Ros:
             type: Type in the form of ROS 1 or ROS 2.
             latch: Whether the server stores the last message for later subscribers; it is sent again after a
                 reconnection.
-            queue_size: Maximum number of messages that wait for a slow server; also passed to the server, for
-                ROS.
+            queue_size: Maximum number of messages that wait for a slow server; also the queue size that the
+                server is to use in ROS.
             qos: Quality of service in ROS 2; older servers ignore it.
 
         Raises:
@@ -219,8 +219,8 @@ class Ros:
     async def call(self, service: str, args: Mapping[str, Any] | None = None, timeout: float = 5.0) -> Any:
         """Call a service.
 
-        If the service's type is known to rosapi, the request is checked before it is sent. The first call of a
-        service asks for the type, which may take up to two seconds more.
+        If the service's type is known to rosapi, the request is checked before it is sent. Before the first
+        call of a service, the client asks for its type, which may take up to two seconds more.
 
         Args:
             service: Name of the service.

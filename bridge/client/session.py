@@ -50,9 +50,9 @@ ATTEMPT_TIMEOUT: Final = 5.0
 STEADY: Final = 5.0
 """A connection that lasts this many seconds resets the delay of the next reconnection to `FIRST_DELAY`."""
 SILENCE: Final = 2.0
-"""Seconds without a message after which a subscription is checked."""
+"""Seconds after which a subscription that has had no message is checked."""
 LONGEST_SILENCE: Final = 30.0
-"""Maximum delay in seconds between two checks of silent subscriptions; the delay doubles until it is reached."""
+"""Maximum delay in seconds between two checks of silent subscriptions; the delay doubles up to it."""
 _ROSAPI_TIMEOUT: Final = 1.0
 KEPT_STATUSES: Final = 16
 """Number of status messages of the server that are stored."""
@@ -173,7 +173,7 @@ class Session:
         self._delay = FIRST_DELAY
 
         # Silent subscriptions: the timer runs while the connection is open and a topic has had no message. The task
-        # asks rosapi about those with a type; there is at most one.
+        # asks rosapi about those subscribed to with a type; there is at most one such task.
         self._retry_timer: asyncio.TimerHandle | None = None
         self._renewal_delay = SILENCE
         self._looking: asyncio.Task[None] | None = None
@@ -184,7 +184,8 @@ class Session:
         self._waiting = 0
         # Number of messages since a publisher last yielded; without yielding, a tight loop would starve other tasks.
         self._burst = 0
-        # Size of the largest message sent on this connection: if the server ends it with 1009, its limit is less.
+        # Size of the largest message sent on this connection: if the server closes it with 1009 (message too big), the
+        # limit of the server is less.
         self._largest_sent = 0
 
         # The objects behind the numbers, absolute names and ids in the core's events. An entry is made when its

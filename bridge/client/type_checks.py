@@ -22,7 +22,7 @@ from bridge.names import absolute, ros2_type
 _ROSAPI_TIMEOUT: Final = 1.0
 _ROSAPI: Final = "/rosapi/"
 _MAX_SERVICES: Final = 1000
-"""Maximum number of services whose types are remembered; for others, each call asks for the type again."""
+"""Maximum number of services whose types are remembered; each call of a further one asks for the type again."""
 
 _log = logging.getLogger("bridge")
 
@@ -30,7 +30,7 @@ _Part = Literal["service_request", "service_response", "action_goal", "action_re
 
 
 class TypeChecks:
-    """The checks of what one client sends. A server that does not answer is not asked again on the same connection."""
+    """The checks of what one client sends. If rosapi does not answer, it is not asked again on the same connection."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

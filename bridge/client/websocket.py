@@ -185,7 +185,7 @@ class WebSocket(WebSocketTransport):
         self._answered.set()
 
     def messages_received(self, messages: list[bytes]) -> None:
-        """Call back with the messages."""
+        """Pass the messages to `on_messages`, after `begin`."""
         if self.opened:
             self._on_messages(messages)
         else:
@@ -199,7 +199,7 @@ class WebSocket(WebSocketTransport):
             self.abort()  # a peer with another protocol may never close the connection
 
     def connection_ended(self, exc: Exception | None) -> None:
-        """Report the end."""
+        """Wake `handshake`, or call `on_lost` after `begin`."""
         self._answered.set()
         self._cancel_watchdog()
         if self.opened:

@@ -41,7 +41,8 @@ _HOPS: Final = 64
 _SMALL: Final = 6
 # The first byte of `null`; testing for a number is ten times as fast as for a byte string.
 _N: Final = ord("n")
-# For `is_deeper`: all other bytes, braces as brackets, and these as one level up or down (signed bytes).
+# For `is_deeper`: the bytes to remove, braces translated to square brackets, and these to steps of one level up or down
+# (signed bytes).
 _NO_BRACKETS: Final = bytes(byte for byte in range(256) if byte not in b"[]{}")
 _BRACKETS: Final = bytes.maketrans(b"{}", b"[]")
 _STEPS: Final = bytes.maketrans(b"[]", b"\x01\xff")

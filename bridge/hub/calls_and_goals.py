@@ -270,7 +270,7 @@ class Calls(_Exchange):
         client, server = caller.client, service.client
         if len(client.calls) >= self._limits.calls_per_client:
             raise RefusedOperationError(f"this client already waits for {len(client.calls)} calls")
-        # Both ends are bounded: a client could otherwise fill the outbox of a server that does not answer.
+        # Bounded for the server too: many clients could otherwise fill the outbox of a server that does not answer.
         if len(server.requests) >= self._limits.calls_per_client:
             raise RefusedOperationError(f"{name} already has {len(server.requests)} calls to answer")
         deadline = now + min(number(operation, "timeout") or inf, self._limits.call_timeout)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Encode = Callable[[Any], bytes]
 
-# Element types of arrays by rosbags' names of numbers.
+# Element types of NumPy by the names of numeric types in rosbags.
 _NUMBERS: Final = {
     "int8": "i1",
     "uint8": "u1",
@@ -51,7 +51,8 @@ _BYTES: Final = frozenset({"uint8", "octet", "char"})
 TIMES: Final = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/Duration": "duration"}
 # Fields of a time in ROS 1, by their names in rosbags, which are ROS 2's.
 ROS1_TIME: Final = {"sec": "secs", "nanosec": "nsecs"}
-# Kinds of CBOR items, sizes from which on theirs is not in the first byte, and that byte for a size of four bytes.
+# First bytes of CBOR arrays and maps, to which a size below `_INLINE` is added; for others `_FOUR_BYTES` is added, and
+# the size follows in four bytes.
 _ARRAY: Final = 0x80
 _MAP: Final = 0xA0
 _INLINE: Final = 24

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from rosbags.typesys import Stores
     from rosbags.typesys.store import Typestore
 
-# Bytes of the size limit per value of a serialised message; `{}` in an array can stand for dozens of
-# values.
+# A message to be serialised may have one value per so many bytes of the size limit; a `{}` in an array can stand for
+# dozens of values.
 _BYTES_A_VALUE: Final = 16
 _HEADER: Final = "std_msgs/msg/Header"
 _TIME_FIELDS: Final = {1: ("secs", "nsecs"), 2: ("sec", "nanosec")}

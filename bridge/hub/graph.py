@@ -111,7 +111,7 @@ class TopicSubscription:
     typed: bool = False
     """True if the client named a type, which becomes the type of the topic."""
     options: dict[OperationId, SubscribeOptions] = field(default_factory=dict)
-    """Options of each subscribe operation; the smallest of their numbers apply, as in rosbridge_suite."""
+    """Options of each subscribe operation; the smallest throttle, queue length and fragment size apply."""
 
 
 @dataclass(eq=False, slots=True)

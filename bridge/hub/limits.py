@@ -56,23 +56,23 @@ class HubLimits:
     Attributes:
         message_bytes: One WebSocket message, in both directions. A larger one closes the connection with 1009.
             Incomplete messages in fragments may occupy four times as much (`bridge.codecs.fragments.Reassembler`).
-        depth: Nested objects and arrays in one message.
-        clients: Simultaneous connections; the answer to a further one is 503.
-        topics: Topics of all clients.
+        depth: Levels of nested objects and arrays in one message.
+        clients: Simultaneous connections; a further one is refused with HTTP status 503.
+        topics: Number of topics of all clients together.
         advertisements_per_client: Open advertise operations (topic and id) of one client.
         subscriptions_per_client: Open subscribe operations (topic and id) of one client.
         services_per_client: Services that one client offers, and as many actions.
         calls_per_client: Open calls that one client made, and as many that it must answer.
         goals_per_client: Open goals that one client sent, and as many that it executes.
         call_timeout: A call without an answer fails after this time; a client may request less.
-        queue_length: Messages of a topic queued for a slow client that did not request a length, oldest
-            dropped first.
+        queue_length: Messages of a topic queued for a slow client that did not request a length; then the
+            oldest is dropped.
         longest_queue: Maximum `queue_length` that a client can request.
         client_bytes: All output queued for one client. If it is exceeded, the oldest messages of topics are
             dropped; a client whose answers alone exceed it is disconnected.
-        latched_bytes: All latched messages; a message that exceeds it is delivered but not latched.
-        parameters: Number of parameters.
-        parameter_bytes: All parameters' values, as JSON.
+        latched_bytes: All latched messages together; one that would exceed this is delivered but not latched.
+        parameters: Number of parameters of ROS (see `bridge.hub.rosapi`).
+        parameter_bytes: The values of all parameters together, as JSON.
         handshake_timeout: Time from the TCP connection to a valid WebSocket request.
         ping_interval: A client silent for this long is pinged.
         ping_timeout: A client that remains silent for this long after a ping is disconnected.

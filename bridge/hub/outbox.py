@@ -199,7 +199,7 @@ class Outbox:
 
     def adjust(self, lane: Lane, throttle: float, queue_length: int) -> None:
         """Change a lane's throttle and length, and queue or drop the messages that these no longer hold."""
-        # The next message was due one old interval after the last one; now it is one new interval.
+        # The throttle would have admitted the next message one old interval after the last one; now one new interval.
         lane.next_time += throttle - lane.throttle
         lane.throttle, lane.queue_length = throttle, queue_length
         while lane.held and not throttle:

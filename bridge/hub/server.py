@@ -165,7 +165,7 @@ class _Hub:
         # Monotonic seconds: until when a response is prompt, from when on sockets may be polled for it, and when
         # polling was last in vain.
         self._prompt_until = self._poll_from = self._in_vain = -inf
-        # Seconds without polling after the next one in vain, and True while `_poll` is scheduled.
+        # Seconds without polling, the next time that polling was in vain; and True while `_poll` is scheduled.
         self._pause = _PAUSES[0]
         self._is_polling = False
         # Lines about connections since `_log_since` (see `warn`).

@@ -30,7 +30,7 @@ from bridge.names import absolute, same_type, split_type
 
 # Keys of an operation with a reusable envelope: op, topic and msg.
 _ENVELOPE_KEYS: Final = 3
-# Units of work of one message, besides those for each subscriber.
+# Units of work (see `TURN_WORK`) of one message, besides those for each subscriber.
 _MESSAGE_WORK: Final = 20
 # Bytes copied for a subscriber in one unit of work. Filling a message and writing it as JSON, which happens at most
 # once, takes as long as this many copies.
@@ -130,11 +130,11 @@ class Topics:
             topic = advertisement.topic
             batch = messages
             if len(messages) > 1:
-                # What is left of the turn, in messages like the next one if all subscribers want another encoding.
+                # As many as the rest of the turn allows, if all are like the next one, and each subscriber wants CBOR or PNG.
                 each = _MESSAGE_WORK + (2 + (len(messages[first]) >> 6)) * len(topic.subscriptions)
                 batch = messages[first : first + 1 + (TURN_WORK - self._dispatcher.work) // each]
-            # Otherwise the numbers of a message are freed before the next one is parsed, which is faster. A loop,
-            # because `any` takes as long as parsing a small message.
+            # Parsed messages are kept only for CBOR and PNG, because freeing each before the next one is parsed is
+            # faster. A loop, because `any` takes as long as parsing a small message.
             keep = False
             for subscription in topic.subscriptions.values():
                 if subscription.compression is not _PLAIN:
@@ -199,7 +199,7 @@ class Topics:
     ) -> None:
         """Deliver messages; a payload is a message's JSON between `prefix` and a closing brace."""
         dispatcher, subscriptions = self._dispatcher, topic.subscriptions
-        # A message that is not latched for its size also ends the latching of the one before.
+        # A message that is too large to be latched also removes the latched one before it.
         if topic.latching:
             latched = payloads[-1][len(prefix) : -1]
             room = self._limits.latched_bytes - self._graph.latched_bytes + len(topic.latched or b"")
