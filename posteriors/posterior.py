@@ -313,7 +313,7 @@ def _grid(dimensions: Iterable[tuple[str, int]]) -> str:
 
 
 def posterior_layout(deployment: "Deployment") -> dict[str, Any]:
-    """Return the `layout` of a deployment's posteriors: dimensions with labels, row-major strides.
+    """Return the `layout` of messages with a deployment's posteriors: dimensions with labels, row-major strides.
 
     With several replicas, the first dimension is labelled `replica`.
     """

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 MAP_FRAME: Final = "map"
 """The frame of grid and pose, in which the searched variables are coordinates."""
 MOST_OCCUPIED: Final = 98
-"""Value of the most probable cell: rviz paints 99 and 100 as obstacles."""
+"""Value of the most probable cell in a grid message, because rviz paints 99 and 100 as obstacles."""
 _HEADING_VARIANCE: Final = math.pi**2 / 3
 """Variance of an angle that is uniform over the circle: a grid has no heading."""
 _METRES: Final = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "km": 1000.0}
@@ -82,7 +82,7 @@ class Plane(NamedTuple):
 
 
 def has_coordinates(dimensions: Sequence[Dimension]) -> bool:
-    """Return whether there are two searched variables, each a length or a number without unit that is not an index."""
+    """Return whether there are two searched variables, each a length, or without unit but more than an index."""
     return len(dimensions) == 2 and all(
         not each.states and (each.unit in _METRES or (not each.unit and (each.offset, each.step) != (0, 1)))
         for each in dimensions
@@ -175,7 +175,7 @@ def pose_at(x: float, y: float) -> dict[str, Any]:
 def diagnostics(
     statuses: Iterable[dict[str, Any]], stamp_ns: int, frame_id: str, ros_version: RosVersion
 ) -> dict[str, Any]:
-    """Return a diagnostic_msgs/DiagnosticArray."""
+    """Return a diagnostic_msgs/DiagnosticArray with these statuses."""
     return {"header": header(stamp_ns, frame_id, ros_version), "status": list(statuses)}
 
 

@@ -142,7 +142,7 @@ def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[
 async def serve_health(
     directory: str | os.PathLike[str] | None, name: str, answer: Callable[[], bytes]
 ) -> AsyncIterator[None]:
-    """Answer in the running event loop within the context, so an answer proves that the loop is not blocked.
+    """Answer health checks in the running event loop within the context: an answer proves that the loop is not blocked.
 
     `answer` returns the JSON object. Without a directory nothing is served.
     """

@@ -9,7 +9,7 @@ VIRIDIS: Final = (
     *((68, 1, 84), (72, 36, 117), (64, 67, 135), (52, 94, 141), (41, 120, 142), (32, 144, 140)),
     *((34, 167, 132), (68, 190, 112), (121, 209, 81), (189, 222, 38), (253, 231, 36)),
 )
-"""The colour map in eleven steps."""
+"""The colour map viridis in eleven steps of red, green and blue."""
 
 
 def new_figure(width: float, height: float) -> Any:

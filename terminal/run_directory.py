@@ -70,7 +70,7 @@ def status_directory(given: Path | None, name: str) -> Path | None:
 
 
 class LockedRunDirectory:
-    """The run directory of a master that starts processes, locked until `release` and the end of its children."""
+    """The run directory of a master that starts processes, locked until `release` and until its children end."""
 
     def __init__(self, given: Path | None) -> None:
         """Lock the directory.

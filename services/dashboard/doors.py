@@ -41,7 +41,7 @@ class Doors:
     Args:
         app: The application behind the doors.
         policy: Tokens, and other web pages that may connect.
-        loopback: Whether only this machine can reach the server.
+        loopback: Whether the server listens on loopback, so that only this machine can reach it.
     """
 
     def __init__(self, app: ASGIApp, policy: AccessPolicy, *, loopback: bool) -> None:

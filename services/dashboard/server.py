@@ -76,7 +76,7 @@ class PageServer:
             self.ready.set()
             await asyncio.shield(serving)
         finally:
-            # it would report with a traceback that an open request of a page has to end
+            # the server would report with a traceback that an open request of a page has to end
             logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)
             self._server.should_exit = True
             await asyncio.gather(serving, return_exceptions=True)

@@ -32,6 +32,8 @@ async def show_frames(
 ) -> int:
     """Show and save frames until `count` posteriors have arrived.
 
+    After the first frame, `silence` is the maximum number of seconds between two; None for no limit.
+
     Raises:
         NoResultError: No frame arrived in time.
         BadResultError: The first message does not come from a master.

@@ -40,7 +40,7 @@ class ResultFile(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Write everything to the file."""
+        """Write what is not yet in the file; nothing is added afterwards."""
 
     def _error(self, why: str | OSError) -> SettingsError:
         if isinstance(why, OSError):
@@ -49,7 +49,7 @@ class ResultFile(ABC):
 
 
 def open_result_file(path: Path) -> ResultFile:
-    """Open a file, or raise a SettingsError: `.jsonl` and `.csv` are appended to, `.npz` is overwritten."""
+    """Open a file (`.jsonl` and `.csv` are appended to, `.npz` is overwritten), or raise a SettingsError."""
     kinds: dict[str, Callable[[Path], ResultFile]] = {
         ".jsonl": _JsonLines,
         ".csv": _CsvLines,
@@ -165,7 +165,7 @@ class _JsonLines(_Lines):
 
 
 class _CsvLines(_Lines):
-    """One row per posterior: number, times, the most probable cell, and a column for every cell."""
+    """One row per posterior: frame number, times, the most probable cell, and a column for every cell."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)

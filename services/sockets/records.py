@@ -33,7 +33,7 @@ VERSION = version("rosbayes")
 
 
 class LossReason(StrEnum):
-    """Reason why a reading has no result, or has one not on all topics; shown by `status`."""
+    """Reason why a reading has no result, or no result on some topics; shown by `status`."""
 
     PASSED_OVER = "passed over"
     """Replaced by a newer reading (`queue = latest`)."""

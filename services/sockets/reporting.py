@@ -173,7 +173,7 @@ def check_metrics(metrics: str, *, insecure: bool) -> None:
 
 
 def shifted(metrics: str, ports: int) -> str:
-    """Return the address for the metrics of another process of the run, whose port is this many ports higher."""
+    """Return the address for the metrics of another process of the run: that of `metrics`, `ports` ports higher."""
     if not metrics:
         return ""
     endpoint = metrics_endpoint(metrics)
@@ -218,6 +218,6 @@ async def _keep_sampling(report: Report, manager: ServiceManager) -> None:
 def serve_status_in_thread(
     directory: Path | None, name: str, get_status: GetStatus, **more: Any
 ) -> Iterator[None]:
-    """Do the same from a thread of its own within the context, for a process whose main thread blocks."""
+    """Report the status from another thread within the context, for a process whose main thread blocks."""
     with in_thread(lambda: serve_status(directory, name, get_status, **more)):
         yield
