@@ -36,7 +36,7 @@ entity bm1_axi is
     -- access
     request_o : out   std_logic;                                   -- pulse: an access begins
     write_o   : out   std_logic;                                   -- 1: write, 0: read
-    address_o : out   std_logic_vector(ADDRESS_BITS - 1 downto 0); -- in bytes
+    address_o : out   std_logic_vector(ADDRESS_BITS - 1 downto 0); -- address in bytes
     strobe_o  : out   std_logic_vector(3 downto 0);                -- byte enables of a write
     data_o    : out   std_logic_vector(31 downto 0);               -- data to write
     respond_i : in    std_logic;                                   -- pulse: the access is complete

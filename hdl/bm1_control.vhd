@@ -26,10 +26,10 @@ entity bm1_control is
     resume_i : in    std_logic; -- run the frame's next slice
     reset_i  : in    std_logic; -- stop and clear
     -- settings
-    target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- latched by a start
-    max_cycles_i : in    std_logic_vector(63 downto 0);               -- latched by a start
-    run_until_i  : in    std_logic_vector(63 downto 0);               -- must be stable while the machine runs; 0: none
-    halt_i       : in    std_logic_vector(REPLICAS - 1 downto 0);     -- latched by a resume
+    target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- target count; latched by a start
+    max_cycles_i : in    std_logic_vector(63 downto 0);               -- maximum cycles; latched by a start
+    run_until_i  : in    std_logic_vector(63 downto 0);               -- end of the slice, 0: none; stable while running
+    halt_i       : in    std_logic_vector(REPLICAS - 1 downto 0);     -- replicas to halt; latched by a resume
     -- matrices
     overflow_i   : in    std_logic_vector(REPLICAS - 1 downto 0);     -- a counter is at the target
     impossible_i : in    std_logic_vector(REPLICAS - 1 downto 0);     -- every line has a code 0

@@ -20,7 +20,7 @@ entity bm1_generators is
     TAPS         : std_logic_vector; -- feedback taps of an LFSR; STATE_BITS wide
     STEPS        : positive;         -- steps per clock
     BANKS        : positive;         -- sets of seeds
-    PROB_BITS    : positive;         -- width of a number
+    PROB_BITS    : positive;         -- width of a random number
     SEED_FILE    : string;           -- MIF of the seeds: bank by bank, generator by generator
     TABLE_FILE   : string;           -- MIF of the random numbers, if a table is used
     TABLE_LENGTH : positive          -- number of random numbers
@@ -29,10 +29,10 @@ entity bm1_generators is
     clk_i     : in    std_logic;                                             -- clock
     rst_i     : in    std_logic;                                             -- load bank 0
     restart_i : in    std_logic;                                             -- load the bank
-    bank_i    : in    std_logic_vector(bits_for(BANKS) - 1 downto 0);        -- number of the bank
+    bank_i    : in    std_logic_vector(bits_for(BANKS) - 1 downto 0);        -- index of the bank
     step_i    : in    std_logic;                                             -- a cycle is run
     ready_o   : out   std_logic;                                             -- all seeds are loaded
-    randoms_o : out   std_logic_vector(GENERATORS * PROB_BITS - 1 downto 0); -- numbers, generator 0 lowest
+    randoms_o : out   std_logic_vector(GENERATORS * PROB_BITS - 1 downto 0); -- random numbers, generator 0 lowest
     states_o  : out   std_logic_vector(GENERATORS * STATE_BITS - 1 downto 0) -- states, generator 0 lowest
   );
 end entity bm1_generators;

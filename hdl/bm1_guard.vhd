@@ -27,14 +27,14 @@ entity bm1_guard is
   port (
     -- access
     write_i   : in    std_logic;                                       -- 1: write, 0: read
-    address_i : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0); -- in bytes
+    address_i : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0); -- address in bytes
     strobe_i  : in    std_logic_vector(3 downto 0);                    -- byte enables of a write
     data_i    : in    std_logic_vector(31 downto 0);                   -- data to write
     -- state
     running_i    : in    std_logic;                               -- the machine runs
     can_resume_i : in    std_logic;                               -- the machine is at the end of a slice
     ready_i      : in    std_logic_vector(REPLICAS - 1 downto 0); -- replicas that can be resumed
-    done_i       : in    std_logic_vector(31 downto 0);           -- number of the last start or resume that has stopped
+    done_i       : in    std_logic_vector(31 downto 0);           -- register DONE: number of the last ended start or resume
     cycles_i     : in    std_logic_vector(63 downto 0);           -- cycles of the frame
     -- settings
     target_i     : in    std_logic_vector(31 downto 0);  -- target count
@@ -117,7 +117,7 @@ begin
   is_resume <= '1' when write_i = '1' and unsigned(address_i) = RESUME_ADDRESS and unsigned(data_i) /= 0 else
                '0';
 
-  -- numbers wrap from 2^32 - 1 to 1
+  -- doorbell numbers wrap from 2^32 - 1 to 1
   due <= to_unsigned(1, 32) when (and done_i) = '1' else
          unsigned(done_i) + 1;
 

@@ -16,9 +16,9 @@ entity bm1_lfsr is
   port (
     clk_i   : in    std_logic;                                 -- clock
     shift_i : in    std_logic;                                 -- shift the seed in
-    seed_i  : in    std_logic_vector(STATE_BITS - 1 downto 0); -- next seed of the chain
+    seed_i  : in    std_logic_vector(STATE_BITS - 1 downto 0); -- seed from the memory or the previous generator
     step_i  : in    std_logic;                                 -- make the steps of a cycle
-    state_o : out   std_logic_vector(STATE_BITS - 1 downto 0)  -- state, whose low bits are the number
+    state_o : out   std_logic_vector(STATE_BITS - 1 downto 0)  -- state, whose low bits are the random number
   );
 end entity bm1_lfsr;
 

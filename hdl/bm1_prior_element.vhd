@@ -15,7 +15,7 @@ entity bm1_prior_element is
   port (
     clk_i    : in    std_logic;                                -- clock
     load_i   : in    std_logic;                                -- a frame starts: latch the written code
-    code_i   : in    std_logic_vector(PROB_BITS - 1 downto 0); -- from the table, which holds it for the frame, or written
+    code_i   : in    std_logic_vector(PROB_BITS - 1 downto 0); -- code from the prior's table, or from the host
     random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- random number of column 0
     bit_o    : out   std_logic;                                -- bitstream of P(S)
     never_o  : out   std_logic                                 -- the bitstream is all zeros

@@ -47,7 +47,7 @@ entity bm1_registers is
     -- access
     request_i : in    std_logic;                                       -- pulse: an access begins
     write_i   : in    std_logic;                                       -- 1: write, 0: read
-    address_i : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0); -- in bytes
+    address_i : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0); -- address in bytes
     strobe_i  : in    std_logic_vector(3 downto 0);                    -- byte enables of a write
     data_i    : in    std_logic_vector(31 downto 0);                   -- data to write
     respond_o : out   std_logic;                                       -- pulse: the access is complete

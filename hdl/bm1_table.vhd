@@ -12,7 +12,7 @@ library ieee;
 
 entity bm1_table is
   generic (
-    FILE_NAME    : string;   -- MIF
+    FILE_NAME    : string;   -- path of the MIF
     WORD_BITS    : positive; -- width of the MIF's words
     DEPTH        : positive; -- number of words
     ADDRESS_BITS : positive; -- width of the address

@@ -14,15 +14,15 @@ library work;
 entity bm1_table_player is
   generic (
     STATE_BITS : positive; -- width of the index in the table
-    PROB_BITS  : positive; -- width of a number
-    TABLE_FILE : string;   -- MIF of the numbers
-    LENGTH     : positive; -- number of entries
-    STEPS      : positive  -- entries per clock
+    PROB_BITS  : positive; -- width of a random number
+    TABLE_FILE : string;   -- MIF of the random numbers
+    LENGTH     : positive; -- number of entries in the table
+    STEPS      : positive  -- entries by which the index advances per clock
   );
   port (
     clk_i    : in    std_logic;                                 -- clock
     shift_i  : in    std_logic;                                 -- shift the seed in
-    seed_i   : in    std_logic_vector(STATE_BITS - 1 downto 0); -- next seed of the chain
+    seed_i   : in    std_logic_vector(STATE_BITS - 1 downto 0); -- seed from the memory or the previous generator
     step_i   : in    std_logic;                                 -- make the steps of a cycle
     state_o  : out   std_logic_vector(STATE_BITS - 1 downto 0); -- index in the table
     random_o : out   std_logic_vector(PROB_BITS - 1 downto 0)   -- entry at that index
@@ -72,7 +72,7 @@ begin
 
   end process hold_place;
 
-  -- The memory is read at the next index, so its output always belongs to the current one.
+  -- The memory is read at the next index, so its output always belongs to the current index.
   numbers : component bm1_table
     generic map (
       file_name    => TABLE_FILE,

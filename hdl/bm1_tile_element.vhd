@@ -15,7 +15,7 @@ entity bm1_tile_element is
   generic (
     PROB_BITS    : positive;      -- width of a code
     MODE         : sensor_mode_t; -- input of the cell
-    ADDRESS_BITS : positive;      -- of the table; SENSOR_CELL
+    ADDRESS_BITS : positive;      -- address width of the table; SENSOR_CELL
     TABLE_FILE   : string;        -- MIF of the column; SENSOR_CELL
     LINES        : positive;      -- lines in the MIF's words; SENSOR_CELL
     LINE         : natural        -- the cell's line; SENSOR_CELL
@@ -23,12 +23,12 @@ entity bm1_tile_element is
   port (
     clk_i    : in    std_logic;                                -- clock
     load_i   : in    std_logic;                                -- a frame starts: latch the cell's input
-    given_i  : in    std_logic_vector(SLOT_BITS - 1 downto 0); -- by MODE: code from the column's table, address, or code
+    given_i  : in    std_logic_vector(SLOT_BITS - 1 downto 0); -- code from the column's table, or the cell's input
     random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- random number of the column or cell
     bit_i    : in    std_logic;                                -- bitstream of the cells to the left
-    never_i  : in    std_logic;                                -- one of their codes is 0
+    never_i  : in    std_logic;                                -- one of those cells has the code 0
     bit_o    : out   std_logic;                                -- bitstream of the product
-    never_o  : out   std_logic                                 -- one of the codes so far is 0
+    never_o  : out   std_logic                                 -- this cell or one to the left has the code 0
   );
 end entity bm1_tile_element;
 

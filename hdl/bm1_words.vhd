@@ -16,17 +16,17 @@ entity bm1_words is
   generic (
     DEPTH         : positive;        -- number of words
     USED          : natural;         -- words that the machine uses, from word 0 on; at most DEPTH
-    WIDTHS        : natural_array_t; -- used bits of a word, column by column, 0 to SLOT_BITS
-    PER_COLUMN    : positive;        -- successive words of a column
+    WIDTHS        : natural_array_t; -- used bits of the words of each column, 0 to SLOT_BITS
+    PER_COLUMN    : positive;        -- number of successive words for each column
     INITIAL_FILE  : string;          -- MIF of the initial words; "": zeros
-    INITIAL_WORDS : positive;        -- words in the MIF; repeated up to DEPTH
-    INITIAL_BITS  : positive         -- width of these words
+    INITIAL_WORDS : positive;        -- words in the MIF; they are repeated up to DEPTH
+    INITIAL_BITS  : positive         -- width of the MIF's words
   );
   port (
     clk_i    : in    std_logic;                                       -- clock
     rst_i    : in    std_logic;                                       -- write the initial words
     busy_o   : out   std_logic;                                       -- the initial words are being written
-    write_i  : in    std_logic;                                       -- write the word
+    write_i  : in    std_logic;                                       -- write data_i to the word
     index_i  : in    std_logic_vector(bits_for(DEPTH) - 1 downto 0);  -- index of the word
     data_i   : in    std_logic_vector(31 downto 0);                   -- data to write
     data_o   : out   std_logic_vector(31 downto 0);                   -- the word, one clock after its index

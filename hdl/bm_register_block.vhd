@@ -18,41 +18,41 @@ entity bm_register_block is
     rst_i             : in    std_logic;                      -- reset of the board
     write_i           : in    std_logic;                      -- write the word; it must be allowed
     read_i            : in    std_logic;                      -- read the word
-    word_i            : in    std_logic_vector(7 downto 0);   -- number of the word: address / 4
+    word_i            : in    std_logic_vector(7 downto 0);   -- index of the word: address / 4
     data_i            : in    std_logic_vector(31 downto 0);  -- data to write
-    data_o            : out   std_logic_vector(31 downto 0);  -- data read, a clock after read_i
-    liveness_i        : in    std_logic_vector(31 downto 0);  -- Liveness, as read
-    liveness_o        : out   std_logic_vector(31 downto 0);  -- Liveness, as written
-    programmed_i      : in    std_logic_vector(31 downto 0);  -- Programmings, as read
-    map_hash_i        : in    std_logic_vector(255 downto 0); -- Hash of the map's definition, as read
-    image_hash_i      : in    std_logic_vector(255 downto 0); -- Hash of the image, as read
-    cap_machine_i     : in    std_logic_vector(31 downto 0);  -- Machine, as read
-    cap_lines_i       : in    std_logic_vector(31 downto 0);  -- Lines on this board, as read
-    cap_total_lines_i : in    std_logic_vector(31 downto 0);  -- Lines of the whole model, as read
-    cap_line_offset_i : in    std_logic_vector(31 downto 0);  -- First line of this board, as read
-    cap_partition_i   : in    std_logic_vector(31 downto 0);  -- Partition, as read
-    cap_sensors_i     : in    std_logic_vector(31 downto 0);  -- Sensor columns, as read
-    cap_widths_i      : in    std_logic_vector(31 downto 0);  -- Widths, as read
-    cap_banks_i       : in    std_logic_vector(31 downto 0);  -- RNG banks, as read
-    cap_replicas_i    : in    std_logic_vector(31 downto 0);  -- Replicas, as read
-    cap_interface_i   : in    std_logic_vector(31 downto 0);  -- Interface, as read
-    cap_speed_i       : in    std_logic_vector(31 downto 0);  -- Speed, as read
-    cap_steps_i       : in    std_logic_vector(31 downto 0);  -- Steps of the RNGs, as read
-    cap_link_i        : in    std_logic_vector(31 downto 0);  -- Link, as read
-    cap_sensor_bits_i : in    std_logic_vector(511 downto 0); -- Widths of the sensors' addresses, as read
-    control_o         : out   std_logic_vector(31 downto 0);  -- Control, as written
-    target_count_o    : out   std_logic_vector(31 downto 0);  -- Target count, as written
-    max_cycles_o      : out   std_logic_vector(63 downto 0);  -- Maximum cycles of a frame, as written
-    bank_o            : out   std_logic_vector(31 downto 0);  -- RNG bank, as written
-    prior_select_o    : out   std_logic_vector(31 downto 0);  -- Prior select, as written
-    run_until_o       : out   std_logic_vector(63 downto 0);  -- End of the slice, as written
-    start_o           : out   std_logic_vector(31 downto 0);  -- Start, as written
-    resume_o          : out   std_logic_vector(31 downto 0);  -- Resume, as written
-    done_i            : in    std_logic_vector(31 downto 0);  -- Done, as read
-    status_i          : in    std_logic_vector(31 downto 0);  -- Status, as read
-    cycles_i          : in    std_logic_vector(63 downto 0);  -- Cycles, as read
-    compute_ns_i      : in    std_logic_vector(63 downto 0);  -- Computing time, as read
-    halt_o            : out   std_logic_vector(255 downto 0)  -- Replicas to halt, as written
+    data_o            : out   std_logic_vector(31 downto 0);  -- data read, one clock after read_i
+    liveness_i        : in    std_logic_vector(31 downto 0);  -- what reads of LIVENESS return
+    liveness_o        : out   std_logic_vector(31 downto 0);  -- what was written to LIVENESS
+    programmed_i      : in    std_logic_vector(31 downto 0);  -- what reads of PROGRAMMED return
+    map_hash_i        : in    std_logic_vector(255 downto 0); -- what reads of MAP_HASH return
+    image_hash_i      : in    std_logic_vector(255 downto 0); -- what reads of IMAGE_HASH return
+    cap_machine_i     : in    std_logic_vector(31 downto 0);  -- what reads of CAP_MACHINE return
+    cap_lines_i       : in    std_logic_vector(31 downto 0);  -- what reads of CAP_LINES return
+    cap_total_lines_i : in    std_logic_vector(31 downto 0);  -- what reads of CAP_TOTAL_LINES return
+    cap_line_offset_i : in    std_logic_vector(31 downto 0);  -- what reads of CAP_LINE_OFFSET return
+    cap_partition_i   : in    std_logic_vector(31 downto 0);  -- what reads of CAP_PARTITION return
+    cap_sensors_i     : in    std_logic_vector(31 downto 0);  -- what reads of CAP_SENSORS return
+    cap_widths_i      : in    std_logic_vector(31 downto 0);  -- what reads of CAP_WIDTHS return
+    cap_banks_i       : in    std_logic_vector(31 downto 0);  -- what reads of CAP_BANKS return
+    cap_replicas_i    : in    std_logic_vector(31 downto 0);  -- what reads of CAP_REPLICAS return
+    cap_interface_i   : in    std_logic_vector(31 downto 0);  -- what reads of CAP_INTERFACE return
+    cap_speed_i       : in    std_logic_vector(31 downto 0);  -- what reads of CAP_SPEED return
+    cap_steps_i       : in    std_logic_vector(31 downto 0);  -- what reads of CAP_STEPS return
+    cap_link_i        : in    std_logic_vector(31 downto 0);  -- what reads of CAP_LINK return
+    cap_sensor_bits_i : in    std_logic_vector(511 downto 0); -- what reads of CAP_SENSOR_BITS return
+    control_o         : out   std_logic_vector(31 downto 0);  -- what was written to CONTROL
+    target_count_o    : out   std_logic_vector(31 downto 0);  -- what was written to TARGET_COUNT
+    max_cycles_o      : out   std_logic_vector(63 downto 0);  -- what was written to MAX_CYCLES
+    bank_o            : out   std_logic_vector(31 downto 0);  -- what was written to BANK
+    prior_select_o    : out   std_logic_vector(31 downto 0);  -- what was written to PRIOR_SELECT
+    run_until_o       : out   std_logic_vector(63 downto 0);  -- what was written to RUN_UNTIL
+    start_o           : out   std_logic_vector(31 downto 0);  -- what was written to START
+    resume_o          : out   std_logic_vector(31 downto 0);  -- what was written to RESUME
+    done_i            : in    std_logic_vector(31 downto 0);  -- what reads of DONE return
+    status_i          : in    std_logic_vector(31 downto 0);  -- what reads of STATUS return
+    cycles_i          : in    std_logic_vector(63 downto 0);  -- what reads of CYCLES return
+    compute_ns_i      : in    std_logic_vector(63 downto 0);  -- what reads of COMPUTE_NS return
+    halt_o            : out   std_logic_vector(255 downto 0)  -- what was written to HALT
   );
 end entity bm_register_block;
 
@@ -164,7 +164,7 @@ begin
   resume_o       <= resume;
   halt_o         <= halt;
 
-  -- Reading a low word holds the high one until that is read, so that the pair is never torn.
+  -- Reading a low word holds the high word until the high word is read, so that both are of the same value.
   hold_high_words : process (clk_i) is
   begin
 

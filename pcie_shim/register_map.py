@@ -30,8 +30,8 @@ class ErrorCode(IntEnum):
     READ_ONLY = 4  # the register cannot be written
     BUSY = 5  # the machine is running; only CONTROL.RESET may be written
     BLANK = 6  # no image has been loaded
-    DOORBELL = 7  # the number is not DONE + 1, or there is nothing to resume
-    BAD_VALUE = 8  # a value is not valid for the machine: address, target, bank, cycles
+    DOORBELL = 7  # the number written to START or RESUME is not DONE + 1, or there is nothing to resume
+    BAD_VALUE = 8  # the machine does not accept a value: an address, the target, the bank or a number of cycles
     STALE = 9  # the board was programmed after this handle was opened
     HELD = 10  # another host holds the board, or another loader is programming it
     BAD_FRAME = 11  # the frame is invalid: operation, length, CRC or sequence number; the link is closed
