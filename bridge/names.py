@@ -59,7 +59,7 @@ def same_type(one: str, other: str) -> bool:
 
 
 def ros_version_of_type(name: str) -> RosVersion | None:
-    """Return the ROS version of a type name, or None if the name is malformed."""
+    """Return the ROS version whose form a type name has, or None if the name is malformed."""
     try:
         return 2 if split_type(name)[1] else 1
     except NameFormError:

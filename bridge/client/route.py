@@ -38,7 +38,7 @@ def shown(uri: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """The route to a server.
+    """What a connection to a server needs besides its URI.
 
     Attributes:
         tls: TLS settings; None for `ws://`.

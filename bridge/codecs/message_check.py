@@ -26,7 +26,7 @@ _TIMES: Final = frozenset({"time", "duration", "builtin_interfaces/Time", "built
 
 
 class FieldType(NamedTuple):
-    """Type of a field: the type of its elements in the form of ROS 1, and its length (`SCALAR`, 0, or fixed)."""
+    """Type of a field: its element type in the form of ROS 1, and its length (`SCALAR`, 0 for any length, or fixed)."""
 
     element: str
     length: int

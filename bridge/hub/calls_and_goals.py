@@ -88,7 +88,7 @@ class Caller:
 
 
 def _filled(filler: Filler | None, values: Any, room: int) -> Any:
-    """Return arguments or results as an object, after filling absent fields with at most `room` bytes."""
+    """Return arguments or results as an object, after filling absent fields, which adds at most `room` bytes."""
     if values is None:
         values = {}
     if filler is not None:

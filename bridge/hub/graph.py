@@ -71,7 +71,7 @@ class Client:
 
 @dataclass(eq=False, slots=True)
 class Advertisement:
-    """A client's publication on one topic, from all its advertise operations."""
+    """A client's publication on one topic, combined from all its advertise operations."""
 
     client: Client
     topic: "Topic"
@@ -98,7 +98,7 @@ class SubscribeOptions:
 
 @dataclass(eq=False, slots=True)
 class TopicSubscription:
-    """A client's subscription to one topic, from all its subscribe operations."""
+    """A client's subscription to one topic, combined from all its subscribe operations."""
 
     client: Client
     topic: "Topic"

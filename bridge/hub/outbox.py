@@ -149,7 +149,7 @@ class Outbox:
             wire.append(payload)
 
     def offer_all(self, lane: Lane, payloads: list[bytes], now: float) -> None:
-        """Offer each message of a list; while the socket accepts data, many cost hardly more than one."""
+        """Offer each message of a list; while the socket accepts data, this takes hardly longer than offering one."""
         if self.wire is None or lane.throttle or lane.fragment_size or not self.empty:
             for payload in payloads:
                 self.offer(lane, payload, now)

@@ -45,7 +45,7 @@ def rosout_type(ros_version: int) -> str:
 
 
 class Rosapi:
-    """The services of one hub."""
+    """The rosapi services of one hub."""
 
     def __init__(
         self, graph: Graph, limits: HubLimits, definitions: MessageDefinitions, wall_clock: Callable[[], int]

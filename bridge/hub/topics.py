@@ -130,7 +130,7 @@ class Topics:
             topic = advertisement.topic
             batch = messages
             if len(messages) > 1:
-                # As many as the rest of the turn allows, if all are like the next one, and each subscriber wants CBOR or PNG.
+                # As many as the turn still allows, if all are like the first, and each subscriber wants CBOR or PNG.
                 each = _MESSAGE_WORK + (2 + (len(messages[first]) >> 6)) * len(topic.subscriptions)
                 batch = messages[first : first + 1 + (TURN_WORK - self._dispatcher.work) // each]
             # Parsed messages are kept only for CBOR and PNG, because freeing each before the next one is parsed is

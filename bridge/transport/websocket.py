@@ -51,7 +51,7 @@ class WebSocketTransport(asyncio.Protocol):
     slice_bytes: ClassVar[int] = sys.maxsize
 
     def __init__(self, protocol: ClientProtocol | ServerProtocol, *, max_size: int, write_limit: int) -> None:
-        """Prepare the connection; `max_size` equals the protocol's. `paused` is set when `write_limit` bytes wait."""
+        """Prepare the connection; `protocol` has the same `max_size`. `paused` is set when `write_limit` bytes wait."""
         # Monotonic seconds of the last data from the peer, whatever it was.
         self.last_heard = time.monotonic()
         # True while messages can be sent. It copies the library's state, which takes longer to look up, after each

@@ -125,7 +125,7 @@ class Subscriptions:
     """All subscriptions of a client.
 
     Receiving messages is the client's busiest path: `receive_known` handles messages whose envelope is known from an
-    earlier message, and `receive` all others, after parsing. Both use values that are computed only when subscriptions change.
+    earlier message, and `receive` all others, after parsing. What both need is computed when subscriptions change.
     """
 
     def __init__(self, wire: Wire) -> None:

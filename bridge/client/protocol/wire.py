@@ -40,7 +40,7 @@ class Wire:
         self.write_bytes(encode(operation, max_size=self.sendable, max_depth=self.max_depth))
 
     def limit(self, size: int) -> None:
-        """From now on, refuse messages of more than `size` bytes."""
+        """From now on, refuse to send messages of more than `size` bytes."""
         self.sendable = min(self.sendable, max(size, SMALLEST_LIMIT))
 
     def write_bytes(self, data: bytes) -> None:
