@@ -49,7 +49,7 @@ def bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.f
 
 
 def share_of_frames(share: float, frames: int) -> Interval:
-    """Return a share of frames with its Wilson interval, which is valid even if all frames agree."""
+    """Return a share of frames with its Wilson interval, which is valid even if the share is 0 or 1."""
     square = _NORMAL_95**2 / frames
     middle = (share + square / 2) / (1 + square)
     half = _NORMAL_95 / (1 + square) * math.sqrt(share * (1 - share) / frames + square / (4 * frames))
@@ -105,7 +105,7 @@ class ZScores:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cycles:
-    """Cycles of the longest-running board, over frames and banks."""
+    """Statistics of a frame's cycles on its longest-running board, over frames and banks of seeds."""
 
     median: Interval
     percentile_95: Interval
@@ -128,7 +128,7 @@ class Accuracy:
     Attributes:
         posteriors: Number of posteriors: one per frame, or one per replica of a frame.
         banks: Number of seed sets with which each reading was run.
-        impossible: Share of posteriors for which no line can count.
+        impossible: Share of posteriors whose readings let no line count.
         without: Share of runs without a posterior, including those whose counts remained 0.
         overflow: Share of runs that ended with an overflow.
         machine: The machine against the model; None without a model.

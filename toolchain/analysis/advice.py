@@ -1,7 +1,8 @@
 """Advice on the machine for a question: BM1, BM2, and exact inference on this host, at one accuracy (thesis 5.2).
 
-Both machines are emulated on readings drawn from the model, and run longer until their mean total variation from exact
-inference is small enough. For a machine that needs more than `MOST_CYCLES`, the advice says how near it came, and why.
+Both machines are emulated on readings drawn from the model, with longer and longer frames until their mean total
+variation from exact inference is small enough. For a machine that would need more than `MOST_CYCLES`, the advice gives
+the total variation that it reached, and says why it is no smaller.
 """
 
 import json
@@ -170,7 +171,7 @@ def _candidate(machine: str, clock_hz: float, run: Callable[[], _Run]) -> Candid
 def _bm1(
     source: Model | Question, options: AdviceOptions, device: Device, begun: Callable[[str], None]
 ) -> _Run:
-    """Run a BM1 with the narrowest codes that are exact enough, on as many boards as its lines need."""
+    """Run a BM1 with the narrowest codes whose quantisation loss is small enough, on the boards that its lines need."""
     model = source.model() if isinstance(source, Question) else source
     readings = sample_readings(model, options.frames, seed=options.seed)
 

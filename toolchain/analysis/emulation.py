@@ -121,7 +121,7 @@ class EmulatedBoards:
     def run_for(
         self, addresses: Inputs, prior_address: int, bank: int, cycles: int, prior: WrittenPrior = None
     ) -> FrameRun:
-        """Run every board that can count for this many cycles, regardless of its counts."""
+        """Run each board for `cycles` cycles, regardless of its counts; one on which no line can count does not run."""
         start = Start(
             addresses=(),
             prior_address=prior_address,
@@ -162,7 +162,7 @@ def one_replica(machine: BM1Machine) -> BM1Machine:
 
 
 def joined(machines: Sequence[BM1Machine]) -> BM1Machine:
-    """Join the machines of all boards to the whole machine."""
+    """Return the machine with the lines of all boards, from the boards' machines."""
     first = machines[0]
     return BM1Machine(
         replace(first.parameters, lines=sum(machine.parameters.lines for machine in machines)),

@@ -1,4 +1,4 @@
-"""Inspection of a deployment: losses, accuracy, cycles, resources and energy, as text or as a JSON object."""
+"""Inspection of a BM1's deployment: losses, accuracy, cycles, resources and energy, as text or as a JSON object."""
 
 import json
 from dataclasses import asdict, dataclass, replace

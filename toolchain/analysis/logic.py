@@ -21,7 +21,7 @@ from toolchain.outputs.mif import LENGTH
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Device:
-    """An FPGA and its board; a design that needs more than the share `usable` cannot be placed and routed."""
+    """An FPGA and its board; a design that needs more than the share `usable` of it cannot be placed and routed."""
 
     name: str
     title: str
@@ -277,7 +277,7 @@ class Memories:
 
 
 def tables_of(p: BM1Parameters) -> list[EqualMemories]:
-    """Return the tables: one per column with one address, otherwise one per cell.
+    """Return the tables of codes: one per column if its cells share an address, otherwise one per cell.
 
     Every replica has its own tables, because it uses its own addresses. A prior of one row, whose MIF has one word, is
     not a memory but a constant.

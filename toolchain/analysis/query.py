@@ -170,7 +170,7 @@ def _machine_answer(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """The variables of a network and, if some are searched, which other variables a BM1 cannot know together."""
+    """The variables of a network and, if some are searched, which of the others cannot both be known to a BM1."""
 
     joint: JointDistribution
     searched: tuple[str, ...] = ()
@@ -211,7 +211,7 @@ class Contents:
 
 
 def contents(joint: JointDistribution, searched: Sequence[str] = (), known: Sequence[str] = ()) -> Contents:
-    """Return the variables of a network; `known` are the candidates for known variables; if empty, all others.
+    """Return the variables of a network; `known` are the candidates for known ones (if empty, all not searched).
 
     Raises:
         ToolchainError: A variable does not exist or is named twice, or there are too many candidates.

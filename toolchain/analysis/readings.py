@@ -20,7 +20,7 @@ from toolchain.models.model import Known, Model, PriorSelect
 
 MISSING: Final = -1
 MOST_FRAMES: Final = 100_000
-"""Maximum number of frames, because all are in memory with a row of every column's table."""
+"""Maximum number of frames, because all are kept in memory, each with a row of every column's table."""
 
 _WEIGHT_STEPS: Final = 500
 
@@ -84,7 +84,7 @@ def check_frames(frames: int) -> None:
 def sample_readings(
     model: Model, frames: int, *, seed: int, source: str = "", in_sequence: bool = False
 ) -> Readings:
-    """Draw the line of each frame, then its readings; a `prior_select` gets equally probable values.
+    """Draw the line of each frame, then its readings; if a variable selects the prior, its values are equally probable.
 
     With `in_sequence`, the line of a frame is drawn from the transition out of the line before, if the model has one.
     """

@@ -125,7 +125,7 @@ class PartFile:
     records: NDArray[np.void]
     """All records, mapped from the file, so that those which `add` writes later appear here too."""
     there: bytearray
-    """For each row, 1 if it has its record."""
+    """For each row, 1 if its record is in the file."""
     written: int = 0
     """Number of rows that `ready` has yielded."""
 
@@ -167,7 +167,7 @@ class PartFile:
         self.there[row] = 1
 
     def earlier(self, row: int) -> tuple[_Posterior, int] | None:
-        """Return posterior and cycles of a row if it has its record."""
+        """Return the posterior and cycles of a row, or None if its record is not in the file."""
         if not self.there[row]:
             return None
         posterior: NDArray[np.float64] = np.array(self.records[row]["posterior"])
@@ -306,7 +306,7 @@ _WRITERS: Final = {".npz": _archive, ".mcap": _bag}
 
 
 def check_request(path: Path, deployment: Deployment) -> None:
-    """Raise a BuildError, before a long run, if the output cannot be written or the machines read arrays."""
+    """Raise a BuildError, before a long run, if the output cannot be written or readings must be arrays."""
     if not deployment.machine.is_plain or deployment.prior is not None:
         raise BuildError(
             f"{deployment.directory} reads arrays of numbers (for each line or replica, or a prior), but the columns of a "

@@ -63,7 +63,7 @@ def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Chang
 
     Raises:
         BuildError: The sources contradict each other, or need another machine.
-        MifError: A memory is not that of this machine.
+        MifError: A memory's file does not fit this machine.
         DeploymentError: The deployment is missing or damaged.
     """
     deployment = load_deployment(directory, interrupted=True)

@@ -172,7 +172,7 @@ class LineBlock:
 
 
 def partition_lines(lines: int, count: int) -> tuple[LineBlock, ...]:
-    """Return blocks of `lines` lines for `count` boards, in order; the first `lines` mod `count` have one more line."""
+    """Divide `lines` lines among `count` boards, in order, or raise a BuildError; the first may get one more."""
     if not 1 <= count <= lines:
         raise BuildError(
             f"{lines} lines cannot be divided among {count} boards: expected 1 to {lines} partitions"
@@ -205,7 +205,7 @@ class BoardLayout:
     """The lines of each board, and the size of the register interface, which all boards share."""
 
     blocks: tuple[LineBlock, ...]
-    """Blocks of lines by board; the first one is one of the largest."""
+    """The block of lines of each board; none is larger than the first."""
     interface: tuple[int, int]
     """Numbers of input and result words of a board's registers."""
     reason: str

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 _FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path", "shared": "--per-cell"}
-"""Flags with other names than their fields."""
+"""The flags whose names do not follow from those of their fields."""
 
 
 URI: Final = typer.Option(help="rosbridge server of the readings.", metavar="ws://HOST:PORT|robot:NAME")
@@ -308,7 +308,7 @@ def _flag(key: str) -> str:
 
 
 def refused_option(reason: ValidationError) -> BuildError:
-    """Return the error for an option that pydantic refuses, with the flag of the field."""
+    """Return the error for an option that pydantic refuses, with the flag in place of the field's name."""
     detail = reason.errors(include_url=False)[0]
     key = str(detail["loc"][0]) if detail["loc"] else ""
     flag = {

@@ -44,7 +44,7 @@ class ColumnLoss:
     P exactly; all lines read the same k. (KL(P || Q) would be infinite if a tail became 0.)
     """
     dead_values: int
-    """Number of possible addresses that have code 0 on every line."""
+    """Number of values with a probability above 0 that have code 0 on every line."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

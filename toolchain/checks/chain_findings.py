@@ -2,7 +2,7 @@
 
 Zeros of a factor are clipped to the smallest chance that a code can express, so the chain does enter impossible states,
 but rarely. The error that results is computed exactly if there are few states; otherwise a finding says
-that it was not.
+that it was not computed.
 """
 
 import math
@@ -31,7 +31,7 @@ _LARGE_ERROR: Final = 0.01
 _STATE_BITS: Final = 20
 """Maximum number of bits of a state with which the check runs whether all states are connected."""
 _PATTERN_BITS: Final = 24
-"""Maximum for the same check of these bits plus the number of known variables whose readings may be missing."""
+"""The same check's maximum for the sum of these bits and the known variables whose readings may be missing."""
 _BLANKET_BITS: Final = 16
 """Maximum number of bits that share a factor with the bit of a move; the search for clips tries all their values."""
 _RELATED_BITS: Final = 2048
@@ -283,7 +283,7 @@ def _limits(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
 
 
 def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
-    """Find random numbers that boards, banks or CDEs share, that are related, or that repeat in a frame or in each."""
+    """Find random numbers that boards, banks or CDEs share, that are related, or that repeat in a frame or the next."""
     p, about = chain.machine.parameters, f"rng = {chain.machine.parameters.rng}"
     width, boards, sets = p.rng.lfsr_bits, p.chains, p.rng_banks * p.chains
     wider = "" if p.rng is RngKind.LFSR32 else "--rng lfsr32, or "

@@ -90,7 +90,7 @@ def check_deployment(directory: Path) -> list[Finding]:
 
 
 def refusal(reason: Exception, about: str) -> Finding:
-    """Return an exception as a finding: `about`, such as a model, cannot be built, or a deployment cannot be read."""
+    """Return an exception as the finding that `about`, a part of a model or a deployment, cannot be built or read."""
     return error(Check.CANNOT_BE_BUILT, about, str(reason).rstrip("."))
 
 
@@ -209,7 +209,7 @@ _WITHOUT_HEADER: Final = frozenset(
 )  # fmt: skip
 """Message types without a header in a package whose other types have one; no type of std_msgs has one."""
 _LEAST_TOLERANCE_S: Final = 0.005
-"""Minimum tolerance in seconds for messages sent together to be paired by their times of receipt."""
+"""Minimum tolerance, in seconds, with which messages sent together can be paired by their times of receipt."""
 
 
 def source_findings(deployment: Deployment) -> Iterator[Finding]:
