@@ -1,6 +1,6 @@
 """Case studies, each with a model, a simulator or a data reader, and a page that describes it.
 
-This module has the common flags of their commands.
+This module has the flags that their commands have in common.
 """
 
 import random

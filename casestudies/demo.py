@@ -26,18 +26,18 @@ from terminal.processes import Process, Screen
 from terminal.signals import run_async
 
 FIRST_TIMEOUT: Final = 180.0
-"""Seconds until the viewer's first result: before it, the deployment is built and kernels are compiled."""
+"""Seconds in which the viewer's first result must come; meanwhile the deployment is built and kernels are compiled."""
 PORT: Final = "9090"
 """Port of the hub in a demo that runs until Ctrl-C."""
 FIRST_RESULT: Final = r"^ *[0-9]+ "
-"""A viewer's line for a frame."""
+"""Pattern of the line that a viewer prints for a frame."""
 
 app = CommandLine()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """A case study in the form that the demo runs; its commands get `--uri` besides the options given here."""
+    """What the demo needs to run a case study; each of its commands gets `--uri` besides the options given here."""
 
     name: str
     topic: str
@@ -46,14 +46,14 @@ class Case:
     options: Sequence[str] = ()
     """Options of the build."""
     pointer: str = ""
-    """Advice, if any, at the end of the line with the page's address."""
+    """Advice, if any, that is printed after the address of the dashboard's page."""
     viewer: str
     viewing: Sequence[str] = ()
     """Options of the viewer."""
     publishers: Mapping[str, Sequence[str]]
     """The commands on the robot's side with their options, in the order of their start."""
     counts_frames: bool = True
-    """Whether viewer and master count the same frames, so that `--count` ends both; otherwise it ends only the viewer."""
+    """Whether the master counts the same frames as the viewer, so that it also gets `--count`, and ends by itself."""
 
 
 def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:
@@ -203,7 +203,7 @@ def _check_port(whose: str, port: int, otherwise: str) -> None:
 
 
 async def _load_kernels() -> None:
-    """Load the boards' kernels in a thread; master and boards, which are forked from this process, inherit them."""
+    """Load the emulated boards' kernels in a thread; master and boards, forked from this process, inherit them."""
     loop, loaded = asyncio.get_running_loop(), asyncio.Event()
 
     def load() -> None:

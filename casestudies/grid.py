@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grid:
-    """A grid over [x_low, x_high] and [y_low, y_high], in the map's units.
+    """A grid of cells over [x_low, x_high] and [y_low, y_high], in the units of a map.
 
     Cells are numbered from the lower left corner in row-major order, like the lines of the machine: line =
     row * width + column (row along y, column along x).
@@ -39,7 +39,7 @@ class Grid:
     def mean(self, posterior: Sequence[float]) -> tuple[float, float]:
         """Return the mean position (x, y) of a posterior over the cells' centres, in the map's units.
 
-        The posterior is float64[cells], row-major and not negative; it need not sum to 1, but not all of it is 0.
+        The posterior is float64[cells], row-major, of numbers from 0; it need not sum to 1, but one must be above 0.
         """
         total = math.fsum(posterior)
         by_row = [

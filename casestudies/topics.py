@@ -1,4 +1,4 @@
-"""Topics of case studies: publications that drop messages, readiness, and a listener that yields frames with their truth."""
+"""Topics of case studies: publications that may drop messages, readiness, and frames with their true positions."""
 
 import asyncio
 import contextlib
@@ -90,13 +90,13 @@ def run_viewer(watching: Coroutine[Any, Any, None], finish: Callable[[], None]) 
 
 
 SETTLED_S: Final = 3.0
-"""If a server does not list an advertised topic after this many seconds, it has refused it."""
+"""Seconds after which a server that does not list an advertised topic is known to have refused the topic."""
 
 
 async def report_refused(
     ros: Ros, topic: str, type_: str, otherwise: str = "publish arrays with --array"
 ) -> None:
-    """Warn if, according to rosapi, the server rejects an advertised topic; `otherwise` is the user's alternative."""
+    """Warn if the server does not list an advertised topic (rosapi); `otherwise` is what the user can do instead."""
     await asyncio.sleep(SETTLED_S)
     known = await ros.topic_type(topic)
     if known is None or (known and same_type(known, type_)):
@@ -110,15 +110,16 @@ async def report_refused(
 
 
 class LossyPublication:
-    """A publication that drops messages while the server is disconnected or slow, with one warning each time.
+    """A publication that drops messages while the server is disconnected or slow.
 
-    A message that is too large for the server is dropped, too.
+    A message that is too large for the server is dropped, too. The user is warned once of
+    slowness or size, until messages are published again.
     """
 
     def __init__(self, publication: Publication) -> None:
         """Wrap a publication."""
         self._publication = publication
-        # Whether the last message was dropped with a warning.
+        # Whether the last message was dropped because the server was slow, or because the message was too large.
         self._slow = self._large = False
 
     async def publish(self, message: Mapping[str, Any]) -> bool:
@@ -157,7 +158,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Instance:
-    """A frame's outcome and its true position.
+    """The outcome of a frame, heard on the topics of results, and the true position at its time.
 
     `truth` is None if no true pose matches the stamp. `truth_age_ns` is the age of the true pose relative to the
     frame's stamp, 0 if the stamps are equal.
@@ -174,7 +175,7 @@ class Instance:
 
     @property
     def report(self) -> FrameReport | None:
-        """The report, or None for a posterior that no `/bm/frame` announced."""
+        """The frame's report on `/bm/frame`, or None for a posterior that no report announced."""
         return self.heard.report if isinstance(self.heard, Posterior) else self.heard
 
 
@@ -207,14 +208,14 @@ def read_truth(message: dict[str, Any], topic: str) -> Truth:
 
 _QUEUE_SIZE: Final = 256
 _PATIENCE_S: Final = 1.0
-"""Seconds that a frame waits for its truth."""
+"""Maximum seconds that a frame waits for the true position at its time."""
 
 
 class Listener:
-    """The frames of a stack, each with its true position; created by `listen`.
+    """The frames that a running stack publishes, each with its true position; created by `listen`.
 
     If no true pose has exactly the frame's stamp, the newest earlier one is used if it is at most `tolerance_ns` older.
-    This serves messages without a header, which are stamped only when they reach the host.
+    This is for readings without a header, which are stamped only when they reach the host.
 
     Attributes:
         route: The true positions received, the newest last.
@@ -225,7 +226,7 @@ class Listener:
         self.route: deque[Truth] = deque(maxlen=100_000)
         self._heard = heard
         self._tolerance_ns = tolerance_ns
-        # Set by every truth; cleared by a frame whose truth did not come in time, so that later ones do not wait, too.
+        # Set by every true position; cleared by a frame for which none came in time, so that later frames do not wait.
         self._truths_come = False
         self._news = asyncio.Event()
         # The task that reads truths, from `follow` on; a message that is not a truth ends it with an error.
@@ -237,7 +238,7 @@ class Listener:
         return self._heard.announced_only
 
     async def next(self, limit_s: float) -> Instance:
-        """Wait for the next frame, then for its truth or a newer one.
+        """Wait for the next frame, then for a true position of its time or later; return the frame with a fitting one.
 
         Raises:
             NoResultError: No frame arrived within the limit, in seconds.
@@ -263,7 +264,7 @@ class Listener:
         return instance
 
     async def _wait_for_truth(self, stamp_ns: int) -> None:
-        """Wait for a true position of this time, or a newer one."""
+        """Wait at most `_PATIENCE_S` for a true position of this time or a later one."""
         try:
             async with asyncio.timeout(_PATIENCE_S):
                 while self._truths_come and self.route[-1].stamp_ns < stamp_ns:

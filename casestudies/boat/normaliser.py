@@ -38,7 +38,7 @@ def normalise_bearing(raw: float) -> int:
 
 
 def normalise(raw: tuple[float | None, ...]) -> tuple[int | None, ...]:
-    """Return the machine's readings for raw readings, both in the order of `SENSOR_NAMES`; None is a missing one."""
+    """Return the machine's readings from raw ones, both in the order of `SENSOR_NAMES`; None if missing."""
     return tuple(
         None
         if value is None
@@ -52,8 +52,8 @@ def normalise(raw: tuple[float | None, ...]) -> tuple[int | None, ...]:
 async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) -> None:
     """Normalise messages until cancelled; raise a BridgeError if no server answers at the URI.
 
-    A message with anything but finite numbers is dropped, and each cause is reported once. A missing reading stays
-    missing.
+    A message is dropped if a field is not a finite number, and each different error is reported once. A missing reading
+    stays missing.
     """
     from casestudies.topics import LossyPublication, connected, report_refused
 

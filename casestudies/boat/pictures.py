@@ -18,7 +18,7 @@ from terminal.pictures import new_figure, save_figure
 
 
 class StageKind(StrEnum):
-    """The parts of the system that the thesis measured, and the host's sockets, which it did not."""
+    """The parts of the system in which a frame spends time: those that the thesis measured, and the host's sockets."""
 
     ROSBRIDGE = "rosbridge"
     HOST = "between the host's processes"
@@ -27,13 +27,13 @@ class StageKind(StrEnum):
 
 
 THESIS_SHARES: Final = {StageKind.ROSBRIDGE: 0.9874, StageKind.COMPUTING: 0.0124, StageKind.REGISTERS: 0.0001}
-"""Shares of a cycle's time in the thesis (4.3)."""
+"""Shares of the time of a frame that the thesis reports (4.3)."""
 PCIE: Final = "pcie-gen2"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageShare:
-    """One stage of a frame: its mean over the frames that report it, and its share of all stages."""
+    """One stage of a frame: its mean time over the frames that report it, and its share of the sum of these means."""
 
     name: str
     part: StageKind
@@ -46,7 +46,7 @@ def _reported(field: str) -> Callable[[Instance], float | None]:
 
 
 def _of_computing(instance: Instance) -> tuple[float | None, float | None]:
-    """Split the wait for the boards into the time of computing and the time of the link, in us; None if not known."""
+    """Split the wait for the boards into the time of computing and that of the link, in us; None if not known."""
     if instance.report is None or (waited := instance.report.stages.compute) is None:
         return None, None
     own = instance.report.stages.boards_compute
@@ -72,7 +72,7 @@ _STAGES: Final[tuple[_Stage, ...]] = (
 
 
 def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
-    """Return the stages in order, except those that no published frame reports.
+    """Return the stages in order, except those that no frame with a posterior reports.
 
     `rosbridge out` is measured here, from the sending of a result to its arrival; the others come from
     `/bm/frame`.
@@ -83,8 +83,8 @@ def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
 def projected_shares(instances: Iterable[Instance], clock_hz: float) -> tuple[StageShare, ...]:
     """Return the stages as they would be with real boards; empty if the frames do not report cycles and bytes.
 
-    The time of computing is the boards' count of cycles at this clock. The time of the link is modelled: PCIe, with the
-    bytes that have moved. The times of host and rosbridge are measured.
+    The time of computing is the number of cycles that the boards counted, at this clock. The time of the link is that
+    of a model of PCIe for the bytes transferred. The times of host and rosbridge are measured.
     """
     stages = (
         _STAGES[0],
@@ -139,14 +139,14 @@ _PART_COLOURS: Final = {
 }
 _TRUTH_COLOUR: Final = "#ff4d4d"
 _EDGE: Final = 0.2
-"""Width of each edge as a share of the map's; labels within it are not centred."""
+"""Width of the strip along each edge in which labels are not centred, as a share of the map's width."""
 
 
 def far_apart(instances: Iterable[Instance]) -> tuple[Instance, ...]:
-    """Return `POSITIONS_SHOWN` results whose true positions are far from each other, in the order of time.
+    """Return at most `POSITIONS_SHOWN` results whose true positions are far from each other, in the order of time.
 
-    The first result is chosen, then repeatedly the one furthest from all those chosen. Results without a
-    truth are used only if there are no others.
+    The first result is chosen, then repeatedly the one furthest from those chosen before. Results without a truth are
+    used only if there are no others.
     """
     results = [instance for instance in instances if instance.posterior is not None]
     candidates = [instance for instance in results if instance.truth is not None] or results
@@ -158,7 +158,7 @@ def far_apart(instances: Iterable[Instance]) -> tuple[Instance, ...]:
 
 
 def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence[Truth] = ()) -> None:
-    """Draw figure 4.4: for each instance the true position and, next to it, the posterior over x and y.
+    """Draw figure 4.4: for each instance the true position on the map and, next to it, the posterior over x and y.
 
     The true positions of the whole route are drawn faintly.
 
@@ -202,7 +202,7 @@ def draw_shares(
 ) -> None:
     """Draw figure 4.5, the mean time of each stage and its share of a frame's time, or raise an OutputError.
 
-    The note is below the axis. The legend shows the share of each part, and its share in the thesis if `beside` has it.
+    `note` is below the axis. The legend has the share of each part and, if it is in `beside`, the one in the thesis.
     """
     figure = new_figure(8.4, 1.5 + 0.42 * max(len(shares), 1))
     axes = figure.subplots()

@@ -3,8 +3,8 @@
 The boat localisation problem of thesis 2.1.2.1 with the numbers of its published version (Bessiere et al.,
 Bayesian Programming, ch. 7). Distances are in map units, bearings in degrees.
 
-Messages with named fields (`boat_msgs/Raw`, `boat_msgs/Sensors`) are easy to read and carry a time stamp. A
-ROS server accepts only types of installed packages; on one without `boat_msgs` the same numbers are sent as
+Messages with named fields (`boat_msgs/Raw`, `boat_msgs/Sensors`) are easy to read and carry a time stamp. A ROS
+server accepts only types of installed packages; to one without `boat_msgs`, the same readings are sent as
 std_msgs/Float64MultiArray, in the order of `SENSOR_NAMES`.
 """
 
@@ -25,9 +25,9 @@ BEACON_NAMES: Final = ("beacon1", "beacon2", "beacon3")
 DISTANCE_NAMES: Final = ("D1", "D2", "D3")
 BEARING_NAMES: Final = ("B1", "B2", "B3")
 SENSOR_NAMES: Final = DISTANCE_NAMES + BEARING_NAMES
-"""Names of the sensors, in the order of the machine's columns and of the numbers in an array message."""
+"""Names of the sensors, in the order of the machine's columns and of the readings in an array message."""
 LONGEST_DISTANCE: Final = 100
-"""Readings are whole numbers 0..100; longer distances, such as those to the map's far corners, are clamped."""
+"""Largest distance reading, in map units; longer distances, such as from the map's far corners, are clamped to it."""
 BEARING_SIGMA: Final = 10.0
 """Standard deviation of a bearing, in degrees."""
 
@@ -61,9 +61,9 @@ ARRAY_TYPE: Final = "std_msgs/Float64MultiArray"
 TRUE_POSE_TOPIC: Final = "/boat/true_pose"
 TRUE_POSE_TYPE: Final = "geometry_msgs/PoseStamped"
 SET_POSE_TOPIC: Final = "/boat/set_pose"
-"""Topic of poses to which anybody may move the boat, of the same type as the true pose."""
+"""Topic on which anybody may publish a pose to move the boat there, of the same type as the true pose."""
 DRIVE_TOPIC: Final = "/cmd_vel"
-"""Topic of the velocity at which anybody may drive the boat."""
+"""Topic on which anybody may publish a velocity to drive the boat."""
 DRIVE_TYPE: Final = "geometry_msgs/Twist"
 COMPASS_TOPIC: Final = "/boat/imu"
 COMPASS_TYPE: Final = "sensor_msgs/Imu"
@@ -151,7 +151,7 @@ def true_pose(x: float, y: float, head: dict[str, Any], heading: float = 0.0) ->
 
 
 def compass(heading: float, head: dict[str, Any]) -> dict[str, Any]:
-    """Return a heading in radians as a sensor_msgs/Imu, which marks what it does not measure by a covariance of -1."""
+    """Return a heading in radians as a sensor_msgs/Imu; a covariance of -1 marks what is not measured."""
     nothing = {"x": 0.0, "y": 0.0, "z": 0.0}
     unknown = [-1.0, *[0.0] * 8]
     return {

@@ -1,4 +1,4 @@
-"""Simulator in place of Gazebo: a boat that sails, is driven or is dragged, and publishes its sensors' readings.
+"""Simulator in place of Gazebo: a boat sails, or is driven or dragged, and its sensors' readings are published.
 
 /cmd_vel ───────────────────────────▶ Boat ─▶ /boat/true_pose, /boat/imu, /boat/raw at each step
 /boat/set_pose, services /boat/... ─▶                                           and at once after these
@@ -70,9 +70,9 @@ _SWITCH_TYPE = "std_srvs/SetBool"
 _SHORE = 2.0  # waypoints are at least this far from the map's edge
 # Minimum number of seconds before a change causes another reading: a mouse moves 1000 times a second.
 _SHORTEST = 0.02
-_POSE_BYTES = 65_536  # a larger message on the topics that move the boat is no such message, and is discarded
+_POSE_BYTES = 65_536  # a larger message on the topics that move the boat is neither pose nor velocity, and is discarded
 DRIVE_TIMEOUT: Final = 1.0
-"""Seconds after a velocity until the boat stops if no other arrives, as robots do."""
+"""Seconds after a velocity command until the boat stops, unless another command arrives, as robots do."""
 
 
 class Boat:
@@ -87,7 +87,7 @@ class Boat:
     """
 
     def __init__(self, seed: int, speed: float) -> None:
-        """Put the boat in the middle of the map; `speed` is its highest, in map units per second."""
+        """Put the boat in the middle of the map; `speed` is its top speed, in map units per second."""
         self._random = random.Random(seed)
         self._speed = speed
         self.x = (MAP_LOW + MAP_HIGH) / 2
@@ -179,8 +179,8 @@ async def simulate(
     """Sail and publish `count` readings, or until cancelled; raise a BridgeError if no server answers at the URI.
 
     Each step publishes true pose, compass and then the readings, with the same stamp. The readings on `topic` are a
-    `boat_msgs/Raw`, or with `array` a std_msgs/Float64MultiArray. A change of the boat from outside is published at
-    once, between steps. While the server is away, the boat sails on.
+    `boat_msgs/Raw`, or with `array` a std_msgs/Float64MultiArray. If somebody else moves the boat or sets a switch,
+    readings are also published at once, between steps. While the server is away, the boat sails on.
     """
     from bridge.stamps import header
     from casestudies.topics import LossyPublication, connected, report_refused
@@ -220,7 +220,7 @@ async def simulate(
 
 
 async def _is_changed_before(due: float, boat: Boat) -> bool:
-    """Wait until the boat is changed, at most until `due` (monotonic seconds); return whether it was changed."""
+    """Wait until somebody changes the boat, at most until `due` (monotonic seconds); return whether somebody did."""
     try:
         async with asyncio.timeout(due - time.monotonic()):
             await asyncio.sleep(_SHORTEST)

@@ -1,4 +1,4 @@
-"""Viewer of the boat's posteriors next to the truth; it needs only three topics."""
+"""Viewer of the boat's posteriors next to its true positions, from the topics of both and of frame reports."""
 
 import math
 from collections import deque
@@ -26,7 +26,7 @@ POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
 PROJECTED_PICTURE: Final = "figure-4.5-projected.png"
 CLOCK_HZ: Final = 100e6
-"""Clock of the boards in the projected figure, as in `toolchain inspect`; the thesis does not state a clock."""
+"""Clock, as in `toolchain inspect`, in the figure projected to real boards; the thesis does not state one."""
 Clock: TypeAlias = Annotated[
     float,
     typer.Option(
@@ -41,7 +41,7 @@ Numbers = dict[str, Any]
 
 
 def numbers_of(instance: "Instance") -> Numbers:
-    """Return a frame in numbers, or raise an OutputError if its posterior is not over a map.
+    """Return a frame as a JSON object, or raise an OutputError if its posterior is not over a map.
 
     `true_cell` and `mean` are indices of cells, from the lower left corner, as in the objects of `listen --json`;
     `true_position` and `mean_value` are the positions in map units. `distance_cells` is the distance from the
@@ -101,11 +101,11 @@ def line(numbers: Numbers) -> str:
 
 
 class BoatViewer:
-    """The frames of a run and their numbers, from which the pictures are drawn.
+    """The frames that arrive while the viewer runs, also as JSON objects, and the pictures drawn from them.
 
     Attributes:
         instances: The frames, the newest last; only the last `KEPT` if the viewer runs until Ctrl-C.
-        numbers: The numbers of each of these frames.
+        numbers: Each of these frames as a JSON object.
         frames: The number of frames.
         results: The number of frames with a posterior.
     """
@@ -196,7 +196,7 @@ class BoatViewer:
         return tuple(written)
 
     def medians(self) -> tuple[float | None, float | None]:
-        """Return the median distance in cells and the median time in milliseconds, where they are known."""
+        """Return the median distance in cells and the median time in milliseconds of the frames; None if not known."""
         distances, times = (
             [each[key] for each in self.numbers if each[key] is not None]
             for key in ("distance_cells", "time_ms")
@@ -275,7 +275,7 @@ def boat_viewer(
 
 
 def _finish(viewer: BoatViewer, out: Path | None, numbers: Path | None) -> None:
-    """Print the summary, and write numbers and pictures."""
+    """Print the summary, and write the JSON object and the pictures that were asked for."""
     if not viewer.results:
         return
     distance, time = viewer.medians()

@@ -1,4 +1,4 @@
-"""Comparison of the machines' disparities with float64 fusion, the truth and the thesis: lines and a picture."""
+"""Comparison of the machines' disparities with float64 fusion, the truth and the thesis, printed and drawn."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,14 +12,14 @@ from terminal.pictures import new_figure, save_figure
 THESIS_S: Final = 0.6
 """Seconds for the matching costs of a pair on the thesis's host (4.4); the thesis does not give the images' size."""
 UNKNOWN: Final = -1.0
-"""Disparity of a pixel without a posterior."""
+"""The disparity that stands for a pixel without a posterior."""
 _BAD: Final = 1.0
-"""Pixels by which a disparity may be wrong without being counted as bad."""
+"""Largest error in pixels for which a disparity is not counted as bad."""
 HEADING: Final = "pair  host (ms)  pairs/s  projected/s    cycles  bad float64  bad BM1  agreement  variation"
 
 
 def most_probable(posterior: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the most probable disparities of float64[disparities, height, width]; `UNKNOWN` where all are 0."""
+    """Return pixels' most probable disparities, of float64[disparities, height, width]; `UNKNOWN` where all are 0."""
     return np.where(posterior.any(axis=0), posterior.argmax(axis=0), UNKNOWN)
 
 

@@ -1,4 +1,4 @@
-"""Images as ROS messages: sensor_msgs/Image read and written, stereo_msgs/DisparityImage written, and pairs by stamp."""
+"""Images as ROS messages: read and write sensor_msgs/Image, write stereo_msgs/DisparityImage, pair by stamps."""
 
 import base64
 import binascii
@@ -26,7 +26,7 @@ class BadImageError(Exception):
 
 
 def read_image(message: Mapping[str, Any], *encodings: str) -> NDArray[Any]:
-    """Return a sensor_msgs/Image as an array [height, width], or raise a BadImageError if it is no such image."""
+    """Return a sensor_msgs/Image as an array [height, width], or raise a BadImageError; `encodings` are accepted."""
     encoding = message.get("encoding")
     if encoding not in encodings:
         raise BadImageError(f"its encoding is {str(encoding)[:20]!r}, expected {' or '.join(encodings)}")
@@ -114,7 +114,7 @@ class ImagePairs:
     """The images of two cameras, paired by equal stamps.
 
     Attributes:
-        unpaired: Number of images of the left and right camera since the last pair; a silent camera stays at 0.
+        unpaired: The number of images of the left and of the right camera since the last pair; 0 for a silent camera.
     """
 
     def __init__(self) -> None:
@@ -151,7 +151,7 @@ class ImagePairs:
         return StereoImages(stamp_ns=stamp_ns, head=left["header"], left=images[0], right=images[1])
 
     def silence(self, left: str, right: str) -> str:
-        """Return why no pair comes, in terms of the two topics."""
+        """Return a sentence on why no pair comes, which names the topics `left` and `right`."""
         if all(self.unpaired):
             return f"images come on {left} and {right}, but no two with equal stamps: synchronise the cameras"
         if not any(self.unpaired):

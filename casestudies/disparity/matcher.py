@@ -1,4 +1,4 @@
-"""The matcher: a stereo pair in, its likelihoods to the boards in tiles, the disparity image out.
+"""The matcher: it reads stereo pairs, sends their likelihoods to the boards in tiles, and publishes disparity images.
 
 left and right image ─▶ filters, matching costs ─▶ tiles of likelihoods ─▶ stack, boards
 disparity image ◀── most probable disparities ◀── posteriors of a tile ◀── /bm/frame, /BMresults
@@ -52,10 +52,10 @@ from terminal.connection import report_connection
 from terminal.output import check_writable, say, warn
 
 WINDOW: Final = 8
-"""Tiles under way at once, so that processes and boards work at the same time."""
+"""Maximum number of tiles sent and not yet answered, so that processes and boards work at the same time."""
 PICTURE: Final = "disparity.png"
 _REPEAT_S: Final = 2.0
-"""Seconds without a result after which the tiles under way are sent again."""
+"""Seconds without a result after which the tiles that are not answered yet are sent again."""
 _SILENT_S: Final = 5.0
 """Seconds without a pair after which the matcher says which camera is silent."""
 
@@ -72,7 +72,7 @@ def tiles_of(codes: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
 
 
 class Stack:
-    """The stack as the matcher uses it: tiles of likelihoods out, posteriors in."""
+    """The running stack (master and boards), to which the matcher sends tiles of likelihoods for posteriors."""
 
     def __init__(
         self, tiles: LossyPublication, heard: Posteriors, ros: Ros, *, first_limit_s: float, limit_s: float
@@ -81,12 +81,12 @@ class Stack:
         self._heard = heard
         self._ros = ros
         self._limits_s = first_limit_s, limit_s
-        # True from the first result on. Until then only one tile is under way: the master may be absent, or its boards not
-        # programmed yet, and what is sent again meanwhile must not fill its queue.
+        # True from the first result on. Until then only one tile is sent: the master may be absent, or its boards not
+        # programmed yet, and what is sent again meanwhile must not fill the master's queue.
         self._answers = False
 
     async def posteriors(self, tiles: NDArray[np.uint8]) -> tuple[NDArray[np.float64], int]:
-        """Send the tiles, uint8[tiles, filters, pixels, disparities], and return their posteriors and the cycles.
+        """Send the tiles, uint8[tiles, filters, pixels, disparities], and wait for their posteriors.
 
         Each tile has its own stamp, which identifies its result; late results of an earlier image are skipped.
 
@@ -141,7 +141,7 @@ class Matcher:
     """The received stereo images, and their disparities as the machines compute them.
 
     Attributes:
-        matched: The newest pair, for the picture.
+        matched: The newest pair with its posteriors, for the picture; None before the first.
         pairs: Number of pairs matched.
     """
 
@@ -277,7 +277,7 @@ class Matcher:
                     task.cancel()
 
     def finish(self, out: Path | None) -> None:
-        """Print the newest pair's times beside the thesis's, and draw it."""
+        """Print the times of the newest pair next to the time in the thesis, and draw the pair."""
         if self.matched is None:
             return
         print(self.matched.summary())

@@ -1,4 +1,4 @@
-"""The host's part: three filters for each image, matching costs, likelihoods, and their fusion in float64 (thesis 4.4).
+"""What the host computes: filters of images, matching costs, likelihoods, and fusion in float64 (thesis 4.4).
 
 Everything is computed for all pixels and disparities at once. A cost volume is float32[disparities, height, width].
 """
@@ -11,19 +11,20 @@ from numpy.typing import NDArray
 FILTERS: Final = ("gradient_x", "gradient_y", "surround")
 """The sensors of the machine, one for each filter.
 
-The derivatives across and down, and the difference between a small and a large surround (a Laplacian). None of them
-sees the brightness that the cameras do not share, and their noise is nearly independent, as naive fusion assumes.
+The derivatives across and down, and the difference between a small and a large surround (a Laplacian). None of the
+filters responds to a difference in brightness between the cameras, and their noise is nearly independent, as naive
+fusion assumes.
 """
 SCALES: Final = (2.0, 2.0, 4.0)
 """Mean matching cost of each filter at the true disparity, in grey levels."""
 OUTLIER: Final = 0.05
-"""Likelihood of any cost at the true disparity, relative to that of cost 0: occlusions, reflections."""
+"""Likelihood added to every cost at the true disparity, relative to that of cost 0, for occlusions and reflections."""
 WINDOW: Final = 2
 """Pixels on each side of a pixel over which a cost is averaged."""
 
 
 def box_sum(values: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
-    """Return the sums over windows of 2 * reach + 1 in the last two dimensions, cut off at the borders."""
+    """Return sums over windows of 2 * reach + 1 values in each of the last two dimensions, cut off at the borders."""
     for axis in (-1, -2):
         size = values.shape[axis]
         zero = np.zeros_like(np.take(values, [0], axis))

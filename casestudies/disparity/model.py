@@ -19,10 +19,10 @@ TRUTH_TOPIC: Final = "/stereo/true_disparity"
 DISPARITY_TOPIC: Final = "/stereo/disparity"
 TILE_TOPIC: Final = "/disparity/likelihoods"
 TILE_TYPE: Final = "disparity_msgs/Likelihoods"
-"""A header, and a `uint8[]` named after each filter: a byte for each pixel and disparity, 255 for a pixel's likeliest."""
+"""A header, and a `uint8[]` named after each filter: a likelihood per pixel and disparity; the largest is 255."""
 
 _COSTS: Final = 64
-"""Number of the costs in the tables, which describe the model; a machine that gets likelihoods has no tables."""
+"""Number of costs in the tables, which are only for the model: a machine that gets likelihoods has no tables."""
 
 
 def model(disparities: int = DISPARITIES) -> Question:

@@ -1,4 +1,4 @@
-"""Renderer of stereo pairs: spheres and boxes of solid texture before a wall, seen by two rectified cameras.
+"""Renderer of stereo pairs: spheres and boxes with a solid texture in front of a wall, seen by two rectified cameras.
 
 Positions are in metres, from the left camera: x to the right, y down, z forward. The right camera is `BASELINE` to the
 right of the left one.
@@ -19,7 +19,7 @@ FOCAL: Final = 1.0
 NOISE: Final = 1.5
 """Standard deviation of the cameras' noise, in grey levels."""
 RIGHT_GAIN: Final = 0.95
-"""Brightness of the right image relative to the left: two cameras are never equal."""
+"""Brightness of the right image relative to the left one, because two cameras are never equal."""
 _OCTAVES: Final = tuple(1.6 / 2**octave for octave in range(8))
 """Periods of the texture, in metres."""
 _TOLERANCE: Final = 1e-6
@@ -28,7 +28,7 @@ _TOLERANCE: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pair:
-    """A rectified pair of images, and the truth about the left one."""
+    """A rectified pair of images, and the true disparities and occlusions of the left one."""
 
     left: NDArray[np.uint8]
     """uint8[height, width]: grey levels."""
@@ -87,7 +87,7 @@ class Scene:
         self._lattices = random.uniform(-1, 1, (len(_OCTAVES), 32, 32, 32))
 
     def pair(self, number: int, width: int, height: int) -> Pair:
-        """Render the pair of this number, from 0: both images, with noise, and the truth."""
+        """Render pair `number`, counted from 0: both images, with noise, and the truth about the left one."""
         things = self._things(number)
         down, across = np.mgrid[:height, :width] + 0.5
         focal = FOCAL * width

@@ -1,4 +1,4 @@
-"""Conversion of the downloaded data set into CSV files, with a line for each second in which a robot hardly moved.
+"""Conversion of the downloaded data set MR.CLAM into CSV files, with a row per second in which a robot hardly moved.
 
 python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR
 """
@@ -29,7 +29,7 @@ LEAST_LANDMARKS: Final = 3
 MOST_MOVED_M: Final = 0.12
 WINDOW_S: Final = 1.0
 _REFERENCE_GAP_S: Final = 0.2
-"""Maximum time in seconds between two positions to interpolate between them."""
+"""Maximum time in seconds between two positions of a track for positions in between to be interpolated."""
 _REFERENCE_STD_M: Final = 0.001
 """Precision of the motion capture in metres, from the data set's page."""
 _SUBJECTS: Final = range(1, 21)
@@ -52,7 +52,7 @@ class Track:
         return x, y, heading
 
     def known(self, begin: float, end: float) -> bool:
-        """Return whether the samples between two times have no gaps."""
+        """Return whether the track has no gap between two times."""
         inside = self.time[(self.time > begin) & (self.time < end)]
         around = np.concatenate((self.time[self.time <= begin][-1:], inside, self.time[self.time >= end][:1]))
         ends_known = len(around) > 1 and around[0] <= begin and around[-1] >= end
@@ -161,7 +161,7 @@ def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[l
 
 
 def windows(track: Track, measured: Sequence[Measured]) -> tuple[list[Window], Counter[str]]:
-    """Return the seconds in which the robot hardly moved and saw enough landmarks, and count the others by reason."""
+    """Return the seconds in which the robot hardly moved and saw enough landmarks, and count the rest by reason."""
     kept: list[Window] = []
     left_out: Counter[str] = Counter()
     if not measured:

@@ -1,7 +1,7 @@
 """The robot's model: P(range | cell) and P(bearing | cell) for each landmark, with an outlier floor.
 
-Columns are range_6, bearing_6, range_7, bearing_7, ... for the landmarks in the order of the file; line = y * width
-+ x from the lower left corner. Readings of a landmark that is not seen are missing.
+The columns are range_6, bearing_6, range_7, bearing_7, ... for the landmarks in the order of the landmarks' file. The
+line of a cell is y * width + x, from the lower left corner. Readings of a landmark that is not seen are missing.
 """
 
 import math
@@ -74,8 +74,9 @@ def model(
             bits round 1e-3 to 0, and then a single outlier makes every line impossible.
         range_step: Metres between distinguishable ranges, from 0; longer ranges are clamped.
         range_values: The number of distinguishable ranges.
-        bearing_values: The number of distinguishable bearings in a turn; readings are radians, any turn.
-        fit: The file that `toolchain fit` learned from a recording, instead of sigmas and floors set by hand.
+        bearing_values: The number of distinguishable bearings in a turn; readings are radians, plus any number of
+            turns.
+        fit: A file written by `toolchain fit`, whose sigmas and outliers replace those set by hand.
 
     Raises:
         ModelError: The file does not contain landmarks, or a size is not positive.

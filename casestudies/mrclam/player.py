@@ -34,7 +34,7 @@ SIGHTINGS_TOPIC: Final = "/mrclam/sightings"
 SIGHTINGS_TYPE: Final = "mrclam_msgs/Sightings"
 MAP_FRAME: Final = "map"
 LANDMARKS: Final = range(6, 21)
-"""The data set's numbers of the 15 landmarks; 1 to 5 are the robots."""
+"""The numbers of the 15 landmarks in the data set, in which 1 to 5 are the robots."""
 
 SIGHTINGS_MSG: Final = (
     "# mrclam_msgs/Sightings: range (m) and absolute bearing (rad, counter-clockwise from +x) of the landmarks "
@@ -59,7 +59,7 @@ class RecordedFrame:
     x: float
     y: float
     readings: Mapping[str, float]
-    """Ranges in metres and absolute bearings in radians, `range_6` and `bearing_6`, of the landmarks that were seen."""
+    """Ranges in metres and absolute bearings in radians of the landmarks that were seen, by names such as `range_6`."""
 
 
 def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
@@ -88,7 +88,7 @@ def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
 
 
 LOST_DISTANCE: Final = 9.0
-"""Distance in metres that counts for a frame without a result: the width of the area."""
+"""Distance in metres with which a frame without a result enters the median: the width of the area."""
 _REPEAT_S: Final = 1.0
 """Seconds between publications of the first frame, until its result arrives."""
 

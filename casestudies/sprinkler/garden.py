@@ -1,4 +1,4 @@
-"""The garden in place of a robot: each morning it has rained or the sprinkler was on, and the grass is wet or dry."""
+"""A simulated garden in place of a robot: rain, sprinkler and grass of each morning, drawn from the model."""
 
 import asyncio
 import random
@@ -26,7 +26,7 @@ def mornings(seed: int) -> Iterator[tuple[int, int, int]]:
 
 
 async def publish_mornings(uri: str, *, seed: int, rate: float, count: int | None = None) -> None:
-    """Publish the grass of `count` mornings, or of all until cancelled; a BridgeError if no server answers at the URI."""
+    """Publish the grass of `count` mornings, or until cancelled; a BridgeError if no server answers at the URI."""
     from casestudies.topics import LossyPublication, connected
 
     async with connected("sprinkler-garden", "the grass was published", uri) as (ros, readiness):

@@ -1,6 +1,6 @@
 """The sprinkler's network P(R) P(S | R) P(G | S, R), its question P(R | G), and its topics (thesis 2.1.3.1).
 
-R: it has rained; S: the sprinkler was on; G: the grass is wet.
+R: whether it has rained; S: whether the sprinkler was on; G: whether the grass is wet.
 """
 
 from functools import cache

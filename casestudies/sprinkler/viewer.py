@@ -1,4 +1,4 @@
-"""Viewer of the sprinkler's samples: the estimates of P(R | G) from them, and their picture; it needs only topics."""
+"""Viewer of the samples that a BM2 publishes for the sprinkler: estimates of P(R | G) from them, and a picture."""
 
 import math
 from collections import deque
@@ -30,13 +30,13 @@ HEADING: Final = "frame  grass  P(R = 1)   error   exact  effective samples"
 GRASS: Final = ("dry", "wet")
 """The states of G."""
 _SIZES: Final = (2, 2, 2)
-"""Numbers of values of the variables R, S, G of a sampled state."""
+"""The number of values of each variable, R, S and G, in a sampled state."""
 _R, _G = 0, 2
 _COLOURS: Final = ("#aa7744", "#4477aa")
 _POINTS: Final = 200
-"""Number of points of a curve."""
+"""Number of points at which the running estimate of a frame is drawn."""
 _WAITING: Final = 4
-"""Number of messages of samples that wait for their frame; if none of them fits a frame, its samples are lost."""
+"""Maximum number of sample messages that wait for their frame; if none of them fits a frame, its samples are lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,15 +45,15 @@ class FrameSummary:
 
     number: int
     grass: int
-    """G, the value of the grass."""
+    """The value of G in this frame: 0 for dry, 1 for wet grass."""
     share: float
-    """P(R = 1) on `/BMresults`."""
+    """P(R = 1) in the posterior on `/BMresults`."""
     error: float
-    """Standard error of `share` on `/bm/frame`; 0.5, the largest possible, if it is not stated."""
+    """Standard error of `share`, from `/bm/frame`; 0.5, the largest possible, if that does not state it."""
     effective: float
-    """Effective samples on `/bm/frame`; 1 if they are not stated."""
+    """Number of effective samples, from `/bm/frame`; 1 if that does not state it."""
     curve: NDArray[np.int64]
-    """int64[points, 2]: the number of samples so far, and how many have R = 1; the last point is the whole frame."""
+    """int64[points, 2]: a number of samples from the first on, and how many of these have R = 1; last, all samples."""
 
 
 def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> FrameSummary:
@@ -72,13 +72,13 @@ def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> FrameSummary:
 
 
 def mean_and_error(frames: Sequence[FrameSummary]) -> tuple[float, float]:
-    """Return the mean P(R = 1) of at least one frame, and its standard error."""
+    """Return the mean P(R = 1) of at least one frame, and the standard error of this mean."""
     mean = math.fsum(frame.share for frame in frames) / len(frames)
     return mean, math.sqrt(math.fsum(frame.error**2 for frame in frames)) / len(frames)
 
 
 def draw(path: Path, frames: Sequence[FrameSummary]) -> None:
-    """Draw the running estimates over the samples, next to the exact answers, or raise an OutputError."""
+    """Draw each frame's estimate against the number of samples, and the exact P(R = 1), or raise an OutputError."""
     figure = new_figure(8, 4.6)
     axes = figure.subplots()
     for grass, (name, colour) in enumerate(zip(GRASS, _COLOURS, strict=True)):
@@ -106,7 +106,7 @@ def draw(path: Path, frames: Sequence[FrameSummary]) -> None:
 
 
 class SamplesViewer:
-    """The frames of a run, from which estimates and picture are made.
+    """The frames that arrive while the viewer runs, from which it makes the estimates and the picture.
 
     Attributes:
         frames: The frames whose samples differ from those of all earlier frames, the newest last.
@@ -119,7 +119,7 @@ class SamplesViewer:
         self.results = 0
         self._count = count
         self._seen: set[int] = set()
-        self._unclaimed: list[NDArray[np.int64]] = []  # samples without their frame, in the order of arrival
+        self._unclaimed: list[NDArray[np.int64]] = []  # without a frame yet, in the order of arrival
 
     async def watch(self, uri: str, *, first_limit_s: float, limit_s: float) -> None:
         """Listen until all results have arrived, and print a line for each.

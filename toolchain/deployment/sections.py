@@ -450,7 +450,7 @@ class TopicsSection(Section):
 
 
 def parse_interface(text: str) -> tuple[int, int]:
-    """Return the numbers of inputs and results in an interface such as `20x1200` (thesis 3.2), or raise a ValueError."""
+    """Return the counts of inputs and results in an interface such as `20x1200` (thesis 3.2), or raise a ValueError."""
     match = _INTERFACE.fullmatch(text)
     if not match:
         raise ValueError(f"{text!r} is not {_AN_INTERFACE}")

@@ -77,7 +77,7 @@ class Support:
 
 
 def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> TrueCells:
-    """Return the true position in each of `rows` rows; `columns` has the true values of each dimension, by its label."""
+    """Return the true position in each of `rows` rows; `columns` has the true values of each dimension by label."""
     places = np.array(
         [[_position(dimension, value) for value in columns[dimension.label]] for dimension in model.searched]
     ).reshape(len(model.searched), rows)

@@ -45,7 +45,7 @@ class Memory:
     board: int | None = None
     """The board that has this memory, or None if all boards have the same."""
     section: str = ""
-    """The section of the programming file with the memory's codes; empty for seeds, which follow from the parameters."""
+    """The section of the programming file with the memory's codes; empty for seeds, which follow from parameters."""
 
     def lines(self) -> Iterator[str]:
         """Yield the MIF, in canonical form."""
