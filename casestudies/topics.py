@@ -112,8 +112,8 @@ async def report_refused(
 class LossyPublication:
     """A publication that drops messages while the server is disconnected or slow.
 
-    A message that is too large for the server is dropped, too. The user is warned once of
-    slowness or size, until messages are published again.
+    A message that is too large for the server is dropped, too. The user is warned once of slowness, and once of size,
+    until messages are published again.
     """
 
     def __init__(self, publication: Publication) -> None:
