@@ -70,7 +70,8 @@ _SWITCH_TYPE = "std_srvs/SetBool"
 _SHORE = 2.0  # waypoints are at least this far from the map's edge
 # Minimum number of seconds before a change causes another reading: a mouse moves 1000 times a second.
 _SHORTEST = 0.02
-_POSE_BYTES = 65_536  # a larger message on the topics that move the boat is not one of theirs, and is discarded
+# A larger message on the topics that move the boat is neither a pose nor a velocity, and is discarded.
+_POSE_BYTES = 65_536
 DRIVE_TIMEOUT: Final = 1.0
 """Seconds after a velocity command until the boat stops, unless another command arrives, as robots do."""
 
