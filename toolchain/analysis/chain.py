@@ -229,7 +229,7 @@ def chain_error(machine: BM2Machine, model: NetworkModel, *, samples: int) -> Ch
         evidence = dict(zip(p.known, addresses, strict=True))
         chain = ExactChain(machine, evidence)
         state = start_state(machine, evidence)
-        if state is None:  # its probability is a rounding error
+        if state is None:  # the reading's probability is a rounding error
             continue
         stationary = chain.posterior(chain.law)
         shares = chain.effective()

@@ -61,8 +61,8 @@ class EmulatedBoards:
         self.max_cycles = max_cycles
         self.stop = stop
         self._ends = np.cumsum([machine.parameters.lines for machine in machines])[:-1]
-        # Counters that never stop a run of a given length. Frames are stopped by the target, so their results
-        # do not change.
+        # Counters so wide that they never stop `run_for`. They do not change frames, which the target stops
+        # earlier.
         self._kernels = [
             make_kernel(
                 replace(machine, parameters=replace(machine.parameters, counter_bits=COUNTER_BITS_MAX)),

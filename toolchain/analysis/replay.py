@@ -207,7 +207,7 @@ def replay(
         _WRITERS[output.suffix](output, deployment, frames) as write,
     ):
         if deployment.machine.rng_reset is RngReset.FREE:
-            part.there[:] = bytes(len(frames))  # the state of the generators is not in the records
+            part.there[:] = bytes(len(frames))  # all again: records lack the generators' state
         missing = [row for row, there in enumerate(part.there) if not there]
         begun(len(frames) - len(missing))
 

@@ -79,7 +79,7 @@ def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Chang
         edits += edit
     boards = []
     for board, old, image in zip(changed.boards, images, new, strict=True):
-        # images[0] of a BM1 has the model's hash from the package; a BM2 has no source of which values are possible
+        # a BM1's package has the model's hash, as images[0] has; no source of a BM2 says which values are possible
         same_model = changed.machine.type == "BM1" and old.model_hash == images[0].model_hash
         if not same_model and old.image_hash not in {board.image_hash, image.image_hash}:
             raise other_image(changed.directory / board.image, old.image_hash, board.image_hash)

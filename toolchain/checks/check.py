@@ -144,7 +144,7 @@ def _same_readings(deployment: Deployment) -> Iterator[Finding]:
     """Find variables that read the same path in messages of the same topic."""
     readers: dict[tuple[int, str], list[str]] = {}
     for variable in deployment.variables:
-        # A bare name as a path is searched for like the name itself.
+        # A path that is a bare name finds the same field as a variable of that name without a path.
         readers.setdefault((variable.source, variable.path or variable.name), []).append(variable.name)
     for (_, path), names in readers.items():
         if len(names) > 1:

@@ -78,7 +78,7 @@ def memories(
         before, date = _lines(directory), build_date(model_file(model))
         changes = regenerate_memories(directory, source, flags=flags.section(old.model.bits), build_date=date)
         _print_changes(changes, before, _lines(directory), verbose=verbose)
-        # the parameters of the build are not stored, so images that differ may be due to them or to the model
+        # the parameters of the build are not stored, so images may differ from the build's by them or by the model
         new = load_deployment(directory, images=False)
         built = [(one.built_hash, two.image_hash) for one, two in zip(old.boards, new.boards, strict=True)]
         if old.machine.type == "BM1" and any(one not in {None, two} for one, two in built):
