@@ -1,4 +1,4 @@
-"""Route of a connection to its server: TLS and certificates, headers and tokens.
+"""What a connection to a server needs besides the URI: TLS and certificates, headers and tokens.
 
 Secrets do not appear in logs and errors: the repr of a `Route` does not contain headers, and `shown` removes
 credentials and queries from a URI.

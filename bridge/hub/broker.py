@@ -146,7 +146,7 @@ class Broker:
             self._refuse(client, str(error), self._operation_id, with_status=client.wants_status)
 
     def receive_turn(self, client: Client, messages: list[bytes], now: float) -> int:
-        """Perform a client's messages in order, up to `TURN_WORK`; each has at most `limits.message_bytes`.
+        """Perform a client's messages in order until `TURN_WORK` is reached; each has at most `limits.message_bytes`.
 
         Returns the number of messages performed. Call it again with the others; if the client's outbox is
         congested, not before the client has read its answers.

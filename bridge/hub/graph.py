@@ -53,7 +53,7 @@ class Client:
     wants_status: bool = False
     """True if the client requested status messages about refusals."""
     status_lane: Lane | None = None
-    """The queue of the client's status messages, once one was sent."""
+    """The queue of the status messages for the client, from the first one on."""
     last_published: "Advertisement | None" = None
     """The advertisement of the client's last message with a known envelope."""
     envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)

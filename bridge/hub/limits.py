@@ -65,8 +65,8 @@ class HubLimits:
         calls_per_client: Open calls that one client made, and as many that it must answer.
         goals_per_client: Open goals that one client sent, and as many that it executes.
         call_timeout: A call without an answer fails after this time; a client may request less.
-        queue_length: Messages of a topic queued for a slow client that did not request a length; then the
-            oldest is dropped.
+        queue_length: Messages of a topic queued for a slow client that did not request a length; a further one
+            replaces the oldest.
         longest_queue: Maximum `queue_length` that a client can request.
         client_bytes: All output queued for one client. If it is exceeded, the oldest messages of topics are
             dropped; a client whose answers alone exceed it is disconnected.
