@@ -82,7 +82,7 @@ class Plane(NamedTuple):
 
 
 def has_coordinates(dimensions: Sequence[Dimension]) -> bool:
-    """Return whether there are two searched variables, each a length, or without unit but more than an index."""
+    """Return whether there are two searched variables, each a length, or without unit and not a mere index."""
     return len(dimensions) == 2 and all(
         not each.states and (each.unit in _METRES or (not each.unit and (each.offset, each.step) != (0, 1)))
         for each in dimensions

@@ -26,7 +26,7 @@ class BoardAwayError(BoardError):
 
 
 def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> FrameInput:
-    """Return the driver's input for a frame, or raise a FrameInputError; `stop` (`slices`, `own`) is the setting."""
+    """Return the driver's input for a frame, or raise a FrameInputError; `stop` is the setting: `slices` or `own`."""
     machine = deployment.machine
     prior = np.frombuffer(frame.prior_codes, "<u2") if frame.prior_codes else None
     addresses: tuple[int | None, ...] | npt.NDArray[np.int64]

@@ -34,7 +34,7 @@ def archive(frames: Sequence[KeptFrame], axes: Sequence[Axis]) -> bytes:
 
 
 def table(frames: Sequence[KeptFrame]) -> bytes:
-    """Return a CSV table, a row per frame: its most probable cell, all probabilities; `frames` must not be empty."""
+    """Return a CSV table with each frame's most probable cell and all probabilities; `frames` must not be empty."""
     labels, first = frames[0].labels, frames[0].values
     cells = cell_names(labels, first.shape) if first is not None else ()
     file = io.StringIO(newline="")

@@ -16,7 +16,7 @@ from services.sockets.records import AnyRecord, Outcome, Published, Reading, Rea
 
 
 class EachMessagePeers(Peers):
-    """The three services; each message gets a new subscriber and a new publisher."""
+    """The three services; for each message, a new subscriber and a new publisher are started."""
 
     # Peers that have done their work and were told to end, until they have ended. Their records are ignored: another
     # reading arrived together with the one that was taken, and is missed as if nobody had subscribed.

@@ -40,7 +40,7 @@ def print_json(record: Published, deployment: Deployment) -> None:
 
 
 def sentence(record: Published, deployment: Deployment) -> str:
-    """Return a result as a line, worded like those of `listen`."""
+    """Return a result as a line of text, worded like the lines of `listen`."""
     axes = deployment_axes(deployment)
     return (
         f"frame {record.number}: {in_words(axes, _cell(axes, record.best_line))} with {record.best_probability:.3g}; "

@@ -25,7 +25,7 @@ def reading_from_line(line: bytes, number: int) -> LineReading:
 
 
 def compute_lines(boards: DeployedBoards, banks: int) -> int:
-    """Compute the readings of standard input; the frames use the boards' seed banks 0 to `banks` - 1 in turn.
+    """Compute the readings of standard input; the frames use the boards' seed banks in turn, from 0 to `banks` - 1.
 
     Raises:
         InputLineError: A line is not a reading for this deployment.

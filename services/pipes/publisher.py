@@ -21,7 +21,7 @@ _Line = LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # JSON has no i
 
 
 def result_from_line(line: bytes, number: int, machine: MachineSection) -> Publish | list[float]:
-    """Return the result of `pcie-app` with its reading, or the probabilities, in a line, or raise an InputLineError."""
+    """Parse a line: a result of `pcie-app` with its reading, or probabilities; raise an InputLineError otherwise."""
     where = f"line {number} of standard input"
     count, replicas, reasons = machine.results, machine.replicas, machine.kind.reasons
     expected = f"a result of pcie-app or an array of {count} probabilities"

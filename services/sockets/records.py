@@ -142,7 +142,7 @@ reading, and for an array.
 class Reading(Record, tag="reading", frozen=True):
     """Subscriber to master: one complete set of addresses, with the newest stamp of its messages (or time of receipt).
 
-    `prior_codes` is a prior to write, two bytes per cell (and replica); empty for the prior in the machine.
+    `prior_codes` is the prior from a message, two bytes per cell (and replica); empty for the prior in the machine.
     `passed_over` is the number of readings that the subscriber dropped since the last one it sent; `unpaired` is the
     number of unpaired messages.
     """
