@@ -27,7 +27,7 @@ class EmulatedPosterior(Posterior):
     machines: tuple[Any, ...] = field(compare=False)
     """The emulated machines of the boards, kept for `exact`, because the deployment's folder may change later."""
     addresses: tuple[int | None, ...]
-    """The reading of each variable of the deployment; None without one."""
+    """The address of each variable's reading, in the order of the deployment; None for a missing reading."""
 
     def exact(self, model: "Path | str | Model | Question | None" = None, **settings: object) -> Posterior:
         """Return the exact posterior for the same readings, by inference in float64.

@@ -16,7 +16,7 @@ class NoResultError(PosteriorError, NoMessageError):
 
 
 class BadResultError(PosteriorError):
-    """Raised when a message on a result topic was not published by a master."""
+    """Raised when a message on a result topic cannot come from a master."""
 
 
 class LabelError(PosteriorError):

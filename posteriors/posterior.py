@@ -27,14 +27,14 @@ RESULTS_TYPE: Final = "std_msgs/Float64MultiArray"
 SAMPLES_TOPIC: Final = "/bm/samples"
 SAMPLES_TYPE: Final = "std_msgs/UInt8MultiArray"
 MAX_RESULT: Final = 1 << 23
-"""Maximum size of a posterior as JSON in bytes: 64 boards of 4096 lines, 26 bytes per number, and the rest
+"""Maximum size of a posterior as JSON in bytes: 64 boards of 4096 cells, 26 bytes per number, and the rest
 of the message.
 """
 REPLICA: Final = "replica"
 """Label of the first dimension of the posteriors of several replicas."""
 
 _MAX_DIMENSIONS: Final = 32
-"""Limit of NumPy."""
+"""Maximum number of dimensions of a NumPy array."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -54,7 +54,7 @@ class Posterior:
     sizes: tuple[int, ...]
     """Number of values of each dimension."""
     heard_ns: int
-    """Time of arrival, Unix time in nanoseconds."""
+    """Arrival in this process, Unix time in nanoseconds."""
     report: FrameReport | None = None
     """The frame's report from `/bm/frame`; None if it was lost."""
     details: Mapping[str, str] = field(default_factory=dict)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from posteriors.axes import Axis, printable, reading_order
 
 _MOST_BARS: Final = 24
-"""Maximum number of cells that have a row of their own."""
+"""Maximum number of cells that are shown as one row each; more are drawn as a picture."""
 _BAR: Final = 24
 _SIDE: Final = 256
 """Size of a picture in pixels, along its longer side; finer posteriors are drawn in blocks of cells."""

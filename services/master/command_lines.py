@@ -10,7 +10,7 @@ from terminal.processes import own_command
 from toolchain.deployment import Deployment
 
 METRICS_PORTS = {"subscriber": 1, "publisher": 2, "pcie-app": 3, "board": 4}
-"""Offsets of the processes' metrics ports from the master's port; board N uses the offset of board 0 plus N."""
+"""Offsets of the processes' metrics ports from the master's port; board N uses the offset of `board` plus N."""
 
 
 def _metrics(settings: Settings, role: str) -> list[str]:

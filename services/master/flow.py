@@ -50,7 +50,7 @@ MOST_AT_PUBLISHER = 8
 """Maximum number of results that the publisher has not acknowledged; at this number, frames wait."""
 
 REMEMBERED = 1000
-"""Number of frames over which quantiles are computed."""
+"""Number of the last frames over which quantiles of latencies are computed."""
 
 _STAGES = (
     *("rosbridge_in", "waited", "register_writes", "compute", "reads", "rosbridge_out"),

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 _PICTURES_A_SECOND: Final = 10
 _REPLICAS: Final = 4
-"""Maximum number of replicas in a line; a file contains all."""
+"""Maximum number of replicas in a printed line; a saved file contains all."""
 _WORDS: Final = 7
 """Number of terminal lines reserved for the text around a picture."""
 
 ROWS: Final = 32
 """Maximum number of lines in a picture; finer posteriors are drawn in blocks of cells."""
 WIDTH: Final = 160
-"""Maximum width in characters."""
+"""Maximum width of a picture in characters."""
 _SHADES: Final = " .:-=+*#%@"
 Show = Callable[[FrameOutcome, list[Axis]], None]
 """Function that shows a frame; the axes are those of its posterior."""

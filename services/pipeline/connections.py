@@ -26,7 +26,7 @@ AFTER: Final = 2.0
 ROSAPI_TIME = 2.0
 """Seconds in which rosapi may answer. Many servers lack it; then nothing is known about their topics."""
 SETTLED_TIME = 3.0
-"""If a server does not list an advertised topic after this many seconds, it has refused it."""
+"""If a server does not list an advertised topic after this many seconds, the topic counts as refused."""
 CHECK_INTERVAL = 10.0
 
 
