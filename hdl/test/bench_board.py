@@ -69,7 +69,7 @@ class SlowKernel:
         return self.kernel.start(replace(start, run_until=1) if self.slow else start)
 
     def resume(self, run_until: int, halted: Collection[int] = ()) -> StopReason:
-        """Run the next cycle of a slice, or all of them."""
+        """Run the next cycle of a slice, or all cycles of it if `slow` is False."""
         return self.kernel.resume(self.kernel.cycles + 1 if self.slow else run_until, halted)
 
 
@@ -159,7 +159,7 @@ class Both:
         return refused is None
 
     async def write_long(self, address: int, value: int) -> None:
-        """Write a 64-bit value to both."""
+        """Write a 64-bit value to both boards."""
         await self.write(address, value & 0xFFFFFFFF)
         await self.write(address + 4, value >> 32)
 
@@ -219,7 +219,7 @@ class Both:
         return kernel.cycles - before
 
     async def finish(self) -> None:
-        """Wait until both have stopped, and compare."""
+        """Wait until both boards have stopped, and compare them."""
         self.slow.slow = False
         while self.board.running:
             self.board.step()
@@ -246,7 +246,7 @@ class Session:
 
     @property
     def is_plain(self) -> bool:
-        """True if the inputs are in SENSORS."""
+        """True if the machine takes its inputs from SENSORS, not from INPUTS."""
         return self.parameters.replicas == 1 and self.parameters.sensor_mode is SensorMode.COLUMN
 
     def chance(self, probability: float) -> bool:

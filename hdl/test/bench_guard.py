@@ -1,4 +1,4 @@
-"""Bench of the guard alone: numbers, cycles and masks that a machine never reaches in a simulation.
+"""Bench of the guard alone: doorbell numbers, cycles and masks that a machine never reaches in a simulation.
 
     access, state, settings --> bm1_guard     --> verdict
                             --> EmulatedBoard --> the same?

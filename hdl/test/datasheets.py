@@ -1,4 +1,4 @@
-"""Datasheets of the hardware's units: generated purposes, generics and ports, and handwritten theory.
+"""Datasheets of the hardware's units: purpose, generics and ports are generated, the theory is written by hand.
 
 `scripts/datasheets` writes the pages in docs/hardware and keeps their "Theory of operation".
 """

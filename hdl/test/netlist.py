@@ -21,7 +21,7 @@ BLACK_BOX: Final = """
   DATA_BITS = 1) (input clk_i, input enable_i, input [ADDRESS_BITS-1:0] address_i, output [DATA_BITS-1:0] data_o);
 endmodule
 """
-"""Verilog of a table without contents, which replaces each table: only its interface matters."""
+"""Verilog of a table that has only an interface; it replaces every table, so that yosys does not count their cells."""
 
 _FAMILY: Final = "cyclonev"
 """A family of FPGAs with the same ALM as a Stratix V."""
@@ -32,9 +32,9 @@ class Netlist:
     """Cells of an Intel FPGA with ALMs.
 
     Attributes:
-        luts: Look-up tables by their inputs, 1 to 6.
-        sums: Bits of carry chains.
-        registers: Flip-flops, without those at the output of a memory block.
+        luts: Numbers of look-up tables with 1, 2, ... 6 inputs.
+        sums: Number of bits of carry chains.
+        registers: Number of flip-flops, without those at the output of a memory block.
     """
 
     luts: tuple[int, ...]

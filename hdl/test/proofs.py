@@ -44,7 +44,7 @@ def failed_proof(name: str, folder: Path, hdl: Path = HDL) -> str | None:
     Args:
         name: One of `proofs`.
         folder: Working folder of the tools.
-        hdl: Folder of the VHDL, which differs for mutants.
+        hdl: Folder of the VHDL; that of a mutant is a changed copy.
 
     Raises:
         HardwareToolError: GHDL is not installed or refuses the hardware.

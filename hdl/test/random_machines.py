@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MOST_CELLS: Final = 450
-"""Maximum number of cells over all replicas; of this many, a simulator runs some thousand cycles per second.
+"""Maximum number of cells over all replicas; with this many, a simulator runs some thousand cycles per second.
 """
 
 _KINDS: Final = (RngKind.LFSR32, RngKind.LFSR16, RngKind.TABLE, RngKind.LFSR24, RngKind.LFSR8)

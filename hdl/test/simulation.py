@@ -47,7 +47,7 @@ def prepare(image: Image, folder: Path, hdl: Path = HDL, more_sources: Sequence[
     Args:
         image: Image of the board.
         folder: Folder of the simulation.
-        hdl: Folder of the VHDL, which differs for mutants.
+        hdl: Folder of the VHDL; that of a mutant is a changed copy.
         more_sources: Further VHDL files, relative to `hdl`, which are analysed last.
 
     Raises:

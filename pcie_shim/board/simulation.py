@@ -1,7 +1,7 @@
 """A simulation of a board's hardware: a child process that executes requests on its AXI4-Lite slave.
 
 Requests and answers are lines of hexadecimal numbers (docs/hardware/simulation.md). The hardware's clock stands
-still between requests, and the child ends with its standard input.
+still between requests, and the child ends when its standard input is closed.
 """
 
 import contextlib
