@@ -211,7 +211,7 @@ async def _greet(address: str, arguments: dict[str, Any]) -> None:
 
 @cache
 def software() -> str:
-    """Return a hash of everything here on which results depend: our modules, NumPy and Numba."""
+    """Return a hash of the software on this host on which results depend: rosbayes, NumPy, Numba and SciPy."""
     digest = sha256()
     for name in ("numpy", "numba", "scipy"):
         with suppress(metadata.PackageNotFoundError):
@@ -237,7 +237,7 @@ def do_batch(pickled: bytes, numbers: Sequence[int], most_s: float, theirs: str)
     scheduler uncompressed. `theirs` is the client's `software()`.
 
     Raises:
-        ClusterError: This worker has another version of our software than the client.
+        ClusterError: This worker has another version of this software than the client.
     """
     if software() != theirs:
         raise ClusterError("it has another version of rosbayes, NumPy or Numba")

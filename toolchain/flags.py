@@ -79,7 +79,7 @@ def _group(kind: Any) -> Group:
 
 
 def key_values(settings: Iterable[str], flag: str = "--set", example: str = "width=64") -> dict[str, str]:
-    """Return the values of a flag by key; a BuildError for a missing `=` or key, or a duplicate key."""
+    """Return the values of repeated flags KEY=VALUE by key; a BuildError for a missing `=` or key, or a duplicate."""
     found: dict[str, str] = {}
     for setting in settings:
         key, equals, value = setting.partition("=")

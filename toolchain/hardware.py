@@ -192,9 +192,9 @@ class Compiled:
     """A compiled simulation, which executes requests from its standard input (docs/hardware/simulation.md)."""
 
     command: tuple[str, ...]
-    """Its command."""
+    """The command that runs the simulation."""
     folder: Path
-    """The folder in which the command runs."""
+    """The folder in which to run the command."""
 
 
 def check_tools(simulator: Simulator) -> None:

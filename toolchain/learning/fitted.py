@@ -128,7 +128,7 @@ def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
 
 
 def normal_of(known: Known) -> Normal:
-    """Return the normals behind a variable's table, or raise a ModelError if there are none."""
+    """Return the normals from which a variable's table was computed, or raise a ModelError if there are none."""
     if known.normal is None:
         raise ModelError(
             f"{known.name} is not normal around a mean in the model; fit it with --method counts"

@@ -2,6 +2,7 @@
 
 The address of a reading is the index of its bin, which extends half a step to each side of the bin's centre. A bin's
 probability is the integral of the normal over the bin, not the density at the centre, so coarse bins are exact too.
+The lines of a table are the values of S.
 """
 
 import math

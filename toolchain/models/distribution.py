@@ -33,7 +33,7 @@ def _is_whole(number: object) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class IntegerType:
-    """The whole numbers `low` to `high`, each times `scale`; a reading in between counts as the nearest.
+    """The whole numbers `low` to `high`, each times `scale`; a reading between two of them counts as the nearest.
 
     With `wraps` they are on a circle, and `high` is adjacent to `low`.
     """
@@ -284,7 +284,7 @@ class Potential:
     scope: tuple[Symbol, ...]
     """The symbols of the axes of its table."""
     table: NDArray[np.float64]
-    """float64[size of each symbol], from 0."""
+    """float64[size of each symbol], each number at least 0."""
 
     @property
     def title(self) -> str:
@@ -302,7 +302,7 @@ def table(symbol: Symbol, values: ArrayLike, *, given: Sequence[Symbol] = ()) ->
     """Return P(symbol | given) from numbers, float64[size of the symbol, size of each parent in `given`].
 
     Raises:
-        ModelError: The shape is wrong, a number is not a probability, or a column does not sum to 1.
+        ModelError: The shape is wrong, a number is not a probability, or the sum over the symbol's values is not 1.
     """
     given = tuple(given)
     scope = _scope(symbol, given)
@@ -402,7 +402,7 @@ def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distrib
 def potential(symbols: Sequence[Symbol], values: ArrayLike) -> Potential:
     """Return a factor that is not a distribution itself, as in a Markov network.
 
-    `values` are float64[size of each symbol], from 0.
+    `values` are float64[size of each symbol], each at least 0.
 
     Raises:
         ModelError: The shape is wrong, or a number is negative, infinite or NaN.

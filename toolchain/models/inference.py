@@ -53,7 +53,7 @@ def reduced(term: Term, values: Mapping[str, int]) -> Term:
 
 
 def product(terms: Sequence[Term], scope: Sequence[str], sizes: Mapping[str, int]) -> NDArray[np.float64]:
-    """Return the product of terms over all their names, float64[size of each]; a ModelError if it is too large."""
+    """Return the product of terms, float64[size of each symbol in `scope`]; a ModelError if it is too large."""
     _check_size(scope, sizes, "the answer")
     if len(terms) == 1 and terms[0].scope == tuple(scope):  # not copied: it may be large
         return terms[0].table

@@ -104,7 +104,8 @@ class JointDistribution:
         """Return the question P(searched | known).
 
         Args:
-            searched: The searched symbols, the slowest dimension first: a line of the machine for each combination.
+            searched: The searched symbols, the slowest dimension first; each combination of values is a line of the
+                machine.
             known: The symbols known in every frame, in the order of the machine's columns.
             given: Symbols with a fixed value, by name: the label or number of the value.
             prior_select: A known symbol that selects the prior instead of being a column (thesis 2.1.2).
@@ -251,7 +252,7 @@ class Question:
         return Transition(first / first.sum(), table / table.sum(axis=1, keepdims=True))
 
     def _check_known(self, earlier: set[str]) -> None:
-        """Raise a ModelError if a known symbol is not independent of the previous ones given the searched ones."""
+        """Raise a ModelError if a known symbol depends on the `earlier` searched symbols, given the present ones."""
         active = self.joint.active
         _, links = self._linked(active, [*(symbol.name for symbol in self.known), *earlier])
         for component in links.components():
@@ -281,7 +282,7 @@ class Question:
         return None
 
     def dependent(self) -> list[tuple[str, str]]:
-        """Return the pairs of known symbols that are dependent given the searched ones; a BM1 can use one of each."""
+        """Return the pairs of known symbols that are dependent given the searched ones; a BM1 knows one of a pair."""
         factors, pairs = self._pairs()
         return [
             (one, other) for _, one, other in pairs if self._linked(factors, [one, other])[1].path(one, other)

@@ -88,7 +88,8 @@ def network_model(
     """Return the network of a question; `symbols` are those of its joint distribution, in the machine's order.
 
     Raises:
-        ModelError: A factor has a number that is negative, infinite or NaN, or is 0 for all values that remain.
+        ModelError: A factor has a number that is negative, infinite or NaN, or is 0 everywhere once the given values
+            are fixed.
     """
     for factor in factors:
         if not np.all(np.isfinite(factor.table)) or np.any(factor.table < 0):

@@ -31,7 +31,7 @@ class Place(Protocol):
     """The position of a reader in its file."""
 
     def error(self, sentence: str) -> NetworkFileError:
-        """Return an error with the file and the line before the sentence."""
+        """Return an error that starts with the file and the line, followed by the sentence."""
 
 
 class NetworkBuilder:
@@ -107,7 +107,7 @@ class NetworkBuilder:
     def distribution(
         self, child: str, parents: Sequence[str], values: NDArray[np.float64], place: Place
     ) -> None:
-        """Add P(child | parents), float64[child's states, each parent's], normalised if sums are nearly 1."""
+        """Add P(child | parents), float64[child's states, each parent's]; normalise sums that are 1 within `ROUNDING`."""
         if child in self._children:
             raise place.error(f"{child} has two tables")
         self._children.add(child)

@@ -376,7 +376,7 @@ def read_uai(data: bytes, builder: NetworkBuilder) -> None:
 
     The last variable of a factor varies fastest; in a BAYES file it is the child. (pyagrum 3.3.1 writes the first parent
     fastest, contrary to the format.) pgmpy, 0.1 to 1.1, writes the same scopes with the first variable fastest and the
-    child slowest. A file is read in pgmpy's order if one of its tables is a distribution in that order only.
+    child slowest. A whole file is read in pgmpy's order if one of its tables sums to 1 in that order only.
     """
     text = Scanner(data, builder.path, comments=_UAI_COMMENTS)
     kind = text.word("BAYES or MARKOV")

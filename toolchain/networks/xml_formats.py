@@ -29,7 +29,7 @@ class XmlLine:
     number: int
 
     def error(self, sentence: str) -> NetworkFileError:
-        """Return an error with the file and the line before the sentence."""
+        """Return an error that starts with the file and the line, followed by the sentence."""
         return NetworkFileError(sentence, path=self.path, line=self.number)
 
 

@@ -33,7 +33,7 @@ class Memory:
     """A memory of a board, or a memory shared by all boards."""
 
     name: str
-    """Its file name."""
+    """The name of its MIF."""
     width: int
     """Bits of a word."""
     depth: int
