@@ -283,7 +283,7 @@ def _limits(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
 
 
 def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
-    """Find random numbers that boards, banks or CDEs share, that are related, or that repeat within or between frames."""
+    """Find random numbers that are shared by boards, banks or CDEs, related, or repeated within or between frames."""
     p, about = chain.machine.parameters, f"rng = {chain.machine.parameters.rng}"
     width, boards, sets = p.rng.lfsr_bits, p.chains, p.rng_banks * p.chains
     wider = "" if p.rng is RngKind.LFSR32 else "--rng lfsr32, or "
