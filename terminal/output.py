@@ -22,7 +22,7 @@ ERROR_DESCRIPTOR: Final = "ROSBAYES_ERROR_DESCRIPTOR"
 
 
 def say(text: str) -> None:
-    """Print one line for the user on standard error; do nothing if it has been closed."""
+    """Print one line for the user on standard error; do nothing if standard error is closed."""
     write_line(formatted("info", one_line(text)))
 
 

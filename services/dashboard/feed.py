@@ -74,7 +74,7 @@ class KeptFrame:
             return math.nan
 
     def marginal(self, labels: tuple[str, ...]) -> "NDArray[np.float64]":
-        """Return the marginal of one or two labels, in that order; it sums to 1, also over replicas."""
+        """Return the marginal of one or two labels, in that order; it sums to 1, over all replicas together."""
         if self.values is None:
             raise ValueError("a frame without a posterior has no marginal")
         places = [self.labels.index(label) for label in labels]
@@ -101,7 +101,7 @@ class Feed:
     Attributes:
         frames: The last frames, at most `KEPT_FRAMES`.
         truth: The newest true position (x, y) of the simulated robot; None if there is none.
-        watchers: Functions called after each change; they may only note that, because a frame is still being added.
+        watchers: Functions called after each change; they may only note the change, because a frame is still being added.
         lost: Number of frames without a posterior by reason, at most `_MAX_REASONS` of them.
     """
 

@@ -1,4 +1,4 @@
-"""The web server of the page, in the event loop and with the signals of this process."""
+"""The web server of the page, which runs in the event loop of this process and leaves signals to the process."""
 
 import asyncio
 import contextlib

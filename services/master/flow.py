@@ -224,7 +224,7 @@ class FrameFlow:
             self._send_next()
 
     def received(self, peer: Peer, record: AnyRecord) -> None:
-        """Handle a record of a reading, a frame or a result."""
+        """Handle a record about a reading, a frame or a result."""
         match record:
             case Reading():
                 self._take_reading(record)

@@ -85,7 +85,7 @@ class Peer:
         self.missed = False
 
     def cut(self) -> None:
-        """Kill its process if the master started it, otherwise close the connection; the peer's task restores both."""
+        """Kill the process if the master started it, otherwise close the connection; the peer's task restores both."""
         if self.child is not None:
             self.child.kill()
         elif self.protocol is not None:
@@ -112,7 +112,7 @@ class PeerEvents(Protocol):
         """Handle a peer that has become ready."""
 
     def received(self, peer: Peer, record: AnyRecord) -> None:
-        """Handle a record of a reading, a frame or a result."""
+        """Handle a record about a reading, a frame or a result."""
 
     def lost(self, peer: Peer) -> None:
         """Handle the loss of a peer, with its frame or results."""

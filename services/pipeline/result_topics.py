@@ -142,7 +142,7 @@ class ResultTopics:
     async def publish(self, publish: Publish, *, look: bool) -> Published:
         """Publish the report of a frame and then its posterior, if any, when the servers accept them.
 
-        With `look`, wait until the result is seen on the wire, or until the timeout of the settings.
+        With `look`, wait until the result comes back from the server, for at most the setting `seen_timeout`.
         """
         inference = infer(publish.result, self._deployment)
         # a server that does not accept the result in time does not get it, and the user is warned

@@ -75,8 +75,8 @@ class Synchroniser(Generic[Item]):
     Each set has a *pivot*: the newest among the oldest waiting messages of the needed topics, or the oldest
     waiting message of all if none is needed. Every other topic adds its message nearest to the pivot. The
     message of a needed topic must be within the tolerance; the message of any other topic must also be nearer to
-    this pivot than to the next message of the pivot's topic. While its topic is alive, a set waits for a nearer
-    message, for at most the tolerance. Each message is used once.
+    this pivot than to the next message of the pivot's topic. A set waits for nearer messages of topics that are
+    alive, for at most the tolerance. Each message is used once.
 
     Attributes:
         unpaired: number of messages that remained unpaired.

@@ -163,7 +163,7 @@ def _check(directory: Path | None) -> None:
 
 
 def check_metrics(metrics: str, *, insecure: bool) -> None:
-    """Raise a SettingsError if other machines could read the metrics without permission."""
+    """Raise a SettingsError if other machines could read the metrics, unless `insecure` permits it."""
     # a host name counts as another machine, even if it resolves to this one
     if metrics and not insecure and not metrics_endpoint(metrics).is_loopback:
         raise SettingsError(
