@@ -1,4 +1,4 @@
-"""BM1 as a machine kind: its sections, registers, frames and posteriors (thesis 2.1.2, 3.2)."""
+"""BM1 as a machine kind: its sections of the programming file, registers, frames and posteriors (thesis 2.1.2, 3.2)."""
 
 import math
 import struct
@@ -36,7 +36,7 @@ _SENSOR_BITS_MAX: Final = 64  # columns whose widths fit into the capability reg
 
 
 class BM1Kind(MachineKind):
-    """Exact inference with approximate computations: a line of AND gates for each value (thesis 2.1.2)."""
+    """Exact inference with approximate computations: a line of AND gates for each searched value (thesis 2.1.2)."""
 
     name = "BM1"
     has_hardware = True

@@ -81,7 +81,7 @@ class BM2Parameters:
         factors: Variables of each factor, in rising order; every variable is in a factor.
         searched: Variables whose joint distribution is counted, in the order of its axes (the first varies slowest).
         known: Variables whose values a frame may set, in the order of the frame's addresses.
-        prob_bits: Bits of a code (W), 2 to 16.
+        prob_bits: Bits of a CDE's probability code (W), 2 to 16.
         sequencer: Default order in which the sequencer points at bits.
         literal: True: a bit is written if all CDEs agree on it, as the thesis draws it. False: if those agree whose
             factor has the bit.
@@ -222,7 +222,7 @@ class BM2Parameters:
 
     @property
     def histogram_words(self) -> int:
-        """Number of words of all histograms: one per code of every variable, including unused codes."""
+        """Number of words of the variables' histograms: one for each code of a variable, including unused codes."""
         return sum(1 << bits for bits in self.bits)
 
     @property
@@ -238,7 +238,7 @@ class BM2Parameters:
 
     @property
     def ones_code(self) -> int:
-        """The largest code, and the mask of a generator's output."""
+        """The largest probability code, and the mask of a generator's output."""
         return (1 << self.prob_bits) - 1
 
     @property
@@ -304,8 +304,8 @@ class BM2Machine(MachineContents):
 
     Attributes:
         parameters: Variables, factors, widths and generators.
-        tables: For each CDE, whose factor has n bits, a uint16[n * 2**(n - 1)]: the code with which the factor's bit j
-            is drawn is at j * 2**(n - 1) + v, where v consists of the values of its other n - 1 bits, in rising order.
+        tables: For each CDE, whose factor has n bits, a uint16[n * 2**(n - 1)]: the probability code with which bit j
+            of the factor is drawn is at j * 2**(n - 1) + v, where v consists of the other n - 1 bits, in rising order.
         supports: One bool[cardinalities of the variables] per factor: True where the factor is not 0.
         rng_table: uint32[length], the random numbers for all CDEs if `rng` is `table`; otherwise None.
 
@@ -390,10 +390,10 @@ class BM2Start:
 
 
 def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np.uint16]:
-    """Return a CDE's table (`BM2Machine.tables`): codes of the odds factor(bit = 1) / factor(bit = 0) of each bit.
+    """Return a CDE's table (`BM2Machine.tables`), from the odds factor(bit = 1) / factor(bit = 0) of each bit.
 
     If a cardinality is no power of two, some codes of the variable stand for no value. Between a used and an unused
-    code, the odds favour the used one as far as a code can; if both are unused, or another variable is at an unused
+    code, the odds favour the used one as far as a table can; if both are unused, or another variable is at an unused
     code, the odds are 1. The factor is float64[cardinalities of the variables], for n bits the result is
     uint16[n * 2**(n - 1)].
     """

@@ -1,4 +1,7 @@
-"""BM2 as a machine kind: its sections, registers, frames (batches or a stream) and posteriors (thesis 2.1.3)."""
+"""BM2 as a machine kind: sections of the programming file, registers, frames and posteriors (thesis 2.1.3).
+
+After each start or resume, a board draws one batch of samples, or if it stores them in a stream, as many as fit.
+"""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -85,7 +85,7 @@ class BM1Kernel(ABC):
     def resume(self, run_until: int, halted: Collection[int] = ()) -> StopReason:
         """Run the next slice of the same frame, to cycle `run_until` at most; 0 for no further slices.
 
-        The replicas with the numbers `halted` do not continue in this frame: they keep the reason `SLICE`.
+        The replicas with the indices `halted` do not continue in this frame: they keep the reason `SLICE`.
 
         Raises:
             StartError: No frame can be continued, or `run_until` is not a later cycle; nothing has changed.

@@ -55,10 +55,10 @@ class Image:
     """The content of the programming file of one board.
 
     Attributes:
-        machine: The machine with the lines of the board, of any kind.
-        partition: Position of the lines in the model.
-        interface_sensors: Input words of the interface (thesis 3.2: 20).
-        interface_results: Result words of the interface (thesis 3.2: 1200).
+        machine: The board's machine, of any kind, with the board's lines.
+        partition: Position of these lines in the model.
+        interface_sensors: Number of input words that the board implements (thesis 3.2: 20).
+        interface_results: Number of result words that the board implements (thesis 3.2: 1200).
         model_hash: SHA-256 (hex) of the model; the same for all boards of a deployment.
         build_date: Date of the build, ISO 8601.
 

@@ -175,7 +175,7 @@ class HostConnection(Connection):
 
 
 class LoaderConnection(Connection):
-    """A connection of a loader to the programming port, which excludes other loaders after its first request."""
+    """A loader's connection to the programming port; after its first request, it excludes other loaders."""
 
     def __init__(self, connection: socket.socket, key: bytes, greeting: bytes) -> None:
         super().__init__(connection, key, greeting)

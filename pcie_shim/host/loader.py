@@ -17,7 +17,7 @@ PART_BYTES: Final = 4 * framing.MAX_PAYLOAD_WORDS
 def program(
     endpoint: Endpoint | str, image: Image | Path, *, timeout: float = 30.0, token: bytes = framing.NO_TOKEN
 ) -> str:
-    """Program the board with the given register endpoint, and return the image hash that the board then reports.
+    """Program the board whose registers are at `endpoint`, and return the image hash that the board then reports.
 
     The file and the board's register map are checked before the board is changed. Connecting, transferring the file
     and loading the machine may each take `timeout` seconds. If this host has a link to the board, `token` is that of
