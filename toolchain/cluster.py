@@ -7,7 +7,7 @@
 
 A piece is only a number, so the tables are sent once, with the job. A result depends on job and number alone, not on
 where or in which order the pieces are done. A caller that keeps results on disk can resume with the numbers that have
-none.
+no result yet.
 """
 
 import asyncio
@@ -197,7 +197,7 @@ def runner(options: SchedulerOptions) -> Iterator[Run]:
 
 
 async def _greet(address: str, arguments: dict[str, Any]) -> None:
-    """Raise an OSError if no scheduler answers at an address."""
+    """Raise an OSError if no dask scheduler answers at an address."""
     from distributed.core import rpc
 
     try:

@@ -23,7 +23,7 @@ from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError
 def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Scale) -> NDArray[np.uint16]:
     """Return the codes of one sensor's likelihoods in a frame, one per line (`sensor_mode = threshold`).
 
-    The likelihoods are float64[..., lines]: P(the sensor's reading | S = line); the codes have the same shape. With
+    The likelihoods are float64[..., lines]: P(the sensor's reading | S = line). The codes have the same shape. With
     the scale `column`, each row is divided by its maximum, because only ratios matter; with `none`, values up to 1
     are encoded unchanged.
 

@@ -203,7 +203,7 @@ class Deployment(DeploymentFile):
 
     @property
     def edited_boards(self) -> tuple[int, ...]:
-        """The boards whose images were made from edited sources, so that they may differ from the model."""
+        """The boards whose images were made from sources edited by hand (MIFs, parameters), and may differ from the model."""
         return tuple(index for index, board in enumerate(self.boards) if board.built_hash)
 
     def output_uri(self, output: Output) -> str:
@@ -214,8 +214,8 @@ class Deployment(DeploymentFile):
 def deployment_hash(deployment: DeploymentFile) -> str:
     """Return the SHA-256 (hexadecimal) of the part of a deployment that follows from the model.
 
-    URIs, endpoints, units of readings and the like are left out: a deployment remains valid for another robot, but
-    not after an edit that contradicts its tables.
+    URIs, endpoints, units of readings and the like are left out: `deployment.toml` may be edited for another robot,
+    but not so that it contradicts the tables in the images.
     """
     content = deployment.model_dump(
         mode="json",
@@ -248,7 +248,7 @@ def load_deployment(
 
     Raises:
         DeploymentError: The deployment is absent, not TOML, or has a wrong key or value.
-        DeploymentVersionError: Another format.
+        DeploymentVersionError: The deployment has another format.
         DamagedDeploymentError: `deployment.toml` or an image has changed since the build; the sentence
             contains the file and both hashes.
     """

@@ -156,18 +156,18 @@ class Stop(StrEnum):
     """The stop rule for the boards of a partitioned machine."""
 
     SLICES = "slices"
-    """All boards stop at the end of the slice in which the first one overflows."""
+    """All boards stop at the end of the slice (section of a frame) in which the first counter overflows."""
     OWN = "own"
-    """Each board stops at its own overflow, as in the thesis."""
+    """Each board stops when one of its own counters overflows, as in the thesis."""
 
 
 class Queue(StrEnum):
     """Which readings wait if they arrive faster than frames are computed."""
 
     LATEST = "latest"
-    """Only the newest waits; the readings that it replaces are counted."""
+    """Only the newest reading waits; the readings that it replaces are counted."""
     ALL = "all"
-    """All wait, in order."""
+    """All readings wait, in order of arrival."""
 
 
 class Scale(StrEnum):
@@ -288,12 +288,12 @@ class CommonSection(Section):
 
     @property
     def interface_sensors(self) -> int:
-        """The number of inputs in the registers of a board."""
+        """The number of inputs for which a board has registers."""
         return parse_interface(self.interface)[0]
 
     @property
     def interface_results(self) -> int:
-        """The number of results in the registers of a board."""
+        """The number of results for which a board has registers."""
         return parse_interface(self.interface)[1]
 
 
@@ -440,7 +440,7 @@ class Output(Section):
 
 
 class TopicsSection(Section):
-    """`[topics]`: whether each topic for robot tools is published; None leaves it to the deployment."""
+    """`[topics]`: whether to publish each topic for robot tools; None for those that fit the searched variables."""
 
     counts: bool | None = None
     posterior: bool | None = None

@@ -31,7 +31,7 @@ _STEP: Final = re.compile(r"(\w+)((?:\[\d{1,9}\])*)")
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Columns of a recording."""
+    """The columns of a recording that were asked for."""
 
     path: Path
     """The file."""

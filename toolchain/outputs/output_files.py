@@ -113,7 +113,7 @@ _PROJECT: Final = re.compile(rf"{PROJECT}\.(qpf|tcl)|{PROJECT}_board\d+\.qsf")
 
 
 def memory_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
-    """Return the MIFs and, of a BM1, `bm1_parameters.vhd` (thesis 3.2)."""
+    """Return the MIFs and, for a BM1, `bm1_parameters.vhd` (thesis 3.2)."""
     contents: dict[str, Iterable[bytes]] = {}
     if deployment.machine.type == "BM1":
         contents[PARAMETERS_FILE] = [parameters_vhd(deployment, images).encode()]
@@ -159,7 +159,7 @@ def quartus_files(deployment: Deployment, images: Sequence[Image]) -> OutputFile
 
 
 def image_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
-    """Return the programming files."""
+    """Return the boards' programming files."""
     pairs = zip(deployment.boards, images, strict=True)
     return OutputFiles({board.image: map(image_bytes, [image]) for board, image in pairs}, _IMAGES)
 
@@ -173,7 +173,7 @@ def filter_file(transition: Transition | None) -> OutputFiles:
 
 
 def text_file(name: str, text: str) -> OutputFiles:
-    """Return one text file."""
+    """Return one text file as a part of a deployment."""
     return OutputFiles({name: [text.encode()]}, re.compile(re.escape(name)))
 
 

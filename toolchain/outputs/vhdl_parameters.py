@@ -232,7 +232,7 @@ class PackageTokens:
     """
 
     name: str
-    """The file, for errors."""
+    """The file of the package, to be named in errors."""
     tokens: tuple[tuple[str, int], ...]
 
     @classmethod
