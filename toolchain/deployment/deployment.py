@@ -203,7 +203,7 @@ class Deployment(DeploymentFile):
 
     @property
     def edited_boards(self) -> tuple[int, ...]:
-        """The boards whose images were made from MIFs or parameters edited by hand, so they may differ from the model."""
+        """The boards whose images come from MIFs or parameters edited by hand, and may differ from the model."""
         return tuple(index for index, board in enumerate(self.boards) if board.built_hash)
 
     def output_uri(self, output: Output) -> str:
