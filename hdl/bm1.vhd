@@ -14,7 +14,7 @@ library work;
 
 entity bm1 is
   generic (
-    BOARD         : natural  := 0;                      -- index of this board in PARTITIONS
+    BOARD         : natural  := 0;                      -- index of this board in the constant PARTITIONS
     MEMORY_FOLDER : string   := "bm_arch/Memory_MIFs/"; -- path of the MIFs, with a trailing slash
     CLOCK_HZ      : positive := 100_000_000             -- frequency of the clock
   );
@@ -24,22 +24,22 @@ entity bm1 is
     rstn_i : in    std_logic; -- reset of the board, active low, synchronous
     irq_o  : out   std_logic; -- pulse: the machine has stopped
     -- AXI4-Lite
-    axi_awvalid : in    std_logic; -- write address
+    axi_awvalid : in    std_logic; -- write address channel
     axi_awready : out   std_logic;
     axi_awaddr  : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0);
     axi_awprot  : in    std_logic_vector(2 downto 0);
-    axi_wvalid  : in    std_logic; -- write data
+    axi_wvalid  : in    std_logic; -- write data channel
     axi_wready  : out   std_logic;
     axi_wdata   : in    std_logic_vector(31 downto 0);
     axi_wstrb   : in    std_logic_vector(3 downto 0);
-    axi_bvalid  : out   std_logic; -- write response
+    axi_bvalid  : out   std_logic; -- write response channel
     axi_bready  : in    std_logic;
     axi_bresp   : out   std_logic_vector(1 downto 0);
-    axi_arvalid : in    std_logic; -- read address
+    axi_arvalid : in    std_logic; -- read address channel
     axi_arready : out   std_logic;
     axi_araddr  : in    std_logic_vector(BAR_ADDRESS_BITS - 1 downto 0);
     axi_arprot  : in    std_logic_vector(2 downto 0);
-    axi_rvalid  : out   std_logic; -- read data
+    axi_rvalid  : out   std_logic; -- read data channel
     axi_rready  : in    std_logic;
     axi_rdata   : out   std_logic_vector(31 downto 0);
     axi_rresp   : out   std_logic_vector(1 downto 0)

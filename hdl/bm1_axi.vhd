@@ -16,20 +16,20 @@ entity bm1_axi is
     clk_i : in    std_logic; -- clock
     rst_i : in    std_logic; -- reset of the board
     -- AXI4-Lite
-    axi_awvalid : in    std_logic; -- write address
+    axi_awvalid : in    std_logic; -- write address channel
     axi_awready : out   std_logic;
     axi_awaddr  : in    std_logic_vector(ADDRESS_BITS - 1 downto 0);
-    axi_wvalid  : in    std_logic; -- write data
+    axi_wvalid  : in    std_logic; -- write data channel
     axi_wready  : out   std_logic;
     axi_wdata   : in    std_logic_vector(31 downto 0);
     axi_wstrb   : in    std_logic_vector(3 downto 0);
-    axi_bvalid  : out   std_logic; -- write response
+    axi_bvalid  : out   std_logic; -- write response channel
     axi_bready  : in    std_logic;
     axi_bresp   : out   std_logic_vector(1 downto 0);
-    axi_arvalid : in    std_logic; -- read address
+    axi_arvalid : in    std_logic; -- read address channel
     axi_arready : out   std_logic;
     axi_araddr  : in    std_logic_vector(ADDRESS_BITS - 1 downto 0);
-    axi_rvalid  : out   std_logic; -- read data
+    axi_rvalid  : out   std_logic; -- read data channel
     axi_rready  : in    std_logic;
     axi_rdata   : out   std_logic_vector(31 downto 0);
     axi_rresp   : out   std_logic_vector(1 downto 0);

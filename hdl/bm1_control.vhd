@@ -13,9 +13,9 @@ library work;
 
 entity bm1_control is
   generic (
-    REPLICAS     : positive; -- machines that share the generators
+    REPLICAS     : positive; -- number of replicas: machines that share the generators
     COUNTER_BITS : positive; -- width of a counter
-    RESET_BANK   : boolean   -- a frame restarts the generators
+    RESET_BANK   : boolean   -- true: each frame restarts the generators
   );
   port (
     -- system

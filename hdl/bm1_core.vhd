@@ -13,25 +13,25 @@ library work;
 
 entity bm1_core is
   generic (
-    LINES         : positive;         -- lines of this board
-    SENSORS       : natural;          -- sensor columns
-    REPLICAS      : positive;         -- machines that share the generators
+    LINES         : positive;         -- number of lines on this board
+    SENSORS       : natural;          -- number of sensor columns
+    REPLICAS      : positive;         -- number of replicas: machines that share the generators
     MODE          : sensor_mode_t;    -- input of the cells in a sensor column
     ADDRESS_BITS  : natural_array_t;  -- address widths of the sensor columns (index 1 to SENSORS)
-    PROB_BITS     : positive;         -- width of a code
+    PROB_BITS     : positive;         -- width of a probability code
     PRIOR_BITS    : natural;          -- width of the prior's address
-    WRITTEN       : boolean;          -- the host writes the prior
+    WRITTEN       : boolean;          -- true: the host writes the prior; false: it is a table
     COUNTER_BITS  : positive;         -- width of a counter
     KIND          : rng_kind_t;       -- generators: LFSR or table
     STATE_BITS    : positive;         -- width of a generator's state
     TAPS          : std_logic_vector; -- feedback taps of an LFSR; STATE_BITS wide
     RNG_SHARED    : boolean;          -- one generator per column; otherwise one per cell
     STEPS         : positive;         -- steps of a generator per clock
-    BANKS         : positive;         -- sets of seeds
-    RESET_BANK    : boolean;          -- a frame restarts the generators
+    BANKS         : positive;         -- number of seed sets
+    RESET_BANK    : boolean;          -- true: each frame restarts the generators
     TABLE_LENGTH  : positive;         -- random numbers in the table, if one is used
     MEMORY_FOLDER : string;           -- path of the MIFs, with a trailing slash
-    BOARD         : natural           -- number of the board
+    BOARD         : natural           -- index of this board
   );
   port (
     -- system
@@ -48,7 +48,7 @@ entity bm1_core is
     bank_i       : in    std_logic_vector(bits_for(BANKS) - 1 downto 0); -- set of seeds
     halt_i       : in    std_logic_vector(REPLICAS - 1 downto 0);        -- replicas to halt
     -- inputs of the frame, replica 0 lowest
-    priors_i      : in    std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);         -- addresses of the prior
+    priors_i      : in    std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);         -- each replica's address in the prior's table
     prior_codes_i : in    std_logic_vector(REPLICAS * LINES * SLOT_BITS - 1 downto 0); -- written prior
     inputs_i      : in    std_logic_vector(
       REPLICAS * SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0);   -- readings

@@ -19,7 +19,7 @@ entity bm1_generators is
     STATE_BITS   : positive;         -- width of a state
     TAPS         : std_logic_vector; -- feedback taps of an LFSR; STATE_BITS wide
     STEPS        : positive;         -- steps per clock
-    BANKS        : positive;         -- sets of seeds
+    BANKS        : positive;         -- number of seed sets
     PROB_BITS    : positive;         -- width of a random number
     SEED_FILE    : string;           -- MIF of the seeds: bank by bank, generator by generator
     TABLE_FILE   : string;           -- MIF of the random numbers, if a table is used

@@ -13,16 +13,16 @@ library work;
 
 entity bm1_guard is
   generic (
-    REPLICAS            : positive; -- machines that share the generators
+    REPLICAS            : positive; -- number of replicas: machines that share the generators
     COUNTER_BITS        : positive; -- width of a counter
     PRIOR_BITS          : natural;  -- width of the prior's address
-    BANKS               : positive; -- sets of seeds
-    SENSORS_DEPTH       : natural;  -- words of SENSORS that exist
-    INPUTS_DEPTH        : natural;  -- words of INPUTS that exist
-    PRIOR_SELECTS_DEPTH : natural;  -- words of PRIOR_SELECTS that exist
-    OUTCOMES_DEPTH      : natural;  -- words of OUTCOMES that exist
-    RESULTS_DEPTH       : natural;  -- words of RESULTS that exist
-    PRIOR_CODES_DEPTH   : natural   -- words of PRIOR_CODES that exist
+    BANKS               : positive; -- number of seed sets
+    SENSORS_DEPTH       : natural;  -- number of implemented words of SENSORS
+    INPUTS_DEPTH        : natural;  -- number of implemented words of INPUTS
+    PRIOR_SELECTS_DEPTH : natural;  -- number of implemented words of PRIOR_SELECTS
+    OUTCOMES_DEPTH      : natural;  -- number of implemented words of OUTCOMES
+    RESULTS_DEPTH       : natural;  -- number of implemented words of RESULTS
+    PRIOR_CODES_DEPTH   : natural   -- number of implemented words of PRIOR_CODES
   );
   port (
     -- access

@@ -13,13 +13,13 @@ library work;
 
 entity bm1_matrix is
   generic (
-    LINES         : positive;        -- lines of this board
-    SENSORS       : natural;         -- sensor columns
+    LINES         : positive;        -- number of lines on this board
+    SENSORS       : natural;         -- number of sensor columns
     MODE          : sensor_mode_t;   -- input of the cells in a sensor column
     ADDRESS_BITS  : natural_array_t; -- address widths of the sensor columns (index 1 to SENSORS)
-    PROB_BITS     : positive;        -- width of a code
+    PROB_BITS     : positive;        -- width of a probability code
     PRIOR_BITS    : natural;         -- width of the prior's address
-    WRITTEN       : boolean;         -- the host writes the prior
+    WRITTEN       : boolean;         -- true: the host writes the prior; false: it is a table
     COUNTER_BITS  : positive;        -- width of a counter
     RNG_SHARED    : boolean;         -- one random number per column; otherwise one per cell
     MEMORY_PREFIX : string           -- start of the MIFs' file names: folder and board

@@ -9,7 +9,7 @@ library ieee;
 
 entity bm1_prior_element is
   generic (
-    PROB_BITS : positive; -- width of a code
+    PROB_BITS : positive; -- width of a probability code
     WRITTEN   : boolean   -- the host writes the codes; otherwise they come from the prior's table
   );
   port (

@@ -12,7 +12,7 @@ entity bm1_readout is
   generic (
     RESULTS      : positive; -- counters of all replicas
     COUNTER_BITS : positive; -- width of a counter
-    REPLICAS     : positive  -- machines that share the generators
+    REPLICAS     : positive  -- number of replicas: machines that share the generators
   );
   port (
     clk_i     : in    std_logic;                                             -- clock

@@ -15,25 +15,25 @@ library work;
 
 entity bm1_registers is
   generic (
-    LINES             : positive;                       -- lines of this board
-    SENSORS           : natural;                        -- sensor columns
-    REPLICAS          : positive;                       -- machines that share the generators
+    LINES             : positive;                       -- number of lines on this board
+    SENSORS           : natural;                        -- number of sensor columns
+    REPLICAS          : positive;                       -- number of replicas: machines that share the generators
     MODE              : sensor_mode_t;                  -- input of the cells in a sensor column
     ADDRESS_BITS      : natural_array_t;                -- address widths of the sensor columns (index 1 to SENSORS)
-    PROB_BITS         : positive;                       -- width of a code
+    PROB_BITS         : positive;                       -- width of a probability code
     PRIOR_BITS        : natural;                        -- width of the prior's address
-    WRITTEN           : boolean;                        -- the host writes the prior
+    WRITTEN           : boolean;                        -- true: the host writes the prior; false: it is a table
     COUNTER_BITS      : positive;                       -- width of a counter
     KIND              : rng_kind_t;                     -- generators: LFSR or table
     RNG_SHARED        : boolean;                        -- one generator per column; otherwise one per cell
     STEPS             : positive;                       -- steps of a generator per clock
-    BANKS             : positive;                       -- sets of seeds
-    RESET_BANK        : boolean;                        -- a frame restarts the generators
+    BANKS             : positive;                       -- number of seed sets
+    RESET_BANK        : boolean;                        -- true: each frame restarts the generators
     INTERFACE_INPUTS  : positive;                       -- words of SENSORS or INPUTS
     INTERFACE_RESULTS : positive;                       -- words of RESULTS
     MODEL_LINES       : positive;                       -- lines of the whole model
     LINE_OFFSET       : natural;                        -- first line of this board
-    BOARD             : natural;                        -- number of this board
+    BOARD             : natural;                        -- index of this board
     BOARDS            : positive;                       -- number of boards
     IMAGE_HASH        : std_logic_vector(255 downto 0); -- identity of this board's image
     MEMORY_FOLDER     : string;                         -- path of the MIFs, with a trailing slash
@@ -62,7 +62,7 @@ entity bm1_registers is
     run_until_o   : out   std_logic_vector(63 downto 0);                               -- end of the slice
     bank_o        : out   std_logic_vector(bits_for(BANKS) - 1 downto 0);              -- set of seeds
     halt_o        : out   std_logic_vector(REPLICAS - 1 downto 0);                     -- replicas to halt
-    priors_o      : out   std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);         -- addresses of the prior
+    priors_o      : out   std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);         -- each replica's address in the prior's table
     prior_codes_o : out   std_logic_vector(REPLICAS * LINES * SLOT_BITS - 1 downto 0); -- written prior
     inputs_o      : out   std_logic_vector(
       REPLICAS * SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0);   -- readings

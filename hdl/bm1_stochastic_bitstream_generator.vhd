@@ -10,7 +10,7 @@ library ieee;
 
 entity bm1_stochastic_bitstream_generator is
   generic (
-    PROB_BITS : positive -- width of a code
+    PROB_BITS : positive -- width of a probability code
   );
   port (
     random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- output of the generator

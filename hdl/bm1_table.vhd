@@ -7,7 +7,7 @@
 library ieee;
   use ieee.std_logic_1164.all;
 
--- The architecture is chosen by the file that is compiled with this one:
+-- The architecture is in the file that is compiled with this one:
 -- simulation/bm1_table_textio.vhd or synthesis/bm1_table_block.vhd.
 
 entity bm1_table is

@@ -13,7 +13,7 @@ library work;
 
 entity bm1_tile_element is
   generic (
-    PROB_BITS    : positive;      -- width of a code
+    PROB_BITS    : positive;      -- width of a probability code
     MODE         : sensor_mode_t; -- input of the cell
     ADDRESS_BITS : positive;      -- address width of the table; SENSOR_CELL
     TABLE_FILE   : string;        -- MIF of the column; SENSOR_CELL

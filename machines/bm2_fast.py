@@ -202,7 +202,7 @@ def load_state(parameters: BM2Parameters, state: int, values: Words, addresses: 
 
 
 def wiring_of(machine: BM2Machine) -> Wiring:
-    """Return the wiring of a machine with LFSRs; it does not depend on its seeds."""
+    """Return the wiring of a machine with LFSRs, which is the same for all seeds."""
     parameters = machine.parameters
     # the CDEs whose factor has a bit, and the bit's place in that factor
     concerned: list[list[tuple[int, int]]] = [[] for _ in range(parameters.state_bits)]

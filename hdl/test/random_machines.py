@@ -54,7 +54,7 @@ class Case:
 def random_case(seed: int, most_cells: int = MOST_CELLS) -> Case:
     """Return the case of a seed, always the same one.
 
-    Kinds of generators, sensor modes, sharing, priors and replicas cycle with the seed; the rest is random.
+    Kinds of generators, sensor modes, sharing, priors and replicas take turns from seed to seed; the rest is random.
     """
     random = np.random.default_rng(seed)
     kind = _KINDS[seed % len(_KINDS)]
