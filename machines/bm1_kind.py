@@ -133,7 +133,7 @@ class BM1Kind(MachineKind):
         return joint if joint is not StopReason.NONE else StopReason.SLICE
 
     def infer(self, results: Sequence[BoardResult], _: Sequence[str] = ()) -> Inference:
-        """Return the joint posterior; each board has some lines of every replica, and its own number of cycles."""
+        """Return the joint posterior of all boards, each of which has some lines of every replica."""
         joint: npt.NDArray[np.float64] | None = None
         totals: list[int] = []
         if results and results[0].replica_cycles:

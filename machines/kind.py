@@ -183,7 +183,7 @@ class BoardMachine(ABC):
     @property
     @abstractmethod
     def paused(self) -> bool:
-        """True if the machine has stopped only because of `end`, and `step` continues."""
+        """True if the machine has stopped only because it has reached `end`: then `step` continues."""
 
     @property
     def resumable(self) -> bool:

@@ -92,7 +92,7 @@ class BM1Parameters:
         lines: Lines of the matrix, one per value of the searched variable (M in the thesis).
         sensor_bits: Address bits of each sensor column's table, columns 1..N. The top address of each column
             means a missing reading, so a column of b bits supports 2**b - 1 values.
-        prob_bits: Bits of a code (W), 1 to 16.
+        prob_bits: Bits of a probability code (W), 1 to 16.
         prior_bits: Address bits of the prior's table; 0 for a table with a single row.
         prior_mode: `table`, or `written`: the host writes the codes with the start; until then, the single
             row of the table applies.

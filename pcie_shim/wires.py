@@ -1,4 +1,4 @@
-"""Figures of the kinds of links whose time can be modelled: rate, latency, and whether all boards share a wire."""
+"""Figures of the links whose transfer times can be modelled: rate, latency, and whether all boards share a wire."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class LinkFigures:
 
 
 class LinkRate(StrEnum):
-    """The kinds of links whose time can be modelled."""
+    """The kinds of links whose transfer times can be modelled."""
 
     NONE = "none"
     PCIE_GEN2 = "pcie-gen2"

@@ -199,7 +199,7 @@ class Both:
                     break
 
     async def wait_for_seeds(self) -> None:
-        """Wait until the generators are loaded after a reset, which takes one clock for each."""
+        """Wait until all generators have their seeds after a reset, which takes one clock for each generator."""
         for _ in range(self.slow.rng_state.size + 8):
             if self.dut.core.seeds_ready.value == 1 and self.dut.rstn_i.value == 1:
                 return
