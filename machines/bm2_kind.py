@@ -188,7 +188,13 @@ class BM2Kind(MachineKind):
     def posterior(
         self, machines: Sequence[BM2Machine], frame: FrameInput, variables: Sequence[str] = ()
     ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
-        """Run the chains one after the other in this process, as boards run them."""
+        """Return the posterior of a frame, and statistics, from chains that run one after the other in this process.
+
+        Each chain has the samples that it would have on its board.
+
+        Raises:
+            NoPosteriorError: The frame has none.
+        """
         inference = self.infer(run_batches(kernels_of(machines), frame), variables)
         if inference.posterior is None:
             raise NoPosteriorError(f"There is {inference.outcome}.")

@@ -35,7 +35,7 @@ def jit(function: _Function) -> _Function:
 
 
 class Generators(NamedTuple):
-    """The steps of an LFSR as linear maps of its state, which all columns share."""
+    """Linear maps that advance an LFSR; all columns use the same maps, each on its own state."""
 
     jumps: Words  # [bits, bits / 8, 256]: the state 2**i clocks later
     bits: Words  # [prob_bits, bits / 4, 16, BLOCK_WORDS]: the next block of each output bit

@@ -49,7 +49,11 @@ def default_of(model: type[BaseModel], name: str) -> str:
 
 
 def flags_of(model: type[BaseModel], names: Sequence[str], *, prefix: str) -> list[inspect.Parameter]:
-    """Return the flags of a model's fields. An omitted flag is None: its variable `PREFIX...` or default applies."""
+    """Return a command-line flag for each of these fields.
+
+    A flag that the user omits is None; the field's value is then that of the environment variable `PREFIX...`, or its
+    default.
+    """
     return [_flag_of(model, name, f"{prefix}{name.upper()}") for name in names]
 
 

@@ -55,9 +55,9 @@ class Client:
     status_lane: Lane | None = None
     """The queue of the status messages for the client, from the first one on."""
     last_published: "Advertisement | None" = None
-    """The advertisement of the client's last message with a known envelope."""
+    """The advertisement of the client's last message that began with one of `envelopes`."""
     envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)
-    """The client's advertisements by known envelope (see `bridge.codecs.json_codec`)."""
+    """The client's advertisements, by the bytes before the message in its publish operations (their envelope)."""
     close_reason: str = ""
     """Reason why the client must be disconnected, or empty."""
     is_ready: bool = False

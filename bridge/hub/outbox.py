@@ -198,7 +198,10 @@ class Outbox:
         self.deadline = min((lane.next_time for lane in self._holding), default=inf)
 
     def adjust(self, lane: Lane, throttle: float, queue_length: int) -> None:
-        """Change a lane's throttle and length, and queue or drop the messages that these no longer hold."""
+        """Change a lane's throttle and queue length.
+
+        A message that the throttle no longer holds back is queued; the oldest beyond the new length are dropped.
+        """
         # The throttle would have admitted the next message one old interval after the last one; now one new interval.
         lane.next_time += throttle - lane.throttle
         lane.throttle, lane.queue_length = throttle, queue_length

@@ -95,7 +95,7 @@ def line(numbers: Numbers) -> str:
 
     start = f"{shown('frame', 'd'):>5}  {shown('true_position', '.1f', 'not known'):>12}"
     if numbers["mean_value"] is None:
-        return f"{start}  no posterior: {numbers['outcome'] or 'no reason given'}"
+        return f"{start}  {numbers['outcome'] or 'no posterior: no reason given'}"
     times = f"{shown('cycles', 'd'):>9}  {shown('time_ms', '.2f'):>10}"
     return f"{start}  {shown('mean_value', '.1f'):>12}  {shown('distance_cells', '.2f'):>8}  {times}"
 

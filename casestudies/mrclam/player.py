@@ -206,7 +206,7 @@ def _line(played: PlayedFrame) -> str:
     start = f"{frame.number:>5}  {seen:>4}  ({frame.x:6.3f}, {frame.y:6.3f})"
     estimate = played.estimate()
     if estimate is None:
-        return f"{start}  no posterior: {played.outcome or 'no reason given'}"
+        return f"{start}  {played.outcome or 'no posterior: no reason given'}"
     cycles = "-" if played.cycles is None else str(played.cycles)
     return f"{start}  ({estimate[0]:6.3f}, {estimate[1]:6.3f})  {played.distance():>12.3f}  {cycles:>7}"
 

@@ -56,7 +56,7 @@ class Link(Protocol):
         """Send a record; return whether a master is connected."""
 
     def keep(self, record: Record) -> None:
-        """Send a record now and to every later master: a state that lasts, such as readiness."""
+        """Send a lasting state, such as readiness, now and to every master that connects later."""
         self.send(record)
 
     def notice(self, level: str, sentence: str) -> None:
@@ -192,7 +192,7 @@ class MasterLink(Link):
         return self._master is not None and self._greeted and self._master.send(record)
 
     def keep(self, record: Record) -> None:
-        """Send a record now and to every later master: a state that lasts, such as readiness."""
+        """Send a lasting state, such as readiness, now and to every master that connects later."""
         self._last[type(record)] = record
         self.send(record)
 

@@ -25,7 +25,9 @@ def frame_message(stamp, number, *, published):
     stages = {"rosbridge_in": 100, "local_hops": 200, "register_writes": 50, "compute": 600, "reads": 50}
     values |= {f"{stage}_us": time for stage, time in stages.items()}
     values |= {"received_ns": now - 1_000_000, "sent_ns": now, "published": str(published).lower()}
-    return report_message(stamp, "overflow" if published else "impossible on every board", **values)
+    return report_message(
+        stamp, "overflow" if published else "no posterior: impossible on every board", **values
+    )
 
 
 class PretendStack:

@@ -9,6 +9,7 @@ import sys
 import pytest
 from matplotlib.image import imread
 
+from casestudies.demo import FIRST_RESULT
 from casestudies.sprinkler.model import exact_rain
 from tests.integration.conftest import until
 
@@ -45,9 +46,13 @@ async def test_a_demo_outlives_its_boards_and_its_pcie_application(stage, tmp_pa
         *(sys.executable, "-m", "rosbayes", "demo", "--sprinkler"),
         *("--count", "30", "--seed", "2", "--out", str(tmp_path)),
     )
+
+    def frames():
+        return len(re.findall(FIRST_RESULT, demo.out, re.MULTILINE))
+
     for role in ("pcie-app", "board"):
-        seen = demo.out.count("\n")
-        await until(lambda seen=seen: demo.out.count("\n") > seen + 3, lambda: demo.err + demo.out)
+        seen = frames()
+        await until(lambda seen=seen: frames() > seen + 2, lambda: demo.err + demo.out)
         for process in stage.processes()[role]:
             process.kill()
     assert await demo.end() == 0, demo.err + demo.out

@@ -110,7 +110,7 @@ async def test_a_lost_and_an_impossible_frame_have_no_result_and_the_rest_goes_o
     assert heard == played
     assert [one.frame.number for one in played if one.posterior is None] == [3, 5]
     assert played[2].outcome == f"no result within {FACTOR:g} s"
-    assert played[4].outcome == "impossible on every board"
+    assert played[4].outcome == "no posterior: impossible on every board"
     assert played[2].distance() == player.LOST_DISTANCE
     assert played[7].distance() == pytest.approx(0, abs=1e-9)
 
@@ -186,7 +186,7 @@ async def test_the_command_prints_a_line_a_frame_and_a_sum(tmp_path):
     assert process.returncode == 0, err.decode()
     lines = out.decode().splitlines()
     assert len(lines) == 10
-    assert "no posterior: impossible on every board" in lines[2]
+    assert lines[2].endswith(")  no posterior: impossible on every board")
     assert lines[-1].startswith("8 frames, 1 without a result, median distance 0.000 m")
     numbers = json.loads((tmp_path / "n.json").read_text())
     assert numbers["without_result"] == 1

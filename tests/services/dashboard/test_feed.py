@@ -56,11 +56,11 @@ def test_the_rate_covers_the_last_seconds():
 
 def test_losses_have_reasons_and_a_bound():
     feed = Feed()
-    feed.add(report(1, outcome="impossible on every board", published=False), 0.0)
+    feed.add(report(1, outcome="no posterior: impossible on every board", published=False), 0.0)
     for number in range(100):
         feed.add_loss(f"strange {number}")
-    feed.add_loss("impossible on every board")
-    assert feed.lost["impossible on every board"] == 2
+    feed.add_loss("no posterior: impossible on every board")
+    assert feed.lost["no posterior: impossible on every board"] == 2
     assert sum(feed.lost.values()) == 102
     assert len(feed.lost) <= 21
     assert feed.lost[OTHER] > 0

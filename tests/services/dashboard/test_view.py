@@ -130,8 +130,10 @@ def test_pause_step_and_return_to_the_newest():
 
 
 def test_a_frame_without_a_posterior_says_why():
-    head, picture = shown(posterior(1), report(2, outcome="impossible on every board", published=False))
-    assert (head["plot"], head["outcome"], picture) == (None, "impossible on every board", b"")
+    head, picture = shown(
+        posterior(1), report(2, outcome="no posterior: impossible on every board", published=False)
+    )
+    assert (head["plot"], head["outcome"], picture) == (None, "no posterior: impossible on every board", b"")
 
 
 def test_names_stay_what_they_are():
