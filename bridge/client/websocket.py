@@ -192,7 +192,7 @@ class WebSocket(WebSocketTransport):
             self._early += messages
 
     def close_expected(self) -> None:
-        """Limit the time in which the server must end the connection."""
+        """Start the timeout after which the connection is aborted unless the server has ended it."""
         if self.opened:
             self._schedule(CLOSE_TIMEOUT)
         else:

@@ -110,7 +110,7 @@ class Broker:
         return self._dispatcher.deadline
 
     def connect(self, address: str) -> Client:
-        """Admit a client from `address`, after checking `full`."""
+        """Admit a client from `address`; the caller must check `full` before."""
         client = Client(
             next(self._client_numbers), address, Outbox(self.limits.client_bytes, self.limits.message_bytes)
         )

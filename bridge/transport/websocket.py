@@ -116,7 +116,7 @@ class WebSocketTransport(asyncio.Protocol):
         raise NotImplementedError
 
     def close_expected(self) -> None:
-        """Limit the time in which the peer must end the connection."""
+        """Start the timeout after which the connection is aborted unless the peer has ended it."""
         raise NotImplementedError
 
     def connection_ended(self, exc: Exception | None) -> None:

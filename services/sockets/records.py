@@ -94,7 +94,7 @@ class Begin(Record, tag="begin", frozen=True):
 
 
 class Ready(Record, tag="ready", frozen=True):
-    """A service to the master: it is ready (connected, advertised, or boards programmed)."""
+    """A service to the master: the service is ready (connected, advertised, or boards programmed)."""
 
     sentence: str
 
@@ -119,7 +119,7 @@ class Notice(Record, tag="notice", frozen=True):
 
 
 class Trouble(Record, tag="trouble", frozen=True):
-    """A service to the master: it cannot continue, and the reason."""
+    """A service to the master: the reason why the service cannot continue."""
 
     exit_code: int
     sentence: str

@@ -19,7 +19,7 @@ class FitMethod(StrEnum):
 
 
 class FitPrior(StrEnum):
-    """The table with which counting starts; it decides where there are few readings."""
+    """The table with which counting starts; the fewer readings there are, the more it matters."""
 
     MODEL = "model"
     """The model's own table."""
