@@ -37,7 +37,7 @@ app = CommandLine()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """What the demo needs to run a case study; each of its commands gets `--uri` besides the options given here."""
+    """A case study as the demo runs it. Its commands get the options listed here, and `--uri`."""
 
     name: str
     topic: str
@@ -53,7 +53,7 @@ class Case:
     publishers: Mapping[str, Sequence[str]]
     """The commands on the robot's side with their options, in the order of their start."""
     counts_frames: bool = True
-    """Whether the master counts the same frames as the viewer, so that it also gets `--count`, and ends by itself."""
+    """True if the viewer shows each of the master's frames; the demo then ends the master by `--count` as well."""
 
 
 def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:

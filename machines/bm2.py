@@ -74,7 +74,7 @@ class BM2Parameters:
     """Parameters of a BM2: bit-level Gibbs sampling in a product of factors.
 
     Each factor has a conditional distribution encoder (CDE). In a move, the sequencer points at one or more bits of the
-    state, which are drawn anew. A sweep has as many moves as it takes to point at every unknown bit once.
+    state, which are drawn anew. A sweep points once at each unknown bit; with `random`, it is that number of moves.
 
     Attributes:
         cardinalities: Number of values of each variable, in the model's order.
@@ -392,7 +392,7 @@ class BM2Start:
 def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np.uint16]:
     """Return a CDE's table (`BM2Machine.tables`), from the odds factor(bit = 1) / factor(bit = 0) of each bit.
 
-    If a cardinality is no power of two, some codes of the variable stand for no value. Between a used and an unused
+    A variable's codes beyond its cardinality, up to the next power of two, are unused. Between a used and an unused
     code, the odds favour the used one as far as a table can; if both are unused, or another variable is at an unused
     code, the odds are 1. The factor is float64[cardinalities of the variables], for n bits the result is
     uint16[n * 2**(n - 1)].

@@ -49,8 +49,8 @@ PREPARED_CYCLES: Final = 2**14
 class FastBM1(BM1Kernel):
     """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4).
 
-    Words are kept between frames (at most `kept_bytes`) if frames restart from a bank; otherwise, or if not even a block
-    for every bank fits, each frame computes its own.
+    Words are kept between frames (at most `kept_bytes`) if frames restart from a bank. Otherwise, or if not even a
+    block for every bank fits, each frame computes its own.
 
     Raises:
         MachineError: The generators of the machine are not LFSRs, or are not shared.

@@ -287,7 +287,7 @@ class MachineKind(ABC):
 
     @abstractmethod
     def contents(self, machine: Any) -> Blocks:
-        """Return what programming writes to the registers, besides `UsedRegisters.capabilities`."""
+        """Return the words that programming writes to the registers, without `UsedRegisters.capabilities`."""
 
     @abstractmethod
     def kernel(self, machine: Any) -> Any:

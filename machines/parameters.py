@@ -48,7 +48,7 @@ _LFSR_BITS: Final = {RngKind.LFSR8: 8, RngKind.LFSR16: 16, RngKind.LFSR24: 24, R
 
 
 class RngReset(StrEnum):
-    """Where a frame's random numbers begin: at the frame's bank, or where the previous frame ended (`free`)."""
+    """Start of a frame's random numbers: the seeds of the frame's bank, or the end of the previous frame (`free`)."""
 
     BANK = "bank"
     FREE = "free"

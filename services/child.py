@@ -273,9 +273,10 @@ class ForkedChild(Child):
 
 
 class ForkedCommand(Child):
-    """One of our commands. Its first start is a fork, which saves the imports; a restart executes the command anew.
+    """A `rosbayes` command as a child, first forked from this process, and executed anew at each restart.
 
-    A fork takes a few milliseconds, and a new interpreter 0.3 s. But a fork during the run would copy the run's state.
+    A fork takes a few milliseconds, and a new interpreter 0.3 s, because it imports again. But a fork later in the run
+    would copy the run's state.
     """
 
     def __init__(

@@ -20,7 +20,7 @@ from pydantic import BaseModel
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """What a flag has besides its field: `names` other than `--field-name`, a word for the value, a default text."""
+    """A flag's names other than `--field-name`, the word for its value, and the text of its default."""
 
     names: tuple[str, ...] = ()
     metavar: str | None = None

@@ -1,4 +1,4 @@
-"""What a connection to a server needs besides the URI: TLS and certificates, headers and tokens.
+"""Settings of a connection that are not in the server's URI: TLS and certificates, headers and tokens.
 
 Secrets do not appear in logs and errors: the repr of a `Route` does not contain headers, and `shown` removes
 credentials and queries from a URI.
@@ -38,7 +38,7 @@ def shown(uri: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """What a connection to a server needs besides its URI.
+    """Settings of a connection to a server that are not in its URI.
 
     Attributes:
         tls: TLS settings; None for `ws://`.

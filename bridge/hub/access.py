@@ -38,7 +38,7 @@ class AccessPolicy:
 
     Attributes:
         tokens: A client must present one of them; without tokens every client may connect.
-        origins: Web pages (`https://robot.example`) that may connect, besides those of this machine; `null` stands for
+        origins: Web pages (`https://robot.example`) that may connect, in addition to those of this machine; `null` stands for
             pages opened from a file. Programs other than browsers send no origin and may always connect.
         tls: The hub's certificate and key; without it nothing is encrypted.
     """

@@ -72,7 +72,7 @@ def json_prefix(name: str) -> bytes:
 
 
 AROUND: Final = len(json_prefix("")) + 1
-"""Number of bytes in a publish operation besides the name of the topic and the JSON of the message."""
+"""Bytes of a publish operation without the name of its topic and the JSON of its message."""
 
 
 @dataclass(eq=False, slots=True)

@@ -30,7 +30,7 @@ from bridge.names import absolute, same_type, split_type
 
 # Keys of an operation with a reusable envelope: op, topic and msg.
 _ENVELOPE_KEYS: Final = 3
-# Units of work (see `TURN_WORK`) of one message, besides those for each subscriber.
+# Units of work (see `TURN_WORK`) of one message, in addition to those of each subscriber.
 _MESSAGE_WORK: Final = 20
 # Bytes copied for a subscriber in one unit of work. Filling a message and writing it as JSON, which happens at most
 # once, takes as long as this many copies.

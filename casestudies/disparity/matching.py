@@ -1,4 +1,4 @@
-"""What the host computes: filters of images, matching costs, likelihoods, and fusion in float64 (thesis 4.4).
+"""The host's computations: filters of images, matching costs, likelihoods, and fusion in float64 (thesis 4.4).
 
 Everything is computed for all pixels and disparities at once. A cost volume is float32[disparities, height, width].
 """

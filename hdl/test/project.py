@@ -1,4 +1,4 @@
-"""What the verification of the hardware imports from the rest of the project.
+"""Names from the rest of the project for the verification of the hardware.
 
 Only this module imports machines, their emulation, the emulated board and the toolchain.
 """

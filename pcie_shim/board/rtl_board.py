@@ -212,7 +212,7 @@ class RtlBoard:
         self.running = field_of(rm.STATUS_STATE_MASK, status) == BoardState.RUNNING
 
     def interrupt_words(self) -> bytes:
-        """Return an interrupt's payload, the registers from DONE to COMPUTE_NS; the host reads the results separately."""
+        """Return an interrupt's payload, the registers from DONE to COMPUTE_NS; the host reads the results itself."""
         return self.read(rm.DONE, DONE_BLOCK.size // 4)
 
     def release(self) -> None:

@@ -29,7 +29,7 @@ BOARD_TIMEOUT = 2.0 * FACTOR
 
 
 class Topology(StrEnum):
-    """Which processes the campaign starts itself; this also determines where the proxies are."""
+    """The processes that the campaign starts itself, and with them the connections on which it has proxies."""
 
     OWN = "processes"
     """The master starts services and boards; a proxy stands between them and rosbridge."""

@@ -94,7 +94,7 @@ class Peer:
 
 @dataclass(frozen=True, slots=True)
 class Awaited:
-    """What a peer has to do next: description, start of the wait (monotonic, s) and time limit in seconds."""
+    """A step that the master waits for a peer to take: description, start (monotonic, s) and time limit in seconds."""
 
     what: str
     since: float

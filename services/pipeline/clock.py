@@ -27,7 +27,7 @@ class Clock:
         self._time: int | None = None
         self._tick = 0
         self.heard = time.monotonic()
-        """When the last message came, at first the creation of this clock (monotonic seconds)."""
+        """Time of the last message on /clock, before the first the creation of this object (monotonic seconds)."""
 
     def time_ns(self) -> int:
         """Return the time for stamps (ns); 0 before the first message of a simulation."""

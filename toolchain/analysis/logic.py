@@ -72,7 +72,7 @@ class Of(StrEnum):
     """The kinds of units: what a machine's number of ALMs is counted in, and the VHDL that one unit stands for."""
 
     BOARD = "board"
-    """What each board has once: bm1_axi, bm_register_block, bm1_guard, and bm1_control of a single machine."""
+    """The units that each board has once: bm1_axi, bm_register_block, bm1_guard, and bm1_control of a single machine."""
     CODE_BIT = "code bit"
     """A bit of a cell's code, in bm1_stochastic_bitstream_generator: its part of the comparison of the random number
     with the code, of the tests for all ones and all zeros, and of the AND of bm1_tile_element."""

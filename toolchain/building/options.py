@@ -290,7 +290,7 @@ class BuildOptions(MachineOptions, TargetOptions):
 
     @property
     def written_prior(self) -> WrittenPrior | None:
-        """Where a prior that the host writes is found in messages, or None."""
+        """The source and the path of the prior that the host writes; None if it writes none."""
         if self.sources is not None:
             return self.sources.prior
         return None if self.prior_path is None else WrittenPrior(path=self.prior_path)

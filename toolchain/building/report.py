@@ -20,7 +20,7 @@ SHARED_BITS: Final = {
     "BM1": "means are correct, but the variance of counts is up to 2.6 times as large",
     "BM2": "this biases all samples",
 }
-"""What it does to each kind of machine's results if successive random numbers share bits, as a clause."""
+"""For each kind of machine, a clause on the effect of successive random numbers that share bits."""
 
 
 def build_report(model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str) -> str:

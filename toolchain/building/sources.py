@@ -1,4 +1,4 @@
-"""Where a build's readings come from (topics, paths in messages): the file of `--sources`, `--order` and `--path`."""
+"""The topics of a build's readings and their paths in messages: a sources file, `--order` and `--path`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +46,7 @@ class SourcesFile:
 
     @property
     def prior(self) -> WrittenPrior | None:
-        """Which source has the written prior, and at which path; or None."""
+        """The source and the path of the prior that the host writes; None if it writes none."""
         paths = [(at, table.prior) for at, table in enumerate(self.tables) if table.prior is not None]
         return WrittenPrior(source=paths[0][0], path=paths[0][1]) if paths else None
 

@@ -162,7 +162,7 @@ class Stop(StrEnum):
 
 
 class Queue(StrEnum):
-    """Which readings wait if they arrive faster than frames are computed."""
+    """The readings that wait if they arrive faster than frames are computed."""
 
     LATEST = "latest"
     """Only the newest reading waits; the readings that it replaces are counted."""
@@ -171,7 +171,7 @@ class Queue(StrEnum):
 
 
 class Scale(StrEnum):
-    """Which parts of a table are each divided by their maximum before quantising."""
+    """The parts of a table that are each divided by their maximum before quantising."""
 
     ADDRESS = "address"
     """The row of each address, which needs the fewest cycles of the machine."""

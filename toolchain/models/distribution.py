@@ -86,7 +86,8 @@ class IntervalType:
     def __post_init__(self) -> None:
         if not _is_whole(self.intervals):
             raise ModelError(
-                f"[{self.low:g}, {self.high:g}] cannot be cut into {self.intervals!r} intervals: expected a whole number"
+                f"[{self.low:g}, {self.high:g}] cannot be cut into {self.intervals!r} intervals: "
+                "expected a whole number"
             )
         if self.intervals < 1 or not (math.isfinite(self.low) and self.low < self.high < math.inf):
             raise ModelError(f"[{self.low:g}, {self.high:g}] cannot be cut into {self.intervals} intervals")

@@ -54,7 +54,7 @@ class Normal:
     sigma: ArrayLike
     """Standard deviation, one for all or float64[lines], in the unit of the reading."""
     floor: float = 0.0
-    """What is added to each bin's probability for outliers, relative to that of a bin centred at the mean."""
+    """Probability added to each bin for outliers, as a fraction of that of a bin centred at the mean."""
     outliers: float = 0.0
     """Share of readings that do not depend on S."""
 
@@ -165,7 +165,7 @@ class Model:
     prior_select: PriorSelect | None = None
     """The variable that selects the prior; then `prior` is the prior without a selection."""
     transition: Transition | None = None
-    """How the searched variable changes between frames, for a filter; then `prior` is the prediction for the first
+    """The change of the searched variable between frames, for a filter; then `prior` is the prediction for the first
     frame."""
 
     def __post_init__(self) -> None:

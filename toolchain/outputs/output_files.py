@@ -85,7 +85,7 @@ foreach revision {{{" ".join(revisions)}}} {{
 
 
 class Change(StrEnum):
-    """What writing the files of a part does to one file."""
+    """Effect on one file of writing the files of a part."""
 
     UNCHANGED = "unchanged"
     CHANGED = "changed"

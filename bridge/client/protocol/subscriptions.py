@@ -32,7 +32,7 @@ _ENVELOPES: Final = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Delivery:
-    """How the messages of a topic are delivered: the same for all subscriptions of a client to it.
+    """Settings for the delivery of a topic's messages; a client uses one for all of its subscriptions to the topic.
 
     Attributes:
         throttle_rate: Minimum number of milliseconds between two messages.
