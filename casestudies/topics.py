@@ -238,7 +238,7 @@ class Listener:
         return self._heard.announced_only
 
     async def next(self, limit_s: float) -> Instance:
-        """Wait for the next frame, then for a true position of its time or later; return the frame with a fitting one.
+        """Wait for the next frame, then for a true position that is no older; return both, or the frame alone.
 
         Raises:
             NoResultError: No frame arrived within the limit, in seconds.

@@ -322,7 +322,7 @@ class _OnHost(HostMachine):
         self._missing = tuple((1 << bits) - 1 for bits in self._parameters.sensor_bits)
 
     def begin(self, frame: FrameInput) -> FrameCourse:
-        """Return the course of a frame, checked against the whole machine."""
+        """Check a frame's values against the whole machine, and return the frame as a `FrameCourse`."""
         select, selects = self._prior_selects(frame)
         parameters = self._parameters
         check_frame_value("The target count", frame.target_count, 1, parameters.target_count_max)

@@ -308,7 +308,7 @@ def fill(wiring: Wiring, numbers: npt.NDArray[np.uint16], generators: Words, one
 
 @jit
 def refill(exponents: Integers, numbers: npt.NDArray[np.uint16], first: int, rows: int) -> None:
-    """Replace a chain's random numbers, `rows` rows from vector `first` of `numbers` on, by those of the next block."""
+    """In `numbers`, replace `rows` rows, from vector `first` on, by the chain's random numbers for the next block."""
     top, near = exponents[0], exponents[2] == 2  # then the exponents are 32, 22, 2 and 1
     for row in range(first, first + rows * (top + 1), top + 1):
         last, older = load(numbers, row + top - 1), load(numbers, row + top - 2)

@@ -53,7 +53,7 @@ class _Store(NamedTuple):
 
 
 class _Frame(NamedTuple):
-    """A frame of all replicas. Arrays by line contain the lines that can count, without gaps."""
+    """A frame of all replicas. Arrays by line have entries only for lines that can count."""
 
     lines: npt.NDArray[np.int64]  # [replicas, lines]: number of the line in the machine
     places: npt.NDArray[np.uint32]  # [replicas, lines, columns]: rows to AND
@@ -304,7 +304,7 @@ def _mask(first: int, end: int, mask: Words) -> None:
 def _cycle_of(
     words: Words, places: npt.NDArray[np.uint32], width: int, mask: Words, line: int, nth: int
 ) -> int:
-    """Return the cycle of a block in which a line makes its `nth` one (from 1) under the mask; that one must exist."""
+    """Return the cycle of a block in which a line's masked bit is 1 for the `nth` time, from 1; it must exist."""
     word = 0
     while True:
         made = mask[word]

@@ -125,9 +125,9 @@ class UsedRegisters:
     """The registers of a board that a machine uses, according to its parameters.
 
     Attributes:
-        lines: Lines of the model on the board.
+        lines: Number of the model's lines on the board.
         part: Index of the board, and number of boards, if the parameters contain them; otherwise None.
-        replicas: Machines on the board.
+        replicas: Number of machines on the board.
         inputs: Name of the block of inputs.
         input_words: Number of input words of all replicas.
         result_words: Number of words of the block RESULTS, for all replicas.

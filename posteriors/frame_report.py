@@ -57,7 +57,7 @@ class VariableReading(NamedTuple):
     """The reading of a variable in a frame."""
 
     value: Annotated[float | str, BeforeValidator(_number_or_text)]
-    """As received, to nine digits; text for the name of a state, and for `inf`, a number too large for a float."""
+    """As received, to nine digits: a number, or text if it is the name of a state or a number that is not finite."""
     address: int
     """Address in the variable's column."""
     age_ms: FiniteFloat

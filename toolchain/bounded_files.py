@@ -248,7 +248,7 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 def _followed(
     model: type[BaseModel], place: Sequence[str | int]
 ) -> tuple[list[str | int], list[type[BaseModel]]]:
-    """Follow a place through the fields of models; return the place without types of sections, and the models there."""
+    """Follow a place through models; return the place without types of sections, and the models at its end."""
     followed: list[str | int] = []
     models = [model]
     for step in place:

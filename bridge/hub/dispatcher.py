@@ -61,7 +61,7 @@ class Dispatcher:
         self.mark_ready(client)
 
     def as_png(self, payload: bytes) -> bytes:
-        """Return an operation as a PNG picture, or unchanged if that is too large, since no answer may be lost."""
+        """Return an operation as a PNG picture, or unchanged if the picture exceeds the limit and would be lost."""
         wrapped = as_png(payload)
         return wrapped if len(wrapped) <= self._limits.message_bytes else payload
 

@@ -41,7 +41,7 @@ class Client:
     actions: set[str] = field(default_factory=set)
     """Absolute names of the actions that the client offers."""
     goals: dict[OperationId, str] = field(default_factory=dict)
-    """Keys of the goals that the client sent and that have not ended, by its own ids."""
+    """Keys of the goals that the client sent and that have not ended, by the ids in its messages."""
     tasks: set[str] = field(default_factory=set)
     """Keys of the goals that the client executes."""
     refused: int = 0

@@ -149,8 +149,8 @@ def flag(operation: Operation, field: str) -> bool:
 def number(operation: Operation, field: str) -> float:
     """Return a number that is not negative; 0 if it is left out.
 
-    The reference server accepts only integers, and ignores an operation that contains `0.0`; no client relies on
-    that.
+    The reference server accepts only integers: it ignores an operation that contains `0.0`. The hub accepts `0.0` too,
+    because no client wants its operations ignored.
     """
     value = operation.get(field)
     if value is None:

@@ -25,7 +25,7 @@ _BRACE: Final = ord("{")
 
 
 def is_text(payload: bytes) -> bool:
-    """Return whether a payload is JSON: its object begins with a brace, as a map of CBOR cannot."""
+    """Return whether a payload is JSON, which begins with a brace, and not CBOR, whose maps begin with other bytes."""
     return payload[0] == _BRACE
 
 

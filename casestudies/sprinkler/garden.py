@@ -26,7 +26,7 @@ def mornings(seed: int) -> Iterator[tuple[int, int, int]]:
 
 
 async def publish_mornings(uri: str, *, seed: int, rate: float, count: int | None = None) -> None:
-    """Publish the grass of `count` mornings, or until cancelled; a BridgeError if no server answers at the URI."""
+    """Publish the grass, for `count` mornings or until cancelled; a BridgeError if no server answers at the URI."""
     from casestudies.topics import LossyPublication, connected
 
     async with connected("sprinkler-garden", "the grass was published", uri) as (ros, readiness):

@@ -165,7 +165,7 @@ class SamplesViewer:
     async def _samples_of(
         self, posterior: Posterior, samples: Subscription, limit_s: float
     ) -> NDArray[np.int64] | None:
-        """Return the samples whose share of R = 1 equals the posterior's P(R = 1), or None if they are lost."""
+        """Return the samples of the posterior's frame, found by their share of R = 1; None if they are lost."""
         share = posterior.marginal("R")[1]
         while True:
             for at, states in enumerate(self._unclaimed):

@@ -180,9 +180,9 @@ class EmulatedBoard:
             self._allow(rm.BLOCKS[name], count, _READ_WRITE)
 
     def _measured_speed(self, image: Image, machine: BoardMachine) -> float:
-        """Return the cycles per second of the slowest frame, whose inputs stay in the registers.
+        """Measure the cycles per second of the frame that takes longest to emulate; its inputs remain in the registers.
 
-        It measures the thread's CPU time, so that other load at this moment does not make the board appear slow.
+        This measures the thread's CPU time, so that other load at this moment does not make the board appear slow.
         """
         host = image.kind.on_host([image.machine])
         course = host.begin(host.slowest())
@@ -357,7 +357,7 @@ class EmulatedBoard:
             self._publish(BoardState.DONE, machine.reason, cycles)
 
     def _chunk_end(self, cycles: int, max_cycles: int) -> int:
-        """Return the cycle at which the next chunk ends, at the latest the slice's end; 0 for the frame's end."""
+        """Return the cycle at which the next chunk ends, at most the slice's last; 0 if the chunk ends with the frame."""
         end = cycles + self._chunk
         if end - cycles > _ALIGNMENT:
             end -= end % _ALIGNMENT

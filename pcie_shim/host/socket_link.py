@@ -71,12 +71,12 @@ class Done(NamedTuple):
 
     @property
     def state(self) -> int:
-        """STATUS.STATE."""
+        """State of the board: the field STATUS.STATE."""
         return field_of(register_map.STATUS_STATE_MASK, self.status)
 
     @property
     def reason(self) -> int:
-        """STATUS.STOP_REASON."""
+        """Stop reason: the field STATUS.STOP_REASON."""
         return field_of(register_map.STATUS_STOP_REASON_MASK, self.status)
 
 

@@ -93,7 +93,7 @@ async def until_read(ros: Ros, topic: str, pause: float = 0.05) -> None:
 
 
 class Measured:
-    """The echo or a stack: its topics for readings and answers, and the times of its cycles and their stages."""
+    """The measured echo or stack: its topics for readings and answers, and the times of its cycles and their stages."""
 
     def __init__(self, publication: Publication, answers: Subscription, master: int) -> None:
         self._publication, self._answers = publication, answers

@@ -38,7 +38,7 @@ SINGLE_AIMS: Final = {"sprinkler": 6e7, "alarm": 2e7}
 RATIO_AIMS: Final = {"sprinkler": 10, "alarm": 2}
 """Cycles a second of many chains, over those of one."""
 MANY: Final = {"sprinkler": 512, "alarm": 32}
-"""Number of chains."""
+"""Number of chains in a run of many."""
 TURNS: Final = 3
 """Times that each alternative is measured; the fastest counts, because other processes only slow it down."""
 BURN_IN: Final = 100

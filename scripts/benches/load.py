@@ -31,7 +31,7 @@ RATE, SLOT = 2000, 0.01
 """Messages per second over all topics, and interval in seconds; the messages of an interval are published at once."""
 PROBE_HZ = 100
 LIMIT = 24 * 3600.0
-"""Time limit in seconds, which any number of minutes should keep."""
+"""Time limit in seconds, beyond any sensible `--minutes`."""
 WARM_UP = 200
 """Readings before the first minute."""
 

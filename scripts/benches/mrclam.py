@@ -143,7 +143,7 @@ async def run_stack(
 
 
 async def bench(arguments: argparse.Namespace) -> int:
-    """Play recordings through stacks; return 1 if a robot exceeds the bound or a fit is not better."""
+    """Play recordings through stacks; return 1 if a robot exceeds `BOUND`, or learnt tables are no better."""
     arguments.data = arguments.data.resolve()  # for the processes of the run
     arguments.fit = arguments.fit and arguments.fit.resolve()
     for name in RECORDINGS:

@@ -71,7 +71,7 @@ class Network:
 
     @classmethod
     def read(cls, pyagrum: Any, archive: Path) -> "Network":
-        """Read a compressed BIF file twice."""
+        """Read a compressed BIF file, with this project's reader and with pyagrum's."""
         joint = read_network(archive, on_missing="missing")
         zeros = sum(int(np.count_nonzero(factor.table == 0)) for factor in joint.factors)
         names = [symbol.name for symbol in joint.symbols]
@@ -97,9 +97,9 @@ class Network:
         return {variable: inference.posterior(names[variable]).toarray() for variable in unknown}
 
     def evidences(self) -> dict[str, Known]:
-        """Return three evidences: none; the first leaves at their likeliest states; the same at the least likely ones.
+        """Return three evidences: none; the likeliest states of the first leaves; their least likely states.
 
-        Each leaf is set given those before it, so that the states are possible together.
+        The state of each leaf depends on the leaves before it, so that all states are possible together.
         """
         leaves = [
             variable

@@ -41,7 +41,7 @@ PARTS = {
     "registers": ("register_writes", "reads"),
     "boards": ("compute",),
 }
-"""A frame's stages; boards are emulated."""
+"""Parts of a frame's time, each with the stages that it sums; boards are emulated."""
 
 
 class Point(NamedTuple):
@@ -173,7 +173,7 @@ def show(points: Sequence[Point], arguments: argparse.Namespace) -> None:
 
 
 def draw(path: Path, points: Sequence[Point]) -> None:
-    """Draw the stages along each size, and the cycles on an axis of their own."""
+    """Draw the times of `PARTS` against each size, and the cycles on a second axis."""
     figure = new_figure(12, 4.2)
     titles = {"lines": "lines", "sensors": "sensors", "size": "bytes of a message"}
     for axes, (name, those) in zip(figure.subplots(1, 3, sharey=True), varied(points).items(), strict=True):

@@ -32,7 +32,7 @@ from scripts.running.plain_client import REPORTS, PlainClient
 _ANSWER = 0.1 * FACTOR
 """Seconds to wait for a result during a fault before the next reading is published."""
 _ANSWER_LIMIT = 10.0 * FACTOR
-"""The same without a fault, when only one reading is in flight."""
+"""Seconds to wait for a result without a fault, when only one reading is in flight."""
 _RECOVERY_LIMIT = 180.0 * FACTOR
 """Timeout in seconds for new results after a fault; generous, because it does not judge the stack's speed."""
 _CALM_LIMIT = 5.0 * FACTOR

@@ -29,7 +29,7 @@ BOARD_TIMEOUT = 2.0 * FACTOR
 
 
 class Topology(StrEnum):
-    """The processes that the campaign starts itself, and with them the connections on which it has proxies."""
+    """The share of the processes that the campaign starts instead of the master, and the places of its proxies."""
 
     OWN = "processes"
     """The master starts services and boards; a proxy stands between them and rosbridge."""

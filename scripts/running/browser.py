@@ -18,8 +18,8 @@ LOCK: Final = Path(__file__).parents[1] / "verifications" / "playwright.lock"
 NUMBER: Final = "Number(document.querySelector('[data-testid=frame-number]')?.innerText.replace(/\\D/g, ''))"
 """The shown frame number, in JavaScript; 0 without one."""
 NEAR: Final = 0.13
-"""Distance from the posterior's mean to the boat up to which it has followed, as a share of the canvas's width: about
-the posterior's own width.
+"""Maximum distance from the boat to the mean of a posterior that has followed it, as a share of the canvas's width:
+about the posterior's own width.
 """
 FOLLOW: Final = f"""
     window.paints = [];

@@ -28,7 +28,7 @@ class PlainClient:
         take: Callable[[str, Any], None],
         lost: Callable[[], None] = lambda: None,
     ) -> None:
-        """Store the topic and type of readings, and functions for messages, by topic, and for a lost connection."""
+        """Store the arguments: `take` gets the topic and content of each message, `lost` is called after each loss."""
         self._uri = f"ws://127.0.0.1:{port}"
         self._topic, self._type = readings
         self._take, self._lost = take, lost

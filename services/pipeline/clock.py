@@ -10,7 +10,7 @@ from bridge.stamps import stamp_ns
 CLOCK_TOPIC: Final = "/clock"
 _CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
 _INTERVAL_MS: Final = 10
-"""Minimum time between two messages from the server; simulators publish a thousand a second."""
+"""Minimum time in ms between two messages from the server, because simulators publish a thousand a second."""
 _MOST_NS: Final = 3600 * 10**9
 """Maximum advance of the ticks by one message, so that jumps of the time never make them exceed 64 bits."""
 

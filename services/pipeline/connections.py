@@ -22,7 +22,7 @@ OnState = Callable[[str, State, str], None]
 """Callback with the URI of a server, the new state of its connection, and the reason."""
 
 AFTER: Final = 2.0
-"""Seconds in which the publisher of a topic may appear; after them, the topic's name may be mistyped."""
+"""Seconds to wait for a topic's publisher to appear, before a report that suggests similar names."""
 ROSAPI_TIME = 2.0
 """Seconds in which rosapi may answer. Many servers lack it; then nothing is known about their topics."""
 SETTLED_TIME = 3.0

@@ -1,4 +1,4 @@
-"""`publisher` without a master, which publishes the results of standard input."""
+"""`publisher` without a master: it publishes results that it reads from standard input."""
 
 import time
 from collections import Counter

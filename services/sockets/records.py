@@ -162,7 +162,7 @@ class Reading(Record, tag="reading", frozen=True):
 
 
 class Unusable(Record, tag="unusable", frozen=True):
-    """Subscriber to master: an unusable message. `cause` is equal for messages with the same cause."""
+    """Subscriber to master: an unusable message. `cause` is a key, the same for all messages with this kind of flaw."""
 
     cause: str
     sentence: str
@@ -227,7 +227,8 @@ class Published(Record, tag="published", frozen=True):
     `seen` is whether the result came back from the server (None if that was not checked). `best_line` is the number of
     the most probable cell. `total_ns` is the time from the reading's receipt to the result's sending. If there are
     several outputs, `missed` counts those whose servers were not connected. `out_ns` is the duration of publishing.
-    `why` is the report's sentence if there is no posterior or a biased one; `cause` lists the boards' stop reasons.
+    `why` is the sentence of the frame's report, if there is no posterior or a biased one; `cause` lists the boards'
+    stop reasons.
     """
 
     number: int

@@ -25,7 +25,9 @@ from toolchain.errors import BuildError
 TOLERATED: Final = 0.01
 """Share of lost frames above which a build and a check warn."""
 _WORK: Final = 2**26
-"""Number of comparisons of points with codes for one machine, in less than a second; only large models take more."""
+"""Maximum number of comparisons of points with codes, which take less than a second; `_LEAST_FRAMES` of a very
+large model take more.
+"""
 _MOST_FRAMES: Final = 1000
 _LEAST_FRAMES: Final = 10
 _POINTS: Final = 16
@@ -119,7 +121,7 @@ def _advice(plan: MachinePlan, drawn: Readings) -> str:
 def _expected(
     plan: MachinePlan, changes: dict[str, Any], drawn: Readings, count: int, *, longer: bool
 ) -> tuple[str, float]:
-    """Return `changes` as flags, and the share of frames lost with them and with only the first `count` sensors.
+    """Return `changes` as flags, and the share of frames that are lost with these flags and only `count` sensors.
 
     If `longer`, the maximum number of cycles is also raised (as a further flag) until few frames are lost.
     """

@@ -48,7 +48,7 @@ def network_for(source: Model | Question) -> NetworkModel:
 def _refuse(
     flags: list[str], wanted: str, chosen: str, choice: MachineChoice, why: str, *, is_possible: bool = True
 ) -> None:
-    """Raise a BuildError if `flags`, which are those given for the kind `wanted`, is not empty."""
+    """Raise a BuildError if the user passed any `flags` that only the kind `wanted` has."""
     if flags:
         this = f"{chosen}, since {why}" if choice is MachineChoice.AUTO else f"{chosen} (--machine {choice})"
         other = f", or use --machine {wanted.lower()}" if is_possible else ""

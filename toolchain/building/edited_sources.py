@@ -1,7 +1,7 @@
-"""Images (programming files) from edited sources, the MIFs and `bm1_parameters.vhd` of a deployment (thesis 3.2, 3.4).
+"""Images (programming files) from the edited sources of a deployment: MIFs and `bm1_parameters.vhd` (thesis 3.2, 3.4).
 
-An edit is accepted if the sources that the new images give are the same as the edited ones. So sources that contradict
-each other are refused.
+An edit is accepted if the sources, written again from the new images, equal the edited ones. So sources that
+contradict each other are refused.
 """
 
 from collections.abc import Callable, Sequence

@@ -61,8 +61,8 @@ class Quantised:
     """The codes of a model for all lines, before they are divided among boards."""
 
     prior: NDArray[np.uint16]
-    """uint16[rows, lines]: one row or, if a variable selects the prior, one per address of it. Then the last row is
-    the prior without a selection, and rows of addresses that are no value contain 0.
+    """uint16[rows, lines]: a single row or, if a variable selects the prior, a row for each of its addresses. Then the
+    last row is the prior without a selection, and rows of addresses that stand for no value contain 0.
     """
     tables: tuple[NDArray[np.uint16], ...]
     """uint16[2**bits, lines] per known variable; addresses that are no value contain 0, and the top address, for
@@ -195,9 +195,9 @@ def _vanished_floor(
 
 
 def _enough_floor(known: Known, prob_bits: int, scale: Scale) -> float:
-    """Return the lowest floor for which no code is 0, rounded up to two digits; 0 if even a floor of 1 is too low.
+    """Return the lowest floor with which no code is 0, rounded up to two digits; 0 if even a floor of 1 is too low.
 
-    It is searched, because a higher floor also raises the maxima by which probabilities are divided.
+    The floor is found by bisection, because a higher one also raises the maxima by which probabilities are divided.
     """
     peak = known.table.max(axis=0)
     if known.normal is not None:

@@ -1,4 +1,4 @@
-"""The topics of a build's readings and their paths in messages: a sources file, `--order` and `--path`."""
+"""The topics of a build, and the path of each variable in a message: from a sources file, `--order` and `--path`."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -35,7 +35,7 @@ _PATTERN_BITS: Final = 24
 _BLANKET_BITS: Final = 16
 """Maximum number of bits that share a factor with the bit of a move; the search for clips tries all their values."""
 _RELATED_BITS: Final = 2048
-"""Maximum number of random bits per cycle of a board that are searched for relations, because all pairs are kept."""
+"""Maximum number of bits among which relations are searched, because all pairs are kept; a board may draw more."""
 _TIMEOUT_RISK: Final = 1e-6
 _MOVE_CYCLES: Final = 3.0
 

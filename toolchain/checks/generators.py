@@ -160,7 +160,7 @@ _MOST_PAIRS: Final = 20_000_000
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """Bits that XOR to 0 in every cycle, in one group of columns: those of a bank, or of one line in a bank."""
+    """Bits of one group that XOR to 0 in every cycle; a group is all columns of a bank, or those of a line in it."""
 
     group: int
     bits: tuple[Bit, ...]

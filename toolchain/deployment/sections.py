@@ -253,7 +253,7 @@ class Variable(Section):
 
 
 class Dimension(Section):
-    """`[[searched]]`: one searched variable, a dimension of the grid of lines; the first is the slowest."""
+    """`[[searched]]`: one searched variable, a dimension of the grid of lines; the first one varies slowest."""
 
     label: Name
     size: int = Field(ge=1)

@@ -334,9 +334,9 @@ def exact_posterior(
 ) -> NDArray[np.float64]:
     """Return P(S | readings) of the unquantised model, float64[lines].
 
-    `addresses` has one per known variable, in the order of the columns; None for a missing reading. If each line has
-    its own reading (`sensor_mode = cell`), an address is int64[lines]. `prior_address` is the row of the selected
-    prior; None for the prior without a selection. `prior` replaces the prior of the model.
+    `addresses` has one address per known variable, in the order of the columns; None for a missing reading. If each
+    line has its own reading (`sensor_mode = cell`), an address is int64[lines]. `prior_address` is the row of the
+    selected prior; None for the prior without a selection. `prior` replaces the prior of the model.
 
     Raises:
         ModelError: The number of addresses is wrong, an address is not a row of its table, or the readings are

@@ -18,7 +18,7 @@ MAX_VARIABLES: Final = 20_000
 MAX_STATES: Final = 65_535
 """Maximum number of states of a variable: a column of a machine can have 2^16 - 1 values."""
 MAX_PARENTS: Final = 30
-"""Maximum number of parents: NumPy arrays have at most 64 axes, and a table of at most 2^24 entries needs fewer."""
+"""Maximum number of parents, fewer than the 64 axes of NumPy's arrays; 24 parents already make tables too large."""
 MAX_TOTAL: Final = 2 * MAX_ENTRIES
 """Maximum number of entries of all tables together."""
 MAX_NAME: Final = 200

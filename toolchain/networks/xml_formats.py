@@ -52,7 +52,7 @@ def _decimals(words: Sequence[str], child: str, line: XmlLine) -> NDArray[np.flo
 
 @dataclass(slots=True)
 class Element:
-    """An element of an XML file. Its text is what follows its last child, or all that it contains if it has none."""
+    """An element of an XML file. `text` is the text after its last child, or all its text if it has no children."""
 
     name: str
     attributes: dict[str, str]

@@ -20,7 +20,7 @@ ACK_EVERY = 50
 
 
 def message_of(count: int) -> dict[str, Any]:
-    """Return a message of numbers like those of sensors, as an array if there are many."""
+    """Return a message of `count` fractions, in an array if they are more than 16, otherwise in a list."""
     values = (np.arange(count) + 1) / 7.0
     return {"data": values if count > 16 else values.tolist()}
 

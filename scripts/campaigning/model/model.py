@@ -13,7 +13,7 @@ VALUES = {"near": 7, "far": 5}
 
 
 def model() -> Question:
-    """Return the question."""
+    """Return the question: the place, given both sensors."""
     place = Symbol("x", IntervalType(0.0, 16.0, CELLS))
     x = np.arange(CELLS)
     factors = [uniform(place)]

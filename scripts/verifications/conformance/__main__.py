@@ -1,4 +1,4 @@
-"""Tests of other projects on the hub: roslibpy's own suites, and typical uses of roslib (scripts/verify conformance)."""
+"""Tests of the hub with other clients: roslibpy's own suites, typical uses of roslib (scripts/verify conformance)."""
 
 import argparse
 import asyncio

@@ -170,7 +170,7 @@ def check_healthy(stack: Stack) -> None:
 
 @contextlib.contextmanager
 def containers(stack: Stack, commands: dict[str, list[str]], *options: str) -> Iterator[None]:
-    """Run containers outside the compose project, in the network of their machine."""
+    """Run containers outside the compose project, with the network of the host."""
     stack.docker("rm", "--force", *commands, check=False)  # those of a run that was ended
     try:
         for name, command in commands.items():
@@ -222,7 +222,7 @@ def check_absent_robot(stack: Stack) -> None:
 
 
 def check_own_model(stack: Stack) -> None:
-    """Check a user's model, built by `toolchain build` in the project, with readings from outside; then as a BM2."""
+    """Check a user's model with readings from another container; `toolchain build` makes first a BM1, then a BM2."""
     topic = ("--topic", "/mine/readings", "--type", "std_msgs/Float64MultiArray")
     source = ("--uri", "ws://127.0.0.1:9090", *topic)
 
@@ -286,7 +286,7 @@ run serial; run cluster "--scheduler tcp://127.0.0.1:8786"
 cmp serial.npz cluster.npz; cmp serial.jsonl cluster.jsonl
 python -c "from urllib.request import urlopen; print(urlopen('http://127.0.0.1:8787/status').read())"
 """
-"""Of a host: a recording and a sweep, first in one process; then the page of the dashboard."""
+"""Script of a host: a recording and a sweep, in one process and then on the cluster; last, a page from dask."""
 
 
 def check_cluster(stack: Stack) -> None:
@@ -431,7 +431,7 @@ def in_engine(arguments: list[str]) -> int:
 
 
 def main() -> int:
-    """Check that this machine can run it, then run it with a time limit."""
+    """Parse the flags, and run the checks inside a Docker engine that the script starts."""
     parser = ScriptParser("scripts/verify containers", __doc__)
     parser.flag("--only", "only the checks with this in their names, and what they need", "")
     parser.switch("--short", "build, start, compare results, kill a service, stop")

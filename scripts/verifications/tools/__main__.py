@@ -53,9 +53,9 @@ PROGRAMS: Final = {
     f"{MODULES}/nav_msgs": "python3-nav-msgs",
 }
 PLACE: Final[Place] = (15.0, -12.0)
-"""Place in metres where the boat lies on the picture, so that the whole posterior is on the map."""
+"""Place of the boat in the picture, in metres, chosen so that the whole posterior is on the map."""
 NEAR: Final = 12.0
-"""Distance in metres from there to the posterior's mean up to which it has followed."""
+"""Maximum distance in metres from `PLACE` to the mean of a posterior that belongs to this place."""
 SCALE: Final = 4.0
 """Pixels a metre in boat.rviz."""
 BACKGROUND: Final = (48, 48, 48)
