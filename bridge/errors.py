@@ -36,7 +36,7 @@ class TypeConflictError(UsageError):
 
 
 class OptionError(UsageError):
-    """Raised when an option is invalid: a number out of range, an unusable file, or two that exclude each other."""
+    """Raised when a number is out of range, a file is unusable, or two options exclude each other."""
 
 
 class ConcurrentReadError(UsageError):

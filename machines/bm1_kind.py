@@ -374,8 +374,8 @@ class _OnHost(HostMachine):
     def _prior_selects(self, frame: FrameInput) -> tuple[int, bytes]:
         """Return the prior's address and the words of PRIOR_SELECTS.
 
-        If replicas have their own addresses, the first result is the largest, or if any is negative, the smallest: the
-        caller checks only this one.
+        If each replica has its own address, return only one of them for the caller's range check: the smallest if
+        that is negative, otherwise the largest.
         """
         given = frame.prior_address
         if isinstance(given, tuple):

@@ -191,7 +191,7 @@ class Chains:
     def _run_slice(
         self, circuit: _Circuit, moves: Moves, start: BM2Start, states: list[int], seeds: Words
     ) -> _Ran | None:
-        """Run up to 512 chains, sliced; None if a chain may not draw all samples."""
+        """Run up to 512 chains bit-sliced; return None if one of them may stop before it has drawn all its samples."""
         parameters, unknown = self._parameters, circuit.unknown.tolist()
         lfsr, steps = LFSR(parameters.rng), parameters.steps_per_clock
         events = 1 << len(unknown)

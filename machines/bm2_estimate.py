@@ -25,8 +25,8 @@ class BoardSamples:
 
     Attributes:
         reason: Its last stop reason.
-        counts: uint32[batches, values], for each joint value of the searched variables the samples that had it, counted
-            from the frame's start to the end of each batch.
+        counts: uint32[batches, values], the number of samples with each joint value of the searched variables, from the
+            frame's start to the end of each batch.
         values: int[samples], the index of each sample's joint value, -1 for an unused code; None without a stream.
     """
 

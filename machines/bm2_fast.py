@@ -7,7 +7,8 @@ bits, and the masks of the CDEs show the first cycle in which they agree.
 The random numbers of a block of cycles are stored for each CDE. A generator's number in cycle t is the XOR of its
 numbers in the cycles t - e, for the exponents e of its polynomial. Reason: each bit of an LFSR's state goes through the
 LFSR's sequence, and every 2**k-th bit of that sequence is the same sequence at another phase (`steps_per_clock` is a
-power of two). For the same reason, it is the XOR of its numbers in the cycles t - 32 * e: so 32 are computed at a time.
+power of two). For the same reason, the number in cycle t is also the XOR of those in the cycles t - 32 * e, so 32
+numbers are computed at a time.
 """
 
 from functools import lru_cache, partial

@@ -37,7 +37,7 @@ STREAM_WORDS_MAX: Final = 4096
 """Maximum number of words of the stream's buffer: the size of the block STREAM in the register map."""
 
 BATCHES: Final = 20
-"""Number of batches of a frame without a stream. Their means show how much the samples depend on each other."""
+"""Number of batches of samples in a frame without a stream; their means show how much samples depend on each other."""
 
 STREAM_BYTES_MAX: Final = 3 << 20
 """Maximum size in bytes of a frame's streams, of all boards together: one message between services carries them."""

@@ -122,7 +122,7 @@ class LFSR:
 
 
 def sequencer_seed(parameters: BM2Parameters, bank: int) -> int:
-    """Return the state at a bank's start of the LFSR16 with which a BM2's sequencer draws its random order."""
+    """Return a bank's seed for the LFSR16 of a BM2's sequencer, which draws the random order of the bits."""
     return int(LFSR(RngKind.LFSR16).seeds(np.array([seed_set(parameters, bank)], dtype=np.uint64))[0])
 
 

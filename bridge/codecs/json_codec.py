@@ -280,9 +280,9 @@ def envelope_of(data: bytes) -> bytes:
 def topic_of(envelope: bytes) -> str | None:
     """Return the topic of an envelope, or None if it is not one.
 
-    Completed with an empty message and a brace, an envelope is a publish operation with only the keys `op`,
-    `topic` and `msg`. The empty message is the value of the last key, so that key is `msg`, and any object that
-    follows the envelope is the message.
+    An envelope is the text before the message in a publish operation that has only the keys `op`, `topic` and
+    `msg`, the last one being `msg`. To check this, the text is completed with an empty message and a brace, and
+    parsed.
     """
     try:
         operation: Any = orjson.loads(envelope + b"{}}")

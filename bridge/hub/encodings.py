@@ -80,7 +80,7 @@ class OutgoingMessage:
     """One published message, encoded on demand."""
 
     json: bytes
-    """Bytes that end with the message as JSON (from index `_begin` on) and a brace, so that it need not be copied."""
+    """Bytes of JSON: from index `_begin` on the message, then one brace; the rest is kept to avoid copying them."""
     _begin: int
     _parsed: dict[str, Any] | None
     """The parsed message, or None if it was not parsed yet."""

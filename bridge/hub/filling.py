@@ -68,14 +68,14 @@ class Filler:
 
         Args:
             message: The message.
-            room: Number of bytes by which the messages inside it may grow.
+            room: Number of bytes by which its nested messages may grow.
 
         Returns:
-            What to put in place of the last two braces of an operation that ends with the message, both as JSON. It
-            is empty if nothing was absent, and None if the message must be written again.
+            The bytes that replace the last two braces of a JSON operation whose last value is the message, so that it
+            need not be written again; empty if no field was absent, None if a nested message has grown.
 
         Raises:
-            RefusedOperationError: The messages inside it would grow by more than `room`.
+            RefusedOperationError: The nested messages would grow by more than `room`.
         """
         if len(message) == self.count:
             return None if self.parts and _fill_parts(self.parts, message, room) else b""

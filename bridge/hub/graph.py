@@ -55,7 +55,7 @@ class Client:
     status_lane: Lane | None = None
     """The queue of the status messages for the client, from the first one on."""
     last_published: "Advertisement | None" = None
-    """The advertisement that `envelopes` gave for the client's last message; the next one is probably of it, too."""
+    """The advertisement that `envelopes` gave for the client's last message; tried first for the next message."""
     envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)
     """The client's advertisements, by the bytes before the message in its publish operations (their envelope)."""
     close_reason: str = ""

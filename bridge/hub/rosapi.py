@@ -24,9 +24,9 @@ from bridge.hub.limits import HubLimits, RefusedOperationError
 from bridge.names import MAX_NAME, absolute, ros1_type, ros2_type
 
 NODE: Final = "/rosapi"
-"""The node that offers these services."""
+"""The node that offers the services of rosapi."""
 PREFIX: Final = NODE + "/"
-"""The prefix of their names, which clients cannot use."""
+"""The prefix of rosapi's service names; clients cannot offer services under it."""
 ROSOUT: Final = "/rosout"
 """The topic of ROS's log, which carries the hub's refusals."""
 # Topics that a server of ROS 1's actionlib publishes or subscribes to under its name.

@@ -235,7 +235,7 @@ class _Hub:
             self._timer.cancel()
 
     def serve(self) -> None:
-        """Write the clients' output, and schedule the broker's next deadline."""
+        """Write the output that waits for clients, and schedule the broker's next deadline."""
         for client in self.broker.take_ready():
             connection = self._by_client.get(client)
             if connection is not None:

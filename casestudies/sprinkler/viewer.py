@@ -53,7 +53,7 @@ class FrameSummary:
     effective: float
     """Number of effective samples, from `/bm/frame`; 1 if that does not state it."""
     curve: NDArray[np.int64]
-    """int64[points, 2]: a number of samples from the first on, and how many of these have R = 1; last, all samples."""
+    """int64[points, 2]: n, and how many of the first n samples have R = 1; in the last row, n counts all samples."""
 
 
 def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> FrameSummary:

@@ -51,7 +51,7 @@ _ACCESS_CLOCKS: Final = 14
 
 _NS: Final = 10
 _NOT_COMPARED: Final = (rm.CAP_SPEED, rm.COMPUTE_NS, rm.COMPUTE_NS + 4)
-"""Registers whose values depend on the clock. The emulated board measures its own, so they are not compared."""
+"""Registers that are not compared, because the emulated board measures its real speed and time."""
 
 
 class SlowKernel:

@@ -168,9 +168,9 @@ class Measured:
 async def in_turns(
     sides: Sequence[Measured], some: list[dict[str, int]], turn: int = TURN, hz: float = 0.0
 ) -> tuple[float, float, float]:
-    """Return the median cycles of two stacks, and the median of their ratios in neighbouring turns, after a warm-up.
+    """Return the median cycle times of two stacks, and the median of their ratios, after a warm-up.
 
-    The ratios are of neighbouring turns, because the load of the machine changes.
+    Each ratio is of two neighbouring turns, because the load of the machine changes.
     """
     for side in sides:
         await side.one_by_one(some[:TURN], hz)

@@ -1,4 +1,4 @@
-"""Speed of the fast kernels on one core: BM1, and BM2 as one chain and as many, beside other Gibbs samplers.
+"""Speed of the fast kernels on one core: a BM1, and a BM2 with one or many chains against other Gibbs samplers.
 
 sprinkler (the case study), wet grass ──┬──▶ BM2: one chain, many chains; a plain Gibbs sampler in numba
 alarm (pgmpy's), nothing known ─────────┴──▶ pyAgrum's Gibbs sampler; THRML's, with --thrml

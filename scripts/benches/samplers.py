@@ -15,9 +15,9 @@ CHAINS: Final = 64
 _LEAST: Final = 1e-30
 """A zero of a table for THRML, whose weights are logarithms."""
 Factor: TypeAlias = tuple[tuple[int, ...], NDArray[np.float64]]
-"""The numbers of a factor's variables, and its table."""
+"""The indices of a factor's variables, and the factor's table."""
 Known: TypeAlias = Mapping[int, int]
-"""The values of the known variables, by number."""
+"""The values of the known variables, by index."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ def thrml_gibbs(
     sweeps: int,
     burn_in: int,
 ) -> Sampled:
-    """Run THRML's block Gibbs sampler, 64 chains of sweeps/64 from one start; the seconds exclude compilation.
+    """Run THRML's block Gibbs sampler: 64 chains with sweeps/64 sweeps each, from one state; compilation is not timed.
 
     Args:
         factors: The network.

@@ -145,7 +145,7 @@ class Proxy:
     async def _give(
         self, piece: bytes, former: bytes, writer: asyncio.StreamWriter, *, to_client: bool
     ) -> bool:
-        """Forward a piece according to the weather; return whether the connection remains open."""
+        """Forward a piece, treated as `self.weather` says; return whether the connection remains open."""
         weather = self.weather
         if weather.delay:
             await asyncio.sleep(weather.delay)

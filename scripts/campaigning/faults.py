@@ -70,7 +70,7 @@ SHORT: tuple[Step, ...] = (
 # --- what a fault explains -------------------------------------------------------------------
 
 ENDS = {"master": 1, "hub": 2, "boards": 3}
-"""Maximum number of times per round that a board may be ended, because its fourth failure within a minute ends the master."""
+"""Maximum ends of a role per round; 3 for boards, because a board's fourth failure in a minute ends the master."""
 MOST_ENDS = 2
 """The same for the other roles and for their connections to the master."""
 _ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memory"}

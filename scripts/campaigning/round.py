@@ -128,7 +128,7 @@ class Round:
                 await self._news.wait()
 
     async def _special(self, what: str, number: int) -> None:
-        """Publish special readings."""
+        """Publish abnormal readings: nan, huge or unusable values, stamps in disorder, or a burst without pauses."""
         stamps = [next(_stamps) for _ in range(number)]
         if what == "disorder":
             self._rng.shuffle(stamps)
@@ -233,7 +233,7 @@ class Round:
         self._paused = False
 
     async def _calm(self) -> None:
-        """Compute frames without faults, settle without excuses, and sample the processes' resources."""
+        """Compute frames without faults, check that no loss needs a fault as its reason, and sample the resources."""
         observer = self.observer
         observer.calm()
         wanted = observer.results + self._calm_frames

@@ -47,7 +47,7 @@ class ScriptParser(argparse.ArgumentParser):
         self.add_argument(name, action="store_true", help=text)
 
     def run(self, work: Callable[[argparse.Namespace], Awaitable[int]], limit: float) -> NoReturn:
-        """Parse the flags, run the coroutine that `work` makes from them with a time limit in seconds, and exit."""
+        """Parse the flags, call `work` with them, run its coroutine for at most `limit` seconds, and exit."""
         arguments = self.parse_args()
         sys.exit(run_script(lambda: work(arguments), limit))
 

@@ -43,7 +43,7 @@ from scripts.verifications.checks import CheckError, Tally, expect, within
 LIMIT: Final = 1200.0 * FACTOR
 """Time limit of the verification, in seconds."""
 NEAR: Final = 15.0
-"""Distance in map units from the posterior's mean to the boat up to which it has followed."""
+"""Distance in map units from the boat below which the posterior's mean has followed it."""
 START: Final[Place] = (0.0, -25.0)
 """Place in map units where the boat lies before it is dragged."""
 GOALS: Final[tuple[Place, ...]] = ((0.55, 0.4), (0.3, 0.25), (0.65, 0.6))
@@ -200,7 +200,7 @@ async def check_two_browsers(scene: Scene) -> None:
 
 
 async def check_steps(scene: Scene) -> None:
-    """Check the steps in a pause, and the files of the frame that is shown."""
+    """Check stepping from frame to frame on a paused page, and the files that it saves of the shown frame."""
     from PIL import Image
 
     visit = scene.visit

@@ -107,7 +107,7 @@ class Server(Stand):
             self._running = ""
 
     def begin_check(self) -> None:
-        """Let `tails` show only the server and what starts from now on."""
+        """Let `tails` show only the logs of the server and of processes that start from now on."""
         self.shown = [self._running] if self._running else []
 
     @contextlib.asynccontextmanager

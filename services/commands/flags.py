@@ -29,7 +29,7 @@ def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., i
 
 
 def refuse_with_deployment(settings: Settings, flags: Mapping[str, str | None]) -> None:
-    """Raise a SettingsError for flags that describe a topic if there is a deployment, which describes its own."""
+    """Raise a SettingsError for flags that describe a topic if there is a deployment, which has its own topics."""
     given = [f"{flag} {value}" for flag, value in flags.items() if value]
     # if it were ignored, the command would use another topic than the user named
     if settings.deployment is not None and given:

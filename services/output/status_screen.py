@@ -107,7 +107,7 @@ def _processes(stack: StackStatus) -> Table:
 
 
 def _stages(process: ProcessStatus) -> Table:
-    """Return the latencies of a process's published frames by stage; the whole frame comes first."""
+    """Return a table of the latencies of a process's published frames: first of the whole frame, then of each stage."""
     table = _table("latency of")
     for heading in ("p50 ms", "p99 ms", "frames"):
         table.add_column(heading, justify="right")

@@ -37,7 +37,7 @@ _MULTI_ARRAY: Final = re.compile(r"std_msgs/((?:Float(?:32|64)|U?Int(?:8|16|32|6
 _SHOWN: Final = 40
 _MAX_FIELDS: Final = 10_000
 _LONG: Final = 1 << 16
-"""Minimum bytes of a line whose conversion would keep the event loop from answering pings."""
+"""Bytes above which a line is converted in a thread, so that the event loop can still answer pings."""
 _AHEAD: Final = 64
 """Maximum number of messages in flight, so that none is dropped from a queue here or in the server."""
 

@@ -135,7 +135,7 @@ class LogicPart:
 
     @property
     def alms(self) -> float:
-        """ALMs that hold these look-up tables."""
+        """ALMs that hold the look-up tables."""
         return sum(count * COSTS[of].alms for of, count in self.counts.items())
 
 
@@ -152,7 +152,7 @@ class Logic:
 
     @property
     def alms(self) -> float:
-        """ALMs that hold these look-up tables."""
+        """ALMs that hold the look-up tables."""
         return sum(part.alms for part in self.parts)
 
     @property

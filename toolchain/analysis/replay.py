@@ -75,7 +75,7 @@ class Replay:
     machines: Sequence[Any]
     frames: Frames
     earlier: Callable[[int], tuple[_Posterior, int] | None] | None = None
-    """For a sequence, which goes through all rows: returns what an interrupted run computed for a row, if anything."""
+    """Function that returns what an interrupted run computed for a row, if anything; needed only for a sequence."""
 
     @property
     def is_sequence(self) -> bool:
@@ -193,7 +193,7 @@ def replay(
 ) -> tuple[int, int]:
     """Compute all frames that an interrupted run has not computed, and write the output.
 
-    `begun` is called with the number of frames that such a run has computed, and `advance` after each further one.
+    `begun` is called with the number of frames that the interrupted run computed, and `advance` after each further one.
     The frames of a sequence are computed in this process. Return the number of frames computed now, and the number of
     all frames without a posterior.
 

@@ -82,7 +82,7 @@ def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was aske
 
 
 def _check_sizes(model: NetworkModel) -> None:
-    """Raise a BuildError if a factor's table or the results are too large; it names the largest factor or variable."""
+    """Raise a BuildError that names the largest factor or variable if a factor's table or the results are too large."""
     bits = {each.name: (each.size - 1).bit_length() for each in model.symbols}
     widths = [sum(bits[name] for name in term.scope) for term in model.factors]
     codes = [width << width >> 1 for width in widths]

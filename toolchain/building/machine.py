@@ -29,7 +29,7 @@ _MOST_CODES: Final = 1 << 30
 MACHINE_KEYS: Final = tuple(
     key for key in BM1Section.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
 )
-"""The parameters that `[machine]` of `deployment.toml` has too, except `lines`, which counts all boards there."""
+"""The parameters that `[machine]` of `deployment.toml` has too, except `lines`: there it is the lines of all boards."""
 
 
 def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) -> dict[str, Any]:
@@ -172,7 +172,7 @@ class LineBlock:
 
 
 def partition_lines(lines: int, count: int) -> tuple[LineBlock, ...]:
-    """Divide `lines` lines among `count` boards, in order, or raise a BuildError; the first may get one more."""
+    """Divide `lines` lines among boards, in order, or raise a BuildError; the first boards may get one line more."""
     if not 1 <= count <= lines:
         raise BuildError(
             f"{lines} lines cannot be divided among {count} boards: expected 1 to {lines} partitions"

@@ -49,7 +49,7 @@ class ColumnLoss:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VanishedFloor:
-    """An outlier floor that is too low for the codes; `what` and `advice` are clauses for the user."""
+    """An outlier floor that is so low that it becomes code 0; `what` and `advice` are clauses for the user."""
 
     name: str
     what: str
@@ -178,7 +178,7 @@ def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[n
 def _vanished_floor(
     known: Known, ratios: NDArray[np.float64], vanished: NDArray[np.bool_], prob_bits: int, scale: Scale
 ) -> VanishedFloor:
-    """Describe a floor that is too low for the codes, and advise a floor or a code width that is enough."""
+    """Describe an outlier floor that becomes code 0, and advise a floor or a code width that does not."""
     least = float(ratios[vanished].min())
     needed = math.ceil(-math.log2(least) - 1)
     ways = [f"a floor of about {enough:.2g}"] if (enough := _enough_floor(known, prob_bits, scale)) else []

@@ -29,11 +29,11 @@ from toolchain.models.network import NetworkModel
 _LARGE_ERROR: Final = 0.01
 """Total variation above which an error is a warning, not a note."""
 _STATE_BITS: Final = 20
-"""Maximum number of bits of a state with which the check runs whether all states are connected."""
+"""Maximum number of bits of a state for the check whether all states are connected."""
 _PATTERN_BITS: Final = 24
-"""The same check's maximum for the sum of these bits and the known variables whose readings may be missing."""
+"""Maximum number of a state's bits plus known variables that may be missing, for the check whether states connect."""
 _BLANKET_BITS: Final = 16
-"""Maximum number of bits that share a factor with the bit of a move; the search for clips tries all their values."""
+"""Maximum number of bits that share a factor with one bit; the search for opposite clips tries all their values."""
 _RELATED_BITS: Final = 2048
 """Maximum number of bits among which relations are searched, because all pairs are kept; a board may draw more."""
 _TIMEOUT_RISK: Final = 1e-6
@@ -42,7 +42,7 @@ _MOVE_CYCLES: Final = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedChain:
-    """A BM2 to check, on its first board; without a model, the states of hidden variables are shown as numbers."""
+    """The machine of a BM2's first board, to be checked; without `model`, states of hidden variables have no names."""
 
     deployment: Deployment
     machine: BM2Machine
@@ -283,7 +283,7 @@ def _limits(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
 
 
 def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
-    """Find random numbers that are shared by boards, banks or CDEs, related, or repeated within or between frames."""
+    """Find random numbers that CDEs, banks or boards share, that are related, or that repeat within or across frames."""
     p, about = chain.machine.parameters, f"rng = {chain.machine.parameters.rng}"
     width, boards, sets = p.rng.lfsr_bits, p.chains, p.rng_banks * p.chains
     wider = "" if p.rng is RngKind.LFSR32 else "--rng lfsr32, or "

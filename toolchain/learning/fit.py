@@ -69,9 +69,9 @@ class Support:
     readings: int
     """Number of the variable's readings in rows with a true position."""
     cells: int
-    """Number of lines with at least one of these readings."""
+    """Number of lines that have at least one such reading of the variable."""
     median: float
-    """The median number of these readings in a line that has any."""
+    """The median number of such readings in a line that has any."""
     refused: int
     """Number of readings that are not values of the variable."""
 

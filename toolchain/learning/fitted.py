@@ -41,7 +41,7 @@ class FittedRecording(Section):
 
 
 class FittedVariable(Section):
-    """`[[variable]]` of a fit file; after `counts`, it has only name and rows, because its table is an array apart."""
+    """`[[variable]]` of a fit file; with the method `counts` only name and rows: the table is a separate array."""
 
     name: str
     rows: int = Field(ge=0)

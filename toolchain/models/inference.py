@@ -173,7 +173,7 @@ def _entries(graph: _Graph, name: str, sizes: Mapping[str, int]) -> int:
 
 
 def _fill(graph: _Graph, name: str) -> int:
-    """Return how many pairs of a symbol's neighbours are not neighbours of each other; an upper bound for many."""
+    """Return how many pairs of a symbol's neighbours are not adjacent; for many neighbours, an upper bound."""
     neighbours = graph[name]
     if len(neighbours) > _MOST_COUNTED:
         return len(neighbours) ** 2

@@ -226,7 +226,7 @@ _IMAGE_HASH: Final = re.compile(r'(image_hash\s*=>\s*)x"[0-9a-f]{64}"')
 
 @dataclass(frozen=True, slots=True)
 class PackageTokens:
-    """The package as tokens without comments, in lower case like VHDL's names, and the line of each.
+    """The tokens of the package, each with its line; in lower case, as VHDL ignores case, and without comments.
 
     Hashes of images are left out, because they follow from the other tokens.
     """

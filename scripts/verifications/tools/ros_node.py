@@ -2,7 +2,7 @@
 
     /usr/bin/python3 ros_node.py FILE
 
-ROS's own reader decodes them first.
+Each message is first decoded with ROS's own message classes.
 """
 
 import base64
