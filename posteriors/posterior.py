@@ -192,7 +192,11 @@ class Posterior:
         return {axis.label: axis.value(best[axis.label]) for axis in self._known_axes()}
 
     def mean_value(self) -> dict[str, float | str]:
-        """Return the mean in its unit for each label without names of states; a LabelError as for `best_value`."""
+        """Return the mean in its unit, for each label whose states have no names.
+
+        Raises:
+            LabelError: The deployment is not known.
+        """
         mean = self.mean()
         return {
             axis.label: axis.value(mean[axis.label]) for axis in self._known_axes() if not axis.has_states

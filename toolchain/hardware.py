@@ -98,9 +98,10 @@ def verilog(
     more_sources: Sequence[str] = (),
     generics: Mapping[str, int | str] | None = None,
 ) -> str:
-    """Return a board's hardware as Verilog, or raise a HardwareToolError; the package of parameters is in the folder.
+    """Return a board's hardware as Verilog, or raise a HardwareToolError.
 
-    `table` is the Verilog of `bm1_table`; `more_sources` are VHDL files relative to `hdl`, the folder of the VHDL.
+    `folder` has the package of parameters; `table` is the Verilog of `bm1_table`; `more_sources` are VHDL files
+    relative to `hdl`, the folder of the VHDL.
     """
     # without its entity, the table's component remains unbound: a black box
     names = [name for name in SOURCES if name != "bm1_table.vhd"]

@@ -357,7 +357,7 @@ class EmulatedBoard:
             self._publish(BoardState.DONE, machine.reason, cycles)
 
     def _chunk_end(self, cycles: int, max_cycles: int) -> int:
-        """Return the cycle at which the next chunk ends, at most the slice's last; 0 if the chunk ends with the frame."""
+        """Return the cycle at which the next chunk ends, at most the slice's end; 0 if it runs to the frame's end."""
         end = cycles + self._chunk
         if end - cycles > _ALIGNMENT:
             end -= end % _ALIGNMENT

@@ -47,7 +47,7 @@ THEIRS: Final = ("roslibpy, twisted", "roslibpy, asyncio")
 QUANTITIES = ("published/s", "CPU us each", "received/s", "CPU us each ", "round trip us")
 
 Figures = defaultdict[tuple[int, str], defaultdict[str, list[float]]]
-"""Measurements by number of values and quantity, then by client."""
+"""Measurements: first by the number of values and the measured quantity, then by client."""
 Drops = defaultdict[tuple[str, int], int]
 """Number of messages that the hub dropped because the socket that counts them was slow, by client and array length."""
 

@@ -223,7 +223,7 @@ def seconds_at_once(kind: Callable[[Path], Designs | Recording], folder: Path, c
 
 
 def load_kernels(designs: int) -> None:
-    """Do small work of the same kinds, so that this process has compiled or loaded all kernels."""
+    """Do a little of the work that is measured, so that this process has compiled or loaded all kernels."""
     with tempfile.TemporaryDirectory(prefix="bench-cluster-") as name:
         for work in (Designs(Path(name), designs, 1), Recording(Path(name), 1)):
             work(in_this_process)

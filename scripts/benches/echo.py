@@ -1,4 +1,4 @@
-"""An echo, the floor of a cycle: it answers every reading at once with a message of a result's size."""
+"""An echo, whose cycle is the shortest possible: it answers every reading at once with a message of a result's size."""
 
 import asyncio
 import sys

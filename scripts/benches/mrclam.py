@@ -28,7 +28,7 @@ from toolchain.models.model import fuse
 TOPIC, TYPE = "/mrclam/sightings", "mrclam_msgs/Sightings"
 RECORDINGS = ("ds1_robot3.csv", "ds1_robot5.csv")
 BOUND = 1.15
-"""Limit of the stack's median distance, as a multiple of that of fusion in float64."""
+"""Limit of the stack's median distance, as a multiple of the median distance by float64 fusion."""
 MAX_CYCLES = 2**22
 """Limit of cycles, above 2^17, because in frames with three outliers the best line counts once in 4e5 cycles."""
 

@@ -83,7 +83,7 @@ def listed(counts: Counter[str]) -> str:
 
 
 def growth(result: RoundResult) -> list[Finding]:
-    """Return processes that grew too much."""
+    """Return findings about processes whose memory or number of descriptors grew too much."""
     findings = []
     for (role, pid), samples in result.resources.items():
         memory, descriptors = zip(*samples[len(samples) // 2 :], strict=True)

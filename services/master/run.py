@@ -44,7 +44,7 @@ _GRACE_PERIOD = 2.0
 
 
 class Master:
-    """A run with a deployment, once or in a loop. Create it inside the event loop, to which its futures belong."""
+    """A run with a deployment: for one frame, or until it ends. Create it inside the event loop that runs it."""
 
     def __init__(
         self,

@@ -157,7 +157,7 @@ class Model:
     name: str
     """Name of the deployment."""
     searched: tuple[Dimension, ...]
-    """The searched variable's dimensions, the slowest first; line = y * width + x for (y, x)."""
+    """The searched variable's dimensions, the slowest-varying first; line = y * width + x for (y, x)."""
     known: tuple[Known, ...]
     """The known variables in the order of the machine's columns, 1 to N."""
     prior: NDArray[np.float64] | None = None

@@ -33,7 +33,7 @@ class NetworkModel:
     variables: tuple[Variable, ...]
     """The known variables as in `deployment.toml`, in the order of a frame's readings."""
     searched: tuple[Dimension, ...]
-    """The searched variables as in `deployment.toml`, the slowest first."""
+    """The searched variables as in `deployment.toml`, the slowest-varying first."""
 
     def __repr__(self) -> str:
         return f"NetworkModel({self.name!r}, {len(self.symbols)} variables, {len(self.factors)} factors)"
