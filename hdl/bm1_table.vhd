@@ -23,6 +23,6 @@ entity bm1_table is
     clk_i     : in    std_logic;                                   -- clock
     enable_i  : in    std_logic;                                   -- read; otherwise the output is kept
     address_i : in    std_logic_vector(ADDRESS_BITS - 1 downto 0); -- must be less than DEPTH
-    data_o    : out   std_logic_vector(DATA_BITS - 1 downto 0)     -- part of the word, one clock later
+    data_o    : out   std_logic_vector(DATA_BITS - 1 downto 0)     -- bits that are read, one clock later
   );
 end entity bm1_table;

@@ -15,10 +15,10 @@ entity bm1_tile_element is
   generic (
     PROB_BITS    : positive;      -- width of a probability code
     MODE         : sensor_mode_t; -- input of the cell
-    ADDRESS_BITS : positive;      -- address width of the table; SENSOR_CELL
-    TABLE_FILE   : string;        -- MIF of the column; SENSOR_CELL
-    LINES        : positive;      -- lines in the MIF's words; SENSOR_CELL
-    LINE         : natural        -- the cell's line; SENSOR_CELL
+    ADDRESS_BITS : positive;      -- with SENSOR_CELL: address width of the table
+    TABLE_FILE   : string;        -- with SENSOR_CELL: MIF of the column
+    LINES        : positive;      -- with SENSOR_CELL: lines in the MIF's words
+    LINE         : natural        -- with SENSOR_CELL: the cell's line
   );
   port (
     clk_i    : in    std_logic;                                -- clock

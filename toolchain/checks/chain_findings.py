@@ -283,7 +283,7 @@ def _limits(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
 
 
 def _numbers(chain: CheckedChain, found: ChainError | None) -> Iterator[Finding]:
-    """Find random numbers that CDEs, banks or boards share, that are related, or that repeat within or across frames."""
+    """Find random numbers that CDEs, banks or boards share, that are related, or that repeat in or between frames."""
     p, about = chain.machine.parameters, f"rng = {chain.machine.parameters.rng}"
     width, boards, sets = p.rng.lfsr_bits, p.chains, p.rng_banks * p.chains
     wider = "" if p.rng is RngKind.LFSR32 else "--rng lfsr32, or "
