@@ -140,7 +140,7 @@ class Offer:
     type: str
     client: Client
     fillers: Mapping[str, Filler]
-    """Fills the absent fields of its parts, such as `Request`, if their type is known."""
+    """Fillers of the absent fields of its parts, by part, such as `Request`; empty if the type is unknown."""
 
 
 class Graph:

@@ -49,7 +49,7 @@ async def verdict_on(dut: Any, **others: int) -> tuple[ErrorCode, bool]:
 
 @cocotb.test()
 async def doorbells_are_numbers_that_go_round(dut: Any) -> None:
-    """Ring the doorbell with the expected number, which wraps from 2^32 - 1 to 1, and the numbers around it."""
+    """Ring the doorbell with the expected number (1 after 2^32 - 1), and with the numbers next to it."""
     for done in (0, 1, 2, 0x7FFFFFFF, 0xFFFFFFFE, 0xFFFFFFFF):
         due = next_doorbell(done)
         for number in {done, due, (due + 1) % 2**32, 1, 0xFFFFFFFF} - {0}:

@@ -44,7 +44,7 @@ def failed_proof(name: str, folder: Path, hdl: Path = HDL) -> str | None:
     Args:
         name: One of `proofs`.
         folder: Working folder of the tools.
-        hdl: Folder of the VHDL; that of a mutant is a changed copy.
+        hdl: Folder of the VHDL: `HDL`, or a changed copy (a mutant).
 
     Raises:
         HardwareToolError: GHDL is not installed or refuses the hardware.

@@ -47,7 +47,7 @@ def prepare(image: Image, folder: Path, hdl: Path = HDL, more_sources: Sequence[
     Args:
         image: Image of the board.
         folder: Folder of the simulation.
-        hdl: Folder of the VHDL; that of a mutant is a changed copy.
+        hdl: Folder of the VHDL: `HDL`, or a changed copy (a mutant).
         more_sources: Further VHDL files, relative to `hdl`, which are analysed last.
 
     Raises:

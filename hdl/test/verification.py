@@ -39,7 +39,7 @@ class Check:
         """Run the check, and return why it fails, or None.
 
         Args:
-            hdl: Folder of the VHDL; that of a mutant is a changed copy.
+            hdl: Folder of the VHDL: `HDL`, or a changed copy (a mutant).
             frames: Number of frames in a session; None for the usual number.
 
         Raises:

@@ -49,7 +49,7 @@ Rows = list[tuple[str, str, str]]
 
 
 async def publish(ros: Ros, sent: dict[int, float]) -> None:
-    """Until cancelled, publish results like a stack, and store the Unix time of each, in ms, in `sent` by its number."""
+    """Until cancelled, publish results like a stack, and store the Unix time of each in `sent`, in ms, by number."""
     axis, posteriors = np.arange(SIDE), []
     for turn in np.linspace(0, 2 * np.pi, HZ, endpoint=False):
         x, y = SIDE / 2 + SIDE / 3 * np.cos(turn), SIDE / 2 + SIDE / 3 * np.sin(turn)

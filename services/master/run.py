@@ -269,7 +269,7 @@ class Master:
 class ChildrenWatch:
     """The progress of the processes that a master started, according to their status sockets.
 
-    Without it, a child that is stopped or stuck while it has no work would go unnoticed. Children that are being
+    Without this watch, a child that is stopped or stuck while it has no work would go unnoticed. Children that are being
     restarted are ignored.
     """
 

@@ -160,7 +160,7 @@ _MOST_PAIRS: Final = 20_000_000
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """Bits of one group that XOR to 0 in every cycle; a group is all columns of a bank, or those of a line in it."""
+    """Bits of one group that XOR to 0 in every cycle; a group is a bank, or one of its lines if each cell has a generator."""
 
     group: int
     bits: tuple[Bit, ...]

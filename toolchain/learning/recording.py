@@ -25,7 +25,7 @@ MAX_ROWS: Final = 2_000_000
 _LONGEST_LINE: Final = 1 << 20
 
 _STAMP_UNITS: Final = {"stamp_ns": 1, "time_s": 10**9}
-"""The columns for the time of a row in CSV files that this project writes, and the nanoseconds in their unit."""
+"""Names of a time column in CSV files that this project writes, each with the nanoseconds in the column's unit."""
 _STEP: Final = re.compile(r"(\w+)((?:\[\d{1,9}\])*)")
 
 
