@@ -168,9 +168,10 @@ class Topics:
                 if type(parsed) is not dict or (len(message) > shallow and is_deeper(message, depth)):
                     break
                 if filler is not None and len(parsed) != complete:
-                    tail = filler.fill(parsed, room)
                     # With white space between the last braces, the tail has no place.
-                    if tail is None or (tail and data[-2] != BRACE):
+                    is_spliced = data[-2] == BRACE
+                    tail = filler.fill(parsed, room, keep=keep or not is_spliced)
+                    if tail is None or (tail and not is_spliced):
                         payload = b"%b%b}" % (envelope, orjson.dumps(parsed))
                         room -= len(payload) - len(data)  # together they may grow by as much as one
                     elif tail:
