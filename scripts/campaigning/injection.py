@@ -78,8 +78,8 @@ class Injector:
     async def _misbehave(self, fault: Fault) -> None:
         """Restart a board that misbehaves once after some frames, and wait until it has done so.
 
-        Each frame starts the board at least once. So it has misbehaved if another frame fails, or, if the host
-        tolerates this misbehaviour, after enough frames.
+        Each frame starts the board at least once. So it has misbehaved when another frame has failed; if the host
+        tolerates this misbehaviour, it has done so after enough frames.
         """
         await self._stack.kill(fault.target)
         await self._stack.wait(fault.target)

@@ -269,8 +269,8 @@ class Master:
 class ChildrenWatch:
     """The progress of the processes that a master started, according to their status sockets.
 
-    Without this watch, a child that is stopped or stuck while it has no work would go unnoticed. Children that are being
-    restarted are ignored.
+    Without this watch, a child that is stopped or stuck while it has no work would go unnoticed. Children that are
+    being restarted are ignored.
     """
 
     def __init__(self, peers: Iterable[Peer], directory: Path) -> None:

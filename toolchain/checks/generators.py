@@ -160,7 +160,7 @@ _MOST_PAIRS: Final = 20_000_000
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """Bits of one group that XOR to 0 in every cycle; a group is a bank, or one of its lines if each cell has a generator."""
+    """Bits of one group that XOR to 0 in every cycle; a group is a bank or, with a generator per cell, a line of it."""
 
     group: int
     bits: tuple[Bit, ...]
@@ -189,7 +189,7 @@ def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> tuple
 def _bit_words(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> NDArray[np.uint64]:
     """Return one word per bit of the random numbers, uint64[groups, bits]: its values in the generators' first steps.
 
-    There are as many steps as a state has bits, which determine a linear sequence: bits with equal words always agree.
+    There are as many steps as a state has bits, which determine all later ones: bits with equal words always agree.
     """
     lfsr = LFSR(kind)
     shifts = np.arange(prob_bits, dtype=np.uint64)

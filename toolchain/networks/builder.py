@@ -18,7 +18,7 @@ MAX_VARIABLES: Final = 20_000
 MAX_STATES: Final = 65_535
 """Maximum number of states of a variable: a column of a machine can have 2^16 - 1 values."""
 MAX_PARENTS: Final = 30
-"""Maximum number of parents, fewer than the 64 axes of NumPy's arrays; 24 parents already make tables too large."""
+"""Maximum number of parents: more than a table of 2^24 entries needs, and fewer than the 64 axes of a NumPy array."""
 MAX_TOTAL: Final = 2 * MAX_ENTRIES
 """Maximum number of entries of all tables together."""
 MAX_NAME: Final = 200
