@@ -1,4 +1,4 @@
-"""Compiled functions of the fast kernel, which compute and count the words of a block, and their arrays.
+"""Compiled functions of the fast kernel, and their arrays; the functions compute a block's words and count the ones.
 
 They are in one file because numba recompiles a function when its file changes, but not when an imported file does.
 """

@@ -287,7 +287,7 @@ class MachineKind(ABC):
 
     @abstractmethod
     def contents(self, machine: Any) -> Blocks:
-        """Return the words that programming writes to the registers, without `UsedRegisters.capabilities`."""
+        """Return the registers' words that come with an image, except those of `UsedRegisters.capabilities`."""
 
     @abstractmethod
     def kernel(self, machine: Any) -> Any:

@@ -82,9 +82,9 @@ class FrameReport:
     """Bytes between pcie-app and all boards, in both directions; `link_transfers` is the number of their transfers."""
     link_transfers: int | None = None
     received_ns: int | None = None
-    """Receipt of the reading by the subscriber."""
+    """Time at which the subscriber received the reading (Unix time)."""
     sent_ns: int | None = None
-    """Sending of the posterior."""
+    """Time at which the posterior was sent (Unix time)."""
     stages: StageTimes = StageTimes()
     boards: tuple[BoardReport, ...] = ()
     details: Mapping[str, str] = field(default_factory=dict)

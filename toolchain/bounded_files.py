@@ -26,7 +26,7 @@ _PIECE: Final = 1 << 18
 
 @contextmanager
 def file_errors(path: Path, done: str, error: type[ToolchainError], advice: str = "") -> Iterator[None]:
-    """Convert an OSError of the block to `error`: the file cannot be `done`, which is "read" or "written"."""
+    """Convert an OSError in the block to `error`: the file cannot be "read" or "written", as `done` says."""
     try:
         yield
     except OSError as reason:

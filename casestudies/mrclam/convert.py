@@ -1,4 +1,4 @@
-"""Conversion of the downloaded data set MR.CLAM into CSV files, with a row per second in which a robot hardly moved.
+"""Conversion of the downloaded data set MR.CLAM into CSV files: a row for each second in which a robot hardly moved.
 
 python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR
 """

@@ -1,6 +1,6 @@
 """The time of a cycle by lines, sensors and the size of the readings' message (thesis 2.1.2, 4.3).
 
-client --reading of some bytes--> hub --> master and its services --> one board of so many lines and columns --> ... --> client
+client --reading of n bytes--> hub --> master and its services --> one board of l lines and c columns --> ... --> client
 
 One size varies at a time. The lines of a larger machine repeat those of the smallest, and a sensor's two readings
 are nearly equally probable, so that frames of 30 sensors have a posterior too, and the machines differ only in size.

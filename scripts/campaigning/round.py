@@ -40,7 +40,7 @@ _CALM_LIMIT = 5.0 * FACTOR
 _SETTLE_LIMIT = 30.0 * FACTOR
 """Timeout in seconds until nothing is in flight, sufficient even if a board does not answer or the machine is busy."""
 _QUIET = 0.6 * FACTOR
-"""Seconds without a change that show that nothing is in flight."""
+"""Seconds without a change after which nothing is in flight any more."""
 _stamps = count(time.time_ns() // 10**9 * 10**9, 1_000_000)
 now = time.monotonic
 """The campaign's clock, in seconds."""

@@ -167,7 +167,7 @@ def difference(joint: JointDistribution, tables: dict[str, Table], suffix: str) 
 def questions(
     joint: JointDistribution, chance: random.Random
 ) -> tuple[list[Asked], list[tuple[str, str, list[str]]]]:
-    """Return three questions about a network that a BM1 can compute, and the pairs of variables that were refused."""
+    """Return three questions that a BM1 can answer about a network, and pairs of variables that it cannot both know."""
     names = [symbol.name for symbol in joint.symbols]
     asked: list[Asked] = []
     refused: list[tuple[str, str, list[str]]] = []
@@ -196,7 +196,7 @@ def questions(
 
 
 def draw(model: Model, chance: random.Random) -> tuple[int, ...]:
-    """Draw rows of readings from the model, so that each row is possible."""
+    """Draw one value of each known variable from the model, so that they are possible together."""
     prior = model.prior_distribution
     line = chance.choices(range(model.lines), weights=prior.tolist())[0]
     return tuple(

@@ -74,7 +74,7 @@ class View:
     def message(
         self, frame: KeptFrame, axes: Sequence[Axis], words: Mapping[str, tuple[str, tuple[str, ...]]]
     ) -> bytes:
-        """Return the message for the frame that is shown; `words` are the unit and the states of each variable."""
+        """Return the message for the frame that is shown; `words` has each variable's unit and states, by name."""
         head, picture = _encoded(frame, self.labels(frame), tuple(axes))
         kept = self._feed.frames
         now_ns = time.time_ns()

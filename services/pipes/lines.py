@@ -1,4 +1,4 @@
-"""Lines of standard input, bounded in length, and what lines between the commands of a pipe contain.
+"""Lines of standard input, bounded in length, and the content of lines in pipes between commands.
 
 `terminal.output.print_json_line` writes lines of standard output.
 """

@@ -170,7 +170,7 @@ def _machine_answer(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """The variables of a network and, if some are searched, which of the others cannot both be known to a BM1."""
+    """The variables of a network and, if some are searched, the pairs that cannot both be known variables of a BM1."""
 
     joint: JointDistribution
     searched: tuple[str, ...] = ()

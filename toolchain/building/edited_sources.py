@@ -46,8 +46,7 @@ _PARAMETERS: Final[dict[str, tuple[str, Callable[[str], Any]]]] = {
     "TARGET_COUNT": ("target_count", _number),
     "MAX_CYCLES": ("max_cycles", _number),
 }
-"""The constants of `bm1_parameters.vhd` that may be edited, each with its key in `[machine]` and the function that
-parses its value.
+"""The constants of `bm1_parameters.vhd` that may be edited; for each, its key in `[machine]` and its parser.
 
 The other constants are sizes of memories and boards, and the kind of generators, on which the seeds depend.
 """

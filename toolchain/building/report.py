@@ -132,7 +132,7 @@ def loss_heading(sensor_mode: SensorMode) -> str:
 
 
 def many_sentence(machine: MachineSection) -> str:
-    """Describe a frame's readings and results; empty in the usual case, one number per variable and one posterior."""
+    """Describe a frame's readings and results; empty in the usual case of one number per variable and one posterior."""
     sentence = {
         SensorMode.COLUMN: "",
         SensorMode.CELL: f" Each of the {machine.lines} lines has a reading of its own (sensor_mode = cell).",

@@ -92,7 +92,7 @@ class Transition:
 
 
 def _header(shape: tuple[int, int]) -> bytes:
-    """Return the header that the file must have, because NumPy's parser fails in many ways on a hostile header."""
+    """Return the header that the file must have; it is not parsed, because a hostile one breaks NumPy's parser."""
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
     return file.getvalue()

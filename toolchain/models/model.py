@@ -54,7 +54,7 @@ class Normal:
     sigma: ArrayLike
     """Standard deviation, one for all or float64[lines], in the unit of the reading."""
     floor: float = 0.0
-    """Probability added to each bin for outliers, as a fraction of that of a bin centred at the mean."""
+    """Probability added to each bin for outliers, as a fraction of the probability of a bin centred at the mean."""
     outliers: float = 0.0
     """Share of readings that do not depend on S."""
 

@@ -178,7 +178,7 @@ def text_file(name: str, text: str) -> OutputFiles:
 
 
 def write_files(directory: Path, *parts: OutputFiles) -> list[tuple[str, Change]]:
-    """Write the parts' files one after the other, each atomically; return every path, sorted, and the file's change."""
+    """Write the parts' files one after the other, each atomically; return each file's path and change, sorted."""
     changes: dict[str, Change] = {}
     for part in parts:
         changes |= {name: _write(directory / name, pieces) for name, pieces in part.contents.items()}

@@ -118,7 +118,7 @@ class _Known(NamedTuple):
 
 
 _UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, _DEFAULT, "", sys.maxsize))
-"""Placeholder until an envelope is known; no valid message begins with it."""
+"""Placeholder until an envelope is known; its byte 0xFF begins no valid message."""
 
 
 class Subscriptions:

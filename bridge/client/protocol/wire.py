@@ -8,7 +8,7 @@ from bridge.codecs.json_codec import encode
 from bridge.names import Kind, RosVersion, ros1_type, ros2_type
 
 SMALLEST_LIMIT: Final = 2048
-"""Smaller size limits (bytes) of servers are raised to this one, so that subscriptions can always be sent."""
+"""Minimum in bytes for a server's size limit: smaller ones count as this, so that subscriptions can always be sent."""
 
 
 class Wire:
