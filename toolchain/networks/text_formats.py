@@ -167,7 +167,7 @@ class Scanner:
         return self._signs.fullmatch(piece) is not None
 
     def _floats(self, words: list[str], wanted: int, what: str, begin: int) -> NDArray[np.float64]:
-        """Return words as numbers, or raise an error if there are not `wanted`; words beyond these are not converted."""
+        """Return words as numbers, or raise an error if there are not `wanted`; words beyond are not converted."""
         values = []
         for word in words[:wanted]:
             try:
