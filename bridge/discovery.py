@@ -37,7 +37,7 @@ _PATH: Final = re.compile(r"/[A-Za-z0-9._~/-]{0,200}")
 _HOST: Final = re.compile(r"[A-Za-z0-9.-]{1,253}")
 _LAST_PORT: Final = 65535
 _PORT: Final = re.compile(r"[0-9]+(/.*)?")
-"""A port: `robot:9090` is a URI without its ws://, and does not name a robot."""
+"""A port, perhaps with a path: `robot:9090` is a URI without its ws://, and does not name a robot."""
 _TIMEOUT: Final = 10.0
 """Default time in seconds in which a robot must answer, the same as `connect_timeout` of `connect`."""
 _TAKEN_TIME: Final = 3.0

@@ -73,7 +73,7 @@ def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:
 
 
 def sprinkler(rates: Sequence[str], count: int) -> Case:
-    """Return the sprinkler on two chains, with a bank of seeds for each frame, so that no frame repeats another."""
+    """Return the sprinkler on two chains; up to 256 frames have a bank of seeds each, so that none repeats another."""
     options = {"machine": "bm2", "samples": 50_000, "stream": 4096, "rng-banks": min(max(count, 16), 256)}
     return Case(
         name="sprinkler",

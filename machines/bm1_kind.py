@@ -128,7 +128,7 @@ class BM1Kind(MachineKind):
         return _OnHost(machines)
 
     def joint_reason(self, reasons: Sequence[int]) -> int:
-        """Return one stop reason for replicas: SLICE if all were halted because they overflowed on other boards."""
+        """Return the first of OVERFLOW, MAX_CYCLES and IMPOSSIBLE that a replica has, or SLICE if none has them."""
         joint = joint_reason([StopReason(reason) for reason in reasons], range(len(reasons)))
         return joint if joint is not StopReason.NONE else StopReason.SLICE
 

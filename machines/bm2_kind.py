@@ -395,7 +395,7 @@ class _Course(FrameCourse):
     def proceed(
         self, reasons: Sequence[Sequence[int]], answers: Sequence[memoryview]
     ) -> tuple[Sequence[int], Blocks]:
-        """Resume boards whose stream is full, and for the next batch those that have drawn the samples of this one."""
+        """Resume boards whose stream is full, and, for the next batch, boards that have drawn this batch's samples."""
         going = {BM2StopReason.FULL} if not self._targets else {BM2StopReason.FULL, BM2StopReason.SAMPLES}
         for number in self._running:
             self._kept[number].add(answers[number])
@@ -427,7 +427,7 @@ class _OnHost(HostMachine):
         self._starts = lru_cache(_STARTS_KEPT)(self._blocks_of)
 
     def begin(self, frame: FrameInput) -> FrameCourse:
-        """Return the course of a frame; boards start alternately from the smallest and the largest state."""
+        """Return a frame's `FrameCourse`; boards start alternately from the smallest and the largest state."""
         return _Course(*self.starts(frame), self._machines)
 
     def starts(self, frame: FrameInput) -> tuple[Sequence[Blocks], FrameSettings]:

@@ -79,7 +79,7 @@ class ReferenceBM2(BM2Kernel):
         return reason
 
     def _stochastic_bits(self, bit: int, random: list[int]) -> set[int]:
-        """Return the set of values (0, 1) that the compared CDEs make for a pointed bit: one value if they agree."""
+        """Return the set of values (0, 1) that the compared CDEs make for a bit of the move: one if they agree."""
         concerned = self._concerned[bit]
         bits = {int(random[cde] < self._code(cde, bit)) for cde in concerned}
         if self._parameters.literal:
@@ -95,7 +95,7 @@ class ReferenceBM2(BM2Kernel):
         return int(self.machine.tables[cde][address])
 
     def _end_move(self) -> BM2StopReason:
-        """Take a sample if this move ends with one, and point at the next bits."""
+        """Take a sample if this move ends with one, and begin the move for the next bits."""
         ends_sweep = self._move == len(self._moves) - 1
         sampled = self._burn_in == 0 and (ends_sweep or self._parameters.sample_every is SampleEvery.MOVE)
         if sampled:

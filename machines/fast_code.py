@@ -42,7 +42,7 @@ class Generators(NamedTuple):
 
 
 class _Store(NamedTuple):
-    """Words by slot (a block of cycles in a bank; the last slot is scratch) and row (a code of a column)."""
+    """Cached words, by slot (a block of cycles in a bank; the last is for scratch) and by row (a code of a column)."""
 
     words: Words  # [slots, rows * BLOCK_WORDS]
     filled: npt.NDArray[np.uint8]  # [slots, rows]: whether these words are cached

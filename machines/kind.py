@@ -242,7 +242,7 @@ class HostMachine(ABC):
 
     @abstractmethod
     def begin(self, frame: FrameInput) -> FrameCourse:
-        """Return the course of a frame; a StartError if it does not fit the machines."""
+        """Return a frame's `FrameCourse`; a StartError if the frame does not fit the machines."""
 
     @abstractmethod
     def slowest(self) -> FrameInput:

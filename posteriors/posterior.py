@@ -294,7 +294,7 @@ class Posterior:
             The Axes.
 
         Raises:
-            LabelError: These are the posteriors of several replicas.
+            LabelError: The object contains the posteriors of several replicas.
         """
         from posteriors.showing import draw
 

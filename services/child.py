@@ -299,7 +299,7 @@ class ForkedCommand(Child):
 
 
 async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
-    """Stop children within `stop_timeout` seconds, kill those that are left, and return the names of the latter."""
+    """Stop children within `stop_timeout` seconds, kill those still running, and return the names of the killed."""
     children = list(children)
     running = [child for child in children if child.is_running]
     for child in running:

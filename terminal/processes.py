@@ -68,7 +68,7 @@ class Forked:
         return self.returncode
 
     def send_signal(self, number: int) -> None:
-        """Send a signal; the pid cannot be another process's yet, because this one's exit was not collected."""
+        """Send a signal; the pid still belongs to the forked process, because its exit has not been collected."""
         os.kill(self.pid, number)
 
     def kill(self) -> None:

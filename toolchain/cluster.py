@@ -267,7 +267,7 @@ def _noticing_loss() -> Iterator[None]:
 def _on_scheduler(
     address: str, connect: Callable[[], Any], job: Job, numbers: Sequence[int], keep: Keep
 ) -> None:
-    """Do the pieces on the workers of a scheduler; if it is lost, go on as soon as one answers at its address again.
+    """Do the pieces on the workers of a scheduler; if it is lost, go on when a scheduler answers at this address again.
 
     Raises:
         ClusterError: The workers cannot do the pieces, or there is no scheduler or worker for a minute.

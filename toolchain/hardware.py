@@ -297,7 +297,7 @@ def _compile_verilator(image: Image, folder: Path) -> None:
 
 
 def _key(image: Image, simulator: Simulator) -> str:
-    """Return a folder name for a simulation, which differs if image, sources or tools differ."""
+    """Return the name of a simulation's folder: a hash that changes with the image, the sources and the tools."""
     parts = [f"{simulator} {image.image_hash} {image.partition}"]
     parts += [run_tool([tool, "--version"], Path("/")) for tool in simulator.tools]
     names = [*SOURCES, _TABLE_VHDL, _BENCH_VHDL, _TABLE_VERILOG, _BENCH_CPP]

@@ -126,7 +126,7 @@ def is_deeper(data: bytes, limit: int) -> bool:
 
 
 def _has_more_brackets(data: bytes, limit: int) -> bool:
-    """Return whether JSON has more than `limit` opening brackets; few messages do, so most are known to be shallow."""
+    """Return whether JSON has more than `limit` opening brackets; if not, it cannot be nested more deeply than that."""
     if len(data) <= _COUNTED:
         return data.count(b"{") + data.count(b"[") > limit
     # Searching for the next bracket skips long arrays of numbers forty times faster than counting.

@@ -87,7 +87,7 @@ def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
 
 
 def element_of(kind: Any, content: Any) -> tuple[str, int]:
-    """Return the element type of a field from rosbags, and its length: `SCALAR`, 0 for any length, or a fixed one."""
+    """Return the type of a field's elements, from rosbags, and their number: `SCALAR`, 0 for any, or a fixed one."""
     match kind.name:
         case "BASE":
             return str(content[0]), SCALAR

@@ -417,7 +417,7 @@ class _Connection(WebSocketTransport):
             self.proceed()
 
     def _flush_backlog(self, outbox: Outbox) -> None:
-        """Write one turn's share of the queue, and the rest after other tasks have had their turn."""
+        """Write at most `_TURN_MESSAGES` messages of the queue now, and the rest after other tasks have run."""
         left = _TURN_MESSAGES
         while left and not self.paused and not outbox.empty:
             # In portions, because what the socket does not accept can no longer be dropped.

@@ -332,7 +332,7 @@ class WebSocketTransport(asyncio.Protocol):
         self._read_turn(data, at)
 
     def _read(self, data: bytes, at: int) -> int:
-        """Handle the frames of a turn and store an incomplete one; return the index where the turn ended."""
+        """Handle at most `turn_frames` frames and store an incomplete one; return the index at which to continue."""
         size, count, masked = len(data), 0, self._is_server
         while at < size and count < self.turn_frames:
             if self._postponed or self.is_blocked:

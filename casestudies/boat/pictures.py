@@ -139,7 +139,7 @@ _PART_COLOURS: Final = {
 }
 _TRUTH_COLOUR: Final = "#ff4d4d"
 _EDGE: Final = 0.2
-"""Width of the strip along each edge in which labels are not centred, as a share of the map's width."""
+"""Width of the strips at the map's left and right edges where labels are not centred, as a share of its width."""
 
 
 def far_apart(instances: Iterable[Instance]) -> tuple[Instance, ...]:

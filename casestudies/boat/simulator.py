@@ -1,7 +1,7 @@
 """Simulator in place of Gazebo: a boat sails, or is driven or dragged, and its sensors' readings are published.
 
 /cmd_vel ───────────────────────────▶ Boat ─▶ /boat/true_pose, /boat/imu, /boat/raw at each step
-/boat/set_pose, services /boat/... ─▶                                           and at once after these
+/boat/set_pose, services /boat/... ─▶                                           and at once after a new pose or a call
 """
 
 import asyncio
@@ -82,8 +82,8 @@ class Boat:
     Two boats with the same seed and the same switches sail the same route and measure the same readings.
 
     Attributes:
-        heading: Where the bow points, in radians counter-clockwise from the x axis.
-        switches: Whether each of `SWITCHES` is on. `put` and `drive` turn `sail` off.
+        heading: Direction of the bow, in radians counter-clockwise from the x axis.
+        switches: The state of each of `SWITCHES`, True for on. `put` and `drive` turn `sail` off.
         changed: Set when somebody moves the boat or sets a switch, and cleared when the next reading is published.
     """
 

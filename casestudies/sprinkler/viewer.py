@@ -49,7 +49,7 @@ class FrameSummary:
     share: float
     """P(R = 1) in the posterior on `/BMresults`."""
     error: float
-    """Standard error of `share`, from `/bm/frame`; 0.5, the largest possible, if that does not state it."""
+    """Standard error of `share`, from `/bm/frame`; 0.5, the largest possible, if the report lacks it."""
     effective: float
     """Number of effective samples, from `/bm/frame`; 1 if that does not state it."""
     curve: NDArray[np.int64]

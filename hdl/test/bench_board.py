@@ -399,7 +399,7 @@ class Session:
     # ---- refused accesses -------------------------------------------------------------------------------
 
     async def wrong_accesses(self) -> None:
-        """Access words that do not exist, or that do not allow the access made."""
+        """Access words that do not exist, and read or write words where that is not allowed."""
         both = self.both
         inputs, results = both.case.image.interface_sensors, both.case.image.interface_results
         places = [

@@ -232,7 +232,7 @@ class DrivenBoard:
         link.post(writes)
 
     def receive(self) -> bool:
-        """Receive once, after a poll, and return whether the board is done; a LinkError also if its answer is wrong."""
+        """Receive once, after a poll; return whether the board is done. A LinkError also for a wrong answer."""
         link = self.open_link
         done = link.receive_done()
         is_done = done is not None

@@ -53,7 +53,7 @@ Drops = defaultdict[tuple[str, int], int]
 
 
 async def server_rate(uri: str, number: int) -> float:
-    """Return messages of 64 bytes per second from one bare client to another, with 32 in flight."""
+    """Return how many messages of 64 bytes pass from one bare client to another in a second, with 32 in flight."""
     async with bare(uri) as publisher, bare(uri) as subscriber:
         subscriber.send(subscribe("/load", queue_length=1000))
         await settled(subscriber)

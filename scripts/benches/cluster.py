@@ -47,7 +47,7 @@ AIM: Final = 0.95
 NETWORK: Final = "10.213.7"
 """Of the namespaces; the scheduler's host is number 1."""
 TASKS: Final = 2000
-"""Empty tasks, to measure the scheduler."""
+"""Number of empty tasks with which the scheduler is measured."""
 START_S: Final = 60.0
 LEAN: Final = {
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",

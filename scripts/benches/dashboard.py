@@ -41,7 +41,7 @@ SAMPLES: Final = 10
 TURN: Final = 10
 """Number of cycles in a turn, after which the other stack is measured."""
 LIMIT: Final = 24 * 3600.0
-"""Time limit in seconds, which any number of minutes of the measurement of memory should keep."""
+"""Time limit in seconds, longer than any sensible `--minutes`."""
 PARTS: Final = ("cycle", "drag", "display")
 
 Rows = list[tuple[str, str, str]]
@@ -167,7 +167,7 @@ def read(url: str) -> None:
 
 
 async def cycles(plain: Stand, beside: Stand, frames: int, seed: int) -> Rows:
-    """Compare the cycle times of two stacks, of which one has a dashboard with a reader, in short turns."""
+    """Compare the cycle times of two stacks, measured in short turns; only one has a dashboard, with a reader."""
     async with connect(plain.uri) as one, connect(beside.uri) as other:
         # a process of its own, as a browser is
         reader = multiprocessing.get_context("spawn").Process(target=read, args=(beside.url,), daemon=True)

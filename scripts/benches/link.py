@@ -74,7 +74,7 @@ class Fitted(NamedTuple):
 
 
 def image(lines: int, index: int, count: int, *, replicas: int = 1) -> Image:
-    """Return an image that counts to 1 in a few cycles; with replicas, its board has room for INPUTS."""
+    """Return an image whose machine counts to 1 in a few cycles; with replicas, its board has all words of INPUTS."""
     parameters = BM1Parameters(lines=lines, sensor_bits=(1,), replicas=replicas)
     codes = np.full((2, lines), parameters.ones_code, np.uint16)
     return Image(
@@ -264,7 +264,7 @@ def show(transfers: Transfers, frames: Frames, fitted: Sequence[Fitted]) -> None
 
 
 def draw(path: Path, transfers: Transfers, frames: Frames) -> None:
-    """Draw the time of a read by its size, with the model's own time dotted, and the time of a frame by partitions."""
+    """Draw the time of a read by its size, with the link model's own time dotted, and of a frame by partitions."""
     figure = new_figure(9.6, 4.2)
     by_size, by_boards = figure.subplots(1, 2)
     for link, colour in zip(LinkRate, ("#bbbbbb", "#4477aa", "#ee6677"), strict=True):

@@ -132,7 +132,7 @@ async def bench_sizes(arguments: argparse.Namespace) -> int:
 
 
 def varied(points: Sequence[Point]) -> dict[str, list[Point]]:
-    """Return, for each size, the points in which only this size differs from the base."""
+    """Return, for each size, the points in which only this size differs from `BASE`."""
     lines, sensors, padding = BASE
     return {
         "lines": [each for each in points if each[1:3] == (sensors, padding)],

@@ -135,7 +135,7 @@ def excuses_of(step: Step, topology: Topology, until: float = 0.0) -> Excuses:
 
 
 class Schedule:
-    """Generator of a round's steps, with at most as many ended processes as a master tolerates."""
+    """Generator of a round's steps, which end at most as many processes as a master tolerates."""
 
     def __init__(self, rng: random.Random, topology: Topology, kinds: list[Kind]) -> None:
         """Draw faults of these kinds for a topology from the random generator."""

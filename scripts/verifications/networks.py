@@ -35,7 +35,7 @@ EXAMPLES: Final = Path("pgmpy", "utils", "example_models")
 NETWORKS: Final = 24
 FORMATS: Final = (".bif", ".bifxml", ".net", ".uai")
 READ_TOLERANCE: Final = 1e-5
-"""Tolerance of a probability, because pyagrum writes only six digits in the other formats."""
+"""Tolerance of a probability, because pyagrum writes only six digits in formats other than BIF."""
 INFERENCE_TOLERANCE: Final = 1e-6
 MACHINE_TOLERANCE: Final = 0.1
 """Maximum total variation between exact inference and a BM1 that counts to 4095."""

@@ -222,7 +222,7 @@ async def check_cbor(stand: Server) -> None:
 
 
 def deserialised(raw: bytes, type_name: str) -> dict[str, Any]:
-    """Return a message in CDR, which begins with a header, or in the format of ROS 1."""
+    """Deserialise a message in CDR (which begins with a header) or in the format of ROS 1."""
     message: Any
     if raw.startswith(b"\0\1\0\0"):
         message = get_typestore(Stores.ROS2_JAZZY).deserialize_cdr(raw, ros2_type(type_name))

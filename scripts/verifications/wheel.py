@@ -1,6 +1,6 @@
-"""Checks of the wheel of this commit in an environment of its own, without this folder (scripts/verify wheel).
+"""Checks of the wheel of this commit, in a new environment without the project's folder (scripts/verify wheel).
 
-scripts/wheel --> pip install, with what it depends on --> commands in an empty folder, without PATH
+scripts/wheel --> pip install, with dependencies --> commands in an empty folder, without PATH
 """
 
 import argparse

@@ -40,7 +40,7 @@ _DRAWN_EVERY = 0.2
 _REASON_TIME = 5.0
 """Seconds in which the publisher may ask the server why no result is seen."""
 _GRACE_PERIOD = 2.0
-"""Seconds in which the subscriber may report a missing reading itself, with more details."""
+"""Seconds in which the subscriber may report a missing reading before the master does, with more details."""
 
 
 class Master:

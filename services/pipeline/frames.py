@@ -119,7 +119,7 @@ class StampGap:
     """A gap between the stamps of topics that exceeds the tolerance, so that no frames are formed."""
 
     oldest: str
-    """The topic whose newest stamp is the oldest."""
+    """The topic whose newest stamp is older than those of the other topics."""
     newest: str
     apart_s: float
     tolerance_s: float

@@ -29,7 +29,7 @@ RESULTS_DEPTH = 64
 
 
 def same_numbers(received: Any, sent: list[float], *, rel_tol: float = 1e-12, abs_tol: float = 0.0) -> bool:
-    """Return whether a received array equals the sent one; tolerances, because some servers lose the last bit."""
+    """Return whether a received array equals the sent one, within tolerances, as some servers lose the last bit."""
     return (
         isinstance(received, list)
         and len(received) == len(sent)

@@ -80,7 +80,7 @@ class ExactChain:
             self._zero[at] = start * np.prod([1 - chance for _, chance in concerned], axis=0)
 
     def _moved(self, laws: NDArray[np.float64], move: Sequence[int]) -> NDArray[np.float64]:
-        """Return the laws after a move from the laws before it, float64[..., states]."""
+        """Return the distributions of the state after a move, from those before it, float64[..., states]."""
         for at in move:
             one, zero = (each.reshape(-1, 2, 1 << at)[:, :1] for each in (self._one[at], self._zero[at]))
             split = laws.reshape(*laws.shape[:-1], -1, 2, 1 << at).sum(axis=-2, keepdims=True)

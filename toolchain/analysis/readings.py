@@ -169,7 +169,7 @@ def model_of_codes(
 
 
 def _conditional(codes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scale rows so that columns sum to about 1, then normalise the columns; one of zeros becomes uniform."""
+    """Scale rows so that columns sum to about 1, then normalise the columns; a column of zeros becomes uniform."""
     codes = np.where(codes.sum(axis=0) > 0, codes, 1.0)
     served = codes.sum(axis=1) > 0
     weights = served / max(int(served.sum()), 1)

@@ -124,7 +124,7 @@ class MachineChoice(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """The flags of a build about either kind of machine; None stands for the default of the kind that is built."""
+    """The flags of a build that both kinds of machine have; None stands for the default of the kind that is built."""
 
     machine: Annotated[
         MachineChoice,
@@ -173,7 +173,7 @@ def replica_count(text: str) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class BM1Options:
-    """The flags of a build about a BM1, except those that name a file or need parsing."""
+    """The flags of a build that only a BM1 has, except those that name a file or need parsing."""
 
     scale: Annotated[
         Scale | None,
@@ -276,7 +276,7 @@ class BuildOptions(MachineOptions, TargetOptions):
 
     @property
     def scaling(self) -> Scale:
-        """The part of a table that is divided by its own maximum: `scale`, or its default if that is None."""
+        """The part of a table that is divided by its own maximum: `scale`, or the default if `scale` is None."""
         if self.scale is not None:
             return self.scale
         return Scale.ADDRESS if self.sensor_mode is SensorMode.COLUMN else Scale.COLUMN

@@ -3,7 +3,7 @@
 A factor that is the same for all lines does not change the posterior, so by default every row of a column's table (an
 address, which is a value of the variable) is divided by its maximum over all lines of all boards. Otherwise a machine
 would rarely count. An outlier floor is a small probability that a model gives to every value, so that no single outlier
-excludes the true line; if its code becomes 0, an outlier does.
+excludes the true line; if the code of the floor becomes 0, an outlier does.
 """
 
 import math

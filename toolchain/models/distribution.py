@@ -27,7 +27,7 @@ YES: Final = frozenset({"true", "yes", "on"})
 
 
 def _is_whole(number: object) -> bool:
-    """Return whether a value is a Python or NumPy integer, because a user's file is not type-checked."""
+    """Return whether a value is a Python or NumPy integer; a user's file is not type-checked."""
     return isinstance(number, int | np.integer)
 
 

@@ -290,7 +290,7 @@ python -c "from urllib.request import urlopen; print(urlopen('http://127.0.0.1:8
 
 
 def check_cluster(stack: Stack) -> None:
-    """Check the profile `cluster`: only dask runs; a recording and a sweep from the host have the bytes of one process."""
+    """Check the profile `cluster`: only dask runs, and a recording and a sweep give the bytes of one process."""
     with stack.cleared():
         try:
             stack.compose("--profile", "cluster", "up", "--detach", limit=UP_LIMIT)

@@ -1,4 +1,4 @@
-"""The compose project on the engine of scripts/container-engine, in which this process runs."""
+"""The compose project, on the container engine that scripts/container-engine starts for this process."""
 
 import contextlib
 import json

@@ -60,7 +60,7 @@ SCALE: Final = 4.0
 """Pixels a metre in boat.rviz."""
 BACKGROUND: Final = (48, 48, 48)
 FEW: Final = 50
-"""Maximum number of pixels of this colour in a row or column of the rest of the window, such as of text."""
+"""Maximum number of pixels with the background's colour in a row or column outside the scene, such as in text."""
 
 
 class Scene(NamedTuple):
