@@ -14,7 +14,7 @@ from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, SensorMode
 class BM1Kernel(ABC):
     """A running machine with `replicas` replicas, which share its generators (thesis 2.1.2 and 4.4).
 
-    Each replica counts and stops by itself; the generators step until the last one has stopped. Counts,
+    Each replica counts and stops by itself; the generators step until the last replica has stopped. Counts,
     cycles, reasons and states are the same in every kernel, bit for bit.
     """
 

@@ -22,7 +22,7 @@ MOST_WORDS: Final = 256
 ACCESS_CLOCKS: Final = 8
 """Maximum number of clocks of an access, once the memories are filled."""
 ANSWER_S: Final = 20.0
-"""Timeout of an answer in seconds, in addition to ten times the usual duration of its clocks."""
+"""Timeout of an answer in seconds, beyond ten times the usual duration of the clocks that the request takes."""
 START_S: Final = 600.0
 """Timeout of the first answer in seconds, because the simulator elaborates the hardware before it."""
 

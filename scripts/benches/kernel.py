@@ -205,7 +205,7 @@ def measure(runs: dict[str, Callable[[], Sampled]]) -> dict[str, Sampled]:
 
 
 def show(title: str, speeds: dict[str, Sampled]) -> None:
-    """Print a table, with the sweeps a second of each row divided by those of the first one."""
+    """Print a table; its last column is a row's sweeps per second relative to the first row."""
     rows = []
     single = next(iter(speeds.values()))
     for name, each in speeds.items():
