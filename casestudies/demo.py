@@ -219,7 +219,10 @@ async def _load_kernels() -> None:
 
 
 def _ends(case: Case, count: int | None, master: Process, viewer: Process) -> list[asyncio.Future[Any]]:
-    """Return futures of the ends of master and viewer, and of the viewer's last line if the master does not count."""
+    """Return futures of the events that end a demo: the exits of master and viewer.
+
+    If the master does not count frames, the viewer's last line is a third such event.
+    """
     ends: list[asyncio.Future[Any]] = [asyncio.ensure_future(each.succeed()) for each in (master, viewer)]
     if count is not None and not case.counts_frames:
         ends.append(asyncio.ensure_future(viewer.line(rf"^ *{count} ")))

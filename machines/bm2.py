@@ -83,9 +83,9 @@ class BM2Parameters:
         known: Variables whose values a frame may set, in the order of the frame's addresses.
         prob_bits: Bits of a CDE's probability code (W), 2 to 16.
         sequencer: Default order in which the sequencer points at bits.
-        literal: True: a bit is written if all CDEs agree on it, as the thesis draws it. False: if those agree whose
-            factor has the bit.
-        sample_every: Moves after which a sample is taken.
+        literal: True: a bit is written when all CDEs of the machine agree on it, as the thesis draws it. False: when
+            all CDEs of the factors that contain the bit agree.
+        sample_every: Interval of samples: a sweep or a move.
         burn_in: Default number of whole sweeps before the first sample.
         ops_timeout: Default maximum number of cycles of a move.
         rng: Kind of random number generators; `lfsr8` and `lfsr16` are too narrow.

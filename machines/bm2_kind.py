@@ -66,7 +66,7 @@ class BM2Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM2Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield a section for each CDE, one for each factor's non-zero entries, and one for any random numbers."""
+        """Yield one section per CDE, one per factor (its non-zero entries), and one for a table of random numbers."""
         for at in range(parameters.cdes):
             bits = len(parameters.factor_bits(at))
             yield f"cde {at}", "<u2", (bits << bits >> 1,)

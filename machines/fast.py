@@ -3,7 +3,7 @@
 The bits of a cell in 64 cycles are one word, which depends only on the generator of its column and on its
 code, so all cells of a column with the same code share it, in all replicas. A line ANDs the words of its
 cells and counts the ones. Lines with a code 0 cannot count and are omitted. Cycles are run in blocks of 512.
-If a counter reaches the target in a block, the exact cycle is found in the words of those lines, and the
+If a counter reaches the target in a block, the exact cycle is found in the words of its line, and the
 block is counted again up to that cycle. Replicas are run one after the other, each to its own end.
 
 If frames restart from a bank, the words of a frame's first cycles are constants of the machine: they are

@@ -227,7 +227,7 @@ class FrameCourse(ABC):
         """
 
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:
-        """Return the frame's results, after adding to `BoardResult.kept` what the course has stored of its slices."""
+        """Return the frame's results, with the data that this object stored during the slices in `BoardResult.kept`."""
         return results
 
 

@@ -124,7 +124,7 @@ class Image:
 
     @cached_property
     def image_hash(self) -> str:
-        """SHA-256 (hex) of the computation of the board, independent of the build date."""
+        """SHA-256 (hex) of everything that determines what the board computes, but not of the build date."""
         return _manifest(self, self.kind.sections(self.machine)).image_hash
 
 

@@ -57,7 +57,7 @@ class Job(Protocol):
     """Pieces of work with the same tables. A job is pickled, and so is every result."""
 
     def prepare(self) -> Work:
-        """Return a function that takes the number of a piece and does it."""
+        """Return a function that does the piece of work with a given number."""
 
 
 Run: TypeAlias = Callable[[Job, Sequence[int], Keep], None]

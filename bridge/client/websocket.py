@@ -140,7 +140,7 @@ class WebSocket(WebSocketTransport):
         self._silent_for = 0.0
 
     async def handshake(self, headers: tuple[tuple[str, str], ...]) -> None:
-        """Perform the opening handshake, or raise its error."""
+        """Perform the opening handshake; raise the error that ended it, if any."""
         request = self._client_protocol.connect()
         request.headers.update(headers)
         request.headers.setdefault("User-Agent", USER_AGENT)

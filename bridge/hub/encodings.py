@@ -87,7 +87,7 @@ class OutgoingMessage:
     _type: str
     """Its type, or the empty string."""
     _time_ns: int
-    """Its receipt in nanoseconds since 1970, for cbor-raw."""
+    """The time of its receipt in nanoseconds since 1970, for cbor-raw."""
     _definitions: MessageDefinitions
     _max_size: int
     """Maximum number of bytes on the wire."""

@@ -1,6 +1,6 @@
 """The boat's map, its sensors with their noise, and their ROS messages.
 
-The boat localisation problem of thesis 2.1.2.1 with the numbers of its published version (Bessiere et al.,
+This is the boat localisation problem of thesis 2.1.2.1 with the numbers of its published version (Bessiere et al.,
 Bayesian Programming, ch. 7). Distances are in map units, bearings in degrees.
 
 Messages with named fields (`boat_msgs/Raw`, `boat_msgs/Sensors`) are easy to read and carry a time stamp. A ROS

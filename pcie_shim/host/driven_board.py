@@ -271,9 +271,8 @@ class DrivenBoard:
         """Store the answer of a board that is done, which the interrupt carried or `ask` has requested.
 
         This host holds the board, so nobody else starts it; but a reset, or a power cycle, between the interrupt and
-        the reads would clear the results. `ask` therefore reads DONE and the
-        registers up to COMPUTE_NS last: if they still equal the interrupt's values, the machine has not run since, and
-        the blocks contain this frame's results.
+        the reads would clear the results. `ask` therefore reads the registers from DONE to COMPUTE_NS last: if they
+        still equal the interrupt's values, the machine has not run since, and the blocks contain this frame's results.
         """
         done = self._answered()
         words = done.results

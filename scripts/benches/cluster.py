@@ -53,7 +53,7 @@ LEAN: Final = {
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
     "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
 }
-"""Settings of dask that the guide names."""
+"""Settings of dask that docs/how-to/cluster.md recommends."""
 
 
 class Designs:
@@ -111,7 +111,7 @@ class Hosts:
 
     @contextmanager
     def serving(self, workers: int, *, namespaces: bool) -> Iterator[str]:
-        """Run a scheduler and workers, and yield the address; in namespaces, worker n is the host NETWORK.n+2."""
+        """Run a scheduler and workers, and yield its address; with `namespaces`, worker n is at NETWORK.(n + 2)."""
         dask = str(Path(sys.executable).with_name("dask"))
         host, names = "127.0.0.1", [f"rosbayes{at}" for at in range(workers)] if namespaces else []
         try:

@@ -39,7 +39,7 @@ NETWORKS: Final = ("asia", "cancer", "earthquake", "survey", "sachs", "child", "
 NO_ZEROS: Final = ("cancer", "earthquake", "survey", "sachs")
 """Networks without a zero: any state leads to any other by changes of one variable."""
 AIM: Final = 0.01
-"""Maximum total variation of a marginal on these, after a million sweeps."""
+"""Maximum total variation of a marginal on the networks `NO_ZEROS`, after a million sweeps."""
 COLUMNS: Final = (
     "known", "sampler", "largest TV", "mean TV", "effective", "sweeps", "cycles", "per sweep", "seconds", "stop",
 )  # fmt: skip

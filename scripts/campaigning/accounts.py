@@ -41,7 +41,8 @@ class Excuses:
         readings: Whether readings may be lost before the master, whose counters then cannot include them (a
             killed subscriber or master, a cut connection).
         results: Whether results may be lost in the same way after the publisher.
-        most: Maximum number of lost readings, and of results; raised only if a process or connection was held before.
+        most: Maximum number of lost readings, and of lost results; unlimited after a fault that holds up a process
+            or connection.
         until: Time of publication of the first reading that has a result again. Because everything keeps its order,
             earlier readings have a result or are lost by then, and later ones have no excuse.
     """

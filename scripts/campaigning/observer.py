@@ -145,7 +145,7 @@ class Observer:
         return stamp in self._readings and self._readings[stamp].arrived
 
     def newest_since(self, index: int) -> Reading | None:
-        """Return the newest reading with a result, if its index is at least this one."""
+        """Return the newest reading with a result; None if its index is below `index`."""
         return self._newest if self._newest is not None and self._newest.index >= index else None
 
     def pending_readings(self) -> list[Reading]:

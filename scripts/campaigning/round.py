@@ -58,7 +58,7 @@ class RoundResult:
     recoveries: list[tuple[float, str]] = field(default_factory=list)
     """Seconds from a step's end to the next result, and the step; they are only reported."""
     resources: dict[tuple[str, int], list[tuple[int, int]]] = field(default_factory=dict)
-    """By role and process: resident KiB and descriptors after each step."""
+    """Resident KiB and number of descriptors after each step, by role and process id."""
     words: str = ""
 
 

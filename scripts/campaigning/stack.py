@@ -155,12 +155,12 @@ class Stack:
                 raise NotThereError(f"{role} did not come up: {error}") from error
 
     def is_over(self, role: str) -> bool:
-        """Return whether a process of the campaign's own has ended."""
+        """Return whether a process that the campaign started has ended."""
         process = self._parts.get(role)
         return process is None or not process.pid or _stat(process.pid)[0] == "Z"
 
     async def wait(self, role: str) -> str:
-        """Wait for the end of a process of the campaign's own, and return its exit code and last line."""
+        """Wait for the end of a process that the campaign started, and return its exit code and last line."""
         try:
             async with asyncio.timeout(END_LIMIT):
                 code = await self._parts[role].wait()

@@ -1,9 +1,9 @@
 """Verification of the VHDL: comparison with the emulated board, and proofs (scripts/verify hdl).
 
-random machines --> GHDL, driven through AXI4-Lite     --> what the emulated board answers?
-the boat        --> GHDL or Verilator, behind the link --> what four emulated boards answer?
-units           --> GHDL                               --> values that no machine reaches
-VHDL            --> Verilog (GHDL) --> yosys           --> properties for every input
+random machines --> GHDL, driven through AXI4-Lite     --> same answers as the emulated board?
+the boat        --> GHDL or Verilator, behind the link --> same answers as four emulated boards?
+units           --> GHDL                               --> correct at values that no machine reaches?
+VHDL            --> Verilog (GHDL) --> yosys           --> properties proved for every input?
 """
 
 import argparse

@@ -487,7 +487,7 @@ def check_frame(msg: dict[str, Any], after: int, sent: list[Sent]) -> tuple[int,
 
 
 def check_received(stand: Server, received: Received, sent: list[Sent], count: int) -> None:
-    """Raise a CheckError that names the first result without a `/bm/frame`, or of another reading than its stamp's."""
+    """Raise a CheckError that names the first result that has a wrong `/bm/frame`, or belongs to another reading."""
     frames, results = ([msg for each, msg in received if each == topic] for topic in (REPORTS, RESULTS))
     for topic, messages in ((REPORTS, frames), (RESULTS, results)):
         expect(len(messages) == count, f"{len(messages)} messages came on {topic}, not {count}")

@@ -99,7 +99,7 @@ def serve_one(
 def _await_free(endpoint: Endpoint, limit: float) -> None:
     """Wait until no other process listens at an endpoint, or raise a SettingsError after `limit` seconds.
 
-    From then on, a socket at this path counts as one of our own boards.
+    After this call, a process that listens at the endpoint counts as one of our own boards.
     """
     deadline = time.monotonic() + limit
     for each in (endpoint, endpoint.programming):

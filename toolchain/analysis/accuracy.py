@@ -237,7 +237,7 @@ class _Reading(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Frames:
-    """The job of running the readings: piece n is the reading at index n; `replicas` readings are a frame."""
+    """The job of running the readings: piece n is the reading at index n; a frame has `replicas` readings."""
 
     boards: EmulatedBoards
     readings: Readings

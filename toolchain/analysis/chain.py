@@ -164,7 +164,7 @@ class ExactChain:
         return np.asarray(np.divide(own, total, out=np.ones_like(own), where=own > 0))
 
     def frame(self, state: int, burn_in: int, sweeps: int) -> NDArray[np.float64]:
-        """Return the mean law over a frame's sweeps after its burn-in, float64[states].
+        """Return the distribution of the state, averaged over a frame's sweeps after its burn-in: float64[states].
 
         `state` is the start state of all variables, bit i for bit i of the machine.
         """
@@ -187,13 +187,13 @@ class ChainError:
     quantising: float
     """Mean distance of the stationary law from exact inference."""
     worst: float
-    """The largest of these distances, over readings."""
+    """The largest distance of the stationary law from exact inference, over readings."""
     worst_reading: tuple[int, ...]
     """The reading with this distance: an address per known variable."""
     start: float
     """Mean distance of a frame's mean law from the stationary one: the effect of the start after the burn-in."""
     sampling: float
-    """Mean distance of a frame's posterior from its mean law, because samples are finite and correlated."""
+    """Mean distance of a frame's posterior from its expected value, because samples are finite and correlated."""
     cycles: float
     """Mean cycles of a sweep."""
     effective: float

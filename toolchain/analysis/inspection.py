@@ -103,7 +103,8 @@ def inspect_deployment(
 def losses_of(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[ColumnLoss, ...] | None:
     """Return the quantisation loss of the model, or None if the codes were edited since the build.
 
-    A BuildError if the codes are those of another model.
+    Raises:
+        BuildError: The codes are those of another model.
     """
     if model.lines == deployment.machine.lines and len(model.known) == whole.parameters.sensors:
         quantised = quantise(

@@ -69,7 +69,7 @@ _FEW_WORDS: Final = 8
 
 
 class Of(StrEnum):
-    """The kinds of units: what a machine's number of ALMs is counted in, and the VHDL that one unit stands for."""
+    """The kinds of units in which a machine's logic is counted, each with the VHDL that one unit stands for."""
 
     BOARD = "board"
     """The units that each board has once: bm1_axi, bm_register_block, bm1_guard, and bm1_control of a single machine."""
@@ -84,9 +84,9 @@ class Of(StrEnum):
     STEP = "step"
     """A step of an LFSR in a cycle (bm1_lfsr): the parity of the taps."""
     PLACE_BIT = "place bit"
-    """A bit of the index in a table of random numbers (bm1_table_player): the next index, wrapping at the end."""
+    """A bit of the index in a table of random numbers (bm1_table_player): its logic computes the next index."""
     WORD = "word"
-    """A word that the host writes for a frame, in bm1_words: its address and the check of its value."""
+    """A word that the host writes for a frame, in bm1_words: its logic decodes the address and checks the value."""
     MEMORY = "memory"
     """A memory of such words, in bm1_words: its initial contents and its output."""
     REPLICA = "replica"

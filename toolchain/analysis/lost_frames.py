@@ -31,7 +31,7 @@ large model take more.
 _MOST_FRAMES: Final = 1000
 _LEAST_FRAMES: Final = 10
 _POINTS: Final = 16
-"""Number of points that are drawn for a frame."""
+"""Number of random points from which the probability of a frame is estimated."""
 _SEED: Final = 1
 _MOST_CYCLES: Final = 2**26
 """Maximum number of cycles that are tried for the advice: 0.7 s at 100 MHz."""
@@ -60,7 +60,7 @@ def lost_frames(plan: MachinePlan, quantised: Quantised) -> LostFrames:
 
 
 def _chances(plan: MachinePlan, quantised: Quantised, drawn: Readings) -> NDArray[np.float64]:
-    """Return the probability that some line counts in a cycle, for each frame: float64[frames]."""
+    """Return the probability that at least one line counts a one in a cycle, for each frame: float64[frames]."""
     machine = one_replica(whole_machine(plan, quantised))
     if machine.parameters.sensor_mode is not SensorMode.COLUMN:
         drawn = readings_of_lines(drawn, plan.model, machine, scale=plan.options.scaling, seed=_SEED)
@@ -70,7 +70,10 @@ def _chances(plan: MachinePlan, quantised: Quantised, drawn: Readings) -> NDArra
 
 
 def _union(chances: NDArray[np.float64], random: np.random.Generator, *, shared: bool) -> float:
-    """Return the probability that some line counts in a cycle; `chances` are of cells, float64[columns, lines]."""
+    """Return the probability that at least one line counts a one in a cycle.
+
+    `chances` are the probabilities that cells make a 1: float64[columns, lines].
+    """
     lines = np.prod(chances, axis=0)
     total = float(lines.sum())
     if total == 0:  # or so small that doubles underflow

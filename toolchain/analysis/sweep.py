@@ -155,7 +155,7 @@ class Results:
 
 
 _MOST_LOST: Final = 0.5
-"""Maximum share of runs without a posterior on the Pareto front; above it, no median of cycles can be compared."""
+"""Maximum share of runs without a posterior, for a machine to be on the Pareto front."""
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:

@@ -116,7 +116,7 @@ def _check_sizes(model: NetworkModel) -> None:
 
 
 def chain_machines(plan: BM2Plan) -> tuple[BM2Machine, ...]:
-    """Return each board's machine: the same tables, but other seeds; a BuildError if no state is possible."""
+    """Return each board's machine: equal tables, but different seeds. Raise a BuildError if no state is possible."""
     parameters, table = plan.parameters, plan.options.rng_table
     if table is None and parameters.rng is RngKind.TABLE:
         table = random_table(parameters.prob_bits)

@@ -21,7 +21,7 @@ class SourceTable(Source):
     variables: dict[Name, MessagePath] | None = None
     """The path of each variable in the message, by name; None for all variables that no other source has."""
     prior: MessagePath | None = None
-    """The path in the message of a prior that the host writes; None if this topic has none."""
+    """The path, in the message, of the prior that the host writes; None if the message contains no prior."""
 
 
 class SourcesTables(Section):

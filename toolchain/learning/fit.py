@@ -71,7 +71,7 @@ class Support:
     cells: int
     """Number of lines that have at least one such reading of the variable."""
     median: float
-    """The median number of such readings in a line that has any."""
+    """The median number of such readings per line, over the lines that have any."""
     refused: int
     """Number of readings that are not values of the variable."""
 

@@ -48,7 +48,7 @@ def read_recording(
 ) -> Recording:
     """Return the named columns of a recording: a CSV file (`.csv`), an MCAP file, a ROS 1 bag or a ROS 2 bag's folder.
 
-    In a bag, each message on the topic of the first column is a row; those of other topics may be `tolerance_s` away.
+    In a bag, each message on the topic of the first column is a row; other topics' stamps may differ by `tolerance_s`.
     With `stamped`, the stamps of a CSV file are those of its column `stamp_ns` or `time_s`.
 
     Raises:

@@ -252,7 +252,7 @@ class Question:
         return Transition(first / first.sum(), table / table.sum(axis=1, keepdims=True))
 
     def _check_known(self, earlier: set[str]) -> None:
-        """Raise a ModelError if a known symbol depends on the `earlier` searched symbols, given the present ones."""
+        """Raise a ModelError if a known symbol depends on the `earlier` frame's symbols, given the searched ones."""
         active = self.joint.active
         _, links = self._linked(active, [*(symbol.name for symbol in self.known), *earlier])
         for component in links.components():
@@ -282,7 +282,7 @@ class Question:
         return None
 
     def dependent(self) -> list[tuple[str, str]]:
-        """Return the pairs of known symbols that are dependent given the searched ones; a BM1 knows one of a pair."""
+        """Return the pairs of known symbols that are dependent given the searched ones; a BM1 can know only one."""
         factors, pairs = self._pairs()
         return [
             (one, other) for _, one, other in pairs if self._linked(factors, [one, other])[1].path(one, other)
@@ -297,8 +297,8 @@ class Question:
     def _pairs(self) -> tuple[list[Factor], list[tuple[int, str, str]]]:
         """Return the factors relevant for all observed symbols, and the pairs that they join, with lengths of paths.
 
-        Only these pairs may be dependent. Whether one is must be tested with the factors relevant for that pair alone.
-        They are some of the returned factors, so a path through them is at least as long.
+        Only these pairs may be dependent. To find out whether a pair is, use the factors relevant for that pair alone.
+        These are a part of the returned factors, so the pair's path through them is at least as long.
         """
         observed = [symbol.name for symbol in self.observed]
         factors, links = self._linked(self.joint.active, observed)

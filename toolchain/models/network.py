@@ -131,7 +131,7 @@ def network_model(
 
 
 def network_of(model: Model) -> NetworkModel:
-    """Return a naive fusion as a network, each table a factor of all searched variables, or raise a ModelError."""
+    """Return a naive fusion as a network, whose tables all depend on all searched variables, or raise a ModelError."""
     if model.prior_select is not None:
         raise ModelError(
             f"{model.name}: {model.prior_select.name} selects the prior, which only a BM1 has: build one with "

@@ -18,7 +18,7 @@ from scripts.verifications.checks import CheckError, expect
 OUT: Final = ROOT / "out" / "verify-containers"
 CLIENT: Final = Path(__file__).resolve().with_name("client.py")
 UP_LIMIT, FLOW_LIMIT, COMMAND_LIMIT = 300.0 * FACTOR, 180.0 * FACTOR, 120.0 * FACTOR
-"""Seconds until all services are healthy, until an event, and for a docker command; generous, not judged."""
+"""Time limits in seconds until all services are healthy, until an event, and for a docker command."""
 KILLED: Final = 137
 """Exit code after SIGKILL."""
 CORE: Final = ("master", "subscriber", "publisher", "pcie-app")
