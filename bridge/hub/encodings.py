@@ -80,7 +80,7 @@ class OutgoingMessage:
     """One published message, encoded on demand."""
 
     json: bytes
-    """Bytes of JSON: from index `_begin` on the message, then one brace; the rest is kept to avoid copying them."""
+    """JSON that ends, from index `_begin` on, with the message and one brace; kept whole, so that nothing is copied."""
     _begin: int
     _parsed: dict[str, Any] | None
     """The parsed message, or None if it was not parsed yet."""

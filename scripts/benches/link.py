@@ -44,7 +44,7 @@ RESULTS = 4096
 WAYS = {"sent": (), "read": ("--read-results",)}
 """Flags of `board` for the way of the results: in the done message, or by reads of registers as in the thesis."""
 SLOWER = 20
-"""Number of measurements of another link for one over JTAG, because a JTAG transfer takes milliseconds."""
+"""Measurements of every other link for each one over JTAG, because a transfer over JTAG takes milliseconds."""
 TOLERANCE = 0.15
 """Deviation of a fitted rate from the stated one that the bench accepts."""
 LIMIT_S = 30.0

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from scripts.campaigning.observer import Finding, Flaw, Reading
 
 PASSED_OVER = "passed over"
-"""Reason for which there need not be a fault, but a newer reading that arrived before the result."""
+"""Loss reason that needs no fault, only a newer reading that arrived before the result."""
 UNUSABLE = "with an unusable variable"
-"""Reason for which there need not be a fault, but a published reading with an unusable variable."""
+"""Loss reason that needs no fault, only a published reading with an unusable variable."""
 WITH_PUBLISHER = "lost with the publisher"
 """Reason of results that may have arrived, because the publisher was killed before it confirmed them."""
 WITH_APP, FAILED, ROSBRIDGE_AWAY = "lost with pcie-app", "failed on a board", "rosbridge away"

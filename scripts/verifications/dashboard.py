@@ -43,7 +43,7 @@ from scripts.verifications.checks import CheckError, Tally, expect, within
 LIMIT: Final = 1200.0 * FACTOR
 """Time limit of the verification, in seconds."""
 NEAR: Final = 15.0
-"""Distance in map units from the boat below which the posterior's mean has followed it."""
+"""Maximum distance in map units of the posterior's mean from the boat, once the mean has followed the boat."""
 START: Final[Place] = (0.0, -25.0)
 """Place in map units where the boat lies before it is dragged."""
 GOALS: Final[tuple[Place, ...]] = ((0.55, 0.4), (0.3, 0.25), (0.65, 0.6))

@@ -115,7 +115,7 @@ class PeerEvents(Protocol):
         """Handle a record about a reading, a frame or a result."""
 
     def lost(self, peer: Peer) -> None:
-        """Handle the loss of a peer, with which the frame or the results that it had are lost."""
+        """Handle the loss of a peer, and of the frame or the results that it had."""
 
     def awaited(self, peer: Peer) -> Awaited | None:
         """Return what a ready peer has to do next; None if nothing."""

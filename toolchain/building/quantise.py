@@ -178,7 +178,7 @@ def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[n
 def _vanished_floor(
     known: Known, ratios: NDArray[np.float64], vanished: NDArray[np.bool_], prob_bits: int, scale: Scale
 ) -> VanishedFloor:
-    """Describe an outlier floor that becomes code 0, and advise a floor or a code width that does not."""
+    """Describe an outlier floor that becomes code 0, and advise a higher floor or wider codes."""
     least = float(ratios[vanished].min())
     needed = math.ceil(-math.log2(least) - 1)
     ways = [f"a floor of about {enough:.2g}"] if (enough := _enough_floor(known, prob_bits, scale)) else []

@@ -69,7 +69,7 @@ class Support:
     readings: int
     """Number of the variable's readings in rows with a true position."""
     cells: int
-    """Number of lines that have at least one such reading of the variable."""
+    """Number of lines in which the variable was read at least once."""
     median: float
     """The median number of such readings per line, over the lines that have any."""
     refused: int
