@@ -55,10 +55,10 @@ class Field:
         """Look up the variable.
 
         Returns:
-            Whether the message has it, and its unchanged value (None if it is missing or null).
+            True if the message has the variable, and its unchanged value (None if it is missing or null).
 
         Raises:
-            FieldAmbiguousError: A bare name that was not found before occurs more than once.
+            FieldAmbiguousError: The message has several fields with this bare name, and no earlier one had it.
         """
         # A bare name is searched until it is found, and then has the same place in all messages.
         place = self.place

@@ -158,7 +158,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Instance:
-    """The outcome of a frame, heard on the topics of results, and the true position at its time.
+    """The outcome of a frame, received from the topics of results, and the true position at its time.
 
     `truth` is None if no true pose matches the stamp. `truth_age_ns` is the age of the true pose relative to the
     frame's stamp, 0 if the stamps are equal.
@@ -222,7 +222,7 @@ class Listener:
     """
 
     def __init__(self, heard: Posteriors, tolerance_ns: int) -> None:
-        """Start without truths."""
+        """Start without true positions."""
         self.route: deque[Truth] = deque(maxlen=100_000)
         self._heard = heard
         self._tolerance_ns = tolerance_ns

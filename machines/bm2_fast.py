@@ -29,7 +29,7 @@ from machines.rng import LFSR, POLYNOMIALS, Words, jump_tables
 from machines.vectors import aligned, first_one, in_llvm, load, repeated, store
 
 CHUNK: Final = 32
-"""Number of cycles that are examined together: the bits of a mask."""
+"""Number of cycles that are examined together, one for each bit of a mask."""
 
 STREAM_ROOM: Final = 4096
 """Initial size in samples of a stream's buffer, which grows when needed."""

@@ -132,7 +132,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @property
     def is_blocked(self) -> bool:
-        """Return whether to stop reading now, because the peer does not read the output that it causes."""
+        """Return whether to stop reading now, because the peer does not read the answers to its pings."""
         return self._pongs_unread
 
     @property

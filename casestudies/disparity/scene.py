@@ -45,7 +45,7 @@ class _Sphere:
     radius: float
 
     def distance(self, origin: Array, rays: Array) -> Array:
-        """Return the factor by which each ray, float64[pixels, 3], first hits the sphere; infinite for a miss."""
+        """Return where each ray, float64[pixels, 3], first hits the sphere, in ray lengths; infinite for a miss."""
         away = origin - self.centre
         a, b = (rays**2).sum(axis=1), rays @ away
         root = b**2 - a * (away @ away - self.radius**2)
@@ -59,7 +59,7 @@ class _Box:
     high: Array
 
     def distance(self, origin: Array, rays: Array) -> Array:
-        """Return the factor by which each ray, float64[pixels, 3], enters the box; infinite for a miss."""
+        """Return where each ray, float64[pixels, 3], enters the box, in ray lengths; infinite for a miss."""
         with np.errstate(divide="ignore"):
             first, second = (self.low - origin) / rays, (self.high - origin) / rays
         enters = np.minimum(first, second).max(axis=1)

@@ -34,7 +34,7 @@ SIGHTINGS_TOPIC: Final = "/mrclam/sightings"
 SIGHTINGS_TYPE: Final = "mrclam_msgs/Sightings"
 MAP_FRAME: Final = "map"
 LANDMARKS: Final = range(6, 21)
-"""The numbers of the 15 landmarks in the data set, in which 1 to 5 are the robots."""
+"""The numbers of the 15 landmarks in the data set; its numbers 1 to 5 are the robots."""
 
 SIGHTINGS_MSG: Final = (
     "# mrclam_msgs/Sightings: range (m) and absolute bearing (rad, counter-clockwise from +x) of the landmarks "

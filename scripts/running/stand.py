@@ -59,7 +59,7 @@ class Stand:
         """The processes of which `tails` shows the logs."""
 
     def pid(self, name: str) -> int:
-        """Return the number of a process."""
+        """Return the process ID of a process."""
         return self._processes[name].pid
 
     def log(self, name: str) -> Path:

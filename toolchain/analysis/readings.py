@@ -248,7 +248,7 @@ def recorded_frames(
 
     Raises:
         BuildError: A name in `given` is unknown, or a variable that must have a reading has no column.
-        ModelError: The recording is missing or damaged, lacks a column, or no row fits.
+        ModelError: The recording is missing or damaged, lacks a column, or has no row that fits the machine.
     """
     columns = reading_columns([each.name for each in variables], given)
     unnamed = [each.name for each in variables if each.name not in columns and each.on_missing == "error"]

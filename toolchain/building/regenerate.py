@@ -194,7 +194,7 @@ def _plan(
 
 
 def _with_widths(model: Model, deployment: Deployment) -> Model:
-    """Return the model with the address widths of the deployment, or raise a BuildError if it needs another machine."""
+    """Return the model with the deployment's address widths; a BuildError if the model needs another machine."""
     kinds = {variable.name: variable.kind for variable in model.variables}
     built = {variable.table_of or variable.name: variable for variable in deployment.variables}
     built_kinds = {name: variable.kind for name, variable in built.items()}

@@ -29,7 +29,7 @@ _HEADER_BYTES: Final = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transition:
-    """P(S) before the first frame, and its change from frame to frame; a ModelError if a sum of P is not 1."""
+    """P(S) before the first frame, and its change from frame to frame; a ModelError if one does not sum to 1."""
 
     start: NDArray[np.float64]
     """P(S) before the first frame, float64[lines]."""

@@ -53,7 +53,7 @@ class TrueCells:
     rows: NDArray[np.int64]
     """int64[n], the usable rows: every searched dimension has a true value, and it is inside the grid."""
     lines: NDArray[np.int64]
-    """int64[n], the line of the model's grid in which the true position of each of these rows is."""
+    """int64[n], for each of these rows, the line of the model's grid that contains the true position."""
     within: NDArray[np.float64]
     """float64[dimensions, n], the offset of the true position from the centre of its cell, in cells: -0.5 to 0.5."""
     outside: int
@@ -65,7 +65,7 @@ class Support:
     """The amount of data behind a table."""
 
     name: str
-    """The variable."""
+    """Name of the variable."""
     readings: int
     """Number of the variable's readings in rows with a true position."""
     cells: int
@@ -77,7 +77,7 @@ class Support:
 
 
 def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> TrueCells:
-    """Return the true position in each of `rows` rows; `columns` has the true values of each dimension by label."""
+    """Find the usable rows among `rows` rows; `columns` has the true values of each dimension, by its label."""
     places = np.array(
         [[_position(dimension, value) for value in columns[dimension.label]] for dimension in model.searched]
     ).reshape(len(model.searched), rows)

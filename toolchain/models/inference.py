@@ -28,7 +28,7 @@ _MOST_COUNTED: Final = 64
 """Maximum number of neighbours of a symbol among which `_fill` counts the pairs."""
 
 _Graph: TypeAlias = dict[str, set[str]]
-"""For each symbol's name, the names of the symbols with which it shares a term."""
+"""For each symbol's name, the names of the symbols that are in a term (factor) with it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -309,7 +309,7 @@ class Question:
         ]
 
     def _refusal(self) -> NotFusionError:
-        """Return an error with two dependent observed symbols, the path between them, and advice.
+        """Return an error with two dependent observed symbols, the path of arcs between them, and advice.
 
         If the observed symbols are not all independent, two of them are dependent, regardless of the others (a property
         of d-separation).

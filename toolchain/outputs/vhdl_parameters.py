@@ -252,7 +252,7 @@ class PackageTokens:
         return cls.of(read_bounded(path, _MOST_BYTES, BuildError).decode("latin-1"), str(path))
 
     def value(self, constant: str) -> tuple[str, int]:
-        """Return the value of a constant, one token, and its line, or raise a BuildError."""
+        """Return a constant's value, which must be one token, and its line, or raise a BuildError."""
         words = [token for token, _ in self.tokens]
         for at in range(len(words) - 1):
             if words[at : at + 2] == ["constant", constant.lower()] and ":=" in words[at:]:
