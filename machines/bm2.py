@@ -227,7 +227,7 @@ class BM2Parameters:
 
     @property
     def joint_words(self) -> int:
-        """Number of words of the searched variables' joint histogram; 0 if it does not fit after the others."""
+        """Words of the searched variables' joint histogram; 0 if it does not fit after the other histograms."""
         words = 1 << sum(self.bits[variable] for variable in self.searched) if self.searched else 0
         return words if self.histogram_words + words <= RESULT_WORDS_MAX else 0
 

@@ -158,7 +158,7 @@ class Chains:
         ]
 
     def _circuit(self, starts: Sequence[BM2Start]) -> _Circuit | None:
-        """Return the operations for these starts; None if the chains cannot be sliced."""
+        """Return the operations for these starts; None if `run_sliced` cannot run them."""
         parameters, known, state = self._parameters, starts[0].known, starts[0].state
         unknown = [bit for bit in range(parameters.state_bits) if not known >> bit & 1]
         if (
@@ -238,7 +238,7 @@ class Chains:
         return fast.wiring_of(self._machines[0])
 
     def _run_in_step(self, moves: Moves, start: BM2Start, states: list[int], seeds: Words) -> _Ran | None:
-        """Run `IN_STEP` chains in step; None if a chain may not draw all samples."""
+        """Run `IN_STEP` chains in step; return None if a chain may reach a limit before it has drawn its samples."""
         parameters, cdes, row = self._parameters, self._parameters.cdes, fast.row_size(self._parameters)
         numbers = aligned((IN_STEP, cdes, row), np.uint16)
         values, addresses, results, clock = (
@@ -289,7 +289,7 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
     ends: Integers,
     limits: tuple[int, ...],
 ) -> bool:
-    """Run sliced chains to their ends, and set `ends`; return False if a chain may reach a limit before that.
+    """Run sliced chains to their ends, and set `ends`; return False if a chain may reach a limit before its end.
 
     Of the vectors, `counts` has a counter of sweeps, which overflows at the end of the burn-in and of the chain, and a
     counter of samples for each state but 0. `room` is working space: for the contexts' bits or a sample's events, and

@@ -238,7 +238,7 @@ def _start_of(
 
 
 def kernels_of(machines: Sequence[BM2Machine]) -> list[BM2Kernel]:
-    """Return kernels for `run_batches`, without streams, which would not change the samples."""
+    """Return kernels for `run_batches`; they have no streams, because a stream does not change the samples."""
     return [
         make_bm2_kernel(replace(machine, parameters=replace(machine.parameters, stream=0)))
         for machine in machines

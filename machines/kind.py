@@ -220,7 +220,7 @@ class FrameCourse(ABC):
     def proceed(
         self, reasons: Sequence[Sequence[int]], answers: Sequence[memoryview]
     ) -> tuple[Sequence[int], Blocks]:
-        """Return the numbers of the boards to resume (none: the frame is over), and the blocks to write before that.
+        """Return the numbers of the boards to resume (none if the frame is over), and the blocks to write first.
 
         `reasons` are the last stop reasons of each board's replicas. `answers` are each board's words of
         `UsedRegisters.answer`, valid until that board is resumed.

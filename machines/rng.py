@@ -60,7 +60,7 @@ def random_numbers(machine: BM1Machine | BM2Machine) -> RandomNumbers:
 
 
 def seed_set(parameters: RngParameters, bank: int) -> int:
-    """Return the index of the seed set that a bank is on this board; the boards of a BM2 never share a set."""
+    """Return the index of the seed set that this board uses for a bank; the boards of a BM2 never share a set."""
     return bank * parameters.chains + parameters.chain
 
 

@@ -52,5 +52,5 @@ class LinkModel:
 
 
 def link_model(rate: LinkRate) -> LinkModel | None:
-    """Return a model of this kind of link; None for no delay."""
+    """Return a model of a link with this rate; None for no delay."""
     return None if rate is LinkRate.NONE else LinkModel(WIRES[rate])

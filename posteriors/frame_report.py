@@ -30,7 +30,7 @@ class StageTimes:
     reads: FiniteFloat | None = None
     boards_compute: FiniteFloat | None = None
     rosbridge_out: FiniteFloat | None = None
-    """The time for sending the previous posterior, because the report is sent before its own posterior."""
+    """The time for sending the previous posterior, because a report is sent before the posterior of the same frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

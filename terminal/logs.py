@@ -27,7 +27,7 @@ FORMAT_VARIABLE: Final = "BM_LOG_FORMAT"
 
 _CLEAR_LINE: Final = "\r\x1b[K"
 _QUOTED: Final = frozenset(" \t=\r\n\"'")
-"""A value with one of these characters is quoted: they would end it in a text line, or begin another field."""
+"""Characters for which a value is quoted, because in a text line they would end the value or begin another field."""
 
 
 class _Process:
@@ -110,7 +110,7 @@ def write_line(text: str) -> None:
 
 
 def write_progress(text: str) -> None:
-    """Show a text on the terminal, which the next line replaces."""
+    """Show a text on the terminal until the next line replaces it."""
     _write(text)
     _Process.shows_progress = True
 

@@ -148,8 +148,8 @@ class Broker:
     def receive_turn(self, client: Client, messages: list[bytes], now: float) -> int:
         """Perform a client's messages in order until `TURN_WORK` is reached; each has at most `limits.message_bytes`.
 
-        Returns the number of messages performed. Call it again with the others; if the client's outbox is
-        congested, not before the client has read its answers.
+        Returns the number of messages performed. Call it again with the remaining ones; if the client's outbox
+        is congested, wait until the client has read its answers.
         """
         self._now, self._operation_id = now, None
         dispatcher, outbox = self._dispatcher, client.outbox
@@ -166,7 +166,7 @@ class Broker:
         return number
 
     def _perform(self, client: Client, data: bytes, now: float, *, is_whole: bool) -> None:
-        """Perform the operation in a message; a reassembled one (`is_whole` is False) must not be a fragment."""
+        """Perform the operation in a message; a reassembled message (`is_whole` is False) must not be a fragment."""
         operation: Any = None
         raw: bytes | None = data
         if len(data) <= self.limits.message_bytes:

@@ -72,7 +72,7 @@ def json_prefix(name: str) -> bytes:
 
 
 AROUND: Final = len(json_prefix("")) + 1
-"""Bytes of a publish operation without the name of its topic and the JSON of its message."""
+"""Size in bytes of a publish operation without the name of its topic and the JSON of its message."""
 
 
 @dataclass(eq=False, slots=True)

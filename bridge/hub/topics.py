@@ -382,7 +382,7 @@ class Topics:
 
 
 def _learn_envelope(advertisement: Advertisement, name: str, raw: bytes) -> None:
-    """Store an operation's bytes before its message, if the topic's next operations can be recognised by them."""
+    """Store the bytes before the message of an operation, if they identify the topic's next operations."""
     client, envelope = advertisement.client, envelope_of(raw)
     if envelope and topic_of(envelope) == name:
         _forget_envelope(advertisement)

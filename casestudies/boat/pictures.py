@@ -74,8 +74,8 @@ _STAGES: Final[tuple[_Stage, ...]] = (
 def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
     """Return the stages in order, except those that no frame with a posterior reports.
 
-    `rosbridge out` is measured here, from the sending of a result to its arrival; the others come from
-    `/bm/frame`.
+    `rosbridge out` is measured here, from the sending of a result to its arrival; the other stages
+    come from `/bm/frame`.
     """
     return _shares(instances, _STAGES)
 

@@ -132,7 +132,7 @@ class Connection:
         self.send(reply + self._greeting)
 
     def send(self, data: bytes) -> None:
-        """Send all bytes, collecting those of one `answer`; close a connection that accepts none for SEND_S."""
+        """Send bytes, those of one `answer` together; close the connection if the peer accepts nothing for SEND_S."""
         self._unsent += data
         if not self._answering or len(self._unsent) >= _TOGETHER:
             self._flush()

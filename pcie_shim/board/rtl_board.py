@@ -87,7 +87,7 @@ class RtlBoard:
             raise self._preparation.error
 
     def load(self, content: bytes) -> None:
-        """Program the board; a RefusedError as in `Board.load`, or if the hardware is not compiled within LOAD_S."""
+        """Program the board as `Board.load` does; also raise a RefusedError if compiling takes longer than LOAD_S."""
         if self.running:
             raise RefusedError(ErrorCode.BUSY, "the machine is running; reset it before programming")
         try:

@@ -35,7 +35,7 @@ TURNS = 3
 IN_FLIGHT = 32
 """Number of messages in flight when servers are compared."""
 WINDOW = {SMALL: 400, LARGE: 100}
-"""Maximum number of messages by which a receiving client may lag, by number of values; the hub drops none yet."""
+"""Maximum number of messages by which a receiving client lags, by number of values: so few that the hub drops none."""
 COUNTS = {SMALL: (12_000, 12_000, 600), LARGE: (1_000, 2_000, 200)}
 """Number of messages per turn to publish, to receive and in round trips, by number of values (50 ms or more)."""
 SERVER_MESSAGES = {"hub": 100_000, "Tornado double": 8_000}

@@ -36,7 +36,7 @@ from toolchain.networks import read_network
 SINGLE_AIMS: Final = {"sprinkler": 6e7, "alarm": 2e7}
 """Cycles a second of one chain."""
 RATIO_AIMS: Final = {"sprinkler": 10, "alarm": 2}
-"""Cycles a second of many chains, over those of one."""
+"""Minimum ratio of the cycles per second of many chains to those of one chain."""
 MANY: Final = {"sprinkler": 512, "alarm": 32}
 """Number of chains in a run of many."""
 TURNS: Final = 3

@@ -42,7 +42,7 @@ BOARDS = (1, 2, 4)
 WORDS = (1, 16, 256, 1024, 4096, 8192)
 RESULTS = 4096
 WAYS = {"sent": (), "read": ("--read-results",)}
-"""Flags of `board` for the way of the results: in the done message, or by reads of registers as in the thesis."""
+"""Flags of `board` by the way in which results arrive: in the done message, or by register reads as in the thesis."""
 SLOWER = 20
 """Measurements of every other link for each one over JTAG, because a transfer over JTAG takes milliseconds."""
 TOLERANCE = 0.15

@@ -13,7 +13,7 @@ THRML_LOCK: Final = Path(__file__).with_name("thrml.lock")
 CHAINS: Final = 64
 """Chains that THRML runs side by side."""
 _LEAST: Final = 1e-30
-"""A zero of a table for THRML, whose weights are logarithms."""
+"""The probability that replaces a zero of a table for THRML, whose weights are logarithms."""
 Factor: TypeAlias = tuple[tuple[int, ...], NDArray[np.float64]]
 """The indices of a factor's variables, and the factor's table."""
 Known: TypeAlias = Mapping[int, int]

@@ -29,9 +29,9 @@ from toolchain.building.options import BuildOptions
 from toolchain.models import Known, Model, dimension
 
 LINES, SENSORS, PADDING = (64, 256, 1024, 4096), (2, 6, 14, 30), (0, 1_000, 10_000, 100_000, 400_000)
-"""The sizes; a message has so many bytes besides its readings."""
+"""The sizes to measure; PADDING is in bytes, which a message has in addition to its readings."""
 BASE = 1024, 6, 0
-"""The two sizes that do not vary."""
+"""The base problem: lines, sensors and padding, of which each series of measurements varies one."""
 NEARLY_EVEN = 0.45, 0.55
 """Probabilities of a sensor's reading 1, given a line."""
 TYPE = "bench_msgs/Readings"

@@ -38,7 +38,7 @@ class Run:
         self.times: Times = defaultdict(list)
 
     async def cycle(self, reading: dict[str, int]) -> None:
-        """Publish a reading as soon as somebody reads it, and wait for its result."""
+        """Publish a reading once its topic has a subscriber, and wait for the result."""
         started = time.perf_counter_ns()
         await until_read(self._ros, self._topic, PAUSE)
         await self._publication.publish(message(reading))

@@ -14,7 +14,7 @@ from toolchain.deployment import TopicsSection
 
 OFF: Final = "\n[topics]\n" + "".join(f"{key} = false\n" for key in TopicsSection.model_fields)
 LIMIT: Final = 24 * 3600.0
-"""Time limit in seconds, which any number of rounds should keep."""
+"""Time limit of the bench in seconds, long enough for any number of rounds."""
 TOPICS: Final = ("/bm/counts", "/bm/posterior", "/bm/pose", "/bm/decision", "/diagnostics")
 
 

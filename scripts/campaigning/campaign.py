@@ -29,7 +29,7 @@ MOST_KIB, MOST_DESCRIPTORS = 32 * 1024, 8
 
 
 async def run(options: argparse.Namespace, folder: Path) -> int:
-    """Run rounds until enough frames are judged or one has findings, and return the exit code."""
+    """Run rounds until enough frames are judged or a round has findings, and return the exit code."""
     deployment, toolchain = folder / "campaign", Process("toolchain", folder / "toolchain.log")
     await toolchain.start(
         *("toolchain", "build", str(ROOT / "scripts" / "campaigning" / "model"), "-o", str(deployment)),

@@ -72,7 +72,7 @@ SHORT: tuple[Step, ...] = (
 ENDS = {"master": 1, "hub": 2, "boards": 3}
 """Maximum ends of a role per round; 3 for boards, because a board's fourth failure in a minute ends the master."""
 MOST_ENDS = 2
-"""The same for the other roles and for their connections to the master."""
+"""The same maximum for each role that is not in `ENDS`, and for the roles' connections to the master."""
 _ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memory"}
 _FAILS_BOARD = {*_ENDS_LINK, "stop", "hold"}
 _CUTS_ROSBRIDGE = {"gone", "finish", "nonsense", "cut-inside", "files"}

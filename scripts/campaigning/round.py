@@ -36,7 +36,7 @@ _ANSWER_LIMIT = 10.0 * FACTOR
 _RECOVERY_LIMIT = 180.0 * FACTOR
 """Timeout in seconds for new results after a fault; generous, because it does not judge the stack's speed."""
 _CALM_LIMIT = 5.0 * FACTOR
-"""Seconds within which a further result must arrive, on average."""
+"""Seconds allowed for each result of the frames after a fault, in addition to `_RECOVERY_LIMIT`."""
 _SETTLE_LIMIT = 30.0 * FACTOR
 """Timeout in seconds until nothing is in flight, sufficient even if a board does not answer or the machine is busy."""
 _QUIET = 0.6 * FACTOR

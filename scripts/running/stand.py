@@ -87,7 +87,7 @@ class Stand:
         return await asyncio.shield(self._processes[name].wait())
 
     async def start_hub(self, *flags: str) -> None:
-        """Start the hub on a free port, on which it will also start again."""
+        """Start the hub on a free port; a restart uses the same port."""
         self.uri = await self.start("hub", r"ws://\S+", "hub", *flags, "--port", "0")
         self._commands["hub"] = ("hub", *flags, "--port", str(urlsplit(self.uri).port))
 
@@ -119,7 +119,7 @@ class Stand:
         await self.start("simulator", "seed", "boat-simulator", "--uri", self.uri)
 
     async def start_dashboard(self) -> None:
-        """Start the dashboard on a free port, on which it will also start again."""
+        """Start the dashboard on a free port; a restart uses the same port."""
         command = ("dashboard", *self._where("master"), "--port")
         self.url = await self.start("dashboard", r"http://[\w.:]+", *command, "0")
         self._commands["dashboard"] = (*command, str(urlsplit(self.url).port))

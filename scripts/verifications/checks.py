@@ -43,7 +43,7 @@ class Tally:
     def check(
         self, name: str, *errors: type[Exception], details: Callable[[], str] = lambda: ""
     ) -> Iterator[None]:
-        """Report a check, which the block runs; it fails by a CheckError or by one of these errors, with details."""
+        """Run the block as a check and report it; a CheckError or one of `errors` fails it, and adds `details`."""
         started, why = time.monotonic(), None
         known: tuple[type[Exception], ...] = (CheckError, *errors)
         try:

@@ -76,7 +76,7 @@ class Scene:
     received: dict[int, Posterior] = field(default_factory=dict)
     """The posteriors by frame number."""
     news: asyncio.Condition = field(default_factory=asyncio.Condition)
-    """Notified of each of these."""
+    """Notified of each new position and posterior."""
 
     @property
     def newest(self) -> int:

@@ -30,7 +30,7 @@ class Engine(StrEnum):
 
 
 class SimulatedHardware:
-    """The simulator of an engine, and the boards that use it."""
+    """The simulator that `board --engine` selects, and the boards simulated with it."""
 
     def __init__(self, engine: Engine, folder: Path, images: Mapping[int, Image]) -> None:
         """Choose the simulator, and compile the given images of boards into the folder.

@@ -14,7 +14,7 @@ METRICS_PORTS = {"subscriber": 1, "publisher": 2, "pcie-app": 3, "board": 4}
 
 
 def _metrics(settings: Settings, role: str) -> list[str]:
-    """Return the flags for the metrics of a process; `--insecure`, because the master has checked the access."""
+    """Return the flags for a process's metrics, with `--insecure`, because the master has checked the access."""
     if not settings.metrics:
         return []
     return ["--metrics", shifted(settings.metrics, METRICS_PORTS[role]), "--insecure"]

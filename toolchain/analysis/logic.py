@@ -88,7 +88,7 @@ class Of(StrEnum):
     WORD = "word"
     """A word that the host writes for a frame, in bm1_words: its logic decodes the address and checks the value."""
     MEMORY = "memory"
-    """A memory of such words, in bm1_words: its initial contents and its output."""
+    """A memory of words that the host writes, in bm1_words: its initial contents and its output."""
     REPLICA = "replica"
     """One of several replicas, in bm1_control and bm1_readout: its stop, stop reason, resume and outcome."""
 

@@ -306,7 +306,7 @@ _WRITERS: Final = {".npz": _archive, ".mcap": _bag}
 
 
 def check_request(path: Path, deployment: Deployment) -> None:
-    """Raise a BuildError, before a long run, if the output cannot be written or readings must be arrays."""
+    """Raise a BuildError, before a long run, if the output cannot be written or the deployment reads arrays."""
     if not deployment.machine.is_plain or deployment.prior is not None:
         raise BuildError(
             f"{deployment.directory} reads arrays of numbers (for each line or replica, or a prior), but the columns of a "

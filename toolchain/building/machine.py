@@ -209,7 +209,7 @@ class BoardLayout:
     interface: tuple[int, int]
     """Numbers of input and result words of a board's registers."""
     reason: str
-    """The reason for this size, as a clause."""
+    """The reason for the size of the interface, as a clause."""
 
 
 def board_layout(

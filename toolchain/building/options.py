@@ -91,7 +91,7 @@ THESIS: Final = {
     # `toolchain explore` has a list of steps
     "steps": "1",
 }
-"""The values that `--thesis` gives to other flags, for the machine of the thesis; a command may lack some of them."""
+"""The values that `--thesis` gives to other flags, for the machine of the thesis; a command may lack some flags."""
 
 
 def _use_thesis(context: typer.Context, value: bool) -> bool:

@@ -71,7 +71,7 @@ class Quantised:
     losses: tuple[ColumnLoss, ...]
     """The loss of the prior, and one per known variable."""
     floors: tuple[VanishedFloor, ...]
-    """The outlier floors that are too low for the codes."""
+    """The outlier floors (`floor` of a distribution) that are too low for the codes."""
     warnings: tuple[str, ...]
     """Warnings for the user, one sentence each."""
 

@@ -54,7 +54,7 @@ class _Pending:
         return len(self._names)
 
     def forget(self, identity: str) -> None:
-        """Ignore further answers with an id."""
+        """Ignore further answers to the request with this id."""
         self._names.pop(identity, None)
 
     def lost(self) -> None:

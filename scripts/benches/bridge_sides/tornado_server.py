@@ -68,7 +68,7 @@ def fitting(kind: str, value: Any) -> Any:
 
 
 def taken_out(value: Any) -> Any:
-    """Return the content of a message for JSON."""
+    """Return a message as plain dictionaries and lists, for JSON."""
     if isinstance(value, Message):
         return {name: taken_out(getattr(value, name)) for name in value.fields}
     return [taken_out(item) for item in value] if isinstance(value, list) else value
